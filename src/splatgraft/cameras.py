@@ -1,0 +1,117 @@
+"""The value `Cameras`: undistorted pinhole cameras with poses. Knows nothing about images or files."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """v pinhole cameras; OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
+
+    world_from_camera: Float[Tensor, "v 4 4"]
+    """Rigid poses: a point in camera coordinates to world coordinates."""
+    intrinsics: Float[Tensor, "v 3 3"]
+    """fx, fy, cx, cy in pixels in the usual places; no skew."""
+    sizes: Int[Tensor, "v 2"]
+    """Width and height of each image, pixels."""
+    names: tuple[str, ...]
+    """One name per camera, unique; the image file's name where there is one."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, which: int | slice | list[int] | Int[Tensor, "m"] | Bool[Tensor, "v"]) -> "Cameras":
+        """The chosen cameras; one integer gives one camera, still as a batch of 1."""
+        indices = torch.arange(len(self))[[which] if isinstance(which, int) else which]
+        return Cameras(
+            world_from_camera=self.world_from_camera[indices],
+            intrinsics=self.intrinsics[indices],
+            sizes=self.sizes[indices],
+            names=tuple(self.names[int(i)] for i in indices),
+        )
+
+    def __iter__(self) -> Iterator["Cameras"]:
+        return (self[i] for i in range(len(self)))
+
+    @property
+    def same_size(self) -> bool:
+        """Whether all images have one size, so that they can be stacked."""
+        return len(self) == 0 or bool((self.sizes == self.sizes[0]).all())
+
+    @property
+    def width(self) -> int:
+        """Image width that all share, pixels.
+
+        Raises: ValueError where sizes differ.
+        """
+        return self._shared_size(0)
+
+    @property
+    def height(self) -> int:
+        """Image height that all share, pixels.
+
+        Raises: ValueError where sizes differ.
+        """
+        return self._shared_size(1)
+
+    def _shared_size(self, axis: int) -> int:
+        if len(self) == 0 or not self.same_size:
+            found = sorted({tuple(size) for size in self.sizes.tolist()})
+            raise ValueError(f"cameras: expected one image size for all views, found {found}")
+        return int(self.sizes[0, axis])
+
+    @property
+    def centers(self) -> Float[Tensor, "v 3"]:
+        """Optical centres in the world."""
+        return self.world_from_camera[:, :3, 3]
+
+    @property
+    def camera_from_world(self) -> Float[Tensor, "v 4 4"]:
+        """Inverse poses: a point in world coordinates to camera coordinates."""
+        rotation = self.world_from_camera[:, :3, :3].transpose(1, 2)
+        out = torch.eye(4, dtype=rotation.dtype, device=rotation.device).repeat(len(self), 1, 1)
+        out[:, :3, :3] = rotation
+        out[:, :3, 3] = -(rotation @ self.centers[..., None])[..., 0]
+        return out
+
+    def resized(self, factor: float) -> "Cameras":
+        """Cameras of images resampled by `factor`; sizes are rounded, intrinsics follow the rounded size exactly."""
+        sizes = (self.sizes * factor).round().clamp_min(1).to(self.sizes.dtype)
+        ratio = (sizes / self.sizes).to(self.intrinsics)
+        scale = torch.diag_embed(torch.cat([ratio, torch.ones_like(ratio[:, :1])], 1))
+        return replace(self, intrinsics=scale @ self.intrinsics, sizes=sizes)
+
+    def to(self, device: torch.device | str) -> "Cameras":
+        """The same cameras on `device`; sizes stay on the CPU."""
+        return replace(
+            self, world_from_camera=self.world_from_camera.to(device), intrinsics=self.intrinsics.to(device)
+        )
+
+
+def pinhole(
+    world_from_camera: Float[Tensor, "v 4 4"], focal_px: float, *, width: int, height: int, prefix: str = "view"
+) -> Cameras:
+    """Cameras that share one focal length, with the principal point at the image centre."""
+    v = len(world_from_camera)
+    intrinsics = torch.tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]]).repeat(v, 1, 1)
+    return Cameras(
+        world_from_camera=world_from_camera,
+        intrinsics=intrinsics.to(world_from_camera),
+        sizes=torch.tensor([[width, height]]).repeat(v, 1),
+        names=tuple(f"{prefix}_{i:04d}" for i in range(v)),
+    )
+
+
+def look_at(eye: Float[Tensor, "v 3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "v 4 4"]:
+    """Poses at `eye` that look at `target` with `up` upwards in the image."""
+    forward = torch.nn.functional.normalize(target - eye, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.expand_as(forward)), dim=-1)
+    down = torch.linalg.cross(forward, right)
+    out = torch.eye(4, dtype=eye.dtype).repeat(len(eye), 1, 1)
+    out[:, :3, :3] = torch.stack([right, down, forward], -1)
+    out[:, :3, 3] = eye
+    return out

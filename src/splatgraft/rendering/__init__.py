@@ -1,0 +1,5 @@
+"""Rendering of Gaussians: one interface, numba kernels on the CPU, gsplat on CUDA. Knows nothing about files."""
+
+from splatgraft.rendering.interface import Render, RenderOptions, ViewOperator, render, view_operator
+
+__all__ = ["Render", "RenderOptions", "ViewOperator", "render", "view_operator"]

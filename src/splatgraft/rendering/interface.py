@@ -1,0 +1,74 @@
+"""What rendering takes and gives, and the choice of the device's implementation. Holds no arithmetic of its own."""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.cameras import Cameras
+from splatgraft.gaussians import Gaussians
+
+Output = Literal["color", "depth", "normal"]
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """What changes the picture but belongs to no scene."""
+
+    low_pass: Literal["classic", "antialiased"] = "classic"
+    """Both add 0.3 px^2 to the projected covariance; `antialiased` also scales opacity by the area ratio (Mip-Splatting)."""
+    near: float = 0.01
+    """Gaussians whose centre is nearer than this along the optical axis are not drawn, world units."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """sRGB seen through what is not opaque."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Pictures of one scene from v cameras of one size."""
+
+    color: Float[Tensor, "v h w 3"] | None
+    """sRGB over the background, not clamped above; None where not asked for."""
+    alpha: Float[Tensor, "v h w"]
+    """Accumulated opacity in [0, 1]."""
+    depth: Float[Tensor, "v h w"] | None
+    """Expected distance along the optical axis given a hit, world units; 0 where alpha is 0."""
+    normal: Float[Tensor, "v h w 3"] | None
+    """World-frame unit normal towards the camera (shortest axes, blended, normalised); 0 where alpha is 0."""
+    features: Float[Tensor, "v h w f"] | None
+    """Blended per-Gaussian features, not divided by alpha."""
+    visible: Bool[Tensor, "v n"]
+    """Which Gaussians reach at least one pixel's tile list of that view."""
+
+
+class ViewOperator(Protocol):
+    """The fixed linear map W from Gaussian values to pixels of one view: geometry and opacity are frozen."""
+
+    alpha: Float[Tensor, "h w"]
+    visible: Bool[Tensor, "n"]
+
+    def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
+        """W values, over black. Differentiable in `values`."""
+        ...
+
+    def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
+        """W^T image."""
+        ...
+
+
+def render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    *,
+    outputs: frozenset[Output] = frozenset({"color"}),
+    features: Float[Tensor, "n f"] | None = None,
+    options: RenderOptions = RenderOptions(),
+) -> Render:
+    """Splat `gaussians` into `cameras`; differentiable in every field and in `features`."""
+    raise NotImplementedError
+
+
+def view_operator(gaussians: Gaussians, camera: Cameras, options: RenderOptions = RenderOptions()) -> ViewOperator:
+    """The map from Gaussian values to the pixels of one camera, with depth order and tile lists computed once."""
+    raise NotImplementedError
