@@ -1,0 +1,44 @@
+"""What every harmoniser takes and gives: the pictures of one view. Knows nothing about models or weights."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class HarmonizerInputs:
+    """The pictures of one view of a composite."""
+
+    composite: Float[Tensor, "h w 3"]
+    """The object pasted in as it was captured, sRGB in [0, 1]."""
+    background: Float[Tensor, "h w 3"]
+    """The target scene without the object, sRGB in [0, 1]."""
+    mask: Float[Tensor, "h w"]
+    """How much of each pixel the object covers, in [0, 1]."""
+    depth: Float[Tensor, "h w"]
+    """Distance of the composite along the optical axis, world units of the target; 0 where nothing is hit."""
+    normal: Float[Tensor, "h w 3"]
+    """Unit normal of the composite towards the camera, in the target's world; 0 where nothing is hit."""
+    prior: Float[Tensor, "h w 3"]
+    """The composite after light transfer, sRGB in [0, 1]; equal to `composite` where none was done."""
+
+
+@dataclass(frozen=True)
+class Harmonized:
+    """What a harmoniser says about one view."""
+
+    image: Float[Tensor, "h w 3"]
+    """The view with the light made to agree, sRGB in [0, 1]."""
+    confidence: Float[Tensor, "h w"] | None = None
+    """How far each pixel may be trusted, in [0, 1]; None where the harmoniser does not say."""
+
+
+@runtime_checkable
+class Harmonizer(Protocol):
+    """Makes the light of one view agree."""
+
+    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+        """The harmonised image of `view`, of the same size."""
+        ...
