@@ -1,6 +1,5 @@
 """Images as tensors: reading and writing files, sRGB transfer, resampling. Knows nothing about cameras or Gaussians."""
 
-import os
 from pathlib import Path
 
 import cv2
@@ -10,7 +9,12 @@ from jaxtyping import Float
 from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
+from splatgraft.whole_file import whole_file
+
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})
+_EXIF_ORIENTATION = 0x0112
+_EXIF_SWAPS_SIDES = frozenset({5, 6, 7, 8})
+_UNREADABLE = (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
 def linear_from_srgb(srgb: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -40,6 +44,30 @@ def read_rgb(path: Path) -> Float[Tensor, "h w 3"]:
     return torch.from_numpy(np.array(_open(path).convert("RGB"))).float() / 255
 
 
+def read_alpha(path: Path) -> Float[Tensor, "h w"]:
+    """The alpha channel in [0, 1]; ones where the file has none.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    image = _open(path)
+    if not image.has_transparency_data:
+        return torch.ones(image.height, image.width)
+    return torch.from_numpy(np.array(image.convert("RGBA").getchannel("A"))).float() / 255
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height after EXIF rotation, without decoding the pixels.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    try:
+        with Image.open(path) as image:
+            turned = image.getexif().get(_EXIF_ORIENTATION) in _EXIF_SWAPS_SIDES
+            return (image.height, image.width) if turned else image.size
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from error
+
+
 def read_mask(path: Path) -> Float[Tensor, "h w"]:
     """Coverage in [0, 1]: the alpha channel where the file has one that varies, else luma.
 
@@ -58,23 +86,43 @@ def read_mask(path: Path) -> Float[Tensor, "h w"]:
     return torch.from_numpy(np.array(image.convert("L"))).float() / 255
 
 
+def has_transparency(path: Path) -> bool:
+    """Whether the file has an alpha channel or a transparent colour, without decoding the pixels.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    try:
+        with Image.open(path) as image:
+            return image.has_transparency_data
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from error
+
+
 def _open(path: Path) -> Image.Image:
     try:
-        image = ImageOps.exif_transpose(Image.open(path))
-        image.load()
-        return image
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        if not path.is_file():
-            raise ValueError(f"{path}: expected an image file, found none") from error
-        raise ValueError(f"{path}: expected a readable image, found {type(error).__name__}: {error}") from error
+        with Image.open(path) as image:
+            return ImageOps.exif_transpose(image)
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> ValueError:
+    if not path.is_file():
+        return ValueError(f"{path}: expected an image file, found none")
+    return ValueError(f"{path}: expected a readable image, found {type(error).__name__}: {error}")
 
 
 def write_image(path: Path, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"]) -> None:
-    """Write 8-bit sRGB or grey; the format follows the suffix. The file appears whole or not at all."""
+    """Write 8-bit sRGB or grey; the format follows the suffix. The file appears whole or not at all.
+
+    Raises: ValueError where the suffix names no image format.
+    """
+    kind = Image.registered_extensions().get(path.suffix.lower())
+    if path.suffix.lower() not in IMAGE_SUFFIXES or kind is None:
+        raise ValueError(f"{path}: expected an image name that ends in {', '.join(sorted(IMAGE_SUFFIXES))}")
     array = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    Image.fromarray(array).save(partial)
-    os.replace(partial, path)
+    with whole_file(path) as stream:
+        Image.fromarray(array).save(stream, format=kind, **({"quality": 95} if kind == "JPEG" else {}))
 
 
 def resize(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "j i *c"]:

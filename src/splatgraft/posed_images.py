@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
-from splatgraft.images import read_mask, read_rgb, resize
+from splatgraft.distortion import Distortion
+from splatgraft.images import read_alpha, read_mask, read_rgb, resize
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,7 @@ class PosedImages:
     """v images with their cameras, and m sparse points from structure from motion."""
 
     image_paths: tuple[Path, ...]
-    """One file per camera, in the cameras' order, undistorted."""
+    """One file per camera, in the cameras' order, as photographed: `image` serves their undistorted pixels."""
     cameras: Cameras
     """Poses and intrinsics, at the size at which images are served."""
     points: Float[Tensor, "m 3"]
@@ -24,23 +25,31 @@ class PosedImages:
     point_colors: Float[Tensor, "m 3"]
     """sRGB in [0, 1]."""
     mask_paths: tuple[Path | None, ...] = ()
-    """Object mask of each image where there is one; empty where the capture has none."""
+    """Object mask of each image where there is one (the image itself where that is its alpha channel); empty where the
+    capture has none."""
+    distortions: tuple[Distortion | None, ...] = ()
+    """Lens distortion of each image file, removed when it is read; empty where no file has any."""
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     def image(self, index: int) -> Float[Tensor, "h w 3"]:
-        """The image of camera `index`, sRGB, resampled to that camera's size."""
-        width, height = self.cameras.sizes[index].tolist()
-        return resize(read_rgb(self.image_paths[index]), width, height)
+        """The image of camera `index`, sRGB, undistorted and resampled to that camera's size."""
+        return self._served(read_rgb(self.image_paths[index]), index)
 
     def mask(self, index: int) -> Float[Tensor, "h w"] | None:
         """The object mask of camera `index` in [0, 1], or None."""
         path = self.mask_paths[index] if self.mask_paths else None
         if path is None:
             return None
+        return self._served(read_alpha(path) if path == self.image_paths[index] else read_mask(path), index)
+
+    def _served(self, pixels: Float[Tensor, "h w *c"], index: int) -> Float[Tensor, "j i *c"]:
         width, height = self.cameras.sizes[index].tolist()
-        return resize(read_mask(path), width, height)
+        distortion = self.distortions[index] if self.distortions else None
+        if distortion is not None:
+            pixels = distortion.undistort(pixels, self.cameras.intrinsics[index], width=width, height=height)
+        return resize(pixels, width, height)
 
     def select(self, which: Bool[Tensor, "v"]) -> "PosedImages":
         """The views that the mask keeps; points stay."""
@@ -50,6 +59,7 @@ class PosedImages:
             image_paths=tuple(self.image_paths[i] for i in indices),
             cameras=self.cameras[indices],
             mask_paths=tuple(self.mask_paths[i] for i in indices) if self.mask_paths else (),
+            distortions=tuple(self.distortions[i] for i in indices) if self.distortions else (),
         )
 
     def resized(self, factor: float) -> "PosedImages":

@@ -1,1 +1,72 @@
-"""TODO"""
+"""Reading and writing files, by suffix and by what lies in a folder. Holds no format itself."""
+
+from pathlib import Path
+
+from splatgraft.cameras import Cameras
+from splatgraft.formats import gaussian_ply, transforms_json
+from splatgraft.formats.points_ply import read_points, write_points
+from splatgraft.gaussians import Gaussians
+from splatgraft.posed_images import PosedImages
+
+__all__ = [
+    "read_cameras",
+    "read_capture",
+    "read_gaussians",
+    "read_points",
+    "write_cameras",
+    "write_capture",
+    "write_gaussians",
+    "write_points",
+]
+
+
+def read_gaussians(path: Path) -> Gaussians:
+    """The scene in a .ply file.
+
+    Raises: ValueError where the suffix is another, or the file is not what its suffix says.
+    """
+    if path.suffix.lower() != ".ply":
+        raise ValueError(f"{path}: expected a scene that ends in .ply, found '{path.suffix}'")
+    return gaussian_ply.read_gaussian_ply(path)
+
+
+def write_gaussians(path: Path, gaussians: Gaussians) -> None:
+    """Write a scene in the format of the suffix; the file appears whole or not at all."""
+    if path.suffix.lower() != ".ply":
+        raise ValueError(f"{path}: expected a scene that ends in .ply, found '{path.suffix}'")
+    gaussian_ply.write_gaussian_ply(path, gaussians)
+
+
+def read_capture(path: Path) -> PosedImages:
+    """Posed photographs: a folder with transforms.json, or that file itself.
+
+    Raises: ValueError where nothing of these is there, or what is there is broken.
+    """
+    return transforms_json.read_capture(_transforms_path(path))
+
+
+def write_capture(folder: Path, posed_images: PosedImages) -> None:
+    """Write transforms.json and points.ply into an existing folder; image files are referred to, not copied."""
+    transforms_json.write_capture(folder, posed_images)
+
+
+def read_cameras(path: Path) -> Cameras:
+    """The cameras of a capture, or of a transforms.json whose images need not exist.
+
+    Raises: ValueError where nothing of these is there, or what is there is broken.
+    """
+    return transforms_json.read_cameras(_transforms_path(path))
+
+
+def write_cameras(path: Path, cameras: Cameras) -> None:
+    """Write a transforms.json of cameras alone."""
+    transforms_json.write_cameras(path, cameras)
+
+
+def _transforms_path(path: Path) -> Path:
+    if path.suffix.lower() == ".json":
+        return path
+    for name in ("transforms.json", "transforms_train.json"):
+        if (path / name).is_file():
+            return path / name
+    raise ValueError(f"{path}: expected a folder with transforms.json, found none")
