@@ -1,7 +1,9 @@
 """What rendering takes and gives, and the choice of the device's implementation. Holds no arithmetic of its own."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from importlib import import_module
+from types import ModuleType
+from typing import Literal, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -17,7 +19,7 @@ class RenderOptions:
     """What changes the picture but belongs to no scene."""
 
     low_pass: Literal["classic", "antialiased"] = "classic"
-    """Both add 0.3 px^2 to the projected covariance; `antialiased` also scales opacity by the area ratio (Mip-Splatting)."""
+    """Both add 0.3 px^2 to the covariance; `antialiased` also scales opacity by the area ratio (Mip-Splatting)."""
     near: float = 0.01
     """Gaussians whose centre is nearer than this along the optical axis are not drawn, world units."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -42,6 +44,7 @@ class Render:
     """Which Gaussians reach at least one pixel's tile list of that view."""
 
 
+@runtime_checkable
 class ViewOperator(Protocol):
     """The fixed linear map W from Gaussian values to pixels of one view: geometry and opacity are frozen."""
 
@@ -65,10 +68,20 @@ def render(
     features: Float[Tensor, "n f"] | None = None,
     options: RenderOptions = RenderOptions(),
 ) -> Render:
-    """Splat `gaussians` into `cameras`; differentiable in every field and in `features`."""
-    raise NotImplementedError
+    """Splat `gaussians` into `cameras`, which share a size; differentiable in every field and in `features`.
+
+    Raises: ValueError where camera sizes differ.
+    """
+    implementation = _implementation(gaussians)
+    return implementation.render(gaussians, cameras, outputs=outputs, features=features, options=options)
 
 
 def view_operator(gaussians: Gaussians, camera: Cameras, options: RenderOptions = RenderOptions()) -> ViewOperator:
     """The map from Gaussian values to the pixels of one camera, with depth order and tile lists computed once."""
-    raise NotImplementedError
+    return _implementation(gaussians).view_operator(gaussians, camera, options)
+
+
+def _implementation(gaussians: Gaussians) -> ModuleType:
+    # imported when first drawn: numba and gsplat take seconds to load
+    name = "cuda" if gaussians.device.type == "cuda" else "cpu"
+    return import_module(f"splatgraft.rendering.{name}")

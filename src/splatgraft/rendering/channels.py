@@ -1,0 +1,51 @@
+"""The channels that every device blends together, and the pictures made of them. Knows no device."""
+
+from collections.abc import Set as AbstractSet
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.rendering.interface import Output, Render, RenderOptions
+
+WIDTHS: dict[Output, int] = {"color": 3, "depth": 1, "normal": 3}
+"""Channels of each output, blended in this order; features follow."""
+
+
+def pictures(
+    image: Float[Tensor, "v c h w"],
+    alpha: Float[Tensor, "v h w"],
+    visible: Bool[Tensor, "v n"],
+    *,
+    outputs: AbstractSet[Output],
+    has_features: bool,
+    options: RenderOptions,
+) -> Render:
+    """The `Render` of blended channels: background behind colour, depth per hit, normals of length one."""
+    planes, at = {}, 0
+    for name, width in WIDTHS.items():
+        if name in outputs:
+            planes[name], at = image[:, at : at + width], at + width
+    return Render(
+        color=_over(planes["color"], alpha, options.background) if "color" in outputs else None,
+        alpha=alpha,
+        depth=_per_hit(planes["depth"][:, 0], alpha) if "depth" in outputs else None,
+        normal=_unit(planes["normal"].permute(0, 2, 3, 1)) if "normal" in outputs else None,
+        features=image[:, at:].permute(0, 2, 3, 1) if has_features else None,
+        visible=visible,
+    )
+
+
+def _over(planes: Tensor, alpha: Tensor, background: tuple[float, float, float]) -> Tensor:
+    if any(background):
+        planes = planes + (1 - alpha)[:, None] * planes.new_tensor(background)[:, None, None]
+    return planes.permute(0, 2, 3, 1)
+
+
+def _per_hit(depth: Tensor, alpha: Tensor) -> Tensor:
+    return depth / torch.where(alpha > 0, alpha, 1)
+
+
+def _unit(normal: Tensor) -> Tensor:
+    squares = (normal * normal).sum(-1, keepdim=True)
+    return normal / torch.where(squares > 0, squares, 1).sqrt()

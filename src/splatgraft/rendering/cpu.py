@@ -1,0 +1,217 @@
+"""Rendering on the CPU: numba kernels behind torch autograd. Knows nothing about files or training."""
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.cameras import Cameras
+from splatgraft.gaussians import Gaussians
+from splatgraft.rendering import cpu_blend, cpu_project, cpu_tiles
+from splatgraft.rendering.channels import pictures
+from splatgraft.rendering.interface import Output, Render, RenderOptions
+
+# numba's workqueue threading layer crashes when two threads start kernels at once
+_KERNELS = threading.Lock()
+
+
+def render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    *,
+    outputs: frozenset[Output],
+    features: Float[Tensor, "n f"] | None,
+    options: RenderOptions,
+) -> Render:
+    """`rendering.render` for tensors on the CPU."""
+    extra = gaussians.means.new_zeros(gaussians.count, 0) if features is None else features
+    fields = [t.float() for t in (*_geometry(gaussians), gaussians.sh, extra)]
+    views = [_Splat.apply(_View.of(camera, options), outputs, *fields) for camera in cameras]
+    image, alpha, visible = (torch.stack(parts) for parts in zip(*views, strict=True))
+    return pictures(image, alpha, visible, outputs=outputs, has_features=features is not None, options=options)
+
+
+def view_operator(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> "CpuViewOperator":
+    """`rendering.view_operator` for tensors on the CPU."""
+    return CpuViewOperator(gaussians, camera, options)
+
+
+def _geometry(gaussians: Gaussians) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    return gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.opacity_logits
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(tensor.detach().numpy(), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class _View:
+    """One camera and the low-pass mode, as the kernels take them."""
+
+    numbers: np.ndarray
+    width: int
+    height: int
+    antialiased: bool
+
+    @staticmethod
+    def of(camera: Cameras, options: RenderOptions) -> "_View":
+        width, height = camera.width, camera.height
+        pose = camera.camera_from_world[0].detach().double().numpy()
+        k = camera.intrinsics[0].detach().double().numpy()
+        fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
+        # the original's 1.3 times the field of view, for a principal point anywhere (as gsplat)
+        margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
+        bounds = [-cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y]
+        center = camera.centers[0].detach().double().numpy()
+        parts = [pose[:3, :3].ravel(), pose[:3, 3], center, [fx, fy, cx, cy, *bounds, options.near]]
+        return _View(np.concatenate(parts), width, height, options.low_pass == "antialiased")
+
+
+@dataclass(frozen=True)
+class _TileLists:
+    """The splats of one view, nearest first, and which tiles list them."""
+
+    order: np.ndarray
+    """(m,) Gaussian of each splat."""
+    splats: np.ndarray
+    """(m, 8) in the order of `order`."""
+    depths: np.ndarray
+    """(n,) along the optical axis; set where visible."""
+    start: np.ndarray
+    entries: np.ndarray
+    slots: np.ndarray
+    first: np.ndarray
+    visible: Bool[Tensor, "n"]
+
+    @staticmethod
+    def of(view: _View, means: np.ndarray, log_scales: np.ndarray, quaternions: np.ndarray, logits: np.ndarray):
+        n = len(means)
+        splats, depths = np.empty((n, cpu_project.COLUMNS), np.float32), np.zeros(n, np.float32)
+        cpu_project.project(means, log_scales, quaternions, logits, view.numbers, view.antialiased, splats, depths)
+        order = cpu_tiles.depth_order(splats, depths)
+        binned = cpu_tiles.bin_splats(splats, order, view.width, view.height)
+        packed, start, entries, slots, first = binned
+        visible = torch.zeros(n, dtype=torch.bool)
+        visible[torch.from_numpy(order[np.diff(first) > 0]).long()] = True
+        return _TileLists(order, packed, depths, start, entries, slots, first, visible)
+
+    def blend(self, values: np.ndarray, view: _View) -> tuple[np.ndarray, np.ndarray]:
+        """Blended `values (m, c)` as (c, h, w), and alpha (h, w)."""
+        image = np.empty((values.shape[1], view.height, view.width), np.float32)
+        alpha = np.empty((view.height, view.width), np.float32)
+        cpu_blend.blend(self.splats, self.start, self.entries, values, view.width, view.height, image, alpha)
+        return image, alpha
+
+    def sum_slots(self, sums: np.ndarray) -> np.ndarray:
+        """Entries' sums (e, c) gathered to splats (m, c)."""
+        out = np.empty((len(self.order), sums.shape[1]), np.float32)
+        cpu_blend.sum_slots(sums, self.first, out)
+        return out
+
+
+class _Splat(torch.autograd.Function):
+    """One view: raw fields and features to blended channels (c, h, w) in the order of `channels.WIDTHS`."""
+
+    @staticmethod
+    def forward(ctx, view: _View, outputs: frozenset[Output], *fields: Tensor):
+        means, log_scales, quaternions, logits, sh, features = (_array(field) for field in fields)
+        with _KERNELS:
+            lists = _TileLists.of(view, means, log_scales, quaternions, logits)
+            order = lists.order
+            columns = []
+            if "color" in outputs:
+                columns.append(np.empty((len(order), 3), np.float32))
+                cpu_project.shade(means, sh, order, view.numbers, columns[-1])
+            if "depth" in outputs:
+                columns.append(lists.depths[order][:, None])
+            if "normal" in outputs:
+                columns.append(np.empty((len(order), 3), np.float32))
+                cpu_project.normals(means, log_scales, quaternions, order, view.numbers, columns[-1])
+            values = np.concatenate([*columns, features[order]], 1)
+            image, alpha = lists.blend(values, view)
+        ctx.view, ctx.outputs, ctx.lists = view, outputs, lists
+        ctx.save_for_backward(*fields)
+        ctx.drawn = values, image, alpha
+        ctx.mark_non_differentiable(lists.visible)
+        return torch.from_numpy(image), torch.from_numpy(alpha), lists.visible
+
+    @staticmethod
+    def backward(ctx, grad_image, grad_alpha, _grad_visible):
+        means, log_scales, quaternions, logits, sh, _ = (_array(field) for field in ctx.saved_tensors)
+        view, lists, (values, image, alpha) = ctx.view, ctx.lists, ctx.drawn
+        order, camera = lists.order, view.numbers
+        grad_image, grad_alpha = _array(grad_image), _array(grad_alpha)
+        rest = np.einsum("chw,chw->hw", grad_image, image) + grad_alpha * alpha
+        grads = [np.zeros(field.shape, np.float32) for field in ctx.saved_tensors]
+        grad_means, grad_log_scales, grad_quaternions, grad_logits, grad_sh, grad_features = grads
+        with _KERNELS:
+            sums = np.empty((len(lists.entries), cpu_blend.MOMENTS + values.shape[1]), np.float32)
+            cpu_blend.blend_backward(
+                lists.splats, lists.start, lists.entries, lists.slots, values, rest, grad_image, grad_alpha,
+                view.width, view.height, sums,
+            )  # fmt: skip
+            totals = lists.sum_slots(sums)
+            at = cpu_blend.MOMENTS
+            if "color" in ctx.outputs:
+                cpu_project.unshade(means, sh, order, camera, totals[:, at : at + 3], grad_means, grad_sh)
+                at += 3
+            grad_depths, grad_normals = totals[:0, 0], totals[:0, :3]
+            if "depth" in ctx.outputs:
+                grad_depths, at = totals[:, at], at + 1
+            if "normal" in ctx.outputs:
+                grad_normals, at = totals[:, at : at + 3], at + 3
+            grad_features[order] = totals[:, at:]
+            cpu_project.unproject(
+                means, log_scales, quaternions, order, camera, view.antialiased, totals[:, :6],
+                grad_depths, grad_normals, grad_means, grad_log_scales, grad_quaternions, grad_logits, logits,
+            )  # fmt: skip
+        return None, None, *(torch.from_numpy(grad) for grad in grads)
+
+
+class CpuViewOperator:
+    """`ViewOperator` on the CPU; the tile lists are made once."""
+
+    def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> None:
+        """Project, sort and list once."""
+        self._view = _View.of(camera, options)
+        self._n = gaussians.count
+        with _KERNELS:
+            self._lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
+            _, alpha = self._lists.blend(np.empty((len(self._lists.order), 0), np.float32), self._view)
+        self.alpha: Float[Tensor, "h w"] = torch.from_numpy(alpha)
+        self.visible: Bool[Tensor, n] = self._lists.visible
+
+    def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
+        """W values, over black; differentiable in `values`."""
+        return _Blend.apply(self, values)
+
+    def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
+        """W^T image."""
+        planes, lists, view = _array(image.permute(2, 0, 1)), self._lists, self._view
+        sums = np.empty((len(lists.entries), len(planes)), np.float32)
+        out = np.zeros((self._n, len(planes)), np.float32)
+        with _KERNELS:
+            cpu_blend.blend_transpose(
+                lists.splats, lists.start, lists.entries, lists.slots, planes, view.width, view.height, sums
+            )
+            out[lists.order] = lists.sum_slots(sums)
+        return torch.from_numpy(out)
+
+    def _forward(self, values: Tensor) -> Tensor:
+        with _KERNELS:
+            image, _ = self._lists.blend(_array(values)[self._lists.order], self._view)
+        return torch.from_numpy(image).permute(1, 2, 0)
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, operator: CpuViewOperator, values: Tensor) -> Tensor:
+        ctx.operator = operator
+        return operator._forward(values)
+
+    @staticmethod
+    def backward(ctx, grad):
+        return None, ctx.operator.blend_transpose(grad)

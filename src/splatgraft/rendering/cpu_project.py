@@ -1,0 +1,290 @@
+"""Gaussians of one camera as 2D splats, and the way back for gradients: numba kernels. Knows nothing about tiles.
+
+The projection is the original's EWA (3DGS, Eq. 5): covariance J W S W^T J^T plus 0.3 px^2, with the point that J is
+taken at held inside 1.3 times the field of view. All arithmetic on one Gaussian is float64, all storage float32.
+"""
+
+import math
+from typing import no_type_check
+
+import numpy as np
+from numba import njit, prange
+
+from splatgraft.rendering.cpu_basis import basis_and_slope, basis_at
+
+LOW_PASS_PX2 = 0.3
+MIN_ALPHA = 1.0 / 255.0
+BLOCK = 256
+
+# columns of a splat
+MX, MY, CA, CB, CC, OPACITY, REACH_X, REACH_Y = range(8)
+COLUMNS = 8
+
+# places in a camera vector: rotation (9) and translation (3) of camera_from_world, centre (3), then
+FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR = range(15, 24)
+CAMERA_NUMBERS = 24
+
+
+@njit(cache=True)
+@no_type_check
+def _rotation(quaternion, out):
+    """Fill the 3x3 matrix of a wxyz quaternion; one of no length turns nothing. Returns one over the length."""
+    w, x, y, z = float(quaternion[0]), float(quaternion[1]), float(quaternion[2]), float(quaternion[3])
+    inverse = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    out[0, 0], out[0, 1], out[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    out[2, 0], out[2, 1], out[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return inverse
+
+
+@njit(cache=True)
+@no_type_check
+def _view_axes(log_scales, rotation, camera, out):
+    """Fill V = W R S, the Gaussian's scaled axes in the camera, as columns."""
+    for j in range(3):
+        s = math.exp(float(log_scales[j]))
+        for i in range(3):
+            c = camera[3 * i] * rotation[0, j] + camera[3 * i + 1] * rotation[1, j] + camera[3 * i + 2] * rotation[2, j]
+            out[i, j] = s * c
+
+
+@njit(cache=True)
+@no_type_check
+def _normal_axis(log_scales, rotation, offset):
+    """Index of the shortest axis, and the sign that turns it to the camera; `offset` is centre minus camera."""
+    axis = 0
+    for j in range(1, 3):
+        if log_scales[j] < log_scales[axis]:
+            axis = j
+    along = rotation[0, axis] * offset[0] + rotation[1, axis] * offset[1] + rotation[2, axis] * offset[2]
+    return axis, -1.0 if along > 0 else 1.0
+
+
+@njit(cache=True)
+@no_type_check
+def _camera_point(mean, camera, offset):
+    x, y, z = float(mean[0]), float(mean[1]), float(mean[2])
+    for i in range(3):
+        offset[i] = float(mean[i]) - camera[12 + i]
+    return (
+        camera[0] * x + camera[1] * y + camera[2] * z + camera[9],
+        camera[3] * x + camera[4] * y + camera[5] * z + camera[10],
+        camera[6] * x + camera[7] * y + camera[8] * z + camera[11],
+    )
+
+
+@njit(cache=True)
+@no_type_check
+def _jacobian(x, y, z, camera):
+    """Non-zero entries J00, J02, J11, J12, and whether the point was inside the bounds in x and in y."""
+    u, v = x / z, y / z
+    held_u = min(max(u, camera[LOW_X]), camera[HIGH_X])
+    held_v = min(max(v, camera[LOW_Y]), camera[HIGH_Y])
+    fx, fy = camera[FX] / z, camera[FY] / z
+    return fx, -fx * held_u, fy, -fy * held_v, held_u == u, held_v == v
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def project(means, log_scales, quaternions, opacity_logits, camera, antialiased, splats, depths):
+    """Fill `splats (n, 8)` and `depths (n,)`; what no pixel can see has opacity 0."""
+    n = means.shape[0]
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        rotation, axes, offset = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+        for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
+            splats[g, OPACITY] = 0
+            x, y, z = _camera_point(means[g], camera, offset)
+            opacity = 1.0 / (1.0 + math.exp(-float(opacity_logits[g])))
+            if not (z >= camera[NEAR] and z < 1e30 and opacity >= MIN_ALPHA):
+                continue
+            _rotation(quaternions[g], rotation)
+            _view_axes(log_scales[g], rotation, camera, axes)
+            j00, j02, j11, j12, _, _ = _jacobian(x, y, z, camera)
+            xx, xy, yy = 0.0, 0.0, 0.0
+            for j in range(3):
+                h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
+                xx, xy, yy = xx + h0 * h0, xy + h0 * h1, yy + h1 * h1
+            sharp = max(xx * yy - xy * xy, 0.0)
+            determinant = sharp + LOW_PASS_PX2 * (xx + yy) + LOW_PASS_PX2 * LOW_PASS_PX2
+            if antialiased:
+                opacity *= math.sqrt(sharp / determinant)
+            # also false where anything is nan or infinite
+            if not (opacity >= MIN_ALPHA and determinant < 1e30):
+                continue
+            limit = 2 * math.log(opacity / MIN_ALPHA)
+            mx, my = camera[FX] * x / z + camera[CX], camera[FY] * y / z + camera[CY]
+            if not (abs(mx) < 1e9 and abs(my) < 1e9):
+                continue
+            splats[g, MX], splats[g, MY] = mx, my
+            splats[g, CA] = (yy + LOW_PASS_PX2) / determinant
+            splats[g, CB] = -xy / determinant
+            splats[g, CC] = (xx + LOW_PASS_PX2) / determinant
+            splats[g, OPACITY] = opacity
+            splats[g, REACH_X] = math.sqrt(limit * (xx + LOW_PASS_PX2))
+            splats[g, REACH_Y] = math.sqrt(limit * (yy + LOW_PASS_PX2))
+            depths[g] = z
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def shade(means, sh, order, camera, colors):
+    """Fill `colors (m, 3)` of the Gaussians `order (m,)` as the camera sees them."""
+    m, k = order.shape[0], sh.shape[1]
+    for block in prange((m + BLOCK - 1) // BLOCK):
+        basis = np.empty(16)
+        for s in range(block * BLOCK, min(m, (block + 1) * BLOCK)):
+            g = order[s]
+            x, y, z = means[g, 0] - camera[12], means[g, 1] - camera[13], means[g, 2] - camera[14]
+            inverse = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
+            basis_at(x * inverse, y * inverse, z * inverse, k, basis)
+            for c in range(3):
+                value = 0.5
+                for j in range(k):
+                    value += basis[j] * sh[g, j, c]
+                colors[s, c] = max(value, 0.0)
+
+
+@njit(cache=True)
+@no_type_check
+def normals(means, log_scales, quaternions, order, camera, out):
+    """Fill `out (m, 3)` with the world-frame normals of the Gaussians `order (m,)`, towards the camera."""
+    rotation, offset = np.empty((3, 3)), np.empty(3)
+    for s in range(order.shape[0]):
+        g = order[s]
+        _camera_point(means[g], camera, offset)
+        _rotation(quaternions[g], rotation)
+        axis, sign = _normal_axis(log_scales[g], rotation, offset)
+        for i in range(3):
+            out[s, i] = sign * rotation[i, axis]
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def unshade(means, sh, order, camera, grad_colors, grad_means, grad_sh):
+    """Add the gradients of `shade` into `grad_means`; set them in `grad_sh`."""
+    m, k = order.shape[0], sh.shape[1]
+    for block in prange((m + BLOCK - 1) // BLOCK):
+        basis, slope = np.empty(16), np.empty((16, 3))
+        for s in range(block * BLOCK, min(m, (block + 1) * BLOCK)):
+            g = order[s]
+            x, y, z = means[g, 0] - camera[12], means[g, 1] - camera[13], means[g, 2] - camera[14]
+            inverse = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
+            x, y, z = x * inverse, y * inverse, z * inverse
+            basis_and_slope(x, y, z, k, basis, slope)
+            dx, dy, dz = 0.0, 0.0, 0.0
+            for c in range(3):
+                value = 0.5
+                for j in range(k):
+                    value += basis[j] * sh[g, j, c]
+                if value < 0:
+                    continue
+                grad = float(grad_colors[s, c])
+                for j in range(k):
+                    grad_sh[g, j, c] = basis[j] * grad
+                    along = sh[g, j, c] * grad
+                    dx += slope[j, 0] * along
+                    dy += slope[j, 1] * along
+                    dz += slope[j, 2] * along
+            radial = dx * x + dy * y + dz * z
+            grad_means[g, 0] += (dx - radial * x) * inverse
+            grad_means[g, 1] += (dy - radial * y) * inverse
+            grad_means[g, 2] += (dz - radial * z) * inverse
+
+
+@njit(cache=True)
+@no_type_check
+def _add_quaternion_gradient(quaternion, inverse, d, out):
+    """Gradient of a rotation matrix (3x3 `d`) to the raw wxyz quaternion, through its normalisation."""
+    w, x, y, z = quaternion[0] * inverse, quaternion[1] * inverse, quaternion[2] * inverse, quaternion[3] * inverse
+    gw = 2 * (x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1]))
+    gx = 2 * (y * (d[0, 1] + d[1, 0]) + z * (d[0, 2] + d[2, 0]) + w * (d[2, 1] - d[1, 2]) - 2 * x * (d[1, 1] + d[2, 2]))
+    gy = 2 * (x * (d[0, 1] + d[1, 0]) + z * (d[1, 2] + d[2, 1]) + w * (d[0, 2] - d[2, 0]) - 2 * y * (d[0, 0] + d[2, 2]))
+    gz = 2 * (x * (d[0, 2] + d[2, 0]) + y * (d[1, 2] + d[2, 1]) + w * (d[1, 0] - d[0, 1]) - 2 * z * (d[0, 0] + d[1, 1]))
+    along = gw * w + gx * x + gy * y + gz * z
+    out[0] += (gw - along * w) * inverse
+    out[1] += (gx - along * x) * inverse
+    out[2] += (gy - along * y) * inverse
+    out[3] += (gz - along * z) * inverse
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def unproject(
+    means, log_scales, quaternions, order, camera, antialiased, moments, grad_depths, grad_normals,
+    grad_means, grad_log_scales, grad_quaternions, grad_opacity_logits, opacity_logits,
+):  # fmt: skip
+    """Turn what pixels say about splats into gradients of the raw fields, which are zero on entry.
+
+    `moments (m, 6)`: sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2; d from centre to pixel.
+    `grad_depths (m,)` and `grad_normals (m, 3)` may be empty.
+    """
+    m = order.shape[0]
+    for block in prange((m + BLOCK - 1) // BLOCK):
+        rotation, axes, offset = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+        d_axes, d_rotation = np.empty((3, 3)), np.empty((3, 3))
+        for s in range(block * BLOCK, min(m, (block + 1) * BLOCK)):
+            g = order[s]
+            x, y, z = _camera_point(means[g], camera, offset)
+            inverse = _rotation(quaternions[g], rotation)
+            _view_axes(log_scales[g], rotation, camera, axes)
+            j00, j02, j11, j12, free_x, free_y = _jacobian(x, y, z, camera)
+            xx, xy, yy = 0.0, 0.0, 0.0
+            for j in range(3):
+                h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
+                xx, xy, yy = xx + h0 * h0, xy + h0 * h1, yy + h1 * h1
+            sharp = max(xx * yy - xy * xy, 0.0)
+            determinant = sharp + LOW_PASS_PX2 * (xx + yy) + LOW_PASS_PX2 * LOW_PASS_PX2
+            a, b, c = (yy + LOW_PASS_PX2) / determinant, -xy / determinant, (xx + LOW_PASS_PX2) / determinant
+
+            s0, sx, sy = float(moments[s, 0]), float(moments[s, 1]), float(moments[s, 2])
+            sxx, sxy, syy = float(moments[s, 3]), float(moments[s, 4]), float(moments[s, 5])
+            opacity = 1.0 / (1.0 + math.exp(-float(opacity_logits[g])))
+            grad_opacity_logits[g] = s0 * (1 - opacity)
+            d_mx, d_my = a * sx + b * sy, b * sx + c * sy
+            # d covariance = Q S Q / 2, with Q the inverse covariance and S the second moments
+            p00, p01, p10, p11 = a * sxx + b * sxy, a * sxy + b * syy, b * sxx + c * sxy, b * sxy + c * syy
+            d_xx = 0.5 * (p00 * a + p01 * b)
+            d_xy = p00 * b + p01 * c
+            d_yy = 0.5 * (p10 * b + p11 * c)
+            if antialiased:
+                to_sharp, to_blurred = 0.5 * s0 / sharp, -0.5 * s0 / determinant
+                d_xx += to_sharp * yy + to_blurred * (yy + LOW_PASS_PX2)
+                d_yy += to_sharp * xx + to_blurred * (xx + LOW_PASS_PX2)
+                d_xy -= 2 * xy * (to_sharp + to_blurred)
+
+            d00, d02, d11, d12 = 0.0, 0.0, 0.0, 0.0
+            for j in range(3):
+                h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
+                d_h0, d_h1 = 2 * d_xx * h0 + d_xy * h1, 2 * d_yy * h1 + d_xy * h0
+                d00, d02 = d00 + d_h0 * axes[0, j], d02 + d_h0 * axes[2, j]
+                d11, d12 = d11 + d_h1 * axes[1, j], d12 + d_h1 * axes[2, j]
+                d_axes[0, j], d_axes[1, j] = j00 * d_h0, j11 * d_h1
+                d_axes[2, j] = j02 * d_h0 + j12 * d_h1
+
+            dx, dy = camera[FX] / z * d_mx, camera[FY] / z * d_my
+            dz = -(dx * x + dy * y) / z - (d00 * j00 + d02 * j02 + d11 * j11 + d12 * j12) / z
+            if free_x:
+                d_u = -j00 * d02
+                dx, dz = dx + d_u / z, dz - d_u * x / (z * z)
+            if free_y:
+                d_v = -j11 * d12
+                dy, dz = dy + d_v / z, dz - d_v * y / (z * z)
+            if grad_depths.shape[0] > 0:
+                dz += grad_depths[s]
+            for i in range(3):
+                grad_means[g, i] += camera[i] * dx + camera[3 + i] * dy + camera[6 + i] * dz
+
+            for j in range(3):
+                scale = math.exp(float(log_scales[g, j]))
+                total = 0.0
+                for i in range(3):
+                    d = camera[i] * d_axes[0, j] + camera[3 + i] * d_axes[1, j] + camera[6 + i] * d_axes[2, j]
+                    total += d * rotation[i, j]
+                    d_rotation[i, j] = d * scale
+                grad_log_scales[g, j] = total * scale
+            if grad_normals.shape[0] > 0:
+                axis, sign = _normal_axis(log_scales[g], rotation, offset)
+                for i in range(3):
+                    d_rotation[i, axis] += sign * grad_normals[s, i]
+            _add_quaternion_gradient(quaternions[g], inverse, d_rotation, grad_quaternions[g])

@@ -1,0 +1,114 @@
+"""Depth order and tile lists of 2D splats: numba kernels. Knows nothing about 3D, colours or pixels' values."""
+
+import math
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from splatgraft.rendering.cpu_project import CA, CB, CC, COLUMNS, MX, MY, OPACITY, REACH_X, REACH_Y
+
+TILE = 16
+_DIGIT_BITS = 11
+
+
+@njit(cache=True)
+@no_type_check
+def depth_order(splats, depths):
+    """Indices of the splats with opacity above 0, nearest first; equal depths stay in index order."""
+    n = depths.shape[0]
+    keys, order = np.empty(n, np.uint32), np.empty(n, np.int32)
+    bits = depths.view(np.uint32)
+    m = 0
+    for g in range(n):
+        if splats[g, OPACITY] > 0:
+            # positive floats order like their bits
+            keys[m], order[m] = bits[g], g
+            m += 1
+    keys, order = keys[:m], order[:m]
+    other_keys, other_order = np.empty(m, np.uint32), np.empty(m, np.int32)
+    start = np.empty((1 << _DIGIT_BITS) + 1, np.int64)
+    for digit in range(3):
+        shift, mask = np.uint32(digit * _DIGIT_BITS), np.uint32((1 << _DIGIT_BITS) - 1)
+        start[:] = 0
+        for s in range(m):
+            start[((keys[s] >> shift) & mask) + 1] += 1
+        for i in range(1 << _DIGIT_BITS):
+            start[i + 1] += start[i]
+        for s in range(m):
+            place = (keys[s] >> shift) & mask
+            other_keys[start[place]], other_order[start[place]] = keys[s], order[s]
+            start[place] += 1
+        keys, other_keys, order, other_order = other_keys, keys, other_order, order
+    return order
+
+
+@njit(cache=True)
+@no_type_check
+def _tile_span(splat, row, tiles_x):
+    """First and one past the last tile of tile row `row` that the ellipse alpha >= 1/255 meets."""
+    my = float(splat[MY])
+    low, high = row * TILE - my, (row + 1) * TILE - my
+    # the ellipse is a x^2 + 2 b x y + c y^2 <= limit; its rightmost point has y = -b / c * x
+    a, b, c = float(splat[CA]), float(splat[CB]), float(splat[CC])
+    reach_x, reach_y = float(splat[REACH_X]), float(splat[REACH_Y])
+    limit = reach_x * reach_x * (a - b * b / c)
+    low, high = max(low, -reach_y), min(high, reach_y)
+    at_right = -b / c * reach_x
+    y_right, y_left = min(max(at_right, low), high), min(max(-at_right, low), high)
+    right = (-b * y_right + math.sqrt(max(b * b * y_right * y_right - a * (c * y_right * y_right - limit), 0.0))) / a
+    left = (-b * y_left - math.sqrt(max(b * b * y_left * y_left - a * (c * y_left * y_left - limit), 0.0))) / a
+    # a thousandth of a pixel covers the rounding here; the kernels test every pixel exactly
+    first = (splat[MX] + left - 1e-3) / TILE
+    last = (splat[MX] + right + 1e-3) / TILE
+    return int(max(math.floor(min(first, 1e6)), 0)), int(min(math.floor(max(last, -1.0)) + 1, tiles_x))
+
+
+@njit(cache=True)
+@no_type_check
+def bin_splats(splats, order, width, height):
+    """Sorted splats, their tile lists and where each splat's entries stand.
+
+    Returns `sorted (m, 8)`; `start (tiles + 1,)` into `entries (e,)` (splat index, nearest first) and `slots (e,)`
+    (a place of its own for each entry, so that one splat's places are `first (m + 1,)`, next to each other).
+    """
+    m = order.shape[0]
+    tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    packed = np.empty((m, COLUMNS), np.float32)
+    first = np.zeros(m + 1, np.int64)
+    start = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    for s in range(m):
+        packed[s] = splats[order[s]]
+        top, bottom = _tile_rows(packed[s], tiles_y)
+        total = 0
+        for row in range(top, bottom):
+            left, right = _tile_span(packed[s], row, tiles_x)
+            for column in range(left, right):
+                start[row * tiles_x + column + 1] += 1
+            total += max(right - left, 0)
+        first[s + 1] = first[s] + total
+    for t in range(tiles_x * tiles_y):
+        start[t + 1] += start[t]
+    entries, slots = np.empty(first[m], np.int32), np.empty(first[m], np.int32)
+    place = start[:-1].copy()
+    for s in range(m):
+        slot = first[s]
+        if first[s + 1] == slot:
+            continue
+        top, bottom = _tile_rows(packed[s], tiles_y)
+        for row in range(top, bottom):
+            left, right = _tile_span(packed[s], row, tiles_x)
+            for column in range(left, right):
+                tile = row * tiles_x + column
+                entries[place[tile]], slots[place[tile]] = s, slot
+                place[tile] += 1
+                slot += 1
+    return packed, start, entries, slots, first
+
+
+@njit(cache=True)
+@no_type_check
+def _tile_rows(splat, tiles_y):
+    top = (splat[MY] - splat[REACH_Y] - 1e-3) / TILE
+    bottom = (splat[MY] + splat[REACH_Y] + 1e-3) / TILE
+    return int(max(math.floor(min(top, 1e6)), 0)), int(min(math.floor(max(bottom, -1.0)) + 1, tiles_y))
