@@ -1,20 +1,23 @@
 """Images as tensors: reading and writing files, sRGB transfer, resampling. Knows nothing about cameras or Gaussians."""
 
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 from torch import Tensor
 
 from splatgraft.whole_file import whole_file
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})
-_EXIF_ORIENTATION = 0x0112
-_EXIF_SWAPS_SIDES = frozenset({5, 6, 7, 8})
-_UNREADABLE = (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP")
+_GREY_SCALES = {"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I;16N": 65535, "I": 65535, "F": 1}
+"""White in Pillow's modes of more than 8 bits; I is what some versions make of 16-bit PNG."""
 
 
 def linear_from_srgb(srgb: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -37,15 +40,41 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def read_rgb(path: Path) -> Float[Tensor, "h w 3"]:
-    """sRGB in [0, 1]; EXIF rotation applied, alpha dropped.
+    """sRGB in [0, 1] of the picture as a viewer shows it: EXIF rotation applied; what is transparent is black.
 
     Raises: ValueError where the file is no readable image.
     """
-    return torch.from_numpy(np.array(_open(path).convert("RGB"))).float() / 255
+    return _rgb(ImageOps.exif_transpose(_open(path)))
+
+
+def read_stored_rgb(path: Path) -> Float[Tensor, "h w 3"]:
+    """sRGB in [0, 1] on the stored pixel grid, to which poses refer: COLMAP ignores EXIF rotation.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    return _rgb(_open(path))
+
+
+def stored_size(path: Path) -> tuple[int, int]:
+    """Width and height of the stored pixel grid, without decoding it.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    with _opened(path) as image:
+        return image.size
+
+
+def has_transparency(path: Path) -> bool:
+    """Whether the file has an alpha channel or a transparent colour, without decoding the pixels.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    with _opened(path) as image:
+        return image.has_transparency_data
 
 
 def read_alpha(path: Path) -> Float[Tensor, "h w"]:
-    """The alpha channel in [0, 1]; ones where the file has none.
+    """The alpha channel in [0, 1] on the stored pixel grid; ones where the file has none.
 
     Raises: ValueError where the file is no readable image.
     """
@@ -55,61 +84,55 @@ def read_alpha(path: Path) -> Float[Tensor, "h w"]:
     return torch.from_numpy(np.array(image.convert("RGBA").getchannel("A"))).float() / 255
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height after EXIF rotation, without decoding the pixels.
-
-    Raises: ValueError where the file is no readable image.
-    """
-    try:
-        with Image.open(path) as image:
-            turned = image.getexif().get(_EXIF_ORIENTATION) in _EXIF_SWAPS_SIDES
-            return (image.height, image.width) if turned else image.size
-    except _UNREADABLE as error:
-        raise _unreadable(path, error) from error
-
-
 def read_mask(path: Path) -> Float[Tensor, "h w"]:
-    """Coverage in [0, 1]: the alpha channel where the file has one that varies, else luma.
+    """Coverage in [0, 1] on the stored pixel grid: the alpha channel where the file has one that varies, else luma.
 
     Raises: ValueError where the file is no readable image.
     """
     image = _open(path)
-    if image.mode in ("RGBA", "LA"):
-        alpha = np.array(image.getchannel("A"))
+    if image.has_transparency_data:
+        alpha = np.array(image.convert("RGBA").getchannel("A"))
         if alpha.min() < alpha.max():
             return torch.from_numpy(alpha).float() / 255
-    if image.mode == "P":
-        image = image.convert("RGB")
-    if image.mode.startswith("I"):
-        values = np.array(image).astype(np.float32)
-        return torch.from_numpy(values / max(float(values.max()), 1.0))
-    return torch.from_numpy(np.array(image.convert("L"))).float() / 255
+    if image.mode in _GREY_SCALES:
+        return _grey(image)
+    return torch.from_numpy(np.array(image.convert("RGB").convert("L"))).float() / 255
 
 
-def has_transparency(path: Path) -> bool:
-    """Whether the file has an alpha channel or a transparent colour, without decoding the pixels.
+def _rgb(image: Image.Image) -> Float[Tensor, "h w 3"]:
+    if image.mode in _GREY_SCALES:
+        return _grey(image)[..., None].expand(-1, -1, 3).contiguous()
+    if not image.has_transparency_data:
+        return torch.from_numpy(np.array(image.convert("RGB"))).float() / 255
+    values = torch.from_numpy(np.array(image.convert("RGBA"))).float() / 255
+    return values[..., :3] * values[..., 3:]
 
-    Raises: ValueError where the file is no readable image.
-    """
-    try:
-        with Image.open(path) as image:
-            return image.has_transparency_data
-    except _UNREADABLE as error:
-        raise _unreadable(path, error) from error
+
+def _grey(image: Image.Image) -> Float[Tensor, "h w"]:
+    """Modes that Pillow would clip to 8 bits instead of scaling."""
+    values = np.array(image).astype(np.float32) / _GREY_SCALES[image.mode]
+    return torch.from_numpy(np.nan_to_num(values)).clamp(0, 1)
 
 
 def _open(path: Path) -> Image.Image:
-    try:
-        with Image.open(path) as image:
-            return ImageOps.exif_transpose(image)
-    except _UNREADABLE as error:
-        raise _unreadable(path, error) from error
+    with _opened(path) as image:
+        image.load()
+        return image
 
 
-def _unreadable(path: Path, error: Exception) -> ValueError:
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """The image, with every way in which Pillow says that a file is broken turned into one."""
     if not path.is_file():
-        return ValueError(f"{path}: expected an image file, found none")
-    return ValueError(f"{path}: expected a readable image, found {type(error).__name__}: {error}")
+        raise ValueError(f"{path}: expected an image file, found none")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
+            with Image.open(path, formats=_FORMATS) as image:
+                yield image
+    except Exception as error:  # Pillow's decoders raise more kinds than it documents (IndexError, struct.error, ..)
+        raise ValueError(f"{path}: expected a readable image, found {type(error).__name__}: {error}") from error
 
 
 def write_image(path: Path, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"]) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.distortion import Distortion
-from splatgraft.images import read_alpha, read_mask, read_rgb, resize
+from splatgraft.images import read_alpha, read_mask, read_stored_rgb, resize
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class PosedImages:
 
     def image(self, index: int) -> Float[Tensor, "h w 3"]:
         """The image of camera `index`, sRGB, undistorted and resampled to that camera's size."""
-        return self._served(read_rgb(self.image_paths[index]), index)
+        return self._served(read_stored_rgb(self.image_paths[index]), index)
 
     def mask(self, index: int) -> Float[Tensor, "h w"] | None:
         """The object mask of camera `index` in [0, 1], or None."""

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from splatgraft.cameras import Cameras
-from splatgraft.formats import gaussian_ply, transforms_json
+from splatgraft.formats import colmap, gaussian_ply, transforms_json
 from splatgraft.formats.points_ply import read_points, write_points
 from splatgraft.gaussians import Gaussians
 from splatgraft.posed_images import PosedImages
@@ -38,11 +38,14 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
 
 
 def read_capture(path: Path) -> PosedImages:
-    """Posed photographs: a folder with transforms.json, or that file itself.
+    """Posed photographs: a COLMAP folder, a folder with transforms.json (or Blender's), or that file itself.
+
+    Where a folder has both, transforms.json counts. Masks are found by stem in masks/, or in the images' alpha.
 
     Raises: ValueError where nothing of these is there, or what is there is broken.
     """
-    return transforms_json.read_capture(_transforms_path(path))
+    transforms = _transforms_path(path)
+    return transforms_json.read_capture(transforms) if transforms else colmap.read_capture(path)
 
 
 def write_capture(folder: Path, posed_images: PosedImages) -> None:
@@ -51,11 +54,12 @@ def write_capture(folder: Path, posed_images: PosedImages) -> None:
 
 
 def read_cameras(path: Path) -> Cameras:
-    """The cameras of a capture, or of a transforms.json whose images need not exist.
+    """The cameras of a capture, a transforms.json or a cameras.json of the original code; images need not exist.
 
     Raises: ValueError where nothing of these is there, or what is there is broken.
     """
-    return transforms_json.read_cameras(_transforms_path(path))
+    transforms = _transforms_path(path)
+    return transforms_json.read_cameras(transforms) if transforms else colmap.read_cameras(path)
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:
@@ -63,10 +67,18 @@ def write_cameras(path: Path, cameras: Cameras) -> None:
     transforms_json.write_cameras(path, cameras)
 
 
-def _transforms_path(path: Path) -> Path:
-    if path.suffix.lower() == ".json":
+def _transforms_path(path: Path) -> Path | None:
+    """The .json that describes the capture; None where it is a COLMAP folder."""
+    if path.suffix.lower() == ".json" or path.is_file():
         return path
+    if not path.is_dir():
+        raise ValueError(f"{path}: expected a capture folder or a transforms.json, found nothing there")
     for name in ("transforms.json", "transforms_train.json"):
         if (path / name).is_file():
             return path / name
-    raise ValueError(f"{path}: expected a folder with transforms.json, found none")
+    if colmap.is_colmap(path):
+        return None
+    raise ValueError(
+        f"{path}: expected transforms.json, or a COLMAP model in sparse/0, "
+        f"found {sorted(entry.name for entry in path.iterdir())[:6]}"
+    )

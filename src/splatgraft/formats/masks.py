@@ -3,8 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from splatgraft.formats.views import View
-from splatgraft.images import has_transparency, list_images, read_alpha
+from splatgraft.formats.views import View, same_shape
+from splatgraft.images import has_transparency, list_images, read_alpha, stored_size
 
 
 def with_masks(views: list[View], folder: Path) -> list[View]:
@@ -12,19 +12,30 @@ def with_masks(views: list[View], folder: Path) -> list[View]:
 
     0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask the view already has stays.
 
-    Raises: ValueError where masks/ has no mask for any view, or two for one.
+    Raises: ValueError where masks/ has no mask for any view, two for one, or one of another shape.
     """
     masks = folder / "masks"
-    if any(view.mask_path for view in views):
-        return views
-    if masks.is_dir():
-        found = [replace(view, mask_path=_mask_of(view, masks)) for view in views]
-        if views and not any(view.mask_path for view in found):
-            raise ValueError(f"{masks}: expected masks named like the images ({views[0].name}), found none")
-        return found
+    if not any(view.mask_path for view in views):
+        if masks.is_dir():
+            views = [replace(view, mask_path=_mask_of(view, masks)) for view in views]
+            if not any(view.mask_path for view in views):
+                raise ValueError(f"{masks}: expected masks named like the images ({views[0].name}), found none")
+        else:
+            views = _with_alpha_masks(views)
+    for view in views:
+        if view.mask_path is not None and view.mask_path != view.image_path:
+            found = stored_size(view.mask_path)
+            if not same_shape(found, view.size):
+                expected = f"{view.size[0]}x{view.size[1]} px, as its image has, or those scaled"
+                raise ValueError(f"{view.mask_path}: expected {expected}, found {found[0]}x{found[1]}")
+    return views
+
+
+def _with_alpha_masks(views: list[View]) -> list[View]:
+    """Many files have an alpha channel that is 1 everywhere: the first that varies settles that it is meant."""
     transparent = [v.image_path is not None and has_transparency(v.image_path) for v in views]
-    # many files have an alpha channel that is 1 everywhere; the first that varies settles that it is meant
-    if not any(t and bool((read_alpha(v.image_path) < 1).any()) for t, v in zip(transparent, views, strict=True)):
+    paths = [v.image_path for v, t in zip(views, transparent, strict=True) if t and v.image_path]
+    if not any(bool((read_alpha(path) < 1).any()) for path in paths):
         return views
     return [replace(v, mask_path=v.image_path) if t else v for t, v in zip(transparent, views, strict=True)]
 

@@ -11,10 +11,10 @@ import torch
 
 from splatgraft.cameras import Cameras
 from splatgraft.distortion import Distortion
-from splatgraft.formats.masks import with_masks
+from splatgraft.formats.assembly import cameras_of, fitted_to_file, posed_images_of
 from splatgraft.formats.points_ply import read_points, write_points
-from splatgraft.formats.views import View, cameras_of, fitted_to_file, rigid
-from splatgraft.images import IMAGE_SUFFIXES, image_size
+from splatgraft.formats.views import View, existing_file, rigid
+from splatgraft.images import IMAGE_SUFFIXES, stored_size
 from splatgraft.posed_images import PosedImages
 from splatgraft.whole_file import whole_file
 
@@ -29,23 +29,10 @@ def read_capture(path: Path) -> PosedImages:
     Raises: ValueError where the file or one that it names is missing or broken.
     """
     meta = _load(path)
-    views = [fitted_to_file(view, path) for view in _views(path, meta)]
-    for view in views:
-        if view.image_path is None:
-            raise ValueError(f"{path}: expected the image file {view.name} beside it, found none")
-    views = with_masks(views, path.parent)
-    cameras, distortions = cameras_of(views, path)
     points, colors = torch.zeros(0, 3), torch.zeros(0, 3)
     if meta.get("ply_file_path") is not None:
         points, colors = read_points(path.parent / _text(path, meta, "ply_file_path"))
-    return PosedImages(
-        image_paths=tuple(view.image_path for view in views if view.image_path),
-        cameras=cameras,
-        points=points,
-        point_colors=colors,
-        mask_paths=tuple(view.mask_path for view in views) if any(view.mask_path for view in views) else (),
-        distortions=distortions if any(distortions) else (),
-    )
+    return posed_images_of(_views(path, meta), path, folder=path.parent, points=points, colors=colors)
 
 
 def read_cameras(path: Path) -> Cameras:
@@ -132,7 +119,7 @@ def _size(path: Path, camera: dict[str, Any], image_path: Path | None) -> tuple[
     if "w" not in camera and "h" not in camera:
         if image_path is None:
             raise ValueError(f"{path}: expected w and h, or the image file {camera.get('file_path')}, found neither")
-        return image_size(image_path)
+        return stored_size(image_path)
     width, height = _number(path, camera, "w", 0.0), _number(path, camera, "h", 0.0)
     if not (width.is_integer() and height.is_integer() and 1 <= width <= 65536 and 1 <= height <= 65536):
         raise ValueError(f"{path}: expected w and h to be whole and in 1 .. 65536, found {width:g} and {height:g}")
@@ -154,14 +141,14 @@ def _image_file(path: Path) -> Path | None:
     """The file, or with Blender's missing suffix added."""
     suffixes = ["", *sorted(IMAGE_SUFFIXES)] if path.suffix.lower() not in IMAGE_SUFFIXES else [""]
     candidates = [path.with_name(path.name + suffix) for suffix in suffixes]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    return next((found for found in map(existing_file, candidates) if found), None)
 
 
 def _mask_file(path: Path, camera: dict[str, Any]) -> Path | None:
     if camera.get("mask_path") is None:
         return None
     mask = path.parent / _text(path, camera, "mask_path")
-    if not mask.is_file():
+    if existing_file(mask) is None:
         raise ValueError(f"{path}: expected the mask {mask}, found no such file")
     return mask
 
