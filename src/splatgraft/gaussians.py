@@ -1,6 +1,6 @@
 """The value `Gaussians`: a 3DGS scene as raw tensors. Knows nothing about files, cameras or rendering."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -105,7 +105,7 @@ class Gaussians:
         """The Gaussians that a mask keeps, or an index list names."""
         return self.map(lambda tensor: tensor[which])
 
-    def map(self, function) -> "Gaussians":
+    def map(self, function: Callable[[Tensor], Tensor]) -> "Gaussians":
         """A copy with `function` applied to every tensor."""
         return replace(self, **{field.name: function(getattr(self, field.name)) for field in fields(self)})
 

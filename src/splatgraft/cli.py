@@ -1,0 +1,93 @@
+"""The command line: one command per file in steps/. Holds no work of its own and loads only what the command needs."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+COMMANDS = {
+    "init": "write a commented project.toml for two captures",
+    "run": "do what is stale in a project, resuming what was killed",
+    "status": "say what is done, what is stale and why",
+    "capture": "pose photos or a video, or take over poses that are there",
+    "reconstruct": "train a 3DGS scene on posed images",
+    "segment": "lift 2D masks to the Gaussians of the object",
+    "compose": "place the object in the target scene",
+    "relight": "give the object the light of its new place",
+    "render": "render a scene or a composite from given cameras",
+    "harmonize": "make the light of each rendered view agree",
+    "consolidate": "fit the colours of the scene to the harmonised views",
+    "evaluate": "compare, picture and report",
+    "doctor": "say what is installed, what is missing and how to get it",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Do one command; 0 where all went well, 2 where the user's data or arguments are at fault, 130 on Ctrl-C."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        print(_help())
+        return 0
+    if words[0] == "--version":
+        from splatgraft import __version__
+
+        print(__version__)
+        return 0
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    try:
+        return _dispatch(words)
+    except KeyboardInterrupt:
+        return _fail("interrupted; earlier results are whole, and the same command goes on from here", 130)
+    except ModuleNotFoundError as error:
+        from splatgraft.steps.extras import extra_of
+
+        extra = extra_of(error.name or "")
+        if debug or extra is None:
+            raise
+        return _fail(f"{error.name}: expected an installed package, found none; pip install 'splatgraft[{extra}]'", 2)
+    except (ValueError, OSError, MemoryError) as error:
+        if debug:
+            raise
+        return _fail(" ".join(str(error).split()) or type(error).__name__, 2)
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words or words[0] not in COMMANDS:
+        found = words[0] if words else "nothing"
+        raise ValueError(f"splatgraft: expected a command among {', '.join(COMMANDS)}; found {found}")
+    command, rest = words[0], words[1:]
+    if command not in ("init", "run", "status", "doctor") and len(rest) == 1 and rest[0].endswith(".toml"):
+        command, rest = "run", [rest[0], "--to", command]  # `reconstruct project.toml`: the project up to there
+
+    import tyro
+
+    module = importlib.import_module(f"splatgraft.steps.{command}")
+    options = tyro.cli(
+        module.COMMAND,
+        prog=f"splatgraft {command}",
+        args=rest,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    from splatgraft.steps.step import perform
+    from splatgraft.steps.terminal import Terminal
+
+    terminal = Terminal()
+    if hasattr(options, "execute"):
+        return options.execute(terminal)
+    terminal.result(perform(options, terminal))
+    return 0
+
+
+def _help() -> str:
+    lines = [f"  {name:<12} {sentence}" for name, sentence in COMMANDS.items()]
+    head = "usage: splatgraft COMMAND [OPTIONS]; `splatgraft COMMAND --help` says more\n\ncommands:"
+    tail = (
+        "\n`splatgraft reconstruct project.toml` does that project up to there."
+        "\n--debug, with any command: show the traceback of an error. --version: print the version."
+    )
+    return "\n".join([head, *lines, tail])
+
+
+def _fail(sentence: str, code: int) -> int:
+    print(f"splatgraft: {sentence}", file=sys.stderr)
+    return code

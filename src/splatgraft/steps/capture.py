@@ -1,0 +1,55 @@
+"""The command `capture`: photos, a video or a posed capture become a folder with transforms.json and points.ply."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from splatgraft.capture import PoseOptions, extract_frames, pose_photos
+from splatgraft.formats import has_poses, read_capture, write_capture
+from splatgraft.images import list_images
+from splatgraft.posed_images import PosedImages
+from splatgraft.steps.capture_files import capture_inputs
+from splatgraft.steps.step import Context, Inputs, Positional
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Pose photos or a video; poses that are there already are taken over, and images are then referred to."""
+
+    capture: Positional
+    """A folder of photos, a video, a COLMAP folder or a folder with transforms.json."""
+    out: Path = Path("capture")
+    """Folder for transforms.json and points.ply."""
+    max_side: int = 1600
+    """Longest side at which images are served from here on, pixels; 0 keeps all."""
+    options: PoseOptions = field(default_factory=PoseOptions)
+
+    def inputs(self) -> Inputs:
+        """The photos, or the video, or the files of the posed capture."""
+        if has_poses(self.capture):
+            return capture_inputs(self.capture, read_capture(self.capture), masks=True)
+        return {"photos": tuple(list_images(self.capture)) if self.capture.is_dir() else (self.capture,)}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the posed capture."""
+        if has_poses(self.capture):
+            posed = read_capture(self.capture)
+            context.terminal.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points")
+        else:
+            posed, report = pose_photos(
+                self._photos(folder, context), folder, options=self.options, progress=context.progress
+            )
+            context.terminal.say(f"{self.capture}: {report}")
+        write_capture(folder, _limited(posed, self.max_side))
+
+    def _photos(self, folder: Path, context: Context) -> list[Path]:
+        if self.capture.is_dir():
+            return list_images(self.capture)
+        return extract_frames(self.capture, folder / "frames", progress=context.progress)
+
+
+def _limited(posed: PosedImages, max_side: int) -> PosedImages:
+    longest = int(posed.cameras.sizes.max()) if len(posed) else 0
+    return posed.resized(max_side / longest) if 0 < max_side < longest else posed
+
+
+COMMAND = Capture

@@ -1,0 +1,102 @@
+"""What every step is, and the one way to do it: locked, timed, resumed, its folder replaced whole. Knows no algorithm."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol
+
+import torch
+import tyro
+
+from splatgraft.progress import Progress
+from splatgraft.project import FolderCheckpoint, Job, locked, replacing
+from splatgraft.steps.terminal import Terminal
+
+Positional = Annotated[Path, tyro.conf.Positional]
+Device = Literal["auto", "cpu", "cuda"]
+Inputs = Mapping[str, tuple[Path, ...]]
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a step is handed besides its own fields."""
+
+    progress: Progress
+    """Moves the bar."""
+    checkpoint: FolderCheckpoint
+    """Survives a kill."""
+    terminal: Terminal
+    """For sentences."""
+    earlier: Path
+    """The result's final place: what an earlier run left there is still whole while this one works."""
+
+
+class Step(Protocol):
+    """A frozen dataclass: paths of inputs, options, `out`; its fields are the command's arguments."""
+
+    @property
+    def out(self) -> Path:
+        """The folder of the result."""
+        ...
+
+    def inputs(self) -> Inputs:
+        """Files that the result depends on, by role.
+
+        Raises: ValueError where one that must be read to know is missing or broken.
+        """
+        ...
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the result in `folder`."""
+        ...
+
+
+def job_of(step: Step) -> Job:
+    """What must be known of `step` to tell whether its result still stands."""
+    return Job(step=type(step).__name__.lower(), folder=step.out, inputs=step.inputs(), options=_options(step))
+
+
+def path_fields(step: Step) -> list[Path]:
+    """The paths that `step` reads from."""
+    values = [getattr(step, field.name) for field in fields(step) if field.name != "out"]  # pyright: ignore
+    return [value for value in values if isinstance(value, Path)]
+
+
+def perform(step: Step, terminal: Terminal, *, name: str = "") -> Path:
+    """Do `step`, whether or not its result is stale, and give the folder.
+
+    Raises: ValueError where another run works on the same folder, or the inputs are bad.
+    """
+    job = job_of(step)
+    with locked(job.folder):
+        checkpoint = FolderCheckpoint(job)
+        with terminal.bar(name or job.step) as progress, replacing(job) as folder:
+            step.write(folder, Context(progress=progress, checkpoint=checkpoint, terminal=terminal, earlier=step.out))
+        checkpoint.drop()
+    return job.folder
+
+
+def choose_device(wanted: Device, terminal: Terminal) -> torch.device:
+    """The device to work on, said aloud.
+
+    Raises: ValueError where CUDA is asked for and there is none.
+    """
+    has_cuda = torch.cuda.is_available()
+    if wanted == "cuda" and not has_cuda:
+        raise ValueError("--device: expected a CUDA device that torch can use, found none; splatgraft doctor says more")
+    device = "cuda" if wanted != "cpu" and has_cuda else "cpu"
+    reason = "no CUDA device found" if wanted == "auto" and not has_cuda else f"--device {wanted}"
+    terminal.say(f"device: {device} ({reason})")
+    return torch.device(device)
+
+
+def _options(value: Any) -> dict[str, Any]:
+    """All settings as plain JSON: neither paths, whose content counts, nor the device, which only changes rounding."""
+    options: dict[str, Any] = {}
+    for field in fields(value):
+        item = getattr(value, field.name)
+        if is_dataclass(item):
+            options |= _options(item)
+        elif field.name != "device" and not isinstance(item, Path):
+            options[field.name] = list(item) if isinstance(item, tuple) else item
+    return options
