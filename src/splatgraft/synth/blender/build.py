@@ -1,0 +1,288 @@
+"""Builds a scene of `synth.scene` (its JSON form) in Blender. Runs inside Blender; knows nothing about passes or files."""
+
+import math
+import os
+import random
+
+import bmesh
+import bpy
+import materials  # beside this file: the worker puts its own folder on the path
+from mathutils import Euler, Matrix, Vector, noise
+
+
+def clear():
+    """An empty Blender with factory settings."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def _mesh(name, fill):
+    data = bpy.data.meshes.new(name)
+    built = bmesh.new()
+    fill(built)
+    bmesh.ops.recalc_face_normals(built, faces=built.faces)
+    built.to_mesh(data)
+    built.free()
+    thing = bpy.data.objects.new(name, data)
+    bpy.context.scene.collection.objects.link(thing)
+    return thing
+
+
+def _scaled(built, size):
+    bmesh.ops.scale(built, vec=size, verts=built.verts)
+
+
+def _box(part):
+    def fill(built):
+        bmesh.ops.create_cube(built, size=1.0)
+        _scaled(built, part["size"])
+
+    return fill
+
+
+def _cushion(part):
+    """A box with swollen faces and a little seeded unevenness."""
+
+    def fill(built):
+        bmesh.ops.create_cube(built, size=1.0)
+        bmesh.ops.subdivide_edges(built, edges=built.edges[:], cuts=7, use_grid_fill=True)
+        for v in built.verts:
+            x, y, z = (2 * c for c in v.co)
+            swell = (1 - x * x) * (1 - y * y)
+            v.co.z *= 0.75 + 0.45 * swell
+            pinch = 1 - 0.08 * (x * x + y * y) * abs(z)
+            v.co.x, v.co.y = v.co.x * pinch, v.co.y * pinch
+            v.co += 0.02 * noise.noise_vector(v.co * 3.0 + Vector((part["seed"] % 97, 0, 0)))
+        _scaled(built, part["size"])
+
+    return fill
+
+
+def _round(part):
+    def fill(built):
+        if part["shape"] == "sphere":
+            bmesh.ops.create_uvsphere(built, u_segments=40, v_segments=24, radius=0.5)
+        else:
+            bmesh.ops.create_cone(built, cap_ends=True, segments=48, radius1=0.5, radius2=0.5, depth=1.0)
+        _scaled(built, part["size"])
+
+    return fill
+
+
+def _turned(part):
+    """A profile of (radius, height) spun about z; both in units of half the width and of the height."""
+
+    def fill(built):
+        points = [Vector((r * 0.5, 0, h - 0.5)) for r, h in part["profile"]]
+        verts = [built.verts.new(p) for p in points]
+        edges = [built.edges.new(pair) for pair in zip(verts, verts[1:], strict=False)]
+        bmesh.ops.spin(built, geom=verts + edges, angle=2 * math.pi, steps=56, axis=(0, 0, 1), cent=(0, 0, 0))
+        bmesh.ops.remove_doubles(built, verts=built.verts, dist=1e-5)
+        _scaled(built, part["size"])
+
+    return fill
+
+
+def _extruded(part):
+    def fill(built):
+        low = [built.verts.new((x, y, -0.5)) for x, y in part["profile"]]
+        face = built.faces.new(low)
+        made = bmesh.ops.extrude_face_region(built, geom=[face])
+        bmesh.ops.translate(built, vec=(0, 0, 1), verts=[g for g in made["geom"] if isinstance(g, bmesh.types.BMVert)])
+        _scaled(built, part["size"])
+
+    return fill
+
+
+def _blob(part):
+    """A sphere pushed in and out by seeded noise: stones, heads, bushes."""
+
+    def fill(built):
+        bmesh.ops.create_icosphere(built, subdivisions=5, radius=0.5)
+        offset = Vector((part["seed"] % 89, part["seed"] % 53, 0))
+        for v in built.verts:
+            d = v.co.normalized()
+            v.co = d * (0.42 + 0.16 * noise.noise(d * 1.6 + offset) + 0.05 * noise.noise(d * 5.0 + offset))
+        _scaled(built, part["size"])
+
+    return fill
+
+
+def _torus(part):
+    def fill(built):
+        ring = 1 - part["bevel"]
+        rows = []
+        for i in range(40):
+            a = 2 * math.pi * i / 40
+            row = []
+            for j in range(16):
+                b = 2 * math.pi * j / 16
+                r = 0.5 * (ring + part["bevel"] * math.cos(b))
+                row.append(built.verts.new((r * math.cos(a), r * math.sin(a), 0.5 * math.sin(b))))
+            rows.append(row)
+        for i in range(40):
+            for j in range(16):
+                k, n = (i + 1) % 40, (j + 1) % 16
+                built.faces.new((rows[i][j], rows[k][j], rows[k][n], rows[i][n]))
+        _scaled(built, part["size"])
+
+    return fill
+
+
+def _tuft(part):
+    """Leaves: many bent blades that rise from the bottom centre."""
+    rng = random.Random(part["seed"])
+
+    def fill(built):
+        for _ in range(90):
+            turn, lean, length = rng.uniform(0, 2 * math.pi), rng.uniform(0.1, 1.25), rng.uniform(0.5, 1.0)
+            width = rng.uniform(0.03, 0.07)
+            out = Vector((math.cos(turn), math.sin(turn), 0))
+            side = Vector((-out.y, out.x, 0))
+            previous = None
+            for step in range(6):
+                t = step / 5
+                bend = lean * (0.4 + 0.9 * t)
+                centre = Vector((0, 0, -0.5)) + length * t * (out * math.sin(bend) * 0.55 + Vector((0, 0, math.cos(bend))))
+                half = side * width * math.sin(math.pi * min(0.98, 0.15 + 0.85 * t))
+                pair = (built.verts.new(centre - half), built.verts.new(centre + half))
+                if previous:
+                    built.faces.new((previous[0], previous[1], pair[1], pair[0]))
+                previous = pair
+        _scaled(built, part["size"])
+
+    return fill
+
+
+_SHAPES = {
+    "box": _box,
+    "cushion": _cushion,
+    "cylinder": _round,
+    "sphere": _round,
+    "turned": _turned,
+    "extruded": _extruded,
+    "blob": _blob,
+    "torus": _torus,
+    "tuft": _tuft,
+}
+_SMOOTH = {"cushion", "cylinder", "sphere", "turned", "blob", "torus", "tuft"}
+
+
+def _model(part):
+    """Everything in a model file, joined under one empty and scaled to the part's height."""
+    before = set(bpy.data.objects)
+    suffix = os.path.splitext(part["path"])[1].lower()
+    if suffix in (".glb", ".gltf"):
+        bpy.ops.import_scene.gltf(filepath=part["path"])
+    elif suffix == ".obj":
+        bpy.ops.wm.obj_import(filepath=part["path"])
+    elif suffix == ".blend":
+        with bpy.data.libraries.load(part["path"]) as (source, wanted):
+            wanted.objects = source.objects
+        for thing in wanted.objects:
+            bpy.context.scene.collection.objects.link(thing)
+    else:
+        raise ValueError(f"{part['path']}: expected a .glb, .gltf, .obj or .blend model, found '{suffix}'")
+    new = [o for o in bpy.data.objects if o not in before]
+    meshes = [o for o in new if o.type == "MESH"]
+    if not meshes:
+        raise ValueError(f"{part['path']}: expected a model with meshes, found none")
+    bpy.context.view_layer.update()
+    corners = [o.matrix_world @ Vector(c) for o in meshes for c in o.bound_box]
+    low = Vector(min(c[i] for c in corners) for i in range(3))
+    high = Vector(max(c[i] for c in corners) for i in range(3))
+    scale = min(part["size"][i] / max(high[i] - low[i], 1e-6) for i in range(3))
+    place = Matrix.LocRotScale(Vector(part["location"]), Euler(part["rotation"]), Vector((scale,) * 3))
+    matrix = place @ Matrix.Translation(-(low + high) / 2)
+    worlds = {o: o.matrix_world.copy() for o in meshes}
+    for thing in meshes:
+        thing.parent = None
+        thing.matrix_world = matrix @ worlds[thing]
+    return meshes
+
+
+def add_part(part, name):
+    """One part as Blender objects; the list is empty for no part, longer than 1 for a model of several meshes."""
+    if part["shape"] == "model":
+        return _model(part)
+    thing = _mesh(name, _SHAPES[part["shape"]](part))
+    thing.location, thing.rotation_euler = part["location"], part["rotation"]
+    if part["bevel"] > 0 and part["shape"] in ("box", "extruded", "cylinder"):
+        bevel = thing.modifiers.new("bevel", "BEVEL")
+        bevel.width, bevel.segments, bevel.limit_method = part["bevel"], 3, "ANGLE"
+    if part["shape"] in _SMOOTH or part["bevel"] > 0:
+        for polygon in thing.data.polygons:
+            polygon.use_smooth = part["shape"] in _SMOOTH and part["shape"] != "cylinder"
+    if part["shape"] == "cylinder":
+        for polygon in thing.data.polygons:
+            polygon.use_smooth = len(polygon.vertices) == 4
+    if part["shape"] in ("turned", "blob"):
+        smooth = thing.modifiers.new("smooth", "SUBSURF")
+        smooth.levels = smooth.render_levels = 1
+    thing.data.materials.append(materials.make(name, part["material"]))
+    return [thing]
+
+
+def add_lamp(lamp, name):
+    """One lamp."""
+    data = bpy.data.lights.new(name, lamp["kind"].upper())
+    data.color, data.energy = lamp["color"], lamp["power"]
+    if lamp["kind"] == "sun":
+        data.angle = lamp["size"]
+    elif lamp["kind"] == "area":
+        data.size = lamp["size"]
+        if lamp["height"]:
+            data.shape, data.size_y = "RECTANGLE", lamp["height"]
+    else:
+        data.shadow_soft_size = lamp["size"]
+    thing = bpy.data.objects.new(name, data)
+    thing.location = lamp["location"]
+    thing.rotation_euler = Vector(lamp["direction"]).to_track_quat("-Z", "Y").to_euler()
+    thing.visible_camera = False
+    bpy.context.scene.collection.objects.link(thing)
+    return thing
+
+
+def environment_path(name):
+    """A path as it is, or the file of that name among the maps that come with Blender."""
+    if os.path.isabs(name) or os.path.exists(name):
+        return name
+    return os.path.join(bpy.utils.system_resource("DATAFILES"), "studiolights", "world", name)
+
+
+def make_world(world):
+    """A Blender world from the JSON form of `synth.scene.World`."""
+    made = bpy.data.worlds.new("world")
+    made.use_nodes = True
+    nodes, links = made.node_tree.nodes, made.node_tree.links
+    background = nodes["Background"]
+    background.inputs["Strength"].default_value = world["strength"]
+    background.inputs["Color"].default_value = (*world["color"], 1.0)
+    if world["kind"] == "sky":
+        sky = nodes.new("ShaderNodeTexSky")
+        sky.sky_type = "NISHITA"
+        sky.sun_elevation, sky.sun_size, sky.dust_density = world["sun_elevation"], world["sun_size"], world["haze"]
+        # the node turns clockwise from +y, seen from above
+        sky.sun_rotation = math.pi / 2 - world["sun_azimuth"]
+        links.new(sky.outputs["Color"], background.inputs["Color"])
+    elif world["kind"] == "environment":
+        image = nodes.new("ShaderNodeTexEnvironment")
+        image.image = bpy.data.images.load(environment_path(world["path"]))
+        mapping, coordinates = nodes.new("ShaderNodeMapping"), nodes.new("ShaderNodeTexCoord")
+        mapping.inputs["Rotation"].default_value = (0.0, 0.0, world["rotation"])
+        links.new(coordinates.outputs["Generated"], mapping.inputs["Vector"])
+        links.new(mapping.outputs["Vector"], image.inputs["Vector"])
+        links.new(image.outputs["Color"], background.inputs["Color"])
+    return made
+
+
+def add_camera(camera, name):
+    """One camera; the pose is the object's matrix_world, OpenGL axes."""
+    data = bpy.data.cameras.new(name)
+    data.sensor_fit, data.angle = "HORIZONTAL", camera["field_of_view"]
+    data.clip_start, data.clip_end = 0.01, 1000.0
+    thing = bpy.data.objects.new(name, data)
+    thing.location = camera["location"]
+    look = Vector(camera["target"]) - Vector(camera["location"])
+    thing.rotation_euler = look.to_track_quat("-Z", "Y").to_euler()
+    bpy.context.scene.collection.objects.link(thing)
+    return thing

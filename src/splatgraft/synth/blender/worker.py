@@ -1,0 +1,136 @@
+"""One render job in a process of its own: `python worker.py job.json`. Needs bpy and numpy only.
+
+A job names a scene, the object, cameras and takes; a take says whether scene and object are there, under which
+world, and which passes to write. A file that exists is not rendered again, so a killed job goes on where it was.
+Knows nothing about what the takes are for.
+"""
+
+import json
+import math
+import os
+import sys
+import time
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+
+import bpy  # noqa: E402
+import build  # noqa: E402
+import numpy as np  # noqa: E402
+import passes  # noqa: E402
+
+OBJECT_INDEX = 1
+_LUMA = np.array([0.2126, 0.7152, 0.0722])
+
+
+def _populate(job):
+    build.clear()
+    scene_things, object_things = [], []
+    for i, part in enumerate(job["scene"]["parts"]):
+        scene_things += build.add_part(part, f"part{i:03d}")
+    for i, lamp in enumerate(job["scene"]["lamps"]):
+        scene_things.append(build.add_lamp(lamp, f"lamp{i:02d}"))
+    for i, part in enumerate(job["object"]):
+        object_things += build.add_part(part, f"object{i:03d}")
+    for i, thing in enumerate(object_things):
+        thing.name = f"object{i:03d}"
+        thing.pass_index = OBJECT_INDEX
+    cameras = [build.add_camera(camera, f"camera{i:04d}") for i, camera in enumerate(job["cameras"])]
+    bpy.context.view_layer.update()
+    return scene_things, object_things, cameras
+
+
+def _show(take, job, scene_things, object_things, worlds):
+    for thing in scene_things:
+        thing.hide_render = not take["scene"]
+    for thing in object_things:
+        thing.hide_render = not take["object"]
+    key = json.dumps(take.get("world") or job["scene"]["world"], sort_keys=True)
+    if key not in worlds:
+        worlds[key] = build.make_world(json.loads(key))
+    bpy.context.scene.world = worlds[key]
+    bpy.context.scene.render.film_transparent = not take["scene"]
+
+
+def _exposure(job, take, cameras):
+    """Factor that brings the middle of the picture to a photograph's brightness, kept in the job's folder."""
+    path = os.path.join(job["out"], "exposure.json")
+    known = json.load(open(path)) if os.path.exists(path) else {}
+    group = take["exposure_group"]
+    if group not in known:
+        scene = bpy.context.scene
+        full = scene.render.resolution_percentage, scene.cycles.samples
+        scene.render.resolution_percentage, scene.cycles.samples = 25, 12
+        levels = []
+        for camera in cameras[:: max(1, len(cameras) // 3)]:
+            color = passes.render(camera, ["color"])["color"]
+            luma = (color[..., :3] * _LUMA).sum(-1)[color[..., 3] > 0.5]
+            if luma.size:
+                levels.append((np.exp(np.log(luma + 1e-4).mean()), np.quantile(luma, 0.97)))
+        scene.render.resolution_percentage, scene.cycles.samples = full
+        mean, high = np.mean(levels, 0) if levels else (0.18, 1.0)
+        # the mean goes to a mid grey, but no more than three per cent of pixels may clip hard
+        known[group] = float(min(0.22 / max(mean, 1e-4), 1.3 / max(high, 1e-4)))
+        with open(path + ".partial", "w") as out:
+            json.dump(known, out)
+        os.replace(path + ".partial", path)
+    return known[group]
+
+
+def _write(folder, name, take, arrays, exposure):
+    for kind in take["passes"]:
+        path = os.path.join(folder, f"{name}{'' if kind == 'color' else '_' + kind}")
+        if kind == "color":
+            color = passes.srgb(arrays["color"][..., :3] * exposure)
+            transparent = not take["scene"]
+            # straight alpha: premultiplied light divided by coverage before the sRGB curve
+            if transparent:
+                alpha = arrays["color"][..., 3:]
+                straight = arrays["color"][..., :3] / np.maximum(alpha, 1e-4)
+                color = np.concatenate([passes.srgb(straight * exposure), alpha], -1)
+            passes.write_png(path + ".png", color)
+        elif kind == "depth":
+            passes.write_npy(path + ".npy", np.where(arrays["depth"] > 500, 0, arrays["depth"]).astype(np.float16))
+        elif kind == "normal":
+            passes.write_png(path + ".png", arrays["normal"][..., :3] * 0.5 + 0.5)
+        elif kind == "albedo":
+            passes.write_png(path + ".png", passes.srgb(arrays["albedo"][..., :3]))
+        else:
+            passes.write_png(path + ".png", arrays[kind])
+
+
+def main(path):
+    """Render what the job at `path` still lacks."""
+    with open(path) as source:
+        job = json.load(source)
+    os.makedirs(job["out"], exist_ok=True)
+    scene_things, object_things, cameras = _populate(job)
+    passes.configure(job["width"], job["height"], job["samples"], job.get("seed", 0))
+    poses = [[list(row) for row in camera.matrix_world] for camera in cameras]
+    with open(os.path.join(job["out"], "cameras.json.partial"), "w") as out:
+        fields = [camera["field_of_view"] for camera in job["cameras"]]
+        json.dump({"width": job["width"], "height": job["height"], "field_of_view": fields, "poses": poses}, out)
+    os.replace(os.path.join(job["out"], "cameras.json.partial"), os.path.join(job["out"], "cameras.json"))
+    matte = [thing.name for thing in object_things]
+    worlds = {}
+    for take in job["takes"]:
+        folder = os.path.join(job["out"], take["name"])
+        os.makedirs(folder, exist_ok=True)
+        chosen = take.get("cameras", range(len(cameras)))
+        todo = [i for i in chosen if not os.path.exists(os.path.join(folder, f"{i:04d}.done"))]
+        if not todo:
+            continue
+        _show(take, job, scene_things, object_things, worlds)
+        exposure = _exposure(job, take, cameras) * 2.0 ** take.get("stops", 0.0)
+        for i in todo:
+            begin = time.time()
+            arrays = passes.render(cameras[i], take["passes"], matte)
+            if not np.isfinite(arrays["color"]).all():
+                raise ValueError(f"{folder}/{i:04d}: expected finite colours, found {math.nan}")
+            _write(folder, f"{i:04d}", take, arrays, exposure)
+            with open(os.path.join(folder, f"{i:04d}.done"), "w") as out:
+                out.write(f"{time.time() - begin:.2f}\n")
+            print(f"rendered {take['name']} {i:04d} {time.time() - begin:.1f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

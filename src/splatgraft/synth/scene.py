@@ -1,0 +1,178 @@
+"""The values that describe a synthetic scene in full: parts, materials, lamps, sky, cameras. Knows nothing about Blender.
+
+Everything is plain data (numbers, strings, tuples), in metres, z up, so that a scene is a small JSON file that a
+renderer in another interpreter can read. Colours are linear RGB.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Literal
+
+Vector = tuple[float, float, float]
+Color = tuple[float, float, float]
+
+Pattern = Literal[
+    "plain",
+    "planks",
+    "wood",
+    "tiles",
+    "brick",
+    "fabric",
+    "rug",
+    "marble",
+    "plaster",
+    "speckle",
+    "stripes",
+    "checker",
+    "painting",
+    "grass",
+    "metal",
+    "glass",
+]
+Shape = Literal["box", "cushion", "cylinder", "sphere", "turned", "extruded", "blob", "torus", "tuft", "model"]
+
+
+@dataclass(frozen=True)
+class Material:
+    """A principled surface with one procedural pattern of two colours."""
+
+    pattern: Pattern
+    color: Color
+    second: Color = (0.5, 0.5, 0.5)
+    """The pattern's other colour."""
+    roughness: float = 0.5
+    metallic: float = 0.0
+    scale: float = 1.0
+    """Pattern repeats per metre, in the pattern's own sense."""
+    bump: float = 0.0
+    """Height of the bump, 0 to 1."""
+    coat: float = 0.0
+    """Clear coat, 0 to 1."""
+    emission: float = 0.0
+    """Radiance in watts per square metre and steradian; 0 does not shine."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One mesh: a shape with its size, place and material."""
+
+    shape: Shape
+    size: Vector
+    """Extent along the own axes, metres; a turned or extruded shape scales its unit profile by it."""
+    location: Vector
+    """Centre of the shape's bounding box."""
+    material: Material
+    rotation: Vector = (0.0, 0.0, 0.0)
+    """Euler XYZ, radians."""
+    profile: tuple[tuple[float, float], ...] = ()
+    """turned: (radius, height) in units of the half width and height, bottom to top; extruded: outline in [-.5, .5]."""
+    bevel: float = 0.0
+    """Width of rounded edges, metres."""
+    seed: int = 0
+    """For shapes and patterns with own randomness."""
+    path: str = ""
+    """model: a .glb, .gltf, .obj or .blend file."""
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A light source that is no surface of the room."""
+
+    kind: Literal["sun", "area", "point", "spot"]
+    color: Color
+    power: float
+    """sun: W/m^2; else W."""
+    location: Vector = (0.0, 0.0, 0.0)
+    direction: Vector = (0.0, 0.0, -1.0)
+    """Where the light travels; not used by `point`."""
+    size: float = 0.1
+    """area: side in metres; point and spot: radius in metres; sun: angular diameter in radians."""
+    height: float = 0.0
+    """area: the other side where it is no square, metres."""
+
+
+@dataclass(frozen=True)
+class World:
+    """What surrounds the scene."""
+
+    kind: Literal["color", "sky", "environment"]
+    color: Color = (0.0, 0.0, 0.0)
+    strength: float = 1.0
+    sun_elevation: float = 0.8
+    """sky: radians above the horizon."""
+    sun_azimuth: float = 0.0
+    """sky: radians from +x towards +y, where the sun stands."""
+    sun_size: float = 0.0095
+    """sky: angular diameter, radians."""
+    haze: float = 1.0
+    """sky: amount of dust, 0 to 10."""
+    path: str = ""
+    """environment: an .hdr or .exr file; a bare name is one that comes with Blender."""
+    rotation: float = 0.0
+    """environment: radians about z."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A spot on a support surface where an object may stand."""
+
+    location: Vector
+    radius: float
+    """Free radius, metres."""
+    height: float
+    """Free height, metres."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole that looks from one point at another, z up in the picture."""
+
+    location: Vector
+    target: Vector
+    field_of_view: float = 1.05
+    """Horizontal, radians."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A whole scene; `places[0]` is the one that the object takes."""
+
+    name: str
+    kind: str
+    parts: tuple[Part, ...]
+    lamps: tuple[Lamp, ...]
+    world: World
+    places: tuple[Place, ...]
+    bounds: tuple[Vector, Vector]
+    """Lowest and highest corner of where a camera may stand."""
+    obstacles: tuple[tuple[Vector, Vector], ...] = ()
+    """Boxes that cameras keep out of."""
+    notes: dict[str, str] = field(default_factory=dict)
+    """The true light in words and numbers, for the benchmark's `light.json`."""
+
+    def to_json(self) -> str:
+        """The scene as a JSON text that `blender/` can read without this package."""
+        return json.dumps(asdict(self), indent=1)
+
+
+def rotate_z(point: Vector, angle: float) -> Vector:
+    """`point` turned about the z axis."""
+    c, s = math.cos(angle), math.sin(angle)
+    return (c * point[0] - s * point[1], s * point[0] + c * point[1], point[2])
+
+
+def add(a: Vector, b: Vector) -> Vector:
+    """Sum of two vectors."""
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def direction(azimuth: float, elevation: float) -> Vector:
+    """Unit vector towards an azimuth (from +x towards +y) and an elevation above the horizon, radians."""
+    return (
+        math.cos(elevation) * math.cos(azimuth),
+        math.cos(elevation) * math.sin(azimuth),
+        math.sin(elevation),
+    )
