@@ -6,7 +6,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def psnr(image: Float[Tensor, "*n c"], reference: Float[Tensor, "*n c"], region: Bool[Tensor, "*n"] | None = None):
+def psnr(
+    image: Float[Tensor, "*n c"], reference: Float[Tensor, "*n c"], region: Bool[Tensor, "*n"] | None = None
+) -> Float[Tensor, ""]:
     """Peak signal-to-noise ratio in dB for a peak of 1; infinite where equal, nan where the region is empty."""
     squares = (image - reference) ** 2
     mean = squares.mean() if region is None else squares[region].mean()
@@ -39,7 +41,9 @@ def ssim_map(image: Float[Tensor, "h w c"], reference: Float[Tensor, "h w c"]) -
     return (luminance * structure)[0].permute(1, 2, 0)
 
 
-def ssim(image: Float[Tensor, "h w c"], reference: Float[Tensor, "h w c"], region: Bool[Tensor, "h w"] | None = None):
+def ssim(
+    image: Float[Tensor, "h w c"], reference: Float[Tensor, "h w c"], region: Bool[Tensor, "h w"] | None = None
+) -> Float[Tensor, ""]:
     """Mean structural similarity; over a region, the mean of the pixels whose window centre lies in it."""
     values = ssim_map(image, reference)
     return values.mean() if region is None else values[region[5:-5, 5:-5]].mean()

@@ -1,1 +1,27 @@
-"""TODO"""
+"""Evaluate: pictures become numbers and a page that explains them. Knows nothing about scenes or how they were made."""
+
+from splatgraft.evaluate.changes import change_map, describe_change
+from splatgraft.evaluate.measure import ComparedView, compare, measure
+from splatgraft.evaluate.pictures import side_by_side, write_animation
+from splatgraft.evaluate.regions import Regions, Truth, find_regions
+from splatgraft.evaluate.report import Report, ReportView, StepTime, write_report
+from splatgraft.evaluate.turntable import TurntableOptions, turntable_cameras
+
+__all__ = [
+    "ComparedView",
+    "Regions",
+    "Report",
+    "ReportView",
+    "StepTime",
+    "Truth",
+    "TurntableOptions",
+    "change_map",
+    "compare",
+    "describe_change",
+    "find_regions",
+    "measure",
+    "side_by_side",
+    "turntable_cameras",
+    "write_animation",
+    "write_report",
+]

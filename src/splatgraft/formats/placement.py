@@ -21,6 +21,7 @@ from torch import Tensor
 
 from splatgraft.gaussians import rotation_from_quaternion
 from splatgraft.similarity import Similarity
+from splatgraft.whole_file import whole_file
 
 _OBJECT_KEYS = frozenset({"object", "scale", "rotation", "translation"})
 
@@ -80,12 +81,10 @@ def write_placement(path: Path, placement: Placement) -> None:
     content: dict[str, Any] = {"objects": entries}
     if placement.erased is not None:
         content["erased"] = "erased.npy"
-        partial = path.parent / ".erased.partial.npy"
-        np.save(partial, placement.erased.cpu().numpy())
-        os.replace(partial, path.parent / "erased.npy")
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(content, indent=1) + "\n")
-    os.replace(partial, path)
+        with whole_file(path.parent / "erased.npy") as stream:
+            np.save(stream, placement.erased.cpu().numpy())
+    with whole_file(path) as stream:
+        stream.write((json.dumps(content, indent=1) + "\n").encode())
 
 
 def read_erased(path: Path) -> Bool[Tensor, "n"]:
