@@ -102,7 +102,7 @@ class _TileLists:
         """Blended `values (m, c)` as (c, h, w), and alpha (h, w)."""
         image = np.empty((values.shape[1], view.height, view.width), np.float32)
         alpha = np.empty((view.height, view.width), np.float32)
-        cpu_blend.blend(self.splats, self.start, self.entries, values, view.width, view.height, image, alpha)
+        cpu_blend.blend(self.splats, self.start, self.entries, values, image, alpha)
         return image, alpha
 
     def sum_slots(self, sums: np.ndarray) -> np.ndarray:
@@ -144,14 +144,12 @@ class _Splat(torch.autograd.Function):
         view, lists, (values, image, alpha) = ctx.view, ctx.lists, ctx.drawn
         order, camera = lists.order, view.numbers
         grad_image, grad_alpha = _array(grad_image), _array(grad_alpha)
-        rest = np.einsum("chw,chw->hw", grad_image, image) + grad_alpha * alpha
         grads = [np.zeros(field.shape, np.float32) for field in ctx.saved_tensors]
         grad_means, grad_log_scales, grad_quaternions, grad_logits, grad_sh, grad_features = grads
         with _KERNELS:
             sums = np.empty((len(lists.entries), cpu_blend.MOMENTS + values.shape[1]), np.float32)
             cpu_blend.blend_backward(
-                lists.splats, lists.start, lists.entries, lists.slots, values, rest, grad_image, grad_alpha,
-                view.width, view.height, sums,
+                lists.splats, lists.start, lists.entries, lists.slots, values, image, alpha, grad_image, grad_alpha, sums
             )  # fmt: skip
             totals = lists.sum_slots(sums)
             at = cpu_blend.MOMENTS
@@ -194,9 +192,7 @@ class CpuViewOperator:
         sums = np.empty((len(lists.entries), len(planes)), np.float32)
         out = np.zeros((self._n, len(planes)), np.float32)
         with _KERNELS:
-            cpu_blend.blend_transpose(
-                lists.splats, lists.start, lists.entries, lists.slots, planes, view.width, view.height, sums
-            )
+            cpu_blend.blend_transpose(lists.splats, lists.start, lists.entries, lists.slots, planes, sums)
             out[lists.order] = lists.sum_slots(sums)
         return torch.from_numpy(out)
 

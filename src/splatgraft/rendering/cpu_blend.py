@@ -1,7 +1,8 @@
 """Alpha blending of tile lists, forward, backward and transposed: numba kernels. Knows nothing about 3D.
 
-A tile is worked on row by row, 16 pixels at once, in planes of float32 inside one array (so that the compiler can
-see that planes do not overlap); the inner loops have no branch, no call and no reduction, and exp is multiplications.
+A tile is worked on row by row, 16 pixels at once, in planes of float32 inside one array. Inner loops have no branch,
+no call and no reduction; exp is multiplications. Colours (3 channels) keep their sums in registers; any other number
+of channels goes through memory.
 """
 
 import math
@@ -10,209 +11,338 @@ from typing import no_type_check
 import numpy as np
 from numba import float32, njit, prange
 
-from splatgraft.rendering.cpu_project import CA, CB, CC, MIN_ALPHA, MX, MY, OPACITY, REACH_Y
+from splatgraft.rendering.cpu_project import CA, CB, CC, LOG_OPACITY, MIN_ALPHA, MX, MY, REACH_Y
+from splatgraft.rendering.cpu_rows import (
+    lanes,
+    largest,
+    load,
+    smaller,
+    spread,
+    store,
+    total,
+    where_at_least,
+    where_below,
+)
 from splatgraft.rendering.cpu_tiles import TILE
 
 PIXELS = TILE * TILE
 BATCH = 32
+RGB = 3
 MAX_ALPHA = float32(0.99)
 MIN_TRANSMITTANCE = float32(1e-4)
 MOMENTS = 6
 
-# exp(x) on [-0.35, 0] to 1e-7: Chebyshev interpolation
+ONE, ZERO, HALF = float32(1), float32(0), float32(0.5)
+# alpha = exp(x)^16 with x in [log(1/255) / 16, 0]; there the polynomial is exp to 1e-7 (Chebyshev interpolation)
+SIXTEENTH = float32(1 / 16)
+LOWEST = float32(math.log(MIN_ALPHA) / 16)
 E0, E1, E2, E3, E4 = (float32(x) for x in (0.99999994, 0.9999898, 0.49976337, 0.16472879, 0.035080757))
-_FAST = {"contract", "reassoc", "nsz", "arcp"}
-ONE, ZERO = float32(1), float32(0)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 @no_type_check
-def _rows(splat, y0):
-    """First and one past the last row of the tile at `y0` that the splat can reach."""
-    center, reach = splat[MY] - y0 - float32(0.5), splat[REACH_Y] + float32(1e-3)
-    top, bottom = math.ceil(max(center - reach, ZERO)), math.floor(min(center + reach, float32(TILE - 1)))
-    return int(top), int(bottom) + 1
+def _shape(splats, s, x0, y0):
+    """Centre in the tile, the quadratic's a, b, c and constant over 16, first and one past the last row."""
+    mx, my = splats[s, MX] - x0 - HALF, splats[s, MY] - y0 - HALF
+    reach = splats[s, REACH_Y] + float32(1e-3)
+    top, bottom = math.ceil(max(my - reach, ZERO)), math.floor(min(my + reach, float32(TILE - 1)))
+    a, b, c = -HALF * SIXTEENTH * splats[s, CA], -SIXTEENTH * splats[s, CB], -HALF * SIXTEENTH * splats[s, CC]
+    return mx, my, a, b, c, SIXTEENTH * splats[s, LOG_OPACITY], int(top), int(bottom) + 1
 
 
-@njit(cache=True, fastmath=_FAST, inline="always")
+@njit(cache=True)
 @no_type_check
-def _alpha_row(work, at, splat, dy, mx):
-    """Write the 16 alphas of one row, before the cap and 0 below 1/255, to `work[at:]`."""
-    scale = float32(-0.5 / 16)
-    qa, qb = scale * splat[CA], float32(2) * scale * splat[CB] * dy
-    qc, opacity = scale * splat[CC] * dy * dy, splat[OPACITY]
-    for x in range(TILE):
-        dx = float32(x) - mx
-        t = (qa * dx + qb) * dx + qc
-        e = (((E4 * t + E3) * t + E2) * t + E1) * t + E0
-        e *= e
-        e *= e
-        e *= e
-        e *= e
-        alpha = opacity * e
-        work[at + x] = alpha if alpha >= float32(MIN_ALPHA) and t > float32(-0.36) else ZERO
+def _alpha(across, dx, along, down):
+    """A row of alpha before the cap, 0 below 1/255, of the exponent `across` + `along` dx + `down` (all over 16)."""
+    x = across + dx * along + down
+    e = (((x * E4 + E3) * x + E2) * x + E1) * x + E0
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    return where_at_least(x, LOWEST, e)
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True)
 @no_type_check
-def blend(splats, start, entries, values, width, height, image, alpha):
-    """Fill `image (c, h, w)` with blended `values (m, c)` over black, and `alpha (h, w)`."""
+def _saturated(work):
+    """Whether no pixel of the tile lets through anything worth drawing."""
+    for y in range(TILE):
+        if largest(load(work, y * TILE)) >= MIN_TRANSMITTANCE:
+            return False
+    return True
+
+
+@njit(cache=True)
+@no_type_check
+def _blend_rgb(splats, entries, values, x0, y0, work):
+    """Planes of `work`: transmittance, red, green, blue."""
+    for k in range(entries.shape[0]):
+        s = entries[k]
+        mx, my, a, b, c, d, top, bottom = _shape(splats, s, x0, y0)
+        red, green, blue = values[s, 0], values[s, 1], values[s, 2]
+        dx = lanes() - mx
+        across = dx * dx * a + d
+        for y in range(top, bottom):
+            dy = float32(y) - my
+            at = y * TILE
+            before = load(work, at)
+            weight = smaller(_alpha(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            store(work, at, before - weight)
+            store(work, at + PIXELS, load(work, at + PIXELS) + weight * red)
+            store(work, at + 2 * PIXELS, load(work, at + 2 * PIXELS) + weight * green)
+            store(work, at + 3 * PIXELS, load(work, at + 3 * PIXELS) + weight * blue)
+        if k % BATCH == BATCH - 1 and _saturated(work):
+            break
+
+
+@njit(cache=True)
+@no_type_check
+def _blend_any(splats, entries, values, x0, y0, work):
+    """Planes of `work`: transmittance, then the channels."""
+    for k in range(entries.shape[0]):
+        s = entries[k]
+        mx, my, a, b, c, d, top, bottom = _shape(splats, s, x0, y0)
+        dx = lanes() - mx
+        across = dx * dx * a + d
+        for y in range(top, bottom):
+            dy = float32(y) - my
+            at = y * TILE
+            before = load(work, at)
+            weight = smaller(_alpha(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            store(work, at, before - weight)
+            for channel in range(values.shape[1]):
+                at += PIXELS
+                store(work, at, load(work, at) + weight * values[s, channel])
+        if k % BATCH == BATCH - 1 and _saturated(work):
+            break
+
+
+@njit(cache=True)
+@no_type_check
+def _open_tile(tile, width, planes):
+    """Corner of the tile, and its planes: the first 1, the rest 0."""
     tiles_x = (width + TILE - 1) // TILE
+    work = np.zeros(planes * PIXELS, np.float32)
+    work[:PIXELS] = ONE
+    return (tile % tiles_x) * TILE, (tile // tiles_x) * TILE, work
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def blend(splats, start, entries, values, image, alpha):
+    """Fill `image (c, h, w)` with blended `values (m, c)` over black, and `alpha (h, w)`."""
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
-        x0, y0 = float32((tile % tiles_x) * TILE), float32((tile // tiles_x) * TILE)
-        work = np.zeros((channels + 2) * PIXELS, np.float32)
-        work[:PIXELS] = ONE
-        row_at = PIXELS
-        for k in range(start[tile], start[tile + 1]):
-            s = entries[k]
-            splat = splats[s]
-            mx = splat[MX] - x0 - float32(0.5)
-            top, bottom = _rows(splat, y0)
-            for y in range(top, bottom):
-                _alpha_row(work, row_at, splat, float32(y) - (splat[MY] - y0 - float32(0.5)), mx)
-                at = y * TILE
-                for x in range(TILE):
-                    weight = min(work[row_at + x], MAX_ALPHA) * work[at + x]
-                    work[at + x] -= weight
-                    work[row_at + x] = weight
+        x0, y0, work = _open_tile(tile, alpha.shape[1], 1 + channels)
+        listed = entries[start[tile] : start[tile + 1]]
+        if channels == RGB:
+            _blend_rgb(splats, listed, values, float32(x0), float32(y0), work)
+        else:
+            _blend_any(splats, listed, values, float32(x0), float32(y0), work)
+        for y in range(y0, min(y0 + TILE, alpha.shape[0])):
+            for x in range(x0, min(x0 + TILE, alpha.shape[1])):
+                at = (y - y0) * TILE + x - x0
+                alpha[y, x] = ONE - work[at]
                 for c in range(channels):
-                    value, plane = values[s, c], at + (c + 2) * PIXELS
-                    for x in range(TILE):
-                        work[plane + x] += work[row_at + x] * value
-            if (k - start[tile]) % BATCH == BATCH - 1 and work[:PIXELS].max() < MIN_TRANSMITTANCE:
-                break
-        _store(work, image, alpha, int(x0), int(y0))
+                    image[c, y, x] = work[(c + 1) * PIXELS + at]
 
 
 @njit(cache=True)
 @no_type_check
-def _store(work, image, alpha, x0, y0):
-    for y in range(y0, min(y0 + TILE, alpha.shape[0])):
-        for x in range(x0, min(x0 + TILE, alpha.shape[1])):
-            at = (y - y0) * TILE + x - x0
-            alpha[y, x] = ONE - work[at]
-            for c in range(image.shape[0]):
-                image[c, y, x] = work[(c + 2) * PIXELS + at]
+def _read(image, x0, y0, work, plane):
+    """Copy the tile at x0, y0 of `image (h, w)` into a plane, which stays 0 outside the image."""
+    for y in range(y0, min(y0 + TILE, image.shape[0])):
+        for x in range(x0, min(x0 + TILE, image.shape[1])):
+            work[plane * PIXELS + (y - y0) * TILE + x - x0] = image[y, x]
 
 
 @njit(cache=True)
 @no_type_check
-def _load(work, image, x0, y0, plane):
-    """Put the tile of `image (c, h, w)` into the planes from `plane`, 0 outside the image."""
-    for c in range(image.shape[0]):
-        for y in range(y0, min(y0 + TILE, image.shape[1])):
-            for x in range(x0, min(x0 + TILE, image.shape[2])):
-                work[(plane + c) * PIXELS + (y - y0) * TILE + x - x0] = image[c, y, x]
+def _gather_rgb(splats, entries, slots, x0, y0, work, sums):
+    """Planes of `work`: transmittance, red, green, blue."""
+    for k in range(entries.shape[0]):
+        mx, my, a, b, c, d, top, bottom = _shape(splats, entries[k], x0, y0)
+        dx = lanes() - mx
+        across = dx * dx * a + d
+        red, green, blue = spread(ZERO), spread(ZERO), spread(ZERO)
+        for y in range(top, bottom):
+            dy = float32(y) - my
+            at = y * TILE
+            before = load(work, at)
+            weight = smaller(_alpha(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            store(work, at, before - weight)
+            red = red + weight * load(work, at + PIXELS)
+            green = green + weight * load(work, at + 2 * PIXELS)
+            blue = blue + weight * load(work, at + 3 * PIXELS)
+        slot = slots[k]
+        sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(red), total(green), total(blue)
+        if k % BATCH == BATCH - 1 and _saturated(work):
+            return k + 1
+    return entries.shape[0]
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True)
 @no_type_check
-def blend_transpose(splats, start, entries, slots, image, width, height, sums):
+def _gather_any(splats, entries, slots, x0, y0, work, sums):
+    """Planes of `work`: transmittance, the channels of the image, one for sums (at most 256 channels in rows)."""
+    channels = sums.shape[1]
+    column = np.empty(channels * TILE, np.float32)
+    for k in range(entries.shape[0]):
+        mx, my, a, b, c, d, top, bottom = _shape(splats, entries[k], x0, y0)
+        dx = lanes() - mx
+        across = dx * dx * a + d
+        column[:] = ZERO
+        for y in range(top, bottom):
+            dy = float32(y) - my
+            at = y * TILE
+            before = load(work, at)
+            weight = smaller(_alpha(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            store(work, at, before - weight)
+            for channel in range(channels):
+                at += PIXELS
+                store(column, channel * TILE, load(column, channel * TILE) + weight * load(work, at))
+        for channel in range(channels):
+            sums[slots[k], channel] = total(load(column, channel * TILE))
+        if k % BATCH == BATCH - 1 and _saturated(work):
+            return k + 1
+    return entries.shape[0]
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def blend_transpose(splats, start, entries, slots, image, sums):
     """Fill `sums (e, c)`: for every entry, the sum over its pixels of weight times `image (c, h, w)`."""
-    tiles_x = (width + TILE - 1) // TILE
     channels = image.shape[0]
     for tile in prange(start.shape[0] - 1):
-        x0, y0 = float32((tile % tiles_x) * TILE), float32((tile // tiles_x) * TILE)
-        work = np.zeros((channels + 2) * PIXELS, np.float32)
-        work[:PIXELS] = ONE
-        _load(work, image, int(x0), int(y0), 2)
-        column_sums = np.zeros((channels, TILE), np.float32)
-        row_at = PIXELS
-        done = False
-        for k in range(start[tile], start[tile + 1]):
-            s, slot = entries[k], slots[k]
-            if done:
-                sums[slot] = ZERO
-                continue
-            splat = splats[s]
-            mx = splat[MX] - x0 - float32(0.5)
-            top, bottom = _rows(splat, y0)
-            column_sums[:] = ZERO
-            for y in range(top, bottom):
-                _alpha_row(work, row_at, splat, float32(y) - (splat[MY] - y0 - float32(0.5)), mx)
-                at = y * TILE
-                for x in range(TILE):
-                    weight = min(work[row_at + x], MAX_ALPHA) * work[at + x]
-                    work[at + x] -= weight
-                    work[row_at + x] = weight
-                for c in range(channels):
-                    plane = at + (c + 2) * PIXELS
-                    for x in range(TILE):
-                        column_sums[c, x] += work[row_at + x] * work[plane + x]
-            for c in range(channels):
-                sums[slot, c] = column_sums[c].sum()
-            done = (k - start[tile]) % BATCH == BATCH - 1 and work[:PIXELS].max() < MIN_TRANSMITTANCE
+        x0, y0, work = _open_tile(tile, image.shape[2], 1 + channels)
+        listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
+        for c in range(channels):
+            _read(image[c], x0, y0, work, 1 + c)
+        if channels == RGB:
+            used = _gather_rgb(splats, listed, places, float32(x0), float32(y0), work, sums)
+        else:
+            used = _gather_any(splats, listed, places, float32(x0), float32(y0), work, sums)
+        for k in range(used, listed.shape[0]):
+            sums[places[k]] = ZERO
 
 
-@njit(cache=True, parallel=True, fastmath=_FAST)
+@njit(cache=True)
 @no_type_check
-def blend_backward(splats, start, entries, slots, values, rest, grad_image, grad_alpha, width, height, sums):
-    """Fill `sums (e, 6 + c)`: for every entry its moments, as `unproject` takes them, and its values' gradients.
+def _write_moments(sums, slot, dx, s0, sy, syy):
+    """Moments of an entry from its sums by column: of the pull, times dy, times dy squared."""
+    sx = s0 * dx
+    sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(s0), total(sx), total(sy)
+    sums[slot, 3], sums[slot, 4], sums[slot, 5] = total(sx * dx), total(sy * dx), total(syy)
 
-    `rest (h, w)` is the sum over channels of gradient times blended value, that of alpha included.
-    """
-    tiles_x = (width + TILE - 1) // TILE
+
+@njit(cache=True)
+@no_type_check
+def _pull(uncapped, alpha, before, value, left):
+    """Gradient of a row to the exponent: none where alpha is capped."""
+    return where_below(uncapped, MAX_ALPHA, alpha * (before * value - left / (ONE - alpha)))
+
+
+@njit(cache=True)
+@no_type_check
+def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums):
+    """Planes of `work`: transmittance, rest, gradients of alpha, red, green, blue."""
+    for k in range(entries.shape[0]):
+        s, slot = entries[k], slots[k]
+        mx, my, a, b, c, d, top, bottom = _shape(splats, s, x0, y0)
+        red, green, blue = values[s, 0], values[s, 1], values[s, 2]
+        dx = lanes() - mx
+        across = dx * dx * a + d
+        s0, sy, syy = spread(ZERO), spread(ZERO), spread(ZERO)
+        sum_red, sum_green, sum_blue = spread(ZERO), spread(ZERO), spread(ZERO)
+        for y in range(top, bottom):
+            dy = float32(y) - my
+            at = y * TILE
+            before = load(work, at)
+            uncapped = _alpha(across, dx, b * dy, c * dy * dy)
+            alpha = smaller(uncapped, MAX_ALPHA)
+            weight = alpha * before
+            to_red, to_green = load(work, at + 3 * PIXELS), load(work, at + 4 * PIXELS)
+            to_blue = load(work, at + 5 * PIXELS)
+            value = load(work, at + 2 * PIXELS) + to_red * red + to_green * green + to_blue * blue
+            left = load(work, at + PIXELS) - weight * value
+            store(work, at, before - weight)
+            store(work, at + PIXELS, left)
+            pull = _pull(uncapped, alpha, before, value, left)
+            s0, sy, syy = s0 + pull, sy + pull * dy, syy + pull * (dy * dy)
+            sum_red, sum_green = sum_red + weight * to_red, sum_green + weight * to_green
+            sum_blue = sum_blue + weight * to_blue
+        _write_moments(sums, slot, dx, s0, sy, syy)
+        sums[slot, MOMENTS] = total(sum_red)
+        sums[slot, MOMENTS + 1] = total(sum_green)
+        sums[slot, MOMENTS + 2] = total(sum_blue)
+        if k % BATCH == BATCH - 1 and _saturated(work):
+            return k + 1
+    return entries.shape[0]
+
+
+@njit(cache=True)
+@no_type_check
+def _backward_any(splats, entries, slots, values, x0, y0, work, sums):
+    """Planes of `work`: transmittance, rest, gradients of alpha and of the channels."""
+    channels = values.shape[1]
+    column = np.empty(channels * TILE, np.float32)
+    for k in range(entries.shape[0]):
+        s, slot = entries[k], slots[k]
+        mx, my, a, b, c, d, top, bottom = _shape(splats, s, x0, y0)
+        dx = lanes() - mx
+        across = dx * dx * a + d
+        s0, sy, syy = spread(ZERO), spread(ZERO), spread(ZERO)
+        column[:] = ZERO
+        for y in range(top, bottom):
+            dy = float32(y) - my
+            at = y * TILE
+            before = load(work, at)
+            uncapped = _alpha(across, dx, b * dy, c * dy * dy)
+            alpha = smaller(uncapped, MAX_ALPHA)
+            weight = alpha * before
+            value = load(work, at + 2 * PIXELS)
+            for channel in range(channels):
+                to_channel = load(work, at + (3 + channel) * PIXELS)
+                value = value + to_channel * values[s, channel]
+                store(column, channel * TILE, load(column, channel * TILE) + weight * to_channel)
+            left = load(work, at + PIXELS) - weight * value
+            store(work, at, before - weight)
+            store(work, at + PIXELS, left)
+            pull = _pull(uncapped, alpha, before, value, left)
+            s0, sy, syy = s0 + pull, sy + pull * dy, syy + pull * (dy * dy)
+        _write_moments(sums, slot, dx, s0, sy, syy)
+        for channel in range(channels):
+            sums[slot, MOMENTS + channel] = total(load(column, channel * TILE))
+        if k % BATCH == BATCH - 1 and _saturated(work):
+            return k + 1
+    return entries.shape[0]
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def blend_backward(splats, start, entries, slots, values, image, alpha, grad_image, grad_alpha, sums):
+    """Fill `sums (e, 6 + c)`: for every entry its moments, as `unproject` takes them, and its values' gradients."""
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
-        x0, y0 = float32((tile % tiles_x) * TILE), float32((tile // tiles_x) * TILE)
-        # planes: transmittance; rows of alpha, weight and value; rest; gradient of alpha; gradients of the image
-        work = np.zeros((channels + 4) * PIXELS, np.float32)
-        work[:PIXELS] = ONE
-        alpha_at, weight_at, value_at = PIXELS, PIXELS + TILE, PIXELS + 2 * TILE
-        rest_at, grad_alpha_at = 2 * PIXELS, 3 * PIXELS
-        _load(work, rest.reshape((1, height, width)), int(x0), int(y0), 2)
-        _load(work, grad_alpha.reshape((1, height, width)), int(x0), int(y0), 3)
-        _load(work, grad_image, int(x0), int(y0), 4)
-        columns = np.zeros((channels + 3, TILE), np.float32)
-        done = False
-        for k in range(start[tile], start[tile + 1]):
-            s, slot = entries[k], slots[k]
-            if done:
-                sums[slot] = ZERO
-                continue
-            splat = splats[s]
-            mx = splat[MX] - x0 - float32(0.5)
-            top, bottom = _rows(splat, y0)
-            columns[:] = ZERO
-            for y in range(top, bottom):
-                dy = float32(y) - (splat[MY] - y0 - float32(0.5))
-                _alpha_row(work, alpha_at, splat, dy, mx)
-                at = y * TILE
-                for x in range(TILE):
-                    work[weight_at + x] = min(work[alpha_at + x], MAX_ALPHA) * work[at + x]
-                    work[value_at + x] = work[grad_alpha_at + at + x]
+        x0, y0, work = _open_tile(tile, alpha.shape[1], 3 + channels)
+        listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
+        _read(grad_alpha, x0, y0, work, 2)
+        for c in range(channels):
+            _read(grad_image[c], x0, y0, work, 3 + c)
+        # what is behind a splat: at first everything, the gradient times the finished pixel
+        for y in range(y0, min(y0 + TILE, alpha.shape[0])):
+            for x in range(x0, min(x0 + TILE, alpha.shape[1])):
+                rest = grad_alpha[y, x] * alpha[y, x]
                 for c in range(channels):
-                    value, plane = values[s, c], at + (c + 4) * PIXELS
-                    for x in range(TILE):
-                        grad = work[plane + x]
-                        work[value_at + x] += value * grad
-                        columns[c + 3, x] += work[weight_at + x] * grad
-                for x in range(TILE):
-                    alpha, weight, value = work[alpha_at + x], work[weight_at + x], work[value_at + x]
-                    before = work[at + x]
-                    left = work[rest_at + at + x] - weight * value
-                    work[rest_at + at + x] = left
-                    slope = before * value - left / (ONE - min(alpha, MAX_ALPHA))
-                    pull = alpha * slope if alpha < MAX_ALPHA else ZERO
-                    work[at + x] = before - weight
-                    columns[0, x] += pull
-                    columns[1, x] += pull * dy
-                    columns[2, x] += pull * dy * dy
-            s0, sx, sy, sxx, sxy, syy = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-            for x in range(TILE):
-                dx = float32(x) - mx
-                s0 += columns[0, x]
-                sx += columns[0, x] * dx
-                sxx += columns[0, x] * dx * dx
-                sy += columns[1, x]
-                sxy += columns[1, x] * dx
-                syy += columns[2, x]
-            sums[slot, 0], sums[slot, 1], sums[slot, 2] = s0, sx, sy
-            sums[slot, 3], sums[slot, 4], sums[slot, 5] = sxx, sxy, syy
-            for c in range(channels):
-                sums[slot, 6 + c] = columns[c + 3].sum()
-            done = (k - start[tile]) % BATCH == BATCH - 1 and work[:PIXELS].max() < MIN_TRANSMITTANCE
+                    rest += grad_image[c, y, x] * image[c, y, x]
+                work[PIXELS + (y - y0) * TILE + x - x0] = rest
+        if channels == RGB:
+            used = _backward_rgb(splats, listed, places, values, float32(x0), float32(y0), work, sums)
+        else:
+            used = _backward_any(splats, listed, places, values, float32(x0), float32(y0), work, sums)
+        for k in range(used, listed.shape[0]):
+            sums[places[k]] = ZERO
 
 
 @njit(cache=True, parallel=True)
@@ -221,7 +351,7 @@ def sum_slots(sums, first, out):
     """Fill `out (m, c)` with the sums over each splat's slots, in a fixed order."""
     for s in prange(first.shape[0] - 1):
         for c in range(sums.shape[1]):
-            total = ZERO
+            added = ZERO
             for slot in range(first[s], first[s + 1]):
-                total += sums[slot, c]
-            out[s, c] = total
+                added += sums[slot, c]
+            out[s, c] = added

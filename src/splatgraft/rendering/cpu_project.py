@@ -17,7 +17,7 @@ MIN_ALPHA = 1.0 / 255.0
 BLOCK = 256
 
 # columns of a splat
-MX, MY, CA, CB, CC, OPACITY, REACH_X, REACH_Y = range(8)
+MX, MY, CA, CB, CC, LOG_OPACITY, REACH_X, REACH_Y = range(8)
 COLUMNS = 8
 
 # places in a camera vector: rotation (9) and translation (3) of camera_from_world, centre (3), then
@@ -88,12 +88,12 @@ def _jacobian(x, y, z, camera):
 @njit(cache=True, parallel=True)
 @no_type_check
 def project(means, log_scales, quaternions, opacity_logits, camera, antialiased, splats, depths):
-    """Fill `splats (n, 8)` and `depths (n,)`; what no pixel can see has opacity 0."""
+    """Fill `splats (n, 8)` and `depths (n,)`; what no pixel can see has log opacity -inf."""
     n = means.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         rotation, axes, offset = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
-            splats[g, OPACITY] = 0
+            splats[g, LOG_OPACITY] = -np.inf
             x, y, z = _camera_point(means[g], camera, offset)
             opacity = 1.0 / (1.0 + math.exp(-float(opacity_logits[g])))
             if not (z >= camera[NEAR] and z < 1e30 and opacity >= MIN_ALPHA):
@@ -120,7 +120,7 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
             splats[g, CA] = (yy + LOW_PASS_PX2) / determinant
             splats[g, CB] = -xy / determinant
             splats[g, CC] = (xx + LOW_PASS_PX2) / determinant
-            splats[g, OPACITY] = opacity
+            splats[g, LOG_OPACITY] = math.log(opacity)
             splats[g, REACH_X] = math.sqrt(limit * (xx + LOW_PASS_PX2))
             splats[g, REACH_Y] = math.sqrt(limit * (yy + LOW_PASS_PX2))
             depths[g] = z

@@ -6,7 +6,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from splatgraft.rendering.cpu_project import CA, CB, CC, COLUMNS, MX, MY, OPACITY, REACH_X, REACH_Y
+from splatgraft.rendering.cpu_project import CA, CB, CC, COLUMNS, LOG_OPACITY, MX, MY, REACH_X, REACH_Y
 
 TILE = 16
 _DIGIT_BITS = 11
@@ -15,13 +15,13 @@ _DIGIT_BITS = 11
 @njit(cache=True)
 @no_type_check
 def depth_order(splats, depths):
-    """Indices of the splats with opacity above 0, nearest first; equal depths stay in index order."""
+    """Indices of the splats with a finite log opacity, nearest first; equal depths stay in index order."""
     n = depths.shape[0]
     keys, order = np.empty(n, np.uint32), np.empty(n, np.int32)
     bits = depths.view(np.uint32)
     m = 0
     for g in range(n):
-        if splats[g, OPACITY] > 0:
+        if splats[g, LOG_OPACITY] > -np.inf:
             # positive floats order like their bits
             keys[m], order[m] = bits[g], g
             m += 1
