@@ -1,10 +1,14 @@
 """Reading and writing files, by suffix and by what lies in a folder. Holds no format itself."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from splatgraft.cameras import Cameras
-from splatgraft.formats import colmap, gaussian_ply, transforms_json
+from splatgraft.formats import colmap, transforms_json
+from splatgraft.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from splatgraft.formats.points_ply import read_points, write_points
+from splatgraft.formats.splat import read_splat, write_splat
+from splatgraft.formats.spz import read_spz, write_spz
 from splatgraft.gaussians import Gaussians
 from splatgraft.posed_images import PosedImages
 
@@ -20,21 +24,31 @@ __all__ = [
 ]
 
 
+_READERS = {".ply": read_gaussian_ply, ".splat": read_splat, ".spz": read_spz}
+_WRITERS = {".ply": write_gaussian_ply, ".splat": write_splat, ".spz": write_spz}
+
+
 def read_gaussians(path: Path) -> Gaussians:
-    """The scene in a .ply file.
+    """The scene in a .ply, .splat or .spz file.
 
     Raises: ValueError where the suffix is another, or the file is not what its suffix says.
     """
-    if path.suffix.lower() != ".ply":
-        raise ValueError(f"{path}: expected a scene that ends in .ply, found '{path.suffix}'")
-    return gaussian_ply.read_gaussian_ply(path)
+    return _by_suffix(path, _READERS)(path)
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
-    """Write a scene in the format of the suffix; the file appears whole or not at all."""
-    if path.suffix.lower() != ".ply":
-        raise ValueError(f"{path}: expected a scene that ends in .ply, found '{path.suffix}'")
-    gaussian_ply.write_gaussian_ply(path, gaussians)
+    """Write a scene in the format of the suffix; the file appears whole or not at all. Only .ply is exact.
+
+    Raises: ValueError where the suffix is another, or the format cannot hold the scene.
+    """
+    _by_suffix(path, _WRITERS)(path, gaussians)
+
+
+def _by_suffix(path: Path, functions: dict[str, Callable]) -> Callable:
+    function = functions.get(path.suffix.lower())
+    if function is None:
+        raise ValueError(f"{path}: expected a scene that ends in {', '.join(functions)}, found '{path.suffix}'")
+    return function
 
 
 def read_capture(path: Path) -> PosedImages:

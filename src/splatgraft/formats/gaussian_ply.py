@@ -13,6 +13,7 @@ import torch
 
 from splatgraft import spherical_harmonics
 from splatgraft.formats import ply
+from splatgraft.formats.compressed_ply import is_compressed, read_compressed_ply
 from splatgraft.gaussians import Gaussians
 from splatgraft.whole_file import whole_file
 
@@ -25,7 +26,7 @@ _REST_COUNTS = tuple(3 * (spherical_harmonics.coefficient_count(d) - 1) for d in
 
 
 def read_gaussian_ply(path: Path) -> Gaussians:
-    """The scene in a 3DGS .ply; wider or narrower number types are converted to float32.
+    """The scene in a 3DGS .ply, or SuperSplat's compressed form of one; other number types become float32.
 
     Raises: ValueError where the file is no whole PLY with the properties of Gaussians.
     """
@@ -33,6 +34,8 @@ def read_gaussian_ply(path: Path) -> Gaussians:
     vertex = header.element("vertex")
     if vertex is None:
         raise ValueError(f"{path}: expected an element 'vertex', found {[e.name for e in header.elements]}")
+    if is_compressed(header):
+        return read_compressed_ply(header)
     rest = _rest_names(path, vertex)
     _require_gaussians(path, vertex)
     n, k = vertex.count, 1 + len(rest) // 3
