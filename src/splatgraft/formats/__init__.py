@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from splatgraft.cameras import Cameras
-from splatgraft.formats import colmap, transforms_json
+from splatgraft.formats import cameras_json, colmap, transforms_json
 from splatgraft.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from splatgraft.formats.points_ply import read_points, write_points
 from splatgraft.formats.splat import read_splat, write_splat
@@ -72,6 +72,8 @@ def read_cameras(path: Path) -> Cameras:
 
     Raises: ValueError where nothing of these is there, or what is there is broken.
     """
+    if cameras_json.is_cameras_json(path):
+        return cameras_json.read_cameras(path)
     transforms = _transforms_path(path)
     return transforms_json.read_cameras(transforms) if transforms else colmap.read_cameras(path)
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 import numpy as np
 
@@ -73,8 +73,8 @@ class PlyHeader:
     """What a PLY file says of itself."""
 
     path: Path
-    order: Literal["<", ">", ""]
-    """Byte order; empty for ascii."""
+    order: str
+    """Byte order, < or >; empty for ascii."""
     elements: tuple[Element, ...]
     data_start: int
     """Offset of the first byte after the header."""

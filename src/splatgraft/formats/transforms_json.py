@@ -12,6 +12,7 @@ import torch
 from splatgraft.cameras import Cameras
 from splatgraft.distortion import Distortion
 from splatgraft.formats.assembly import cameras_of, fitted_to_file, posed_images_of
+from splatgraft.formats.json_file import array, load, number, shown, text, whole_side
 from splatgraft.formats.points_ply import read_points, write_points
 from splatgraft.formats.views import View, existing_file, rigid
 from splatgraft.images import IMAGE_SUFFIXES, stored_size
@@ -31,7 +32,7 @@ def read_capture(path: Path) -> PosedImages:
     meta = _load(path)
     points, colors = torch.zeros(0, 3), torch.zeros(0, 3)
     if meta.get("ply_file_path") is not None:
-        points, colors = read_points(path.parent / _text(path, meta, "ply_file_path"))
+        points, colors = read_points(path.parent / text(path, meta, "ply_file_path"))
     return posed_images_of(_views(path, meta), path, folder=path.parent, points=points, colors=colors)
 
 
@@ -44,14 +45,9 @@ def read_cameras(path: Path) -> Cameras:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a transforms.json, found no such file")
-    try:
-        meta = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected JSON, found {error}") from None
+    meta = load(path)
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list):
-        raise ValueError(f"{path}: expected a JSON object with a list 'frames', found none")
+        raise ValueError(f"{path}: expected a JSON object with a list 'frames', found {shown(meta)}")
     if not meta["frames"]:
         raise ValueError(f"{path}: expected at least one frame, found none")
     return meta
@@ -66,10 +62,12 @@ def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> View:
         raise ValueError(f"{path}: expected frame {index} to be an object, found {type(frame).__name__}")
     camera = {**{k: v for k, v in meta.items() if k != "frames"}, **frame}
     model = camera.get("camera_model", "OPENCV")
-    if model not in _CAMERA_MODELS or camera.get("is_fisheye") or _number(path, camera, "k4", 0.0):
-        found = f"{str(model)[:40]}, k4 = {camera.get('k4', 0)}, is_fisheye = {camera.get('is_fisheye', False)}"
+    if model not in _CAMERA_MODELS or camera.get("is_fisheye") or number(path, camera, "k4", 0.0):
+        found = (
+            f"{shown(model)}, k4 = {shown(camera.get('k4', 0))}, is_fisheye = {shown(camera.get('is_fisheye', False))}"
+        )
         raise ValueError(f"{path}: expected camera_model {', '.join(_CAMERA_MODELS)} without k4, found {found}")
-    name = _text(path, camera, "file_path")
+    name = text(path, camera, "file_path")
     image_path = _image_file(path.parent / name)
     width, height = _size(path, camera, image_path)
     fl_x = _focal(path, camera, "x", width)
@@ -80,57 +78,36 @@ def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> View:
         name=name,
         image_path=image_path,
         mask_path=_mask_file(path, camera),
-        world_from_camera=rigid(_matrix(path, index, frame), f"{path}: frame {index}") @ _OPENCV_FROM_OPENGL,
+        world_from_camera=_pose(path, index, frame),
         focal=(fl_x, fl_y),
-        center=(_number(path, camera, "cx", width / 2), _number(path, camera, "cy", height / 2)),
+        center=(number(path, camera, "cx", width / 2), number(path, camera, "cy", height / 2)),
         size=(width, height),
-        distortion=tuple(_number(path, camera, key, 0.0) for key in _COEFFICIENTS),
+        distortion=tuple(number(path, camera, key, 0.0) for key in _COEFFICIENTS),
     )
 
 
-def _matrix(path: Path, index: int, frame: dict[str, Any]) -> np.ndarray:
-    rows = frame.get("transform_matrix")
-    try:
-        matrix = np.array(rows, np.float64)
-    except (ValueError, TypeError, OverflowError):
-        matrix = np.empty(0)
-    if matrix.shape == (3, 4):
+def _pose(path: Path, index: int, frame: dict[str, Any]) -> np.ndarray:
+    matrix = array(path, frame, "transform_matrix", ((4, 4), (3, 4)))
+    if len(matrix) == 3:
         matrix = np.concatenate([matrix, [[0, 0, 0, 1]]])
-    if matrix.shape != (4, 4):
-        raise ValueError(f"{path}: expected 4x4 numbers as transform_matrix of frame {index}, found {str(rows)[:60]}")
-    return matrix
-
-
-def _number(path: Path, camera: dict[str, Any], key: str, default: float) -> float:
-    value = camera.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
-        raise ValueError(f"{path}: expected a finite number for '{key}', found {str(value)[:60]}")
-    return float(value)
-
-
-def _text(path: Path, camera: dict[str, Any], key: str) -> str:
-    value = camera.get(key)
-    if not isinstance(value, str) or not value.strip("./\\ ") or "\0" in value or len(value) > 1024:
-        raise ValueError(f"{path}: expected a file name for '{key}', found {str(value)[:60]!r}")
-    return value.replace("\\", "/")
+    return rigid(matrix, f"{path}: frame {index}") @ _OPENCV_FROM_OPENGL
 
 
 def _size(path: Path, camera: dict[str, Any], image_path: Path | None) -> tuple[int, int]:
     if "w" not in camera and "h" not in camera:
         if image_path is None:
-            raise ValueError(f"{path}: expected w and h, or the image file {camera.get('file_path')}, found neither")
+            raise ValueError(
+                f"{path}: expected w and h, or the image file {shown(camera.get('file_path'))}, found neither"
+            )
         return stored_size(image_path)
-    width, height = _number(path, camera, "w", 0.0), _number(path, camera, "h", 0.0)
-    if not (width.is_integer() and height.is_integer() and 1 <= width <= 65536 and 1 <= height <= 65536):
-        raise ValueError(f"{path}: expected w and h to be whole and in 1 .. 65536, found {width:g} and {height:g}")
-    return int(width), int(height)
+    return whole_side(path, camera, "w"), whole_side(path, camera, "h")
 
 
 def _focal(path: Path, camera: dict[str, Any], axis: str, extent: int) -> float | None:
     if f"fl_{axis}" in camera:
-        return _number(path, camera, f"fl_{axis}", 0.0)
+        return number(path, camera, f"fl_{axis}", 0.0)
     if f"camera_angle_{axis}" in camera:
-        angle = _number(path, camera, f"camera_angle_{axis}", 0.0)
+        angle = number(path, camera, f"camera_angle_{axis}", 0.0)
         if not 0 < angle < math.pi:
             raise ValueError(f"{path}: expected camera_angle_{axis} in (0, pi), found {angle:g}")
         return extent / 2 / math.tan(angle / 2)
@@ -147,7 +124,7 @@ def _image_file(path: Path) -> Path | None:
 def _mask_file(path: Path, camera: dict[str, Any]) -> Path | None:
     if camera.get("mask_path") is None:
         return None
-    mask = path.parent / _text(path, camera, "mask_path")
+    mask = path.parent / text(path, camera, "mask_path")
     if existing_file(mask) is None:
         raise ValueError(f"{path}: expected the mask {mask}, found no such file")
     return mask
