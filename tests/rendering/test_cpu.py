@@ -49,7 +49,9 @@ def test_picture_and_gradient_match_the_reference(degree, low_pass):
     for name, tolerance in [("color", 1e-5), ("alpha", 1e-5), ("depth", 1e-4), ("normal", 5e-5), ("features", 2e-5)]:
         ours, theirs = getattr(found, name)[0], getattr(expected, name)[0]
         assert (ours - theirs)[decided].abs().max() < tolerance, name
+        # faint pixels magnify rounding in depth and normal, which are divided by how much there is
         pixel_weights = torch.randn(ours[decided].shape, generator=generator)
+        pixel_weights = torch.einsum("p...,p->p...", pixel_weights, expected.alpha[0][decided].detach().float())
         found_loss = found_loss + (pixel_weights * ours[decided]).sum()
         expected_loss = expected_loss + (pixel_weights * theirs[decided]).sum()
     found_loss.backward()

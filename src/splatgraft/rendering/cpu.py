@@ -149,7 +149,8 @@ class _Splat(torch.autograd.Function):
         with _KERNELS:
             sums = np.empty((len(lists.entries), cpu_blend.MOMENTS + values.shape[1]), np.float32)
             cpu_blend.blend_backward(
-                lists.splats, lists.start, lists.entries, lists.slots, values, image, alpha, grad_image, grad_alpha, sums
+                lists.splats, lists.start, lists.entries, lists.slots,
+                values, image, alpha, grad_image, grad_alpha, sums,
             )  # fmt: skip
             totals = lists.sum_slots(sums)
             at = cpu_blend.MOMENTS
@@ -188,7 +189,7 @@ class CpuViewOperator:
 
     def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
         """W^T image."""
-        planes, lists, view = _array(image.permute(2, 0, 1)), self._lists, self._view
+        planes, lists = _array(image.permute(2, 0, 1)), self._lists
         sums = np.empty((len(lists.entries), len(planes)), np.float32)
         out = np.zeros((self._n, len(planes)), np.float32)
         with _KERNELS:

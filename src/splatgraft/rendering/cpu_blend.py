@@ -14,6 +14,7 @@ from numba import float32, njit, prange
 from splatgraft.rendering.cpu_project import CA, CB, CC, LOG_OPACITY, MIN_ALPHA, MX, MY, REACH_Y
 from splatgraft.rendering.cpu_rows import (
     lanes,
+    larger,
     largest,
     load,
     smaller,
@@ -67,10 +68,10 @@ def _alpha(across, dx, along, down):
 @no_type_check
 def _saturated(work):
     """Whether no pixel of the tile lets through anything worth drawing."""
-    for y in range(TILE):
-        if largest(load(work, y * TILE)) >= MIN_TRANSMITTANCE:
-            return False
-    return True
+    most = load(work, 0)
+    for y in range(1, TILE):
+        most = larger(most, load(work, y * TILE))
+    return largest(most) < MIN_TRANSMITTANCE
 
 
 @njit(cache=True)

@@ -45,11 +45,11 @@ def _define(symbol, instruction: str) -> None:
 
     @infer_global(symbol)
     class _Template(ConcreteTemplate):
-        cases = [
+        cases = (
             signature(_ROW, _ROW, _ROW),
             signature(_ROW, _ROW, types.float32),
             signature(_ROW, types.float32, _ROW),
-        ]  # noqa: RUF012
+        )
 
     def generate(_context, builder, _signature, args):
         return getattr(builder, instruction)(_spread(builder, args[0]), _spread(builder, args[1]), flags=_ALGEBRA)
@@ -123,6 +123,17 @@ def smaller(_typing, row, bound):
         return builder.select(builder.fcmp_ordered("<", args[0], other), args[0], other)
 
     return _ROW(row, types.float32), generate
+
+
+@intrinsic
+@no_type_check
+def larger(_typing, row, other):
+    """The greater of two rows, lane by lane."""
+
+    def generate(_context, builder, _signature, args):
+        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[0], args[1])
+
+    return _ROW(row, other), generate
 
 
 @intrinsic
