@@ -1,0 +1,169 @@
+"""Perceptual losses between two images: windowed Fourier magnitude, LPIPS with VGG. Knows nothing about Gaussians.
+
+Every loss takes an image and a target, sRGB in [0, 1], and gives a scalar that is 0 where they are equal; the gradient
+flows to the image alone. Nothing is downloaded: LPIPS reads weights that are already on the disk.
+"""
+
+import math
+import pickle
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+VGG_FILE = "vgg16-397923af.pth"
+HEADS_FILE = "vgg.pth"
+# index of each 3x3 convolution in torchvision's vgg16().features, one row per resolution
+_VGG_LAYERS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
+_VGG_CHANNELS = (64, 128, 256, 512, 512)
+
+
+class ImageLoss(Protocol):
+    """A distance from `image` to `target`, differentiable in `image`."""
+
+    def __call__(self, image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+        """The scalar distance."""
+        ...
+
+
+def l1(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Mean absolute difference."""
+    return (image - target).abs().mean()
+
+
+def windowed_fourier(
+    image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], *, window_px: int = 16, l1_weight: float = 0.1
+) -> Float[Tensor, ""]:
+    """L1 between the Fourier magnitudes of overlapping Hann windows, plus `l1_weight` L1 between the pixels.
+
+    Windows of `window_px` every half window, all channels. The magnitudes forget where in the window an edge lies, so
+    that views that disagree by a pixel still ask for one sharp edge instead of the average of two. They are scaled so
+    that independent noise gives them the standard deviation that it has in the pixels.
+    """
+    window, multiplicity = _hann(window_px, image.dtype, image.device)
+    magnitude = _magnitudes(image, window)
+    with torch.no_grad():
+        wanted = _magnitudes(target, window)
+    spectral = ((magnitude - wanted).abs().mean((0, 1, 2, 3)) * multiplicity).sum()
+    return spectral + l1_weight * l1(image, target.detach())
+
+
+@lru_cache(maxsize=8)
+def _hann(
+    size: int, dtype: torch.dtype, device: torch.device
+) -> tuple[Float[Tensor, "size size"], Float[Tensor, "half"]]:
+    """The window, of mean square 1, and the share of the full spectrum that each column of a half spectrum holds."""
+    ramp = torch.hann_window(size, dtype=dtype, device=device)
+    window = ramp[:, None] * ramp[None, :]
+    multiplicity = torch.full((size // 2 + 1,), 2.0 / size, dtype=dtype, device=device)
+    multiplicity[0] = multiplicity[-1] = 1.0 / size
+    return window / (window**2).mean().sqrt(), multiplicity
+
+
+def _magnitudes(image: Float[Tensor, "h w 3"], window: Float[Tensor, "s s"]) -> Float[Tensor, "3 i j s t"]:
+    size = len(window)
+    hop = size // 2
+    pads = [(hop, hop + (-length) % hop) for length in image.shape[1::-1]]
+    padded = F.pad(image.permute(2, 0, 1)[None], [*pads[0], *pads[1]], mode="replicate")[0]
+    patches = padded.unfold(1, size, hop).unfold(2, size, hop)
+    return torch.fft.rfft2(patches * window, norm="ortho").abs()
+
+
+@dataclass(frozen=True)
+class LpipsVgg:
+    """LPIPS of Zhang 2018 (version 0.1, VGG-16, linear heads) in plain torch: call it with an image and a target."""
+
+    convolutions: tuple[tuple[tuple[Float[Tensor, "o i 3 3"], Float[Tensor, "o"]], ...], ...]
+    """Weights and biases of VGG-16's 13 convolutions, one tuple per resolution."""
+    heads: tuple[Float[Tensor, "1 c 1 1"], ...]
+    """Non-negative channel weights of the five taps."""
+
+    def __call__(self, image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+        """The perceptual distance; the gradient flows to `image` alone.
+
+        Raises: ValueError where an image is too small for four halvings.
+        """
+        with torch.no_grad():
+            wanted = self.features(target)
+        return self.distance(self.features(image), wanted)
+
+    def features(self, image: Float[Tensor, "h w 3"]) -> tuple[Tensor, ...]:
+        """Activations (c, h', w') after the last convolution of each resolution, of unit length over the channels.
+
+        Raises: ValueError where an image is too small for four halvings.
+        """
+        if min(image.shape[:2]) < 16:
+            raise ValueError(f"lpips: expected images of at least 16x16 pixels, found {tuple(image.shape[:2])}")
+        # the input scaling of the published weights
+        shift, scale = image.new_tensor([-0.030, -0.088, -0.188]), image.new_tensor([0.458, 0.448, 0.450])
+        x = ((2 * image - 1 - shift) / scale).permute(2, 0, 1)[None]
+        taps = []
+        for level, convolutions in enumerate(self.convolutions):
+            x = F.max_pool2d(x, 2) if level else x
+            for weight, bias in convolutions:
+                x = F.relu(F.conv2d(x, weight, bias, padding=1))
+            taps.append((x / ((x**2).sum(1, keepdim=True) + 1e-20).sqrt())[0])
+        return tuple(taps)
+
+    def distance(self, features: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> Float[Tensor, ""]:
+        """The distance between the features of two images of one size."""
+        parts = [
+            F.conv2d(((a - b) ** 2)[None], head).mean() for a, b, head in zip(features, wanted, self.heads, strict=True)
+        ]
+        return torch.stack(parts).sum()
+
+
+def lpips_vgg(folder: Path | None = None) -> LpipsVgg:
+    """LPIPS with the weights vgg16-397923af.pth and vgg.pth in `folder`, by default torch hub's cache.
+
+    vgg16-397923af.pth is torchvision's; vgg.pth holds the heads and is lpips/weights/v0.1/vgg.pth of the lpips package.
+
+    Raises: ValueError where a file is missing or holds something else.
+    """
+    folder = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
+    vgg, heads = _load(folder / VGG_FILE), _load(folder / HEADS_FILE)
+    convolutions, below = [], 3
+    for layers, channels in zip(_VGG_LAYERS, _VGG_CHANNELS, strict=True):
+        level = []
+        for layer in layers:
+            weight = _take(vgg, f"features.{layer}.weight", (channels, below, 3, 3), folder / VGG_FILE)
+            level.append((weight, _take(vgg, f"features.{layer}.bias", (channels,), folder / VGG_FILE)))
+            below = channels
+        convolutions.append(tuple(level))
+    taps = tuple(
+        _take(heads, f"lin{i}.model.1.weight", (1, channels, 1, 1), folder / HEADS_FILE)
+        for i, channels in enumerate(_VGG_CHANNELS)
+    )
+    return LpipsVgg(convolutions=tuple(convolutions), heads=taps)
+
+
+def _load(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise ValueError(
+            f"{path}: expected weights for LPIPS ({VGG_FILE} from torchvision, {HEADS_FILE} from the lpips package, "
+            "weights v0.1), found no such file; put both there or name their folder"
+        )
+    try:
+        # the published heads were saved from a GPU
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError, OSError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path}: expected torch weights, found {reason}") from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{path}: expected a table of weights, found {type(state).__name__}")
+    return state
+
+
+def _take(state: dict[str, Tensor], key: str, shape: tuple[int, ...], path: Path) -> Tensor:
+    tensor = state.get(key)
+    if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
+        found = tuple(tensor.shape) if isinstance(tensor, Tensor) else "nothing"
+        raise ValueError(f"{path}: expected {key} of shape {shape}, found {found}")
+    if not math.isfinite(float(tensor.sum())):
+        raise ValueError(f"{path}: expected finite weights, found {key} with others")
+    return tensor.float()
