@@ -69,7 +69,7 @@ def cube_directions(size: int) -> tuple[Float[Tensor, "6 s s 3"], Float[Tensor, 
 
 
 def render_panorama(scene: Gaussians, center: Float[Tensor, "3"], *, size: int = 64, nearest: float = 0.0) -> Panorama:
-    """What `scene` looks like from `center`; Gaussians with centres nearer than `nearest` (world units) are not seen."""
+    """What `scene` looks like from `center`; Gaussians centred nearer than `nearest` (world units) are left out."""
     far_enough = (scene.means - center.to(scene.means)).norm(dim=-1) >= nearest
     # the plane of each face only has to keep out what is behind it: distance was taken care of above
     near = max(nearest / math.sqrt(3), 1e-6)
