@@ -1,13 +1,13 @@
 """The command `capture`: photos, a video or a posed capture become a folder with transforms.json and points.ply."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatgraft.capture import PoseOptions, extract_frames, pose_photos
-from splatgraft.formats import has_poses, read_capture, write_capture
+from splatgraft.formats import read_capture, write_capture
 from splatgraft.images import list_images
 from splatgraft.posed_images import PosedImages
-from splatgraft.steps.capture_files import capture_inputs
+from splatgraft.steps.capture_files import capture_inputs, has_poses
 from splatgraft.steps.step import Context, Inputs, Positional
 
 

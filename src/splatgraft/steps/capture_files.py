@@ -2,7 +2,14 @@
 
 from pathlib import Path
 
+from splatgraft.formats.colmap import is_colmap
 from splatgraft.posed_images import PosedImages
+
+
+def has_poses(path: Path) -> bool:
+    """Whether `path` describes cameras, rather than being photos or a video."""
+    names = ("transforms.json", "transforms_train.json")
+    return path.suffix == ".json" or any((path / name).is_file() for name in names) or is_colmap(path)
 
 
 def description_files(path: Path) -> tuple[Path, ...]:
