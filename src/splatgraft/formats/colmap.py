@@ -127,6 +127,8 @@ def _views(model: Path, images: list[_Image], folder: Path) -> list[View]:
 
 def _pose(image: _Image, source: Path) -> np.ndarray:
     quaternion = np.array(image.quaternion)
+    if not np.abs([*image.quaternion, *image.translation]).max() < 1e30:  # nan fails too
+        raise ValueError(f"{source}: expected a pose of finite numbers for {image.name}, found nan or infinity")
     norm = float(np.linalg.norm(quaternion))
     if not 0.5 < norm < 2:
         raise ValueError(f"{source}: expected a unit quaternion for {image.name}, found length {norm:.4g}")
@@ -208,6 +210,8 @@ def _text_images(path: Path) -> Iterator[_Image]:
         try:
             _, *pose, camera_id, name = line.split(None, 9)
             values = [float(number) for number in pose]
+            if len(values) != 7:
+                raise ValueError
             image = _Image(name, int(camera_id), tuple(values[:4]), tuple(values[4:]))
         except ValueError:
             expected = "'ID QW QX QY QZ TX TY TZ CAMERA NAME'"

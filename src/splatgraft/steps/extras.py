@@ -20,7 +20,6 @@ EXTRAS = {
     "flux": Extra("the paper's image model", {"diffusers": "diffusers", "transformers": "transformers"}),
     "editor": Extra("the placement editor in a browser", {"viser": "viser"}),
     "blender": Extra("made-up scenes with ground truth", {"bpy": "bpy"}),
-    "spz": Extra("reading and writing .spz", {"gsply": "gsply"}),
     "birefnet": Extra(
         "object masks from a network", {"onnxruntime": "onnxruntime", "huggingface_hub": "huggingface_hub"}
     ),
