@@ -11,7 +11,7 @@ from torch import Tensor
 from splatgraft.cameras import Cameras
 from splatgraft.gaussians import Gaussians
 from splatgraft.rendering import cpu_blend, cpu_project, cpu_tiles
-from splatgraft.rendering.channels import pictures
+from splatgraft.rendering.channels import WIDTHS, pictures
 from splatgraft.rendering.interface import Output, Render, RenderOptions
 
 # numba's workqueue threading layer crashes when two threads start kernels at once
@@ -30,13 +30,18 @@ def render(
     extra = gaussians.means.new_zeros(gaussians.count, 0) if features is None else features
     fields = [t.float() for t in (*_geometry(gaussians), gaussians.sh, extra)]
     views = [_Splat.apply(_View.of(camera, options), outputs, *fields) for camera in cameras]
-    image, alpha, visible = (torch.stack(parts) for parts in zip(*views, strict=True))
+    image, alpha, visible = (_stack(parts) for parts in zip(*views, strict=True))
     return pictures(image, alpha, visible, outputs=outputs, has_features=features is not None, options=options)
 
 
 def view_operator(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> "CpuViewOperator":
     """`rendering.view_operator` for tensors on the CPU."""
     return CpuViewOperator(gaussians, camera, options)
+
+
+def _stack(parts: tuple[Tensor, ...]) -> Tensor:
+    # torch.stack copies even one
+    return parts[0][None] if len(parts) == 1 else torch.stack(parts)
 
 
 def _geometry(gaussians: Gaussians) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -66,7 +71,7 @@ class _View:
         margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
         bounds = [-cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y]
         center = camera.centers[0].detach().double().numpy()
-        parts = [pose[:3, :3].ravel(), pose[:3, 3], center, [fx, fy, cx, cy, *bounds, options.near]]
+        parts = [pose[:3, :3].ravel(), pose[:3, 3], center, [fx, fy, cx, cy, *bounds, options.near, width, height]]
         return _View(np.concatenate(parts), width, height, options.low_pass == "antialiased")
 
 
@@ -84,31 +89,30 @@ class _TileLists:
     entries: np.ndarray
     slots: np.ndarray
     first: np.ndarray
-    visible: Bool[Tensor, "n"]
+    drawn: np.ndarray
+    """(n,) whether any tile lists the Gaussian."""
 
     @staticmethod
     def of(view: _View, means: np.ndarray, log_scales: np.ndarray, quaternions: np.ndarray, logits: np.ndarray):
-        n = len(means)
-        splats, depths = np.empty((n, cpu_project.COLUMNS), np.float32), np.zeros(n, np.float32)
+        splats, depths = np.empty((len(means), cpu_project.COLUMNS), np.float32), np.zeros(len(means), np.float32)
         cpu_project.project(means, log_scales, quaternions, logits, view.numbers, view.antialiased, splats, depths)
         order = cpu_tiles.depth_order(splats, depths)
-        binned = cpu_tiles.bin_splats(splats, order, view.width, view.height)
-        packed, start, entries, slots, first = binned
-        visible = torch.zeros(n, dtype=torch.bool)
-        visible[torch.from_numpy(order[np.diff(first) > 0]).long()] = True
-        return _TileLists(order, packed, depths, start, entries, slots, first, visible)
+        packed, start, entries, slots, first = cpu_tiles.bin_splats(splats, order, view.width, view.height)
+        drawn = np.zeros(len(means), np.bool_)
+        drawn[order[np.diff(first) > 0]] = True
+        return _TileLists(order, packed, depths, start, entries, slots, first, drawn)
 
     def blend(self, values: np.ndarray, view: _View) -> tuple[np.ndarray, np.ndarray]:
-        """Blended `values (m, c)` as (c, h, w), and alpha (h, w)."""
+        """Blended `values (n, c)` as (c, h, w), and alpha (h, w)."""
         image = np.empty((values.shape[1], view.height, view.width), np.float32)
         alpha = np.empty((view.height, view.width), np.float32)
-        cpu_blend.blend(self.splats, self.start, self.entries, values, image, alpha)
+        cpu_blend.blend(self.splats, self.start, self.entries, values[self.order], image, alpha)
         return image, alpha
 
     def sum_slots(self, sums: np.ndarray) -> np.ndarray:
-        """Entries' sums (e, c) gathered to splats (m, c)."""
-        out = np.empty((len(self.order), sums.shape[1]), np.float32)
-        cpu_blend.sum_slots(sums, self.first, out)
+        """Entries' sums (e, c) gathered to Gaussians (n, c)."""
+        out = np.zeros((len(self.drawn), sums.shape[1]), np.float32)
+        cpu_blend.sum_slots(sums, self.first, self.order, out)
         return out
 
 
@@ -120,53 +124,49 @@ class _Splat(torch.autograd.Function):
         means, log_scales, quaternions, logits, sh, features = (_array(field) for field in fields)
         with _KERNELS:
             lists = _TileLists.of(view, means, log_scales, quaternions, logits)
-            order = lists.order
             columns = []
             if "color" in outputs:
-                columns.append(np.empty((len(order), 3), np.float32))
-                cpu_project.shade(means, sh, order, view.numbers, columns[-1])
+                columns.append(np.empty((len(means), 3), np.float32))
+                cpu_project.shade(means, sh, lists.drawn, view.numbers, columns[-1])
             if "depth" in outputs:
-                columns.append(lists.depths[order][:, None])
+                columns.append(lists.depths[:, None])
             if "normal" in outputs:
-                columns.append(np.empty((len(order), 3), np.float32))
-                cpu_project.normals(means, log_scales, quaternions, order, view.numbers, columns[-1])
-            values = np.concatenate([*columns, features[order]], 1)
+                columns.append(np.empty((len(means), 3), np.float32))
+                cpu_project.normals(means, log_scales, quaternions, lists.drawn, view.numbers, columns[-1])
+            values = np.concatenate([*columns, features], 1)
             image, alpha = lists.blend(values, view)
         ctx.view, ctx.outputs, ctx.lists = view, outputs, lists
         ctx.save_for_backward(*fields)
-        ctx.drawn = values, image, alpha
-        ctx.mark_non_differentiable(lists.visible)
-        return torch.from_numpy(image), torch.from_numpy(alpha), lists.visible
+        ctx.blended = values, image, alpha
+        visible = torch.from_numpy(lists.drawn)
+        ctx.mark_non_differentiable(visible)
+        return torch.from_numpy(image), torch.from_numpy(alpha), visible
 
     @staticmethod
     def backward(ctx, grad_image, grad_alpha, _grad_visible):
         means, log_scales, quaternions, logits, sh, _ = (_array(field) for field in ctx.saved_tensors)
-        view, lists, (values, image, alpha) = ctx.view, ctx.lists, ctx.drawn
-        order, camera = lists.order, view.numbers
-        grad_image, grad_alpha = _array(grad_image), _array(grad_alpha)
+        view, lists, (values, image, alpha) = ctx.view, ctx.lists, ctx.blended
         grads = [np.zeros(field.shape, np.float32) for field in ctx.saved_tensors]
-        grad_means, grad_log_scales, grad_quaternions, grad_logits, grad_sh, grad_features = grads
+        grad_means, grad_log_scales, grad_quaternions, grad_logits, grad_sh, _ = grads
+        places, at = {}, cpu_blend.MOMENTS
+        for name, width in WIDTHS.items():
+            if name in ctx.outputs:
+                places[name], at = at, at + width
         with _KERNELS:
             sums = np.empty((len(lists.entries), cpu_blend.MOMENTS + values.shape[1]), np.float32)
             cpu_blend.blend_backward(
-                lists.splats, lists.start, lists.entries, lists.slots,
-                values, image, alpha, grad_image, grad_alpha, sums,
+                lists.splats, lists.start, lists.entries, lists.slots, values[lists.order],
+                image, alpha, _array(grad_image), _array(grad_alpha), sums,
             )  # fmt: skip
             totals = lists.sum_slots(sums)
-            at = cpu_blend.MOMENTS
-            if "color" in ctx.outputs:
-                cpu_project.unshade(means, sh, order, camera, totals[:, at : at + 3], grad_means, grad_sh)
-                at += 3
-            grad_depths, grad_normals = totals[:0, 0], totals[:0, :3]
-            if "depth" in ctx.outputs:
-                grad_depths, at = totals[:, at], at + 1
-            if "normal" in ctx.outputs:
-                grad_normals, at = totals[:, at : at + 3], at + 3
-            grad_features[order] = totals[:, at:]
+            if "color" in places:
+                cpu_project.unshade(means, sh, lists.drawn, view.numbers, totals, places["color"], grad_means, grad_sh)
             cpu_project.unproject(
-                means, log_scales, quaternions, order, camera, view.antialiased, totals[:, :6],
-                grad_depths, grad_normals, grad_means, grad_log_scales, grad_quaternions, grad_logits, logits,
+                means, log_scales, quaternions, logits, lists.drawn, view.numbers, view.antialiased,
+                totals, places.get("depth", 0), places.get("normal", 0),
+                grad_means, grad_log_scales, grad_quaternions, grad_logits,
             )  # fmt: skip
+        grads[-1] = totals[:, at:]
         return None, None, *(torch.from_numpy(grad) for grad in grads)
 
 
@@ -179,9 +179,9 @@ class CpuViewOperator:
         self._n = gaussians.count
         with _KERNELS:
             self._lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
-            _, alpha = self._lists.blend(np.empty((len(self._lists.order), 0), np.float32), self._view)
+            _, alpha = self._lists.blend(np.empty((self._n, 0), np.float32), self._view)
         self.alpha: Float[Tensor, "h w"] = torch.from_numpy(alpha)
-        self.visible: Bool[Tensor, n] = self._lists.visible
+        self.visible: Bool[Tensor, n] = torch.from_numpy(self._lists.drawn)
 
     def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
         """W values, over black; differentiable in `values`."""
@@ -191,15 +191,13 @@ class CpuViewOperator:
         """W^T image."""
         planes, lists = _array(image.permute(2, 0, 1)), self._lists
         sums = np.empty((len(lists.entries), len(planes)), np.float32)
-        out = np.zeros((self._n, len(planes)), np.float32)
         with _KERNELS:
             cpu_blend.blend_transpose(lists.splats, lists.start, lists.entries, lists.slots, planes, sums)
-            out[lists.order] = lists.sum_slots(sums)
-        return torch.from_numpy(out)
+            return torch.from_numpy(lists.sum_slots(sums))
 
     def _forward(self, values: Tensor) -> Tensor:
         with _KERNELS:
-            image, _ = self._lists.blend(_array(values)[self._lists.order], self._view)
+            image, _ = self._lists.blend(_array(values), self._view)
         return torch.from_numpy(image).permute(1, 2, 0)
 
 

@@ -348,11 +348,11 @@ def blend_backward(splats, start, entries, slots, values, image, alpha, grad_ima
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def sum_slots(sums, first, out):
-    """Fill `out (m, c)` with the sums over each splat's slots, in a fixed order."""
+def sum_slots(sums, first, order, out):
+    """Set `out (n, c)` at `order (m,)` to the sums over each splat's slots, in a fixed order."""
     for s in prange(first.shape[0] - 1):
         for c in range(sums.shape[1]):
             added = ZERO
             for slot in range(first[s], first[s + 1]):
                 added += sums[slot, c]
-            out[s, c] = added
+            out[order[s], c] = added

@@ -8,21 +8,21 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit, prange
+from numba import float32, njit, prange
 
 from splatgraft.rendering.cpu_basis import basis_and_slope, basis_at
 
 LOW_PASS_PX2 = 0.3
 MIN_ALPHA = 1.0 / 255.0
 BLOCK = 256
+ZERO, HALF = float32(0), float32(0.5)
 
 # columns of a splat
 MX, MY, CA, CB, CC, LOG_OPACITY, REACH_X, REACH_Y = range(8)
 COLUMNS = 8
 
 # places in a camera vector: rotation (9) and translation (3) of camera_from_world, centre (3), then
-FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR = range(15, 24)
-CAMERA_NUMBERS = 24
+FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR, WIDTH, HEIGHT = range(15, 26)
 
 
 @njit(cache=True)
@@ -114,78 +114,83 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
                 continue
             limit = 2 * math.log(opacity / MIN_ALPHA)
             mx, my = camera[FX] * x / z + camera[CX], camera[FY] * y / z + camera[CY]
-            if not (abs(mx) < 1e9 and abs(my) < 1e9):
+            reach_x, reach_y = math.sqrt(limit * (xx + LOW_PASS_PX2)), math.sqrt(limit * (yy + LOW_PASS_PX2))
+            if not (-reach_x < mx < camera[WIDTH] + reach_x and -reach_y < my < camera[HEIGHT] + reach_y):
                 continue
             splats[g, MX], splats[g, MY] = mx, my
             splats[g, CA] = (yy + LOW_PASS_PX2) / determinant
             splats[g, CB] = -xy / determinant
             splats[g, CC] = (xx + LOW_PASS_PX2) / determinant
             splats[g, LOG_OPACITY] = math.log(opacity)
-            splats[g, REACH_X] = math.sqrt(limit * (xx + LOW_PASS_PX2))
-            splats[g, REACH_Y] = math.sqrt(limit * (yy + LOW_PASS_PX2))
+            splats[g, REACH_X] = reach_x
+            splats[g, REACH_Y] = reach_y
             depths[g] = z
 
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def shade(means, sh, order, camera, colors):
-    """Fill `colors (m, 3)` of the Gaussians `order (m,)` as the camera sees them."""
-    m, k = order.shape[0], sh.shape[1]
-    for block in prange((m + BLOCK - 1) // BLOCK):
-        basis = np.empty(16)
-        for s in range(block * BLOCK, min(m, (block + 1) * BLOCK)):
-            g = order[s]
+def shade(means, sh, drawn, camera, colors):
+    """Fill `colors (n, 3)` as the camera sees them where `drawn (n,)`."""
+    n, k = sh.shape[0], sh.shape[1]
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        basis = np.empty(16, np.float32)
+        for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
+            if not drawn[g]:
+                continue
             x, y, z = means[g, 0] - camera[12], means[g, 1] - camera[13], means[g, 2] - camera[14]
             inverse = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
             basis_at(x * inverse, y * inverse, z * inverse, k, basis)
             for c in range(3):
-                value = 0.5
+                value = HALF
                 for j in range(k):
                     value += basis[j] * sh[g, j, c]
-                colors[s, c] = max(value, 0.0)
+                colors[g, c] = max(value, ZERO)
 
 
 @njit(cache=True)
 @no_type_check
-def normals(means, log_scales, quaternions, order, camera, out):
-    """Fill `out (m, 3)` with the world-frame normals of the Gaussians `order (m,)`, towards the camera."""
+def normals(means, log_scales, quaternions, drawn, camera, out):
+    """Fill `out (n, 3)` with world-frame normals towards the camera where `drawn (n,)`."""
     rotation, offset = np.empty((3, 3)), np.empty(3)
-    for s in range(order.shape[0]):
-        g = order[s]
+    for g in range(drawn.shape[0]):
+        if not drawn[g]:
+            continue
         _camera_point(means[g], camera, offset)
         _rotation(quaternions[g], rotation)
         axis, sign = _normal_axis(log_scales[g], rotation, offset)
         for i in range(3):
-            out[s, i] = sign * rotation[i, axis]
+            out[g, i] = sign * rotation[i, axis]
 
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def unshade(means, sh, order, camera, grad_colors, grad_means, grad_sh):
-    """Add the gradients of `shade` into `grad_means`; set them in `grad_sh`."""
-    m, k = order.shape[0], sh.shape[1]
-    for block in prange((m + BLOCK - 1) // BLOCK):
-        basis, slope = np.empty(16), np.empty((16, 3))
-        for s in range(block * BLOCK, min(m, (block + 1) * BLOCK)):
-            g = order[s]
+def unshade(means, sh, drawn, camera, totals, at, grad_means, grad_sh):
+    """Add the gradients of `shade`, which are columns from `at` of `totals (n, ..)`, to `grad_means` and `grad_sh`."""
+    n, k = sh.shape[0], sh.shape[1]
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        basis, slope, along = np.empty(16, np.float32), np.empty((16, 3), np.float32), np.empty(16, np.float32)
+        for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
+            if not drawn[g]:
+                continue
             x, y, z = means[g, 0] - camera[12], means[g, 1] - camera[13], means[g, 2] - camera[14]
             inverse = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
             x, y, z = x * inverse, y * inverse, z * inverse
             basis_and_slope(x, y, z, k, basis, slope)
-            dx, dy, dz = 0.0, 0.0, 0.0
+            along[:k] = ZERO
             for c in range(3):
-                value = 0.5
+                grad, value = totals[g, at + c], HALF
                 for j in range(k):
                     value += basis[j] * sh[g, j, c]
                 if value < 0:
                     continue
-                grad = float(grad_colors[s, c])
                 for j in range(k):
-                    grad_sh[g, j, c] = basis[j] * grad
-                    along = sh[g, j, c] * grad
-                    dx += slope[j, 0] * along
-                    dy += slope[j, 1] * along
-                    dz += slope[j, 2] * along
+                    grad_sh[g, j, c] += basis[j] * grad
+                    along[j] += sh[g, j, c] * grad
+            dx, dy, dz = ZERO, ZERO, ZERO
+            for j in range(1, k):
+                dx += slope[j, 0] * along[j]
+                dy += slope[j, 1] * along[j]
+                dz += slope[j, 2] * along[j]
             radial = dx * x + dy * y + dz * z
             grad_means[g, 0] += (dx - radial * x) * inverse
             grad_means[g, 1] += (dy - radial * y) * inverse
@@ -211,20 +216,21 @@ def _add_quaternion_gradient(quaternion, inverse, d, out):
 @njit(cache=True, parallel=True)
 @no_type_check
 def unproject(
-    means, log_scales, quaternions, order, camera, antialiased, moments, grad_depths, grad_normals,
-    grad_means, grad_log_scales, grad_quaternions, grad_opacity_logits, opacity_logits,
+    means, log_scales, quaternions, opacity_logits, drawn, camera, antialiased, totals, depth_at, normal_at,
+    grad_means, grad_log_scales, grad_quaternions, grad_opacity_logits,
 ):  # fmt: skip
-    """Turn what pixels say about splats into gradients of the raw fields, which are zero on entry.
+    """Add what pixels say about splats to the gradients of the raw fields.
 
-    `moments (m, 6)`: sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2; d from centre to pixel.
-    `grad_depths (m,)` and `grad_normals (m, 3)` may be empty.
+    `totals (n, ..)`: first sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2, with d from centre
+    to pixel; gradients of depth and of the normal from columns `depth_at` and `normal_at`, unless 0.
     """
-    m = order.shape[0]
-    for block in prange((m + BLOCK - 1) // BLOCK):
+    n = means.shape[0]
+    for block in prange((n + BLOCK - 1) // BLOCK):
         rotation, axes, offset = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
         d_axes, d_rotation = np.empty((3, 3)), np.empty((3, 3))
-        for s in range(block * BLOCK, min(m, (block + 1) * BLOCK)):
-            g = order[s]
+        for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
+            if not drawn[g]:
+                continue
             x, y, z = _camera_point(means[g], camera, offset)
             inverse = _rotation(quaternions[g], rotation)
             _view_axes(log_scales[g], rotation, camera, axes)
@@ -237,10 +243,10 @@ def unproject(
             determinant = sharp + LOW_PASS_PX2 * (xx + yy) + LOW_PASS_PX2 * LOW_PASS_PX2
             a, b, c = (yy + LOW_PASS_PX2) / determinant, -xy / determinant, (xx + LOW_PASS_PX2) / determinant
 
-            s0, sx, sy = float(moments[s, 0]), float(moments[s, 1]), float(moments[s, 2])
-            sxx, sxy, syy = float(moments[s, 3]), float(moments[s, 4]), float(moments[s, 5])
+            s0, sx, sy = float(totals[g, 0]), float(totals[g, 1]), float(totals[g, 2])
+            sxx, sxy, syy = float(totals[g, 3]), float(totals[g, 4]), float(totals[g, 5])
             opacity = 1.0 / (1.0 + math.exp(-float(opacity_logits[g])))
-            grad_opacity_logits[g] = s0 * (1 - opacity)
+            grad_opacity_logits[g] += s0 * (1 - opacity)
             d_mx, d_my = a * sx + b * sy, b * sx + c * sy
             # d covariance = Q S Q / 2, with Q the inverse covariance and S the second moments
             p00, p01, p10, p11 = a * sxx + b * sxy, a * sxy + b * syy, b * sxx + c * sxy, b * sxy + c * syy
@@ -270,8 +276,8 @@ def unproject(
             if free_y:
                 d_v = -j11 * d12
                 dy, dz = dy + d_v / z, dz - d_v * y / (z * z)
-            if grad_depths.shape[0] > 0:
-                dz += grad_depths[s]
+            if depth_at > 0:
+                dz += totals[g, depth_at]
             for i in range(3):
                 grad_means[g, i] += camera[i] * dx + camera[3 + i] * dy + camera[6 + i] * dz
 
@@ -282,9 +288,9 @@ def unproject(
                     d = camera[i] * d_axes[0, j] + camera[3 + i] * d_axes[1, j] + camera[6 + i] * d_axes[2, j]
                     total += d * rotation[i, j]
                     d_rotation[i, j] = d * scale
-                grad_log_scales[g, j] = total * scale
-            if grad_normals.shape[0] > 0:
+                grad_log_scales[g, j] += total * scale
+            if normal_at > 0:
                 axis, sign = _normal_axis(log_scales[g], rotation, offset)
                 for i in range(3):
-                    d_rotation[i, axis] += sign * grad_normals[s, i]
+                    d_rotation[i, axis] += sign * totals[g, normal_at + i]
             _add_quaternion_gradient(quaternions[g], inverse, d_rotation, grad_quaternions[g])

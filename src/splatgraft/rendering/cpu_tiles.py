@@ -4,7 +4,7 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 from splatgraft.rendering.cpu_project import CA, CB, CC, COLUMNS, LOG_OPACITY, MX, MY, REACH_X, REACH_Y
 
@@ -66,6 +66,29 @@ def _tile_span(splat, row, tiles_x):
 
 @njit(cache=True)
 @no_type_check
+def _tile_rows(splat, tiles_y):
+    """First and one past the last tile row that the ellipse can meet."""
+    top = (splat[MY] - splat[REACH_Y] - 1e-3) / TILE
+    bottom = (splat[MY] + splat[REACH_Y] + 1e-3) / TILE
+    return int(max(math.floor(min(top, 1e6)), 0)), int(min(math.floor(max(bottom, -1.0)) + 1, tiles_y))
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def _spans(packed, first_row, tiles_x, tiles_y):
+    """The tiles of every splat, row by row, as first and one past the last; a splat's rows begin at `first_row`."""
+    spans = np.empty((first_row[-1], 2), np.int32)
+    for s in prange(packed.shape[0]):
+        top, bottom = _tile_rows(packed[s], tiles_y)
+        for row in range(top, bottom):
+            left, right = _tile_span(packed[s], row, tiles_x)
+            place = first_row[s] + row - top
+            spans[place, 0], spans[place, 1] = left, max(left, right)
+    return spans
+
+
+@njit(cache=True)
+@no_type_check
 def bin_splats(splats, order, width, height):
     """Sorted splats, their tile lists and where each splat's entries stand.
 
@@ -75,40 +98,33 @@ def bin_splats(splats, order, width, height):
     m = order.shape[0]
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     packed = np.empty((m, COLUMNS), np.float32)
-    first = np.zeros(m + 1, np.int64)
-    start = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    first_row, first = np.zeros(m + 1, np.int32), np.zeros(m + 1, np.int32)
     for s in range(m):
         packed[s] = splats[order[s]]
         top, bottom = _tile_rows(packed[s], tiles_y)
-        total = 0
-        for row in range(top, bottom):
-            left, right = _tile_span(packed[s], row, tiles_x)
-            for column in range(left, right):
-                start[row * tiles_x + column + 1] += 1
-            total += max(right - left, 0)
-        first[s + 1] = first[s] + total
+        first_row[s + 1] = first_row[s] + max(bottom - top, 0)
+    spans = _spans(packed, first_row, tiles_x, tiles_y)
+    start = np.zeros(tiles_x * tiles_y + 1, np.int32)
+    for s in range(m):
+        top, _ = _tile_rows(packed[s], tiles_y)
+        listed = 0
+        for place in range(first_row[s], first_row[s + 1]):
+            row_at = (top + place - first_row[s]) * tiles_x
+            for tile in range(row_at + spans[place, 0], row_at + spans[place, 1]):
+                start[tile + 1] += 1
+            listed += spans[place, 1] - spans[place, 0]
+        first[s + 1] = first[s] + listed
     for t in range(tiles_x * tiles_y):
         start[t + 1] += start[t]
     entries, slots = np.empty(first[m], np.int32), np.empty(first[m], np.int32)
-    place = start[:-1].copy()
+    free = start[:-1].copy()
     for s in range(m):
         slot = first[s]
-        if first[s + 1] == slot:
-            continue
-        top, bottom = _tile_rows(packed[s], tiles_y)
-        for row in range(top, bottom):
-            left, right = _tile_span(packed[s], row, tiles_x)
-            for column in range(left, right):
-                tile = row * tiles_x + column
-                entries[place[tile]], slots[place[tile]] = s, slot
-                place[tile] += 1
+        top, _ = _tile_rows(packed[s], tiles_y)
+        for place in range(first_row[s], first_row[s + 1]):
+            row_at = (top + place - first_row[s]) * tiles_x
+            for tile in range(row_at + spans[place, 0], row_at + spans[place, 1]):
+                entries[free[tile]], slots[free[tile]] = s, slot
+                free[tile] += 1
                 slot += 1
     return packed, start, entries, slots, first
-
-
-@njit(cache=True)
-@no_type_check
-def _tile_rows(splat, tiles_y):
-    top = (splat[MY] - splat[REACH_Y] - 1e-3) / TILE
-    bottom = (splat[MY] + splat[REACH_Y] + 1e-3) / TILE
-    return int(max(math.floor(min(top, 1e6)), 0)), int(min(math.floor(max(bottom, -1.0)) + 1, tiles_y))
