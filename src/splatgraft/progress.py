@@ -1,7 +1,7 @@
 """How a long stage says how far it is and saves what it needs to go on. Knows nothing about terminals or files."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 Progress = Callable[[int, int, str], None]
 """Called with steps done, steps in all, and a short text such as 'psnr 27.1 dB, 41k Gaussians'."""
@@ -11,6 +11,7 @@ def silent(done: int, total: int, message: str) -> None:
     """A `Progress` that tells nobody."""
 
 
+@runtime_checkable
 class Checkpoint(Protocol):
     """Where a long stage leaves its state (tensors, numbers, nested dicts of them) and finds it again."""
 
