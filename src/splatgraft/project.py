@@ -21,6 +21,8 @@ PROJECT_FILE = "project.toml"
 STEP_FILE = "step.json"
 SCENE_FILE = "scene.ply"
 OBJECT_FILE = "object.ply"
+SURROUNDINGS_FILE = "surroundings.ply"
+LIGHT_FILE = "light.txt"
 SELECTION_FILE = "selection.npy"
 IS_OBJECT_FILE = "is_object.npy"
 CAMERAS_FILE = "transforms.json"
@@ -29,6 +31,21 @@ REPORT_FILE = "index.html"
 METRICS_FILE = "metrics.json"
 
 Side = Literal["source", "target"]
+
+RESULTS_IN_ORDER = (
+    "source/capture",
+    "source/scene",
+    "target/capture",
+    "target/scene",
+    "object",
+    "composite",
+    "relit",
+    "views",
+    "harmonized",
+    "result",
+    "report",
+)
+"""All folders of a project, relative to its root, in the order in which they are made."""
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,10 @@ def _build(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
         if field.name in given:
             values[field.name] = given[field.name]
         elif is_dataclass(hint):
-            values[field.name] = _build(hint, table, {})  # pyright: ignore[reportArgumentType]
+            nested = field.default_factory() if field.default_factory is not MISSING else None
+            # what the outer class chose for the inner one stands where the table is silent
+            chosen = {key: getattr(nested, key) for key in _keys(hint) - set(table.values)} if nested else {}
+            values[field.name] = _build(hint, table, chosen)  # pyright: ignore[reportArgumentType]
         elif field.name in table.values:
             values[field.name] = _convert(table.values[field.name], hint, table, field.name)
         elif field.default is MISSING and field.default_factory is MISSING:

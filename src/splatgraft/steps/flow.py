@@ -8,11 +8,13 @@ from typing import Any
 from splatgraft.project import (
     CAMERAS_FILE,
     IS_OBJECT_FILE,
+    LIGHT_FILE,
     OBJECT_FILE,
     PLACEMENT_FILE,
     PROJECT_FILE,
     REPORT_FILE,
     SCENE_FILE,
+    SURROUNDINGS_FILE,
     Layout,
     Side,
 )
@@ -95,17 +97,23 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
 
 def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:
     source, target = (layout.scene(side) / SCENE_FILE for side in ("source", "target"))
+    source_capture, target_capture = layout.capture("source"), layout.capture("target")
     cameras, source_cameras = (layout.capture(side) / CAMERAS_FILE for side in ("target", "source"))
+    surroundings = layout.object / SURROUNDINGS_FILE
     composite, relit = layout.composite / SCENE_FILE, layout.relit / SCENE_FILE
     placement = file.path.parent / PLACEMENT_FILE
 
-    lift = {"scene": source, "capture": layout.capture("source")}
-    place = {"target": target, "object": layout.object / OBJECT_FILE, "cameras": cameras}
-    place |= {"object_cameras": source_cameras} | ({"placement": placement} if placement.is_file() else {})
-    light = {"composite": layout.composite, "source": source}
+    lift = {"scene": source, "capture": source_capture}
+    place = {"target": target, "object": layout.object / OBJECT_FILE, "surroundings": surroundings}
+    place |= {"cameras": cameras, "object_cameras": source_cameras}
+    place |= {"placement": placement} if placement.is_file() else {}
+    light = {"target": target, "placement": layout.composite / PLACEMENT_FILE, "cameras": cameras}
+    light |= {"surroundings": surroundings, "object_cameras": source_cameras}
     draw = {"scene": composite, "cameras": cameras, "prior": relit, "is_object": layout.composite / IS_OBJECT_FILE}
     fit = {"scene": relit, "views": layout.views, "images": layout.harmonized}
     judge = {"result": layout.result / SCENE_FILE, "composite": layout.composite, "cameras": cameras}
+    judge |= {"target_capture": target_capture, "views": layout.views, "light": layout.relit / LIGHT_FILE}
+    judge |= {"project": layout.root}
     plan: list[tuple[type[Any], dict[str, Path], Path]] = [
         (Segment, lift, layout.object),
         (Compose, place, layout.composite),

@@ -12,7 +12,7 @@ from splatgraft.project import METRICS_FILE, SCENE_FILE
 from splatgraft.reconstruct import ReconstructOptions, predict_memory, reconstruct
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.steps.capture_files import capture_inputs
-from splatgraft.steps.step import Context, Device, Inputs, Positional, choose_device
+from splatgraft.steps.step import Context, Inputs, Positional, choose_device
 
 EVAL_EVERY = 8
 """As in 3DGS."""
@@ -28,9 +28,7 @@ class Reconstruct:
     """Folder for scene.ply."""
     eval: bool = False
     """Hold out every 8th view and measure how well the scene predicts it: --eval-every 8."""
-    device: Device = "auto"
-    """Where to compute."""
-    options: ReconstructOptions = field(default_factory=ReconstructOptions)
+    options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(device="auto"))
 
     def inputs(self) -> Inputs:
         """The files of the capture, without masks."""
@@ -39,7 +37,7 @@ class Reconstruct:
     def write(self, folder: Path, context: Context) -> None:
         """Make scene.ply, and metrics.json where views are held out."""
         capture = read_capture(self.capture)
-        device = choose_device(self.device, context.terminal)
+        device = choose_device(self.options.device, context.terminal)
         options = replace(self.options, device=str(device))
         if self.eval and not options.eval_every:
             options = replace(options, eval_every=EVAL_EVERY)

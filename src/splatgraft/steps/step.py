@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol, get_args
 
 import torch
 import tyro
@@ -76,11 +76,13 @@ def perform(step: Step, terminal: Terminal, *, name: str = "") -> Path:
     return job.folder
 
 
-def choose_device(wanted: Device, terminal: Terminal) -> torch.device:
+def choose_device(wanted: str, terminal: Terminal) -> torch.device:
     """The device to work on, said aloud.
 
-    Raises: ValueError where CUDA is asked for and there is none.
+    Raises: ValueError where CUDA is asked for and there is none, or another device is.
     """
+    if wanted not in get_args(Device):
+        raise ValueError(f"--device: expected {', '.join(get_args(Device))}, found {wanted}")
     has_cuda = torch.cuda.is_available()
     if wanted == "cuda" and not has_cuda:
         raise ValueError("--device: expected a CUDA device that torch can use, found none; splatgraft doctor says more")
