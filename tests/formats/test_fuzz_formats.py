@@ -1,4 +1,4 @@
-"""Broken files: whatever the bytes, a reader gives a value or one ValueError line that names the file, in little memory."""
+"""Broken files: whatever the bytes, a reader gives a value or one ValueError line with the file, in little memory."""
 
 import shutil
 import struct

@@ -1,0 +1,193 @@
+"""3DGS .ply: bit for bit round trips, the layouts that other programs write, and refusals in one line."""
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from splatgraft import formats
+from splatgraft.gaussians import empty
+
+BASE = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
+BASE += ("rot_0", "rot_1", "rot_2", "rot_3")
+TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
+
+
+def columns_of(g):
+    """Every field under its .ply name, written down independently of the writer."""
+    out = {"x": g.means[:, 0], "y": g.means[:, 1], "z": g.means[:, 2], "opacity": g.opacity_logits}
+    for i in range(3):
+        out |= {f"f_dc_{i}": g.sh[:, 0, i], f"scale_{i}": g.log_scales[:, i]}
+    for i in range(4):
+        out[f"rot_{i}"] = g.quaternions[:, i]
+    per_channel = g.sh.shape[1] - 1
+    for channel in range(3):
+        for band in range(per_channel):
+            out[f"f_rest_{channel * per_channel + band}"] = g.sh[:, 1 + band, channel]
+    return {name: column.numpy() for name, column in out.items()}
+
+
+def write(path, columns, *, kind="binary_little_endian", before="", before_data=b"", after="", after_data=b""):
+    order = ">" if "big" in kind else "<"
+    dtype = np.dtype([(name, column.dtype.newbyteorder(order)) for name, column in columns.items()])
+    n = len(next(iter(columns.values())))
+    table = np.empty(n, dtype)
+    for name, column in columns.items():
+        table[name] = column
+    lines = "".join(f"property {TYPES[column.dtype.str[1:]]} {name}\n" for name, column in columns.items())
+    header = f"ply\nformat {kind} 1.0\ncomment made by a test\n{before}element vertex {n}\n{lines}{after}end_header\n"
+    if kind == "ascii":
+        data = "".join(" ".join(repr(v.item()) for v in row) + "\n" for row in table).encode()
+    else:
+        data = table.tobytes()
+    path.write_bytes(header.encode() + before_data + data + after_data)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("n", [0, 1, 5000])  # 5000 is more than one chunk of the reader
+def test_round_trip_is_bit_for_bit(tmp_path, n, degree):
+    g = scenes.random_gaussians(n, degree) if n else empty(degree)
+    formats.write_gaussians(tmp_path / "a.ply", g)
+    back = formats.read_gaussians(tmp_path / "a.ply")
+    assert scenes.equal(back, g)
+    formats.write_gaussians(tmp_path / "b.ply", back)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_values_that_are_not_finite_survive(tmp_path):
+    g = scenes.random_gaussians(8, 1)
+    g.means[0, 0], g.opacity_logits[1], g.sh[2, 1, 1] = float("nan"), float("inf"), -float("inf")
+    g.log_scales[3] = torch.tensor([-0.0, 1e-42, -3e38])  # signed zero, a denormal, the edge of the range
+    formats.write_gaussians(tmp_path / "a.ply", g)
+    assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+
+
+def test_written_file_has_the_original_codes_layout(tmp_path):
+    g = scenes.random_gaussians(3, 3)
+    formats.write_gaussians(tmp_path / "a.ply", g)
+    header, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(45))]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    expected = "ply\nformat binary_little_endian 1.0\nelement vertex 3\n"
+    assert header.decode() == expected + "".join(f"property float {name}\n" for name in names)
+    table = np.frombuffer(data, np.dtype([(name, "<f4") for name in names]))
+    for name, column in columns_of(g).items():
+        assert (table[name] == column).all(), name
+
+
+@pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_any_order_extra_properties_and_no_normals(tmp_path, kind, degree):
+    g = scenes.random_gaussians(20, degree)
+    columns = columns_of(g)
+    names = list(columns)
+    np.random.default_rng(0).shuffle(names)
+    mixed = {name: columns[name] for name in names}
+    mixed = {"label": np.arange(20, dtype="i4"), "red": np.zeros(20, "u1"), **mixed, "f_extra": columns["x"]}
+    write(tmp_path / "a.ply", mixed, kind=kind)
+    assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+
+
+def test_wider_types_become_float32(tmp_path):
+    g = scenes.random_gaussians(20, 1)
+    write(tmp_path / "a.ply", {name: column.astype("f8") for name, column in columns_of(g).items()})
+    assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+
+
+def test_other_elements_are_skipped(tmp_path):
+    g = scenes.random_gaussians(20, 1)
+    for kind, order in (("binary_little_endian", "<"), ("binary_big_endian", ">")):
+        faces = np.array(3, "u1").tobytes() + np.array([0, 1, 2], order + "i4").tobytes()
+        write(
+            tmp_path / "a.ply",
+            columns_of(g),
+            kind=kind,
+            before="element face 2\nproperty list uchar int vertex_indices\nelement view 1\nproperty float focal\n",
+            before_data=faces * 2 + np.array(1, order + "f4").tobytes(),
+            after="element extra 1\nproperty short a\n",
+            after_data=b"\0\0",
+        )
+        assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+
+
+def test_windows_line_ends_in_the_header(tmp_path):
+    g = scenes.random_gaussians(5, 0)
+    formats.write_gaussians(tmp_path / "a.ply", g)
+    header, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    (tmp_path / "a.ply").write_bytes(header.replace(b"\n", b"\r\n") + b"end_header\r\n" + data)
+    assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+
+
+def refusal(path):
+    with pytest.raises(ValueError, match="expected") as caught:
+        formats.read_gaussians(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: expected ")
+    assert "\n" not in message
+    return message
+
+
+def test_point_cloud_is_told_apart(tmp_path):
+    formats.write_points(tmp_path / "a.ply", torch.zeros(3, 3), torch.zeros(3, 3))
+    assert "point cloud" in refusal(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("missing", ["opacity", "scale_1", "rot_3", "f_dc_0", "y"])
+def test_missing_property_is_named(tmp_path, missing):
+    columns = columns_of(scenes.random_gaussians(3, 0))
+    del columns[missing]
+    write(tmp_path / "a.ply", columns)
+    assert missing in refusal(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("rest", [[0], [0, 1, 2], list(range(44)), [*range(8), 10], list(range(72))])
+def test_incomplete_bands_are_refused(tmp_path, rest):
+    columns = columns_of(scenes.random_gaussians(3, 0)) | {f"f_rest_{i}": np.zeros(3, "f4") for i in rest}
+    write(tmp_path / "a.ply", columns)
+    assert "f_rest" in refusal(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("change", [-1, -1000, 4])
+def test_length_must_be_what_the_header_says(tmp_path, change):
+    formats.write_gaussians(tmp_path / "a.ply", scenes.random_gaussians(30, 2))
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data[:change] if change < 0 else data + bytes(change))
+    assert "bytes" in refusal(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.ply", b""),
+        ("a.ply", b"solid stl"),
+        ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\n"),
+        ("a.ply", b"ply\nformat binary_little_endian 2.0\nend_header\n"),
+        ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9999999999999\nproperty int x\nend_header\n"),
+        ("a.ply", b"ply\nelement vertex 0\nend_header\n"),
+        ("a.obj", b""),
+    ],
+)
+def test_other_files(tmp_path, name, data):
+    (tmp_path / name).write_bytes(data)
+    refusal(tmp_path / name)
+    refusal(tmp_path / "missing.ply")
+
+
+def test_failed_write_keeps_the_earlier_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    formats.write_gaussians(path, scenes.random_gaussians(3, 0, seed=1))
+    before = path.read_bytes()
+
+    def fail(*arguments):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(torch, "cat", fail)
+    with pytest.raises(OSError, match="disk full"):
+        formats.write_gaussians(path, scenes.random_gaussians(3, 0, seed=2))
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_folder_that_is_not_there(tmp_path):
+    with pytest.raises(ValueError, match="expected an existing folder"):
+        formats.write_gaussians(tmp_path / "none" / "a.ply", empty())

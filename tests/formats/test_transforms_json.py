@@ -1,0 +1,165 @@
+"""transforms.json and cameras.json: Blender's and nerfstudio's keys, axes, round trips, refusals."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+from splatgraft import formats
+from splatgraft.cameras import Cameras, look_at, pinhole
+
+
+def test_opengl_axes_become_opencv_axes(tmp_path):
+    # an OpenGL camera at (1, 2, 3) without rotation looks along -z with y up
+    pose = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    frames = [{"file_path": "a.png", "transform_matrix": pose}]
+    path = scenes.write_transforms(tmp_path, {"w": 24, "h": 16, "frames": frames})
+    cameras = formats.read_cameras(path)
+    assert cameras.centers.tolist() == [[1, 2, 3]]
+    ahead, above = torch.tensor([1.0, 2, 2, 1]), torch.tensor([1.0, 3, 2, 1])
+    assert (cameras.camera_from_world[0] @ ahead).tolist() == [0, 0, 1, 1]
+    assert (cameras.camera_from_world[0] @ above).tolist() == [0, -1, 1, 1]  # y is down in the image
+
+
+def test_blender_keys_and_missing_suffixes(tmp_path):
+    path = scenes.write_transforms(tmp_path, {}, size=(40, 30))
+    meta = json.loads(path.read_text())
+    del meta["fl_x"]
+    meta["camera_angle_x"] = 0.8
+    for frame in meta["frames"]:
+        frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
+    path.unlink()
+    (tmp_path / "transforms_train.json").write_text(json.dumps(meta))
+    capture = formats.read_capture(tmp_path)
+    assert capture.cameras.names == ("0000.png", "0001.png")
+    assert capture.cameras.sizes.tolist() == [[40, 30]] * 2
+    focal = 20 / math.tan(0.4)
+    assert torch.allclose(capture.cameras.intrinsics[0], torch.tensor([[focal, 0, 20], [0, focal, 15], [0, 0, 1]]))
+    assert len(capture.points) == 0
+
+
+def test_nerfstudio_keys_for_each_frame(tmp_path):
+    path = scenes.write_transforms(tmp_path, {"w": 24, "h": 16, "applied_transform": [[1, 0, 0, 9]], "k1": 0.0})
+    meta = json.loads(path.read_text())
+    meta["frames"][1] |= {"fl_x": 30, "fl_y": 31, "cx": 11, "cy": 9, "k1": 0.1, "p2": 0.01}
+    path.write_text(json.dumps(meta))
+    capture = formats.read_capture(path)
+    assert capture.cameras.intrinsics[0].tolist() == [[20, 0, 12], [0, 20, 8], [0, 0, 1]]
+    assert capture.distortions[0] is None
+    assert capture.distortions[1].intrinsics.tolist() == [[30, 0, 11], [0, 31, 9], [0, 0, 1]]
+    assert capture.distortions[1].coefficients.tolist() == [0.1, 0, 0, 0.01, 0]
+
+
+def some_cameras(v=5) -> Cameras:
+    poses = look_at(torch.randn(v, 3) * 3, torch.zeros(3), torch.tensor([0.0, 0, 1]))
+    return pinhole(poses, 33.3, width=24, height=16)
+
+
+def test_cameras_round_trip_bit_for_bit(tmp_path):
+    cameras = some_cameras()
+    cameras.intrinsics[2, 0, 2] += 0.123  # not shared by all
+    formats.write_cameras(tmp_path / "y.json", cameras)
+    back = formats.read_cameras(tmp_path / "y.json")
+    assert torch.equal(back.world_from_camera, cameras.world_from_camera)
+    assert torch.equal(back.intrinsics, cameras.intrinsics)
+    assert torch.equal(back.sizes, cameras.sizes)
+    assert back.names == cameras.names
+
+
+@pytest.mark.parametrize("content", [{"w": 24, "h": 16}, {"w": 24, "h": 16, "k1": -0.05, "k2": 0.01, "cx": 12.5}])
+@pytest.mark.parametrize("factor", [1.0, 0.5])
+def test_capture_round_trip(tmp_path, content, factor):
+    formats.write_points(tmp_path / "cloud.ply", torch.randn(7, 3), torch.randint(0, 256, (7, 3)) / 255)
+    scenes.write_transforms(tmp_path, {**content, "ply_file_path": "cloud.ply"})
+    for i in range(2):
+        scenes.write_photo(tmp_path / "masks" / f"{i:04d}.png", seed=9 + i)
+    capture = formats.read_capture(tmp_path).resized(factor)
+    (tmp_path / "deeper" / "copy").mkdir(parents=True)
+    formats.write_capture(tmp_path / "deeper" / "copy", capture)
+    back = formats.read_capture(tmp_path / "deeper" / "copy")
+    assert torch.equal(back.cameras.world_from_camera, capture.cameras.world_from_camera)
+    # a distorted camera's pinhole is solved again, at the smaller size, in float64; then rounded to float32 near 30
+    torch.testing.assert_close(back.cameras.intrinsics, capture.cameras.intrinsics, atol=4e-6, rtol=0)
+    assert torch.equal(back.points, capture.points)
+    assert torch.equal(back.point_colors, capture.point_colors)
+    for i in range(2):
+        # positions differ by 1e-6 px or so, times contrast 1 per pixel
+        torch.testing.assert_close(back.image(i), capture.image(i), atol=2e-5, rtol=0)
+        torch.testing.assert_close(back.mask(i), capture.mask(i), atol=2e-5, rtol=0)
+
+
+def test_nearly_rigid_poses_are_made_rigid(tmp_path):
+    rotation = np.round(scenes.rotation_and_quaternion(3)[0], 4)
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    frames = [{"file_path": "a.png", "transform_matrix": pose.tolist()}]
+    cameras = formats.read_cameras(scenes.write_transforms(tmp_path, {"w": 24, "h": 16, "frames": frames}))
+    found = cameras.world_from_camera[0, :3, :3].double()
+    assert (found.T @ found - torch.eye(3)).abs().max() < 1e-6  # float32
+    assert np.abs(found.numpy() @ np.diag([1, -1, -1]) - rotation).max() < 1e-4  # what the rounding took
+
+
+def test_cameras_json_of_the_original_code(tmp_path):
+    rotation, _ = scenes.rotation_and_quaternion(1)
+    entry = {"id": 0, "img_name": "a.jpg", "width": 24, "height": 16, "position": [1, 2, 3], "fx": 30.0, "fy": 31.0}
+    (tmp_path / "cameras.json").write_text(json.dumps([{**entry, "rotation": rotation.tolist()}]))
+    cameras = formats.read_cameras(tmp_path / "cameras.json")
+    assert np.abs(cameras.world_from_camera[0, :3, :3].numpy() - rotation).max() < 1e-6
+    assert cameras.centers.tolist() == [[1, 2, 3]]
+    assert cameras.intrinsics[0].tolist() == [[30, 0, 12], [0, 31, 8], [0, 0, 1]]
+    assert cameras.names == ("a.jpg",)
+
+
+SCALED = (np.eye(4) * np.array([2, 2, 2, 1])).tolist()
+MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
+
+
+@pytest.mark.parametrize(
+    ("frame", "content", "told"),
+    [
+        ({"transform_matrix": SCALED}, {}, "axes of length 2, 2, 2"),
+        ({"transform_matrix": MIRRORED}, {}, "determinant -1"),
+        ({"transform_matrix": [[float("nan")] * 4] * 4}, {}, "finite"),
+        ({"transform_matrix": [[1, 2], [3]]}, {}, "transform_matrix"),
+        ({"transform_matrix": None}, {}, "transform_matrix"),
+        ({"file_path": "images/9999.png"}, {}, "images/9999.png"),
+        ({"file_path": "images/0001.png"}, {}, "twice"),
+        ({"file_path": 3}, {}, "file_path"),
+        ({"mask_path": "no.png"}, {}, "no.png"),
+        ({}, {"fl_x": -3}, "focal length above 0"),
+        ({}, {"fl_x": "20"}, "'20'"),
+        ({}, {"fl_x": float("nan")}, "fl_x"),
+        ({}, {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({}, {"k4": 0.1}, "k4 = 0.1"),
+        ({}, {"k1": -3.0}, "k1, k2, p1, p2, k3 = -3"),
+        ({}, {"w": 24.5, "h": 16}, "24.5"),
+        ({}, {"w": 24}, "'h'"),
+        ({}, {"w": 48, "h": 48}, "found 24x16"),
+        ({}, {"ply_file_path": "none.ply"}, "none.ply"),
+        ({}, {"frames": []}, "at least one frame"),
+        ({}, {"frames": "none"}, "frames"),
+    ],
+)
+def test_refusals(tmp_path, frame, content, told):
+    path = scenes.write_transforms(tmp_path, content)
+    meta = json.loads(path.read_text())
+    if meta["frames"] and isinstance(meta["frames"], list):
+        meta["frames"][0] |= frame
+    path.write_text(json.dumps(meta))
+    with pytest.raises(ValueError, match=r"expected .*found") as caught:
+        formats.read_capture(tmp_path)
+    message = str(caught.value)
+    assert str(tmp_path) in message
+    assert told in message
+    assert "\n" not in message
+
+
+def test_json_that_is_none(tmp_path):
+    for text in ("", "{", "[]", '{"frames": 1e999}', "[" * 100_000):
+        (tmp_path / "transforms.json").write_text(text)
+        for read in (formats.read_capture, formats.read_cameras):
+            with pytest.raises(ValueError, match=r"transforms\.json: expected .*found"):
+                read(tmp_path / "transforms.json")
