@@ -192,7 +192,8 @@ def test_yaw_turns_and_offset_shifts():
     base = object_base(thing, up=UP)
     where, flat = torch.tensor([0.0, 0, 1.0]), room(floaters=0)
     plain, _ = rest_on_surface(flat, base, point=where, up=UP)
-    turned, _ = rest_on_surface(flat, base, point=where, up=UP, options=RestOptions(yaw_deg=90.0, offset=(0.1, 0.0, 0.0)))
+    options = RestOptions(yaw_deg=90.0, offset=(0.1, 0.0, 0.0))
+    turned, _ = rest_on_surface(flat, base, point=where, up=UP, options=options)
     x = torch.tensor([1.0, 0, 0])
     # the normal is measured, to a fraction of a degree
     assert torch.allclose(turned.rotation @ x, plain.rotation @ torch.tensor([0.0, 1, 0]), atol=0.02)

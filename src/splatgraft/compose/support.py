@@ -89,5 +89,10 @@ def _fit_level_plane(
             break
         normal = candidate.to(points)
         distance = (middle @ candidate).to(points)
+    height = heights[(heights - level).abs() < 0.06 * radius].median()
+    misses = [(points @ n - d).abs().clamp_max(0.12 * radius).mean() for n, d in ((normal, distance), (up, height))]
+    # a slope that explains little more than none does is noise of the reconstruction
+    if misses[0] > 0.7 * misses[1]:
+        normal, distance = up, height
     near = (points @ normal - distance).abs() < 0.06 * radius
     return near, normal, distance
