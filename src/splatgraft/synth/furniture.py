@@ -5,12 +5,12 @@ import random
 from dataclasses import replace
 
 from splatgraft.synth.palette import Palette, tone
-from splatgraft.synth.scene import Lamp, Material, Part, Vector, add, rotate_z
+from splatgraft.synth.scene import Lamp, Material, Number, Part, Vector, add, rotate_z
 
 Parts = tuple[Part, ...]
 
 
-def placed(parts: Parts, location: Vector, yaw: float) -> Parts:
+def placed(parts: Parts, location: Vector, yaw: Number) -> Parts:
     """Parts turned about z and moved."""
     return tuple(
         replace(
@@ -22,19 +22,19 @@ def placed(parts: Parts, location: Vector, yaw: float) -> Parts:
     )
 
 
-def box(size: Vector, location: Vector, material: Material, bevel: float = 0.004) -> Part:
+def box(size: Vector, location: Vector, material: Material, bevel: Number = 0.004) -> Part:
     """A box with slightly rounded edges; no real edge is sharp."""
     return Part(shape="box", size=size, location=location, material=material, bevel=bevel)
 
 
-def _legs(width: float, depth: float, height: float, thick: float, material: Material) -> Parts:
+def _legs(width: Number, depth: Number, height: Number, thick: Number, material: Material) -> Parts:
     x, y = width / 2 - thick, depth / 2 - thick
     return tuple(
         box((thick, thick, height), (sx * x, sy * y, height / 2), material) for sx in (-1, 1) for sy in (-1, 1)
     )
 
 
-def table(rng: random.Random, palette: Palette, width: float, depth: float, height: float) -> Parts:
+def table(rng: random.Random, palette: Palette, width: Number, depth: Number, height: Number) -> Parts:
     """A table with four legs or a round foot."""
     top = rng.choice([palette.wood, palette.wood, palette.stone, palette.paint])()
     thick = rng.uniform(0.025, 0.05)
@@ -46,11 +46,13 @@ def table(rng: random.Random, palette: Palette, width: float, depth: float, heig
             Part("cylinder", (0.07, 0.07, height - thick), (0, 0, (height - thick) / 2), foot),
             Part("cylinder", (side * 0.5, side * 0.5, 0.02), (0, 0, 0.01), foot, bevel=0.005),
         )
-    legs = _legs(width - 0.06, depth - 0.06, height - thick, rng.uniform(0.035, 0.07), rng.choice([top, palette.wood()]))
+    legs = _legs(
+        width - 0.06, depth - 0.06, height - thick, rng.uniform(0.035, 0.07), rng.choice([top, palette.wood()])
+    )
     return (box((width, depth, thick), (0, 0, height - thick / 2), top, 0.008), *legs)
 
 
-def sofa(rng: random.Random, palette: Palette, width: float = 1.9) -> Parts:
+def sofa(rng: random.Random, palette: Palette, width: Number = 1.9) -> Parts:
     """A sofa with seat, back, arms and loose cushions."""
     cloth, wood = palette.cloth("fabric"), palette.wood()
     depth, seat = 0.86, 0.42
@@ -83,7 +85,7 @@ def chair(rng: random.Random, palette: Palette) -> Parts:
     return (*_legs(0.44, 0.44, 0.43, 0.035, frame), *back, *rails, *seat)
 
 
-def shelf(rng: random.Random, palette: Palette, width: float = 0.9, height: float = 1.8) -> Parts:
+def shelf(rng: random.Random, palette: Palette, width: Number = 0.9, height: Number = 1.8) -> Parts:
     """A shelf with books and small things."""
     wood = rng.choice([palette.wood, palette.paint])()
     depth, thick = 0.3, 0.022
@@ -99,7 +101,9 @@ def shelf(rng: random.Random, palette: Palette, width: float = 0.9, height: floa
         while x < width / 2 - 0.1:
             if rng.random() < 0.12:
                 size = rng.uniform(0.08, 0.14)
-                parts.append(Part("sphere", (size,) * 3, (x + size / 2, 0, z + thick / 2 + size / 2), palette.anything()))
+                parts.append(
+                    Part("sphere", (size,) * 3, (x + size / 2, 0, z + thick / 2 + size / 2), palette.anything())
+                )
                 x += size + 0.04
                 continue
             book_w, book_h = rng.uniform(0.018, 0.05), rng.uniform(0.17, 0.27)
@@ -111,7 +115,7 @@ def shelf(rng: random.Random, palette: Palette, width: float = 0.9, height: floa
     return tuple(parts)
 
 
-def cabinet(rng: random.Random, palette: Palette, width: float, height: float, depth: float = 0.45) -> Parts:
+def cabinet(rng: random.Random, palette: Palette, width: Number, height: Number, depth: Number = 0.45) -> Parts:
     """A cabinet with doors or drawers and handles."""
     body, handle = rng.choice([palette.wood, palette.paint, palette.paint])(), palette.metal()
     parts = [box((width, depth, height), (0, 0, height / 2), body)]
@@ -125,7 +129,7 @@ def cabinet(rng: random.Random, palette: Palette, width: float, height: float, d
     return tuple(parts)
 
 
-def counter(rng: random.Random, palette: Palette, width: float) -> Parts:
+def counter(rng: random.Random, palette: Palette, width: Number) -> Parts:
     """A kitchen counter with a stone top, tap and splash-back."""
     body = cabinet(rng, palette, width, 0.86, 0.58)
     top, metal = palette.stone(), palette.metal()
@@ -152,7 +156,9 @@ def bed(rng: random.Random, palette: Palette) -> Parts:
         Part("cushion", (1.56, 1.3, 0.2), (0, -0.34, 0.53), blanket, seed=3),
     ]
     for s in (-1, 1):
-        parts.append(Part("cushion", (0.62, 0.42, 0.2), (s * 0.36, 0.76, 0.64), palette.cloth("fabric"), (0.25, 0, 0), seed=5))
+        parts.append(
+            Part("cushion", (0.62, 0.42, 0.2), (s * 0.36, 0.76, 0.64), palette.cloth("fabric"), (0.25, 0, 0), seed=5)
+        )
     return tuple(parts)
 
 
@@ -179,7 +185,7 @@ def basin(rng: random.Random, palette: Palette) -> Parts:
     )
 
 
-def plant(rng: random.Random, palette: Palette, height: float) -> Parts:
+def plant(rng: random.Random, palette: Palette, height: Number) -> Parts:
     """A pot with leaves."""
     green = tone(rng, 0.29, (0.4, 0.7), (0.25, 0.55))
     leaf = Material("plain", green, (green[0] * 0.5, green[1] * 0.6, green[2] * 0.5), 0.45)
@@ -187,7 +193,13 @@ def plant(rng: random.Random, palette: Palette, height: float) -> Parts:
     pot = height * 0.3
     profile = ((0.0, 0.0), (0.68, 0.0), (0.9, 0.8), (1.0, 1.0), (0.86, 1.0), (0.0, 0.9))
     return (
-        Part("turned", (pot * 1.1, pot * 1.1, pot), (0, 0, pot / 2), rng.choice([palette.ceramic, palette.stone])(), profile=profile),
+        Part(
+            "turned",
+            (pot * 1.1, pot * 1.1, pot),
+            (0, 0, pot / 2),
+            rng.choice([palette.ceramic, palette.stone])(),
+            profile=profile,
+        ),
         Part("cylinder", (pot * 0.85, pot * 0.85, 0.01), (0, 0, pot * 0.93), soil),
         Part("tuft", (height, height, height * 0.75), (0, 0, pot + height * 0.33), leaf, seed=rng.randrange(10**6)),
     )
@@ -232,7 +244,9 @@ def tabletop(rng: random.Random, palette: Palette, top: Part) -> Parts:
         kind = rng.choice(["bowl", "cup", "book", "ball"])
         if kind == "book":
             size = (rng.uniform(0.12, 0.2), rng.uniform(0.16, 0.26), rng.uniform(0.015, 0.05))
-            parts.append(replace(box(size, (x, y, size[2] / 2), palette.paint(), 0.002), rotation=(0, 0, rng.uniform(0, 3))))
+            parts.append(
+                replace(box(size, (x, y, size[2] / 2), palette.paint(), 0.002), rotation=(0, 0, rng.uniform(0, 3)))
+            )
         elif kind == "ball":
             size = rng.uniform(0.06, 0.1)
             parts.append(Part("sphere", (size,) * 3, (x, y, size / 2), palette.anything()))

@@ -1,4 +1,4 @@
-"""Objects to insert, from a seed: turned, extruded, blobby and assembled things of many materials. Standing on z = 0."""
+"""Objects to insert, from a seed: turned, extruded, blobby, assembled, of many materials. They stand on z = 0."""
 
 import math
 import random
@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatgraft.synth.palette import Palette, tone
-from splatgraft.synth.scene import Material, Part, Place, Vector, add, rotate_z
+from splatgraft.synth.scene import Material, Number, Part, Place, Vector, add, rotate_z
 
 
 def _profile(rng: random.Random) -> tuple[tuple[float, float], ...]:
@@ -47,12 +47,12 @@ def _surface(rng: random.Random, palette: Palette) -> Material:
     if kind == "stone":
         return replace(palette.stone(), scale=rng.uniform(3, 7))
     pattern = rng.choice(["speckle", "stripes", "checker", "rug", "painting", "brick"])
-    return Material(
-        pattern, a, b, rng.uniform(0.15, 0.9), scale=rng.uniform(1.0, 2.5) * (4 if pattern in ("rug", "painting", "brick") else 1), bump=rng.uniform(0, 0.4)
-    )  # fmt: skip
+    finer = 4 if pattern in ("rug", "painting", "brick") else 1
+    scale = rng.uniform(1.0, 2.5) * finer
+    return Material(pattern, a, b, rng.uniform(0.15, 0.9), scale=scale, bump=rng.uniform(0, 0.4))
 
 
-def _primitive(rng: random.Random, palette: Palette, width: float, height: float) -> Part:
+def _primitive(rng: random.Random, palette: Palette, width: Number, height: Number) -> Part:
     shape = rng.choice(["turned", "turned", "extruded", "blob", "box", "sphere", "cylinder", "cushion"])
     material, size, at = _surface(rng, palette), (width, width, height), (0.0, 0.0, height / 2)
     if shape == "turned":
@@ -63,10 +63,12 @@ def _primitive(rng: random.Random, palette: Palette, width: float, height: float
         return Part("blob", (width, width, height), (0, 0, height * 0.46), material, seed=rng.randrange(10**6))
     if shape == "sphere":
         return Part("sphere", (width, width, height), at, material)
-    return Part(shape, (width, width * rng.uniform(0.6, 1.0), height), at, material, bevel=0.05 * width, seed=rng.randrange(99))
+    return Part(
+        shape, (width, width * rng.uniform(0.6, 1.0), height), at, material, bevel=0.05 * width, seed=rng.randrange(99)
+    )
 
 
-def _handle(rng: random.Random, palette: Palette, width: float, height: float) -> Part:
+def _handle(rng: random.Random, palette: Palette, width: Number, height: Number) -> Part:
     turn = rng.uniform(0, 2 * math.pi)
     place = rotate_z((width * 0.52, 0, height * 0.5), turn)
     size = (height * 0.45, height * 0.45, width * 0.09)
@@ -105,9 +107,13 @@ def from_file(path: Path, place: Place) -> tuple[Part, ...]:
     return (Part("model", size, (0, 0, height / 2), any_material, path=str(path)),)
 
 
-def standing_at(parts: tuple[Part, ...], location: Vector, yaw: float) -> tuple[Part, ...]:
+def standing_at(parts: tuple[Part, ...], location: Vector, yaw: Number) -> tuple[Part, ...]:
     """The object turned about the vertical and put down at `location`."""
     return tuple(
-        replace(p, location=add(rotate_z(p.location, yaw), location), rotation=(p.rotation[0], p.rotation[1], p.rotation[2] + yaw))
+        replace(
+            p,
+            location=add(rotate_z(p.location, yaw), location),
+            rotation=(p.rotation[0], p.rotation[1], p.rotation[2] + yaw),
+        )
         for p in parts
     )

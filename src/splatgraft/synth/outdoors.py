@@ -11,7 +11,16 @@ from splatgraft.synth.scene import Material, Part, Place, Scene, World, directio
 
 Outdoor = Literal["terrace", "garden", "square"]
 OUTDOORS: tuple[Outdoor, ...] = ("terrace", "garden", "square")
-SUPPLIED_MAPS = ("city.exr", "courtyard.exr", "forest.exr", "sunrise.exr", "sunset.exr", "studio.exr", "interior.exr", "night.exr")
+SUPPLIED_MAPS = (
+    "city.exr",
+    "courtyard.exr",
+    "forest.exr",
+    "sunrise.exr",
+    "sunset.exr",
+    "studio.exr",
+    "interior.exr",
+    "night.exr",
+)
 
 
 def _tree(rng: random.Random) -> Parts:
@@ -52,7 +61,9 @@ def _support(rng: random.Random, palette: Palette) -> tuple[Parts, Place]:
         return furniture.table(rng, palette, size, size * 0.8, height), Place((0, 0, height), size * 0.27, 1.5)
     if choice == "block":
         side, height = rng.uniform(0.7, 1.1), rng.uniform(0.3, 0.6)
-        return (box((side, side, height), (0, 0, height / 2), palette.stone(), 0.02),), Place((0, 0, height), side * 0.3, 1.5)
+        return (box((side, side, height), (0, 0, height / 2), palette.stone(), 0.02),), Place(
+            (0, 0, height), side * 0.3, 1.5
+        )
     return (), Place((0, 0, 0.0), 0.6, 2.0)
 
 
@@ -60,7 +71,14 @@ def outdoor(seed: int, kind: Outdoor) -> Scene:
     """An outdoor place with the sun where the sky says; the same seed and kind give the same place."""
     rng = random.Random(f"{kind}-{seed}")
     palette = Palette(rng)
-    paving = Material("tiles", tone(rng, 0.08, (0.03, 0.25), (0.4, 0.75)), tone(rng, 0.08, (0.05, 0.2), (0.2, 0.5)), 0.75, scale=rng.uniform(1.2, 2.4), bump=0.3)
+    paving = Material(
+        "tiles",
+        tone(rng, 0.08, (0.03, 0.25), (0.4, 0.75)),
+        tone(rng, 0.08, (0.05, 0.2), (0.2, 0.5)),
+        0.75,
+        scale=rng.uniform(1.2, 2.4),
+        bump=0.3,
+    )
     green = tone(rng, 0.26, (0.45, 0.75), (0.25, 0.5))
     lawn = Material("grass", green, tone(rng, 0.2, (0.3, 0.6), (0.3, 0.5)), 0.9, bump=0.9)
     ground = {"terrace": palette.wood("planks", 1.2), "garden": lawn, "square": paving}[kind]
@@ -83,7 +101,16 @@ def outdoor(seed: int, kind: Outdoor) -> Scene:
         elif what == "tree":
             parts += placed(_tree(rng), where, rng.uniform(0, 6))
         elif what == "wall":
-            parts.append(Part("box", (4, 0.25, rng.uniform(1, 2.2)), (where[0], where[1], 0.6), palette.wall(), (0, 0, facing), bevel=0.02))
+            parts.append(
+                Part(
+                    "box",
+                    (4, 0.25, rng.uniform(1, 2.2)),
+                    (where[0], where[1], 0.6),
+                    palette.wall(),
+                    (0, 0, facing),
+                    bevel=0.02,
+                )
+            )
         else:
             thing = rng.choice([
                 furniture.plant(rng, palette, rng.uniform(0.7, 1.4)),
@@ -94,7 +121,14 @@ def outdoor(seed: int, kind: Outdoor) -> Scene:
     notes: dict[str, str] = {}
     if rng.random() < 0.7:
         elevation, azimuth = rng.uniform(0.3, 1.1), rng.uniform(0, 2 * math.pi)
-        world = World("sky", strength=0.12, sun_elevation=elevation, sun_azimuth=azimuth, sun_size=rng.uniform(0.0095, 0.03), haze=rng.uniform(0.3, 3.0))
+        world = World(
+            "sky",
+            strength=0.12,
+            sun_elevation=elevation,
+            sun_azimuth=azimuth,
+            sun_size=rng.uniform(0.0095, 0.03),
+            haze=rng.uniform(0.3, 3.0),
+        )
         notes["sun_direction"] = " ".join(f"{c:.5f}" for c in direction(azimuth, elevation))
         notes["mood"] = "sun"
     else:

@@ -3,19 +3,19 @@
 import colorsys
 import random
 
-from splatgraft.synth.scene import Color, Material, Pattern
+from splatgraft.synth.scene import Color, Material, Number, Pattern
 
 
-def linear(red: float, green: float, blue: float) -> Color:
+def linear(red: Number, green: Number, blue: Number) -> Color:
     """Linear RGB of sRGB values in [0, 1]."""
 
-    def one(value: float) -> float:
+    def one(value: Number) -> float:
         return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
     return (one(red), one(green), one(blue))
 
 
-def tone(rng: random.Random, hue: float, saturation: tuple[float, float], value: tuple[float, float]) -> Color:
+def tone(rng: random.Random, hue: Number, saturation: tuple[float, float], value: tuple[float, float]) -> Color:
     """A colour near a hue (in turns), with saturation and value drawn from ranges (sRGB HSV)."""
     shifted = (hue + rng.gauss(0, 0.02)) % 1.0
     return linear(*colorsys.hsv_to_rgb(shifted, rng.uniform(*saturation), rng.uniform(*value)))
@@ -25,6 +25,7 @@ class Palette:
     """The materials of one place: woods, walls, cloth and accents that share a few hues."""
 
     def __init__(self, rng: random.Random):
+        """Draw the hues that everything shares."""
         self._rng = rng
         self.accent_hue = rng.random()
         self.second_hue = (self.accent_hue + rng.choice([0.08, 0.33, 0.5, 0.6])) % 1.0
@@ -47,17 +48,24 @@ class Palette:
     def floor(self, kind: str) -> Material:
         """Planks, tiles or stone, by the kind of room."""
         rng = self._rng
-        choice = rng.choice(["tiles", "marble", "tiles"] if kind in ("bathroom", "kitchen") else ["planks"] * 3 + ["tiles"])
+        choice = rng.choice(
+            ["tiles", "marble", "tiles"] if kind in ("bathroom", "kitchen") else ["planks"] * 3 + ["tiles"]
+        )
         if choice == "planks":
             return self.wood("planks", scale=rng.uniform(0.9, 1.6))
         pale = tone(rng, rng.choice([0.07, 0.1, 0.58]), (0.03, 0.25), (0.4, 0.85))
         joint = tone(rng, 0.1, (0.02, 0.1), (0.25, 0.7))
         pattern: Pattern = "tiles" if choice == "tiles" else "marble"
         return Material(
-            pattern=pattern, color=pale, second=joint, roughness=rng.uniform(0.08, 0.5), scale=rng.uniform(1.6, 3.5), bump=0.15
+            pattern=pattern,
+            color=pale,
+            second=joint,
+            roughness=rng.uniform(0.08, 0.5),
+            scale=rng.uniform(1.6, 3.5),
+            bump=0.15,
         )
 
-    def wood(self, pattern: Pattern = "wood", scale: float = 1.0) -> Material:
+    def wood(self, pattern: Pattern = "wood", scale: Number = 1.0) -> Material:
         """Oak to walnut, varnished or oiled."""
         rng = self._rng
         value = min(0.9, max(0.18, self.wood_value + rng.gauss(0, 0.06)))
@@ -88,22 +96,24 @@ class Palette:
         color = tone(rng, self.accent_hue, (0.2, 0.65), (0.3, 0.7))
         second = tone(rng, self.second_hue, (0.1, 0.5), (0.5, 0.9))
         pattern: Pattern = rng.choice(["rug", "rug", "stripes", "speckle"])
-        return Material(pattern=pattern, color=color, second=second, roughness=0.95, bump=0.5, scale=rng.uniform(0.7, 1.6))
+        return Material(
+            pattern=pattern, color=color, second=second, roughness=0.95, bump=0.5, scale=rng.uniform(0.7, 1.6)
+        )
 
     def paint(self) -> Material:
         """Lacquer on furniture."""
         rng = self._rng
         hue = rng.choice([self.accent_hue, self.second_hue, 0.1])
         color = tone(rng, hue, (0.02, 0.55), (0.25, 0.95))
-        return Material(pattern="plain", color=color, second=color, roughness=rng.uniform(0.15, 0.5), coat=rng.choice([0.0, 0.6]))
+        return Material(
+            pattern="plain", color=color, second=color, roughness=rng.uniform(0.15, 0.5), coat=rng.choice([0.0, 0.6])
+        )
 
     def metal(self) -> Material:
         """Steel, brass, blackened iron."""
         rng = self._rng
         color = rng.choice([(0.62, 0.62, 0.64), (0.75, 0.53, 0.25), (0.06, 0.06, 0.065), (0.7, 0.38, 0.25)])
-        return Material(
-            pattern="metal", color=color, second=color, roughness=rng.uniform(0.12, 0.45), metallic=1.0
-        )
+        return Material(pattern="metal", color=color, second=color, roughness=rng.uniform(0.12, 0.45), metallic=1.0)
 
     def stone(self) -> Material:
         """Counters, basins, paving."""
@@ -111,7 +121,9 @@ class Palette:
         color = tone(rng, rng.choice([0.08, 0.6]), (0.02, 0.12), (0.35, 0.9))
         vein = tone(rng, 0.08, (0.05, 0.2), (0.15, 0.6))
         pattern: Pattern = rng.choice(["marble", "speckle", "plaster"])
-        return Material(pattern=pattern, color=color, second=vein, roughness=rng.uniform(0.1, 0.6), scale=rng.uniform(0.6, 1.6))
+        return Material(
+            pattern=pattern, color=color, second=vein, roughness=rng.uniform(0.1, 0.6), scale=rng.uniform(0.6, 1.6)
+        )
 
     def ceramic(self) -> Material:
         """Glazed crockery and sanitary ware."""

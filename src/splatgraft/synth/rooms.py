@@ -8,7 +8,7 @@ from typing import Literal
 from splatgraft.synth import furniture
 from splatgraft.synth.furniture import Parts, box, placed
 from splatgraft.synth.palette import Palette
-from splatgraft.synth.scene import Lamp, Material, Part, Place, Scene, Vector, World, add, direction
+from splatgraft.synth.scene import Lamp, Material, Number, Part, Place, Scene, Vector, World, add, direction
 
 Interior = Literal["living_room", "kitchen", "office", "bathroom", "bedroom"]
 INTERIORS: tuple[Interior, ...] = ("living_room", "kitchen", "office", "bathroom", "bedroom")
@@ -18,14 +18,14 @@ INTERIORS: tuple[Interior, ...] = ("living_room", "kitchen", "office", "bathroom
 class _Shell:
     """The empty room: extent and where the window is."""
 
-    width: float
-    depth: float
-    height: float
-    window_center: float
+    width: Number
+    depth: Number
+    height: Number
+    window_center: Number
     """Along x on the far wall (+y)."""
-    window_width: float
-    sill: float
-    window_height: float
+    window_width: Number
+    sill: Number
+    window_height: Number
 
 
 class _Floor:
@@ -35,7 +35,7 @@ class _Floor:
         self._taken: list[tuple[float, float, float, float]] = []
         self._shell = shell
 
-    def take(self, x: float, y: float, width: float, depth: float, margin: float = 0.05) -> bool:
+    def take(self, x: Number, y: Number, width: Number, depth: Number, margin: Number = 0.05) -> bool:
         """Claim a rectangle; False, and nothing claimed, where it is not free or leaves the room."""
         low_x, high_x, low_y, high_y = x - width / 2, x + width / 2, y - depth / 2, y + depth / 2
         half_w, half_d = self._shell.width / 2, self._shell.depth / 2
@@ -47,9 +47,9 @@ class _Floor:
         self._taken.append((low_x, high_x, low_y, high_y))
         return True
 
-    def boxes(self, height: float) -> tuple[tuple[Vector, Vector], ...]:
-        """All claimed rectangles as boxes from the floor to `height`."""
-        return tuple(((a, c, 0.0), (b, d, height)) for a, b, c, d in self._taken)
+    def boxes(self, first: Number, others: Number) -> tuple[tuple[Vector, Vector], ...]:
+        """All claimed rectangles as boxes from the floor: the first claimed of one height, the others of another."""
+        return tuple(((a, c, 0.0), (b, d, others if i else first)) for i, (a, b, c, d) in enumerate(self._taken))
 
 
 def _walls(rng: random.Random, palette: Palette, shell: _Shell, kind: str) -> Parts:
@@ -120,7 +120,10 @@ def _against_walls(rng: random.Random, palette: Palette, kind: Interior, shell: 
         "living_room": [lambda: (furniture.sofa(rng, palette, rng.uniform(1.6, 2.3)), 2.3, 0.95)],
         "kitchen": [lambda: (furniture.counter(rng, palette, 2.2), 2.25, 0.68)],
         "office": [lambda: (furniture.shelf(rng, palette, 1.1), 1.15, 0.4)],
-        "bathroom": [lambda: (furniture.bathtub(rng, palette), 1.75, 0.8), lambda: (furniture.basin(rng, palette), 0.95, 0.55)],
+        "bathroom": [
+            lambda: (furniture.bathtub(rng, palette), 1.75, 0.8),
+            lambda: (furniture.basin(rng, palette), 0.95, 0.55),
+        ],
         "bedroom": [lambda: (furniture.bed(rng, palette), 1.6, 2.15)],
     }
     extra = [
@@ -173,7 +176,14 @@ def _daylight(rng: random.Random, shell: _Shell, notes: dict[str, str]) -> tuple
         warm = rng.uniform(0.6, 0.95)
         power = rng.uniform(6, 16)
         lamps.append(
-            Lamp("sun", (1.0, warm**0.5, warm), power, (0, 0, 5), (-towards[0], -towards[1], -towards[2]), size=rng.uniform(0.009, 0.03))
+            Lamp(
+                "sun",
+                (1.0, warm**0.5, warm),
+                power,
+                (0, 0, 5),
+                (-towards[0], -towards[1], -towards[2]),
+                size=rng.uniform(0.009, 0.03),
+            )
         )
         notes["sun_direction"] = " ".join(f"{c:.5f}" for c in towards)
         notes["sun_power"] = f"{power:.3f}"
@@ -185,7 +195,11 @@ def interior(seed: int, kind: Interior) -> Scene:
     """A furnished room; the same seed and kind give the same room."""
     rng = random.Random(f"{kind}-{seed}")
     palette = Palette(rng)
-    wide, deep = (rng.uniform(2.6, 3.2), rng.uniform(2.8, 3.4)) if kind == "bathroom" else (rng.uniform(3.8, 5.4), rng.uniform(4.0, 5.6))
+    wide, deep = (
+        (rng.uniform(2.6, 3.2), rng.uniform(2.8, 3.4))
+        if kind == "bathroom"
+        else (rng.uniform(3.8, 5.4), rng.uniform(4.0, 5.6))
+    )
     window = rng.uniform(1.1, min(2.4, wide - 1.2))
     height = rng.uniform(2.4, 2.9)
     sill = rng.uniform(0.4, 0.95)
@@ -223,13 +237,17 @@ def interior(seed: int, kind: Interior) -> Scene:
         warm = (1.0, 0.82, 0.62)
         shade = Material("plain", warm, warm, 0.6, emission=4.0)
         parts.append(Part("cylinder", (0.34, 0.34, 0.06), (spot[0], spot[1], shell.height - 0.03), shade))
-        lit.append(Lamp("area", warm, rng.uniform(45, 90), (spot[0], spot[1], shell.height - 0.08), (0, 0, -1), 0.32, 0.32))
+        lit.append(
+            Lamp("area", warm, rng.uniform(45, 90), (spot[0], spot[1], shell.height - 0.08), (0, 0, -1), 0.32, 0.32)
+        )
         notes["lamp_location"] = " ".join(f"{c:.3f}" for c in spot)
     for _ in range(rng.randint(1, 4)):
         side = rng.choice([-1, 1])
         place_y = rng.uniform(-0.35, 0.35) * shell.depth
         parts += placed(
-            furniture.picture(rng, palette), (side * (shell.width / 2 - 0.02), place_y, rng.uniform(1.45, 1.75)), -side * math.pi / 2
+            furniture.picture(rng, palette),
+            (side * (shell.width / 2 - 0.02), place_y, rng.uniform(1.45, 1.75)),
+            -side * math.pi / 2,
         )
     stand = add(place.location, offset)
     return Scene(
@@ -239,7 +257,10 @@ def interior(seed: int, kind: Interior) -> Scene:
         lamps=tuple(lit),
         world=world,
         places=(replace(place, location=stand),),
-        bounds=((-shell.width / 2 + 0.25, -shell.depth / 2 + 0.25, 0.35), (shell.width / 2 - 0.25, shell.depth / 2 - 0.25, shell.height - 0.3)),
-        obstacles=floor.boxes(min(2.0, place.location[2] + 0.75)),
+        bounds=(
+            (-shell.width / 2 + 0.25, -shell.depth / 2 + 0.25, 0.35),
+            (shell.width / 2 - 0.25, shell.depth / 2 - 0.25, shell.height - 0.3),
+        ),
+        obstacles=floor.boxes(stand[2] + 0.06, 2.0),
         notes=notes,
     )

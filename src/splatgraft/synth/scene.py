@@ -1,17 +1,16 @@
-"""The values that describe a synthetic scene in full: parts, materials, lamps, sky, cameras. Knows nothing about Blender.
+"""The values that describe a synthetic scene: parts, materials, lamps, sky, cameras. Knows nothing about Blender.
 
 Everything is plain data (numbers, strings, tuples), in metres, z up, so that a scene is a small JSON file that a
 renderer in another interpreter can read. Colours are linear RGB.
 """
-
-from __future__ import annotations
 
 import json
 import math
 from dataclasses import asdict, dataclass, field
 from typing import Literal
 
-Vector = tuple[float, float, float]
+Number = float | int
+Vector = tuple[Number, Number, Number]
 Color = tuple[float, float, float]
 
 Pattern = Literal[
@@ -43,15 +42,15 @@ class Material:
     color: Color
     second: Color = (0.5, 0.5, 0.5)
     """The pattern's other colour."""
-    roughness: float = 0.5
-    metallic: float = 0.0
-    scale: float = 1.0
+    roughness: Number = 0.5
+    metallic: Number = 0.0
+    scale: Number = 1.0
     """Pattern repeats per metre, in the pattern's own sense."""
-    bump: float = 0.0
+    bump: Number = 0.0
     """Height of the bump, 0 to 1."""
-    coat: float = 0.0
+    coat: Number = 0.0
     """Clear coat, 0 to 1."""
-    emission: float = 0.0
+    emission: Number = 0.0
     """Radiance in watts per square metre and steradian; 0 does not shine."""
 
 
@@ -69,7 +68,7 @@ class Part:
     """Euler XYZ, radians."""
     profile: tuple[tuple[float, float], ...] = ()
     """turned: (radius, height) in units of the half width and height, bottom to top; extruded: outline in [-.5, .5]."""
-    bevel: float = 0.0
+    bevel: Number = 0.0
     """Width of rounded edges, metres."""
     seed: int = 0
     """For shapes and patterns with own randomness."""
@@ -83,14 +82,14 @@ class Lamp:
 
     kind: Literal["sun", "area", "point", "spot"]
     color: Color
-    power: float
+    power: Number
     """sun: W/m^2; else W."""
     location: Vector = (0.0, 0.0, 0.0)
     direction: Vector = (0.0, 0.0, -1.0)
     """Where the light travels; not used by `point`."""
-    size: float = 0.1
+    size: Number = 0.1
     """area: side in metres; point and spot: radius in metres; sun: angular diameter in radians."""
-    height: float = 0.0
+    height: Number = 0.0
     """area: the other side where it is no square, metres."""
 
 
@@ -100,18 +99,18 @@ class World:
 
     kind: Literal["color", "sky", "environment"]
     color: Color = (0.0, 0.0, 0.0)
-    strength: float = 1.0
-    sun_elevation: float = 0.8
+    strength: Number = 1.0
+    sun_elevation: Number = 0.8
     """sky: radians above the horizon."""
-    sun_azimuth: float = 0.0
+    sun_azimuth: Number = 0.0
     """sky: radians from +x towards +y, where the sun stands."""
-    sun_size: float = 0.0095
+    sun_size: Number = 0.0095
     """sky: angular diameter, radians."""
-    haze: float = 1.0
+    haze: Number = 1.0
     """sky: amount of dust, 0 to 10."""
     path: str = ""
     """environment: an .hdr or .exr file; a bare name is one that comes with Blender."""
-    rotation: float = 0.0
+    rotation: Number = 0.0
     """environment: radians about z."""
 
 
@@ -120,9 +119,9 @@ class Place:
     """A spot on a support surface where an object may stand."""
 
     location: Vector
-    radius: float
+    radius: Number
     """Free radius, metres."""
-    height: float
+    height: Number
     """Free height, metres."""
 
 
@@ -132,7 +131,7 @@ class Camera:
 
     location: Vector
     target: Vector
-    field_of_view: float = 1.05
+    field_of_view: Number = 1.05
     """Horizontal, radians."""
 
 
@@ -158,7 +157,7 @@ class Scene:
         return json.dumps(asdict(self), indent=1)
 
 
-def rotate_z(point: Vector, angle: float) -> Vector:
+def rotate_z(point: Vector, angle: Number) -> Vector:
     """`point` turned about the z axis."""
     c, s = math.cos(angle), math.sin(angle)
     return (c * point[0] - s * point[1], s * point[0] + c * point[1], point[2])
@@ -169,7 +168,7 @@ def add(a: Vector, b: Vector) -> Vector:
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-def direction(azimuth: float, elevation: float) -> Vector:
+def direction(azimuth: Number, elevation: Number) -> Vector:
     """Unit vector towards an azimuth (from +x towards +y) and an elevation above the horizon, radians."""
     return (
         math.cos(elevation) * math.cos(azimuth),

@@ -3,7 +3,7 @@
 import math
 import random
 
-from splatgraft.synth.scene import Camera, Place, Scene, Vector
+from splatgraft.synth.scene import Camera, Number, Place, Scene, Vector
 
 ARC_LENGTH = 5
 """Views per camera arc (paper, Sec. 4.2)."""
@@ -17,7 +17,7 @@ def _free(scene: Scene, eye: Vector) -> bool:
     return not any(all(a[i] - margin < eye[i] < b[i] + margin for i in range(3)) for a, b in scene.obstacles)
 
 
-def _eye(target: Vector, azimuth: float, elevation: float, distance: float) -> Vector:
+def _eye(target: Vector, azimuth: Number, elevation: Number, distance: Number) -> Vector:
     flat = distance * math.cos(elevation)
     return (
         target[0] + flat * math.cos(azimuth),
@@ -26,7 +26,7 @@ def _eye(target: Vector, azimuth: float, elevation: float, distance: float) -> V
     )
 
 
-def arc(scene: Scene, place: Place, object_height: float, seed: int) -> tuple[Camera, ...]:
+def arc(scene: Scene, place: Place, object_height: Number, seed: int) -> tuple[Camera, ...]:
     """Five cameras on a short arc that all see the object's place (paper, Sec. 4.2).
 
     Raises: ValueError where no free arc is found.
@@ -39,13 +39,15 @@ def arc(scene: Scene, place: Place, object_height: float, seed: int) -> tuple[Ca
         sweep = rng.uniform(0.25, 0.6)
         field = rng.uniform(0.8, 1.1)
         aim = (target[0] + rng.gauss(0, 0.06), target[1] + rng.gauss(0, 0.06), target[2] + rng.gauss(0, 0.03))
-        eyes = [_eye(target, azimuth + sweep * (i / (ARC_LENGTH - 1) - 0.5), elevation, distance) for i in range(ARC_LENGTH)]
+        eyes = [
+            _eye(target, azimuth + sweep * (i / (ARC_LENGTH - 1) - 0.5), elevation, distance) for i in range(ARC_LENGTH)
+        ]
         if all(_free(scene, eye) for eye in eyes):
             return tuple(Camera(eye, aim, field) for eye in eyes)
     raise ValueError(f"scene {scene.name}: expected room for an arc of cameras around {place.location}, found none")
 
 
-def capture(scene: Scene, place: Place, object_height: float, count: int, seed: int) -> tuple[Camera, ...]:
+def capture(scene: Scene, place: Place, object_height: Number, count: int, seed: int) -> tuple[Camera, ...]:
     """`count` cameras all around the place at two to three heights, in the order of a person who walks around it.
 
     Raises: ValueError where too little of the surroundings is free.

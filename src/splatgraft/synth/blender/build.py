@@ -1,8 +1,9 @@
-"""Builds a scene of `synth.scene` (its JSON form) in Blender. Runs inside Blender; knows nothing about passes or files."""
+"""Builds a scene of `synth.scene` (its JSON form) in Blender. Runs inside Blender; knows nothing about passes."""
 
 import math
 import os
 import random
+from itertools import pairwise
 
 import bmesh
 import bpy
@@ -74,7 +75,7 @@ def _turned(part):
     def fill(built):
         points = [Vector((r * 0.5, 0, h - 0.5)) for r, h in part["profile"]]
         verts = [built.verts.new(p) for p in points]
-        edges = [built.edges.new(pair) for pair in zip(verts, verts[1:], strict=False)]
+        edges = [built.edges.new(pair) for pair in pairwise(verts)]
         bmesh.ops.spin(built, geom=verts + edges, angle=2 * math.pi, steps=56, axis=(0, 0, 1), cent=(0, 0, 0))
         bmesh.ops.remove_doubles(built, verts=built.verts, dist=1e-5)
         _scaled(built, part["size"])
@@ -97,7 +98,7 @@ def _blob(part):
     """A sphere pushed in and out by seeded noise: stones, heads, bushes."""
 
     def fill(built):
-        bmesh.ops.create_icosphere(built, subdivisions=5, radius=0.5)
+        bmesh.ops.create_icosphere(built, subdivisions=4, radius=0.5)
         offset = Vector((part["seed"] % 89, part["seed"] % 53, 0))
         for v in built.verts:
             d = v.co.normalized()
@@ -142,7 +143,9 @@ def _tuft(part):
             for step in range(6):
                 t = step / 5
                 bend = lean * (0.4 + 0.9 * t)
-                centre = Vector((0, 0, -0.5)) + length * t * (out * math.sin(bend) * 0.55 + Vector((0, 0, math.cos(bend))))
+                centre = Vector((0, 0, -0.5)) + length * t * (
+                    out * math.sin(bend) * 0.55 + Vector((0, 0, math.cos(bend)))
+                )
                 half = side * width * math.sin(math.pi * min(0.98, 0.15 + 0.85 * t))
                 pair = (built.verts.new(centre - half), built.verts.new(centre + half))
                 if previous:
@@ -215,7 +218,8 @@ def add_part(part, name):
     if part["shape"] == "cylinder":
         for polygon in thing.data.polygons:
             polygon.use_smooth = len(polygon.vertices) == 4
-    if part["shape"] in ("turned", "blob"):
+    # a crown of leaves far away needs no second level: fifty of them would take gigabytes
+    if part["shape"] in ("turned", "blob") and max(part["size"]) < 0.8:
         smooth = thing.modifiers.new("smooth", "SUBSURF")
         smooth.levels = smooth.render_levels = 1
     thing.data.materials.append(materials.make(name, part["material"]))

@@ -1,4 +1,4 @@
-"""Renders one view with its passes and writes each as a file. Runs inside Blender; knows nothing about what is shown."""
+"""Renders one view with its passes, and writes pictures. Runs inside Blender; knows nothing about what is shown."""
 
 import os
 import struct
@@ -58,7 +58,6 @@ def configure(width, height, samples, seed):
     scene.view_settings.exposure = 0.0
     layer = bpy.context.view_layer
     layer.use_pass_z = layer.use_pass_normal = layer.use_pass_diffuse_color = True
-    layer.use_pass_object_index = True
     layer.use_pass_cryptomatte_object = True
 
 

@@ -1,6 +1,6 @@
 """One render job in a process of its own: `python worker.py job.json`. Needs bpy and numpy only.
 
-A job names a scene, the object, cameras and takes; a take says whether scene and object are there, under which
+A job names a scene, objects, cameras and takes; a take says whether the scene is there, which object, under which
 world, and which passes to write. A file that exists is not rendered again, so a killed job goes on where it was.
 Knows nothing about what the takes are for.
 """
@@ -13,37 +13,38 @@ import time
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
-import bpy  # noqa: E402
-import build  # noqa: E402
-import numpy as np  # noqa: E402
-import passes  # noqa: E402
+import bpy
+import build
+import numpy as np
+import passes
 
-OBJECT_INDEX = 1
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 
 
 def _populate(job):
     build.clear()
-    scene_things, object_things = [], []
+    scene_things, objects = [], {}
     for i, part in enumerate(job["scene"]["parts"]):
         scene_things += build.add_part(part, f"part{i:03d}")
     for i, lamp in enumerate(job["scene"]["lamps"]):
         scene_things.append(build.add_lamp(lamp, f"lamp{i:02d}"))
-    for i, part in enumerate(job["object"]):
-        object_things += build.add_part(part, f"object{i:03d}")
-    for i, thing in enumerate(object_things):
-        thing.name = f"object{i:03d}"
-        thing.pass_index = OBJECT_INDEX
+    for key, parts in job["objects"].items():
+        things = [thing for part in parts for thing in build.add_part(part, key)]
+        for i, thing in enumerate(things):
+            thing.name = f"{key}_{i:03d}"
+        objects[key] = things
     cameras = [build.add_camera(camera, f"camera{i:04d}") for i, camera in enumerate(job["cameras"])]
     bpy.context.view_layer.update()
-    return scene_things, object_things, cameras
+    return scene_things, objects, cameras
 
 
-def _show(take, job, scene_things, object_things, worlds):
+def _show(take, job, things, worlds):
+    scene_things, objects = things
     for thing in scene_things:
         thing.hide_render = not take["scene"]
-    for thing in object_things:
-        thing.hide_render = not take["object"]
+    for key, members in objects.items():
+        for thing in members:
+            thing.hide_render = key != take["object"]
     key = json.dumps(take.get("world") or job["scene"]["world"], sort_keys=True)
     if key not in worlds:
         worlds[key] = build.make_world(json.loads(key))
@@ -54,7 +55,10 @@ def _show(take, job, scene_things, object_things, worlds):
 def _exposure(job, take, cameras):
     """Factor that brings the middle of the picture to a photograph's brightness, kept in the job's folder."""
     path = os.path.join(job["out"], "exposure.json")
-    known = json.load(open(path)) if os.path.exists(path) else {}
+    known = {}
+    if os.path.exists(path):
+        with open(path) as source:
+            known = json.load(source)
     group = take["exposure_group"]
     if group not in known:
         scene = bpy.context.scene
@@ -103,14 +107,13 @@ def main(path):
     with open(path) as source:
         job = json.load(source)
     os.makedirs(job["out"], exist_ok=True)
-    scene_things, object_things, cameras = _populate(job)
+    scene_things, objects, cameras = _populate(job)
     passes.configure(job["width"], job["height"], job["samples"], job.get("seed", 0))
     poses = [[list(row) for row in camera.matrix_world] for camera in cameras]
     with open(os.path.join(job["out"], "cameras.json.partial"), "w") as out:
         fields = [camera["field_of_view"] for camera in job["cameras"]]
         json.dump({"width": job["width"], "height": job["height"], "field_of_view": fields, "poses": poses}, out)
     os.replace(os.path.join(job["out"], "cameras.json.partial"), os.path.join(job["out"], "cameras.json"))
-    matte = [thing.name for thing in object_things]
     worlds = {}
     for take in job["takes"]:
         folder = os.path.join(job["out"], take["name"])
@@ -119,7 +122,8 @@ def main(path):
         todo = [i for i in chosen if not os.path.exists(os.path.join(folder, f"{i:04d}.done"))]
         if not todo:
             continue
-        _show(take, job, scene_things, object_things, worlds)
+        _show(take, job, (scene_things, objects), worlds)
+        matte = [thing.name for thing in objects.get(take["object"], [])]
         exposure = _exposure(job, take, cameras) * 2.0 ** take.get("stops", 0.0)
         for i in todo:
             begin = time.time()

@@ -1,0 +1,142 @@
+"""Render jobs: what to render, and running it in Blender processes side by side. Knows not what a job is for."""
+
+import json
+import subprocess
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from splatgraft.progress import Progress, silent
+from splatgraft.synth.scene import Camera, Part, Scene, World
+
+Pass = Literal["color", "depth", "normal", "albedo", "mask"]
+_WORKER = Path(__file__).parent / "blender" / "worker.py"
+
+
+@dataclass(frozen=True)
+class RenderSize:
+    """How large and how clean pictures are."""
+
+    width: int = 704
+    height: int = 496
+    samples: int = 128
+
+    @staticmethod
+    def small() -> "RenderSize":
+        """A quarter of the paper's pixels, 16 samples and the denoiser."""
+        return RenderSize(width=352, height=248, samples=16)
+
+
+@dataclass(frozen=True)
+class Take:
+    """One set of pictures of a job, from all its cameras or some."""
+
+    name: str
+    """Its folder's name."""
+    scene: bool
+    """Whether the scene is there; without it the background is transparent."""
+    object: str = ""
+    """Which object is there; none where empty."""
+    passes: tuple[Pass, ...] = ("color",)
+    exposure_group: str = "scene"
+    """Takes of one group share one exposure, found from the first of them."""
+    world: World | None = None
+    """Another world than the scene's."""
+    cameras: tuple[int, ...] | None = None
+    stops: float = 0.0
+    """Exposure on top of the group's, in photographic stops."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that one Blender process renders."""
+
+    scene: Scene
+    objects: dict[str, tuple[Part, ...]]
+    cameras: tuple[Camera, ...]
+    takes: tuple[Take, ...]
+    size: RenderSize
+    seed: int = 0
+    provenance: dict[str, str] = field(default_factory=dict)
+    """Seeds, kinds and licences, kept with the pictures."""
+
+    def files(self, out: Path) -> Iterator[Path]:
+        """The marks that say which pictures are done, one for each take and camera."""
+        for take in self.takes:
+            for i in range(len(self.cameras)) if take.cameras is None else take.cameras:
+                yield out / take.name / f"{i:04d}.done"
+
+    def is_done(self, out: Path) -> bool:
+        """Whether nothing is left to render."""
+        return all(path.exists() for path in self.files(out))
+
+
+def _description(job: Job, out: Path) -> str:
+    takes = [{key: value for key, value in asdict(take).items() if value is not None} for take in job.takes]
+    scene = json.loads(job.scene.to_json())
+    objects = {key: [asdict(part) for part in parts] for key, parts in job.objects.items()}
+    cameras = [asdict(camera) for camera in job.cameras]
+    found = {"out": str(out), "scene": scene, "objects": objects, "cameras": cameras, "takes": takes, "seed": job.seed}
+    return json.dumps({**found, **asdict(job.size), "provenance": job.provenance}, indent=1)
+
+
+def render_job(job: Job, out: Path, blender_python: Path) -> None:
+    """Render what `out` still lacks; safe to repeat, and to kill.
+
+    Raises: ValueError where Blender fails, with its last words and the log's place.
+    """
+    if job.is_done(out):
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    description = out / "job.json"
+    description.write_text(_description(job, out.resolve()))
+    log = out / "render.log"
+    with log.open("ab") as words:
+        code = subprocess.run(
+            [str(blender_python), str(_WORKER), str(description)], stdout=words, stderr=subprocess.STDOUT, check=False
+        ).returncode
+    if not job.is_done(out):
+        tail = log.read_text(errors="replace").strip().splitlines()
+        said = next(
+            (line for line in reversed(tail) if "Error" in line and "freed" not in line), tail[-1] if tail else ""
+        )
+        raise ValueError(f"{log}: expected Blender to render every picture, found exit code {code}: {said}")
+
+
+def check_blender(blender_python: Path) -> str:
+    """Blender's version in that interpreter.
+
+    Raises: ValueError where it has no bpy.
+    """
+    command = [str(blender_python), "-c", "import bpy; print('version', bpy.app.version_string)"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise ValueError(f"{blender_python}: expected a Python with bpy, found {error.strerror}") from error
+    found = [line for line in done.stdout.splitlines() if line.startswith("version ")]
+    if done.returncode or not found:
+        last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+        raise ValueError(
+            f"{blender_python}: expected a Python with bpy (pip install 'splatgraft[blender]' in a Python 3.11), "
+            f"found {last}"
+        )
+    return found[-1].removeprefix("version ")
+
+
+def render_all(
+    jobs: Sequence[tuple[Job, Path]], blender_python: Path, *, processes: int = 2, progress: Progress = silent
+) -> list[str]:
+    """Render many jobs with a few processes at a time; returns what went wrong, a line a job, and goes on past it."""
+    failures: list[str] = []
+    with ThreadPoolExecutor(processes) as pool:
+        running = [(out, pool.submit(render_job, job, out, blender_python)) for job, out in jobs]
+        for done, (out, future) in enumerate(running, 1):
+            error = future.exception()
+            if isinstance(error, ValueError):
+                failures.append(str(error))
+            elif error is not None:
+                raise error
+            progress(done, len(running), out.name)
+    return failures
