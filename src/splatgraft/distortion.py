@@ -71,4 +71,5 @@ class Distortion:
         )
         pixels = image.contiguous().numpy()
         # samples beyond the outermost pixel centres lie at most half a pixel out: repeat the border
-        return torch.from_numpy(cv2.remap(pixels, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        moved = cv2.remap(pixels, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return torch.from_numpy(moved).reshape(image.shape)

@@ -15,7 +15,7 @@ from torch import Tensor
 from splatgraft.whole_file import whole_file
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})
-_FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP")
+_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 _GREY_SCALES = {"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I;16N": 65535, "I": 65535, "F": 1}
 """White in Pillow's modes of more than 8 bits; I is what some versions make of 16-bit PNG."""
 
@@ -154,4 +154,5 @@ def resize(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Ten
         return image
     shrinks = width < image.shape[1] or height < image.shape[0]
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return torch.from_numpy(cv2.resize(image.contiguous().numpy(), (width, height), interpolation=method))
+    resized = cv2.resize(image.contiguous().numpy(), (width, height), interpolation=method)
+    return torch.from_numpy(resized).reshape(height, width, *image.shape[2:])  # OpenCV drops a single channel's axis
