@@ -1,40 +1,27 @@
 """The CPU renderer against the plain-torch reference, and the properties a renderer has of itself."""
 
+from dataclasses import fields, replace
+
 import pytest
 import reference
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import camera, random_scene
 
 from splatgraft import rendering
-from splatgraft.cameras import Cameras, look_at, pinhole
-from splatgraft.gaussians import Gaussians, empty
+from splatgraft.cameras import Cameras
+from splatgraft.gaussians import Gaussians, concatenate, empty, rotation_from_quaternion
 from splatgraft.rendering import RenderOptions
+from splatgraft.similarity import Similarity
 
 ALL = frozenset({"color", "depth", "normal"})
-
-
-def random_scene(n: int, degree: int, seed: int) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    return Gaussians(
-        means=normal(n, 3),
-        log_scales=normal(n, 3) * 0.6 - 2.5,
-        quaternions=normal(n, 4),
-        opacity_logits=normal(n) * 1.5 + 0.5,
-        sh=normal(n, (degree + 1) ** 2, 3) * 0.4,
-    )
-
-
-def camera(width: int = 37, height: int = 29) -> Cameras:
-    pose = look_at(torch.tensor([[0.5, 0.3, -2.2]]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
-    return pinhole(pose, 40.0, width=width, height=height)
+PICTURES = ["color", "alpha", "depth", "normal", "features"]
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("low_pass", ["classic", "antialiased"])
-def test_picture_and_gradient_match_the_reference(degree, low_pass):
+def test_pictures_and_gradients_match_the_reference(degree, low_pass):
     options = RenderOptions(low_pass=low_pass, background=(0.2, 0.5, 0.9))
     single = random_scene(60, degree, seed=degree).map(lambda t: t.requires_grad_())
     double = single.map(lambda t: t.detach().double().requires_grad_())
@@ -56,16 +43,160 @@ def test_picture_and_gradient_match_the_reference(degree, low_pass):
         expected_loss = expected_loss + (pixel_weights * theirs[decided]).sum()
     found_loss.backward()
     expected_loss.backward()
-    pairs = [(getattr(single, f), getattr(double, f)) for f in Gaussians.__dataclass_fields__]
+    pairs = [(getattr(single, field.name), getattr(double, field.name)) for field in fields(Gaussians)]
     for ours, theirs in [*pairs, (single_features, double_features)]:
         # the same arithmetic once more, with differences of like numbers: 5 digits of the largest
         assert (ours.grad - theirs.grad).abs().max() < 5e-5 * theirs.grad.abs().max()
     assert not (expected.visible & ~found.visible).any()
 
 
+def test_colour_alone_matches_the_reference():
+    # three channels have kernels of their own
+    single = random_scene(300, 1, seed=5).map(lambda t: t.requires_grad_())
+    double = single.map(lambda t: t.detach().double().requires_grad_())
+    found = rendering.render(single, camera()).color[0]
+    expected = reference.render(double, camera(), features=torch.zeros(300, 0).double()).color[0]
+    decided = ~reference.undecided(double, camera(), RenderOptions())
+    # early stop leaves out at most 1e-4 of the light, of colours up to 3
+    assert (found - expected)[decided].abs().max() < 3e-4
+    pixel_weights = torch.randn(found.shape, generator=torch.Generator().manual_seed(3)) * decided[..., None]
+    (pixel_weights * found).sum().backward()
+    (pixel_weights * expected).sum().backward()
+    for field in fields(Gaussians):
+        ours, theirs = getattr(single, field.name).grad, getattr(double, field.name).grad
+        assert (ours - theirs).abs().max() < 3e-4 * theirs.abs().max()
+
+
+def test_opaque_layers_hide_what_is_behind_them():
+    # 300 discs over the whole image: the early stop must come, and must not be seen
+    n = 300
+    generator = torch.Generator().manual_seed(1)
+    scene = Gaussians(
+        means=torch.stack([torch.zeros(n), torch.zeros(n), torch.linspace(0, 1, n)], -1),
+        log_scales=torch.full((n, 3), 1.0),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        opacity_logits=torch.zeros(n),
+        sh=torch.rand(n, 1, 3, generator=generator),
+    )
+    found = rendering.render(scene, camera()).color[0]
+    double = scene.map(to_double)
+    expected = reference.render(double, camera(), features=torch.zeros(n, 0).double()).color[0]
+    # 1e-4 of the light is left when drawing stops, of colours up to 0.8
+    assert (found - expected).abs().max() < 1e-4
+
+
+def to_double(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.double()
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_moving_scene_and_camera_together_changes_nothing(degree):
+    scene = random_scene(200, degree, seed=4)
+    axis = torch.nn.functional.normalize(torch.tensor([1.0, -2.0, 0.7, 0.4]), dim=0)
+    turned = rotation_from_quaternion(axis[None])[0]
+    moved_from_scene = Similarity(scale=1.0, rotation=turned, translation=torch.tensor([0.3, -1.2, 0.5]))
+    before = rendering.render(scene, camera(), outputs=ALL)
+    after = rendering.render(moved_from_scene.gaussians(scene), moved_from_scene.cameras(camera()), outputs=ALL)
+    # a pixel at the edge of a splat may fall on its other side, 1/255; elsewhere float32 rounding of poses
+    assert (before.color - after.color).abs().max() < 2 / 255
+    assert (before.color - after.color).abs().mean() < 2e-5
+    assert (before.depth - after.depth).abs().mean() < 2e-4
+    normal = before.normal @ turned.T
+    assert (normal - after.normal).abs().mean() < 2e-4
+
+
 def test_nothing_to_draw_gives_the_background():
-    picture = rendering.render(empty(2), camera(), outputs=ALL, options=RenderOptions(background=(0.1, 0.2, 0.3)))
+    options = RenderOptions(background=(0.1, 0.2, 0.3))
+    picture = rendering.render(empty(2), camera(), outputs=ALL, features=torch.zeros(0, 4), options=options)
     assert torch.equal(picture.color, torch.tensor([0.1, 0.2, 0.3]).expand(1, 29, 37, 3))
+    assert not any(getattr(picture, name).any() for name in ["alpha", "depth", "normal", "features", "visible"])
+
+
+def test_outputs_that_were_not_asked_for_are_none():
+    picture = rendering.render(random_scene(5, 0, seed=0), camera(), outputs=frozenset())
+    assert [name for name in PICTURES if getattr(picture, name) is not None] == ["alpha"]
+
+
+def test_behind_and_too_near_is_not_drawn():
+    scene = random_scene(50, 0, seed=6)
+    pose = camera().world_from_camera[0]
+    # within the near plane, along the optical axis
+    scene = replace(scene, means=pose[:3, 3] + pose[:3, 2] * torch.linspace(-3, 0.5, 50)[:, None])
+    picture = rendering.render(scene, camera(), options=RenderOptions(near=0.51))
     assert not picture.alpha.any()
-    assert not picture.depth.any()
-    assert not picture.normal.any()
+    assert not picture.visible.any()
+
+
+def test_views_of_a_batch_are_the_single_views():
+    scene, one = random_scene(40, 1, seed=7), camera()
+    moved = replace(one, world_from_camera=one.world_from_camera + 0.05 * torch.eye(4)[[0, 1, 2, 3]].roll(1, 1))
+    pair = Cameras(
+        world_from_camera=torch.cat([one.world_from_camera, moved.world_from_camera]),
+        intrinsics=one.intrinsics.repeat(2, 1, 1),
+        sizes=one.sizes.repeat(2, 1),
+        names=("a", "b"),
+    )
+    both = rendering.render(scene, pair, outputs=ALL)
+    for i, single in enumerate([one, moved]):
+        alone = rendering.render(scene, single, outputs=ALL)
+        assert torch.equal(both.color[i], alone.color[0])
+        assert torch.equal(both.visible[i], alone.visible[0])
+
+
+def test_a_tiny_image_and_a_wide_one():
+    scene = random_scene(40, 0, seed=8)
+    for width, height in [(1, 1), (16, 16), (65, 3)]:
+        picture = rendering.render(scene, camera(width, height), outputs=ALL)
+        assert picture.color.shape == (1, height, width, 3)
+        expected = reference.render(scene.map(to_double), camera(width, height), features=torch.zeros(40, 0).double())
+        decided = ~reference.undecided(scene.map(to_double), camera(width, height), RenderOptions())
+        # as above
+        assert ((picture.color - expected.color)[0] * decided[..., None]).abs().max() < 1e-5
+
+
+def test_the_same_input_gives_the_same_bits():
+    runs = []
+    for _ in range(2):
+        scene = random_scene(500, 2, seed=2).map(lambda t: t.requires_grad_())
+        picture = rendering.render(scene, camera(100, 80), outputs=ALL)
+        (picture.color.sin().sum() + picture.depth.sum() + picture.normal.sum()).backward()
+        runs.append([picture.color, *(getattr(scene, field.name).grad for field in fields(Gaussians))])
+    assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
+
+
+def test_cameras_of_different_sizes_are_refused():
+    one, other = camera(), camera(38, 29)
+    mixed = Cameras(
+        world_from_camera=torch.cat([one.world_from_camera, other.world_from_camera]),
+        intrinsics=torch.cat([one.intrinsics, other.intrinsics]),
+        sizes=torch.cat([one.sizes, other.sizes]),
+        names=("a", "b"),
+    )
+    with pytest.raises(ValueError, match="one image size"):
+        rendering.render(random_scene(3, 0, seed=0), mixed)
+
+
+ODD = st.sampled_from(
+    [0.0, 1e-30, -1e-30, 1.0, -1.0, 50.0, -50.0, 1e4, -1e4, 1e20, float("nan"), float("inf"), -float("inf")]
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(numbers=st.lists(ODD, min_size=22, max_size=22), low_pass=st.sampled_from(["classic", "antialiased"]))
+def test_degenerate_gaussians_do_no_harm(numbers, low_pass):
+    good = random_scene(20, 1, seed=3)
+    mean, log_scale, quaternion, opacity, sh = torch.tensor(numbers)[None].split([3, 3, 4, 1, 11], dim=1)
+    bad = Gaussians(
+        means=mean,
+        log_scales=log_scale,
+        quaternions=quaternion,
+        opacity_logits=opacity[:, 0],
+        sh=torch.nn.functional.pad(sh, (0, 1)).reshape(1, 4, 3),
+    )
+    # colours that are not numbers are not for the renderer to mend
+    bad = replace(bad, sh=bad.sh.nan_to_num(0, 0, 0).clamp(-10, 10))
+    scene = concatenate([bad, good]).map(lambda t: t.requires_grad_())
+    picture = rendering.render(scene, camera(), outputs=ALL, options=RenderOptions(low_pass=low_pass))
+    assert all(getattr(picture, name).isfinite().all() for name in ["color", "alpha", "depth", "normal"])
+    (picture.color.sum() + picture.alpha.sum() + picture.depth.sum() + picture.normal.sum()).backward()
+    assert all(getattr(scene, field.name).grad.isfinite().all() for field in fields(Gaussians))

@@ -73,6 +73,7 @@ def render(
     Raises: ValueError where camera sizes differ.
     """
     implementation = _implementation(gaussians)
+    _ = cameras.width  # refuses what cannot be stacked
     return implementation.render(gaussians, cameras, outputs=outputs, features=features, options=options)
 
 

@@ -1,0 +1,126 @@
+"""Rendering on CUDA through gsplat's `rasterization`; its only importer. Knows nothing about files or training."""
+
+from collections.abc import Callable
+from collections.abc import Set as AbstractSet
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft import spherical_harmonics
+from splatgraft.cameras import Cameras
+from splatgraft.gaussians import Gaussians
+from splatgraft.rendering.channels import pictures
+from splatgraft.rendering.interface import Output, Render, RenderOptions
+
+LOW_PASS_PX2 = 0.3
+
+
+def render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    *,
+    outputs: AbstractSet[Output],
+    features: Float[Tensor, "n f"] | None,
+    options: RenderOptions,
+) -> Render:
+    """`rendering.render` for tensors on a CUDA device.
+
+    Raises: ValueError where gsplat is not installed.
+    """
+    views = [_channels(gaussians, camera, outputs, features) for camera in cameras]
+    drawn = [_draw(gaussians, camera, values, options) for camera, values in zip(cameras, views, strict=True)]
+    image, alpha, visible = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+    return pictures(
+        image.permute(0, 3, 1, 2), alpha, visible, outputs=outputs, has_features=features is not None, options=options
+    )
+
+
+def view_operator(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> "CudaViewOperator":
+    """`rendering.view_operator` for tensors on a CUDA device.
+
+    Raises: ValueError where gsplat is not installed.
+    """
+    return CudaViewOperator(gaussians, camera, options)
+
+
+class CudaViewOperator:
+    """`ViewOperator` on CUDA: gsplat keeps no tile lists between calls, so each call draws anew."""
+
+    def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> None:
+        """Freeze geometry and opacity."""
+        self._gaussians, self._camera, self._options = gaussians.map(Tensor.detach), camera, options
+        _, alpha, visible = self._draw(gaussians.means.new_zeros(gaussians.count, 1))
+        self.alpha: Float[Tensor, "h w"] = alpha
+        self.visible: Bool[Tensor, n] = visible
+
+    def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
+        """W values, over black; differentiable in `values`."""
+        return self._draw(values)[0]
+
+    def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
+        """W^T image: the gradient of <W values, image> to `values`."""
+        with torch.enable_grad():
+            values = image.new_zeros(self._gaussians.count, image.shape[-1], requires_grad=True)
+            return torch.autograd.grad(self._draw(values)[0], values, image)[0]
+
+    def _draw(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return _draw(self._gaussians, self._camera, values, self._options)
+
+
+def _draw(
+    gaussians: Gaussians, camera: Cameras, values: Tensor, options: RenderOptions
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Blended `values (n, c)` as (h, w, c) over black, alpha (h, w) and what is visible (n,), for one camera."""
+    if gaussians.count == 0:
+        blank = values.new_zeros(camera.height, camera.width, values.shape[1])
+        return blank, blank.new_zeros(blank.shape[:2]), torch.zeros(0, dtype=torch.bool, device=values.device)
+    image, alpha, info = _rasterization()(
+        means=gaussians.means,
+        quats=gaussians.quaternions,
+        scales=gaussians.scales,
+        opacities=gaussians.opacities,
+        colors=values,
+        viewmats=camera.camera_from_world.to(gaussians.means),
+        Ks=camera.intrinsics.to(gaussians.means),
+        width=camera.width,
+        height=camera.height,
+        near_plane=options.near,
+        eps2d=LOW_PASS_PX2,
+        packed=False,
+        render_mode="RGB",
+        rasterize_mode=options.low_pass,
+    )
+    return image[0], alpha[0, ..., 0], (info["radii"][0] > 0).reshape(gaussians.count, -1).all(-1)
+
+
+def _channels(
+    gaussians: Gaussians, camera: Cameras, outputs: AbstractSet[Output], features: Tensor | None
+) -> Float[Tensor, "n c"]:
+    """What `channels.WIDTHS` lists, per Gaussian."""
+    offset = gaussians.means - camera.centers[0].to(gaussians.means)
+    parts = []
+    if "color" in outputs:
+        directions = torch.nn.functional.normalize(offset, dim=-1)
+        parts.append(spherical_harmonics.colors(gaussians.sh, directions))
+    if "depth" in outputs:
+        forward = camera.world_from_camera[0, :3, 2].to(gaussians.means)
+        parts.append((offset @ forward)[:, None])
+    if "normal" in outputs:
+        axes = gaussians.log_scales.detach().argmin(-1)
+        normal = gaussians.rotations[torch.arange(gaussians.count, device=axes.device), :, axes]
+        parts.append(torch.where((normal * offset).sum(-1, keepdim=True) > 0, -normal, normal))
+    if features is not None:
+        parts.append(features)
+    # gsplat draws at least one channel
+    return torch.cat(parts, -1) if parts else gaussians.means.new_zeros(gaussians.count, 1)
+
+
+def _rasterization() -> Callable:
+    try:
+        from gsplat import rasterization
+    except ImportError as error:
+        raise ValueError(
+            "rendering on CUDA: expected gsplat, found none; install it with: pip install 'splatgraft[cuda]'"
+        ) from error
+    return rasterization

@@ -1,0 +1,56 @@
+"""The operator of one view: linear, the same as the renderer, and its transpose truly its adjoint."""
+
+import pytest
+import torch
+from scenes import camera, random_scene
+
+from splatgraft import rendering, spherical_harmonics
+from splatgraft.gaussians import empty
+from splatgraft.rendering import RenderOptions, ViewOperator
+
+
+@pytest.mark.parametrize("channels", [1, 3, 5])
+@pytest.mark.parametrize("low_pass", ["classic", "antialiased"])
+def test_transpose_is_the_adjoint(channels, low_pass):
+    operator = rendering.view_operator(random_scene(400, 0, seed=1), camera(100, 70), RenderOptions(low_pass=low_pass))
+    generator = torch.Generator().manual_seed(2)
+    values = torch.randn(400, channels, generator=generator)
+    image = torch.randn(70, 100, channels, generator=generator)
+    left = (operator.blend(values).double() * image).sum()
+    right = (operator.blend_transpose(image).double() * values).sum()
+    # float32 sums of some 1e5 products of order one, which cancel
+    scale = operator.blend(values).norm() * image.norm()
+    assert abs(left - right) < 1e-6 * scale
+
+
+def test_blending_colours_is_rendering():
+    scene, view = random_scene(200, 2, seed=3), camera()
+    operator = rendering.view_operator(scene, view)
+    directions = torch.nn.functional.normalize(scene.means - view.centers[0], dim=-1)
+    colors = spherical_harmonics.colors(scene.sh, directions)
+    picture = rendering.render(scene, view)
+    # float32 colours of a few units, made by two routines
+    assert (operator.blend(colors) - picture.color[0]).abs().max() < 1e-5
+    assert (operator.alpha - picture.alpha[0]).abs().max() < 1e-6
+    assert torch.equal(operator.visible, picture.visible[0])
+    assert isinstance(operator, ViewOperator)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_blending_ones_gives_alpha_and_gradient_is_the_transpose(channels):
+    operator = rendering.view_operator(random_scene(200, 0, seed=4), camera())
+    values = torch.ones(200, channels, requires_grad=True)
+    image = operator.blend(values)
+    # sums of weights up to 1 in float32
+    assert (image - operator.alpha[..., None]).abs().max() < 1e-5
+    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(5))
+    image.backward(weights)
+    assert torch.equal(values.grad, operator.blend_transpose(weights))
+    assert not values.grad[~operator.visible].any()
+
+
+def test_nothing_to_see():
+    operator = rendering.view_operator(empty(), camera())
+    assert not operator.alpha.any()
+    assert not operator.blend(torch.zeros(0, 3)).any()
+    assert operator.blend_transpose(torch.ones(29, 37, 3)).shape == (0, 3)
