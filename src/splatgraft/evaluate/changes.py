@@ -33,4 +33,6 @@ def change_map(result: Float[Tensor, "h w 3"], composite: Float[Tensor, "h w 3"]
     """A picture of where light was taken away (blue) or given (orange), full colour at a factor of two; sRGB."""
     stops = luminance_ratio(result, composite).clamp_min(1e-3).log2().clamp(-1, 1)[..., None]
     tint = torch.where(stops < 0, _DARKER, _BRIGHTER)
-    return _SAME + stops.abs().sqrt() * (tint - _SAME)
+    # a fiftieth of a stop is the noise of two renders; the root keeps faint shadows visible beside strong ones
+    strength = ((stops.abs() - 0.02).clamp_min(0) / 0.98) ** 0.7
+    return _SAME + strength * (tint - _SAME)

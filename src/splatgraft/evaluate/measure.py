@@ -24,7 +24,7 @@ class ComparedView:
     name: str
     """The view's name."""
     held_out: bool
-    """Whether no step before has seen a harmonised image of this view."""
+    """Whether no step before has seen a picture of this view."""
     copy_paste: Float[Tensor, "h w 3"]
     """The composite before any light transfer, sRGB in [0, 1]."""
     result: Float[Tensor, "h w 3"]

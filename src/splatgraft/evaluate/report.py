@@ -22,7 +22,7 @@ class ReportView:
     name: str
     """The view's name."""
     held_out: bool
-    """Whether no step before has seen a harmonised image of this view."""
+    """Whether no step before has seen a picture of this view."""
     pictures: Mapping[str, Float[Tensor, "h w 3"]]
     """Label to sRGB picture, e.g. "Copy-paste", "Result"; the first two are what the slider shows first."""
 
