@@ -1,7 +1,7 @@
 """Capture: photos or a video become posed images. Knows nothing about Gaussians."""
 
-from splatgraft.capture.orientation import dominant_plane, upright
+from splatgraft.capture.orientation import upright
 from splatgraft.capture.structure_from_motion import PoseOptions, PoseReport, pose_photos
 from splatgraft.capture.video import extract_frames
 
-__all__ = ["PoseOptions", "PoseReport", "dominant_plane", "extract_frames", "pose_photos", "upright"]
+__all__ = ["PoseOptions", "PoseReport", "extract_frames", "pose_photos", "upright"]

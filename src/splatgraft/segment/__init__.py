@@ -1,1 +1,21 @@
-"""TODO"""
+"""Segment: masks of images become the Gaussians of an object. Knows nothing about files, and how scenes are made."""
+
+from splatgraft.segment.birefnet import BiRefNet, load_birefnet
+from splatgraft.segment.box import Box, default_box
+from splatgraft.segment.grabcut import GrabcutOptions, grabcut_masks, refine_masks
+from splatgraft.segment.lift import LiftOptions, lift_masks
+from splatgraft.segment.select import SelectOptions, select_object
+
+__all__ = [
+    "BiRefNet",
+    "Box",
+    "GrabcutOptions",
+    "LiftOptions",
+    "SelectOptions",
+    "default_box",
+    "grabcut_masks",
+    "lift_masks",
+    "load_birefnet",
+    "refine_masks",
+    "select_object",
+]

@@ -1,0 +1,74 @@
+"""Decides which Gaussians are the object, from a number per Gaussian. Knows nothing about masks."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from splatgraft.gaussians import Gaussians
+from splatgraft.segment.box import Box
+
+_NEIGHBOURS = 16
+
+
+@dataclass(frozen=True)
+class SelectOptions:
+    """What makes a Gaussian part of the object."""
+
+    threshold: float = 0.75
+    """Least feature (section 3.1 of the paper, after its sigmoid)."""
+    box: Box | None = None
+    """Where centres must lie, world units."""
+    keep: Literal["largest", "all"] = "largest"
+    """Whether pieces that do not touch the largest are dropped."""
+
+
+def select_object(
+    gaussians: Gaussians, feature: Float[Tensor, "n"], options: SelectOptions = SelectOptions()
+) -> Bool[Tensor, "n"]:
+    """The Gaussians at or above the threshold, inside the box, in the largest piece (by opacity).
+
+    Raises: ValueError where none is left.
+    """
+    chosen = feature >= options.threshold
+    if not chosen.any():
+        raise ValueError(
+            f"object: expected Gaussians with a feature of at least {options.threshold}, found at most "
+            f"{float(feature.max()) if len(feature) else 0:.2f}; do the masks show what the cameras see?"
+        )
+    if options.box is not None:
+        chosen = chosen & options.box.contains(gaussians.means)
+        if not chosen.any():
+            raise ValueError("object: expected some of its Gaussians inside the box, found all outside")
+    if options.keep == "all":
+        return chosen
+    kept = torch.zeros_like(chosen)
+    kept[torch.nonzero(chosen)[:, 0][largest_piece(gaussians.select(chosen))]] = True
+    return kept
+
+
+def largest_piece(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    """The connected piece with the greatest sum of opacities; two touch if their 2-sigma spheres do.
+
+    Only the 16 nearest of each are asked, which is where touching ones are.
+    """
+    n = gaussians.count
+    if n <= 1:
+        return torch.ones(n, dtype=torch.bool, device=gaussians.device)
+    means = gaussians.means.detach().double().cpu().numpy()
+    # the middle scale: a needle reaches far along one axis only
+    radii = 2 * gaussians.scales.detach().double().cpu().numpy().clip(1e-12)
+    radii = np.median(radii, axis=1)
+    distance, neighbour = cKDTree(means).query(means, k=min(_NEIGHBOURS + 1, n))
+    near = distance <= radii[:, None] + radii[neighbour]
+    rows = np.broadcast_to(np.arange(n)[:, None], near.shape)[near]
+    graph = coo_array((np.ones(len(rows), bool), (rows, neighbour[near])), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    mass = np.bincount(label, weights=gaussians.opacities.detach().double().cpu().numpy())
+    return torch.from_numpy(label == mass.argmax()).to(gaussians.device)
