@@ -62,5 +62,15 @@ def test_no_distortion_is_exact(tmp_path):
     assert (plain.image(0) - same.image(0)).abs().max() < 1e-4  # float32 maps: 1e-6 px off, contrast 1
 
 
+def test_poses_refer_to_the_stored_grid(tmp_path):
+    whole = capture(tmp_path)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    with Image.open(whole.image_paths[0]) as image:
+        before = whole.image(0)
+        image.copy().save(whole.image_paths[0], exif=exif)
+    assert torch.equal(whole.image(0), before)
+
+
 def test_every_eighth_is_held_out():
     assert torch.nonzero(held_out(20)).flatten().tolist() == [0, 8, 16]

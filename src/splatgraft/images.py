@@ -16,6 +16,9 @@ from splatgraft.whole_file import whole_file
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+_ALWAYS_ALLOWED_PIXELS = 1 << 24
+_PIXELS_PER_BYTE = 1 << 14
+"""More than any picture needs: a black 1-bit PNG has 8256. Above 179 million pixels Pillow itself refuses."""
 _GREY_SCALES = {"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I;16N": 65535, "I": 65535, "F": 1}
 """White in Pillow's modes of more than 8 bits; I is what some versions make of 16-bit PNG."""
 
@@ -127,9 +130,10 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise ValueError(f"{path}: expected an image file, found none")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            warnings.filterwarnings("ignore", category=UserWarning, module="PIL")
+            warnings.simplefilter("ignore")  # odd metadata, and sizes that the next check judges better
             with Image.open(path, formats=_FORMATS) as image:
+                if image.width * image.height > max(_ALWAYS_ALLOWED_PIXELS, _PIXELS_PER_BYTE * path.stat().st_size):
+                    raise ValueError(f"{image.width}x{image.height} px claimed by {path.stat().st_size} bytes")
                 yield image
     except Exception as error:  # Pillow's decoders raise more kinds than it documents (IndexError, struct.error, ..)
         raise ValueError(f"{path}: expected a readable image, found {type(error).__name__}: {error}") from error

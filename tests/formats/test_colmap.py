@@ -2,9 +2,9 @@
 
 import struct
 
+import format_files
 import numpy as np
 import pytest
-import scenes
 import torch
 from PIL import Image
 
@@ -12,9 +12,9 @@ from splatgraft import formats
 
 
 def with_photos(root, names=("b.png", "a.png"), **options):
-    poses = scenes.write_colmap(root / "sparse" / "0", names=names, **options)
+    poses = format_files.write_colmap(root / "sparse" / "0", names=names, **options)
     for i, name in enumerate(names):
-        scenes.write_photo(root / "images" / name, seed=i)
+        format_files.write_photo(root / "images" / name, seed=i)
     return poses
 
 
@@ -63,9 +63,9 @@ def test_camera_models(tmp_path, model, parameters, matrix, coefficients):
 
 @pytest.mark.parametrize("layout", ["sparse", ".", "colmap/sparse/0"])
 def test_layouts(tmp_path, layout):
-    scenes.write_colmap(tmp_path / layout)
+    format_files.write_colmap(tmp_path / layout)
     for name in ("a.png", "b.png"):
-        scenes.write_photo(tmp_path / "images" / name)
+        format_files.write_photo(tmp_path / "images" / name)
     assert len(formats.read_capture(tmp_path)) == 2
 
 
@@ -76,9 +76,9 @@ def test_the_models_own_folder_finds_the_images(tmp_path):
 
 def test_the_largest_model_counts(tmp_path):
     with_photos(tmp_path)
-    scenes.write_colmap(tmp_path / "sparse" / "1", names=("a.png", "b.png", "c.png"), text=True)
-    scenes.write_colmap(tmp_path / "sparse" / "2", names=("a.png",))
-    scenes.write_photo(tmp_path / "images" / "c.png")
+    format_files.write_colmap(tmp_path / "sparse" / "1", names=("a.png", "b.png", "c.png"), text=True)
+    format_files.write_colmap(tmp_path / "sparse" / "2", names=("a.png",))
+    format_files.write_photo(tmp_path / "images" / "c.png")
     assert len(formats.read_capture(tmp_path)) == 3
 
 
@@ -107,7 +107,7 @@ def test_refusals(tmp_path):
     assert "OPENCV_FISHEYE" in message
     assert "SIMPLE_RADIAL" in message
     with_photos(tmp_path / "c")
-    scenes.write_photo(tmp_path / "c/images/a.png", 20, 20)
+    format_files.write_photo(tmp_path / "c/images/a.png", 20, 20)
     assert "found 20x20" in refusal(tmp_path / "c")
     with_photos(tmp_path / "d")
     (tmp_path / "d/sparse/0/points3D.bin").unlink()
@@ -130,9 +130,9 @@ def test_counts_are_not_believed(tmp_path, stem):
 
 
 def test_downsized_images_take_their_intrinsics_along(tmp_path):
-    scenes.write_colmap(tmp_path / "sparse/0", camera=("PINHOLE", 4000, 3000, (3000.0, 3100.0, 2010.0, 1490.0)))
+    format_files.write_colmap(tmp_path / "sparse/0", camera=("PINHOLE", 4000, 3000, (3000.0, 3100.0, 2010.0, 1490.0)))
     for name in ("a.png", "b.png"):
-        scenes.write_photo(tmp_path / "images" / name, 500, 375)
+        format_files.write_photo(tmp_path / "images" / name, 500, 375)
     cameras = formats.read_capture(tmp_path).cameras
     assert cameras.sizes.tolist() == [[500, 375]] * 2
     assert cameras.intrinsics[0].tolist() == [[375, 0, 251.25], [0, 387.5, 186.25], [0, 0, 1]]

@@ -1,15 +1,15 @@
 """.splat, .spz and SuperSplat's compressed .ply: within their own steps of the truth, and equal to gsply's decoding.
 
-golden/ was written and decoded by gsply 0.4.6 (MIT), from `scenes.random_gaussians(7, 2, seed=5)`.
+golden/ was written and decoded by gsply 0.4.6 (MIT), from `format_files.random_gaussians(7, 2, seed=5)`.
 """
 
 import struct
 import zlib
 from pathlib import Path
 
+import format_files
 import numpy as np
 import pytest
-import scenes
 import torch
 
 from splatgraft import formats
@@ -47,7 +47,7 @@ def test_spz_as_gsply_decodes_it_turned_to_our_axes():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_spz_round_trip_is_within_its_steps(tmp_path, degree):
-    g = scenes.random_gaussians(300, degree)
+    g = format_files.random_gaussians(300, degree)
     formats.write_gaussians(tmp_path / "a.spz", g)
     back = formats.read_gaussians(tmp_path / "a.spz")
     extent = float(g.means.abs().max())
@@ -83,7 +83,7 @@ def test_spz_version_2(tmp_path):
 
 
 def test_splat_round_trip_is_within_its_steps(tmp_path):
-    g = scenes.random_gaussians(300, 0)
+    g = format_files.random_gaussians(300, 0)
     formats.write_gaussians(tmp_path / "a.splat", g)
     assert (tmp_path / "a.splat").stat().st_size == 300 * 32
     back = formats.read_gaussians(tmp_path / "a.splat")
@@ -99,7 +99,7 @@ def test_splat_round_trip_is_within_its_steps(tmp_path):
 
 
 def test_opaque_and_clear_stay_finite(tmp_path):
-    g = scenes.random_gaussians(2, 0)
+    g = format_files.random_gaussians(2, 0)
     g.opacity_logits[:] = torch.tensor([-200.0, 200.0])
     for suffix in (".splat", ".spz"):
         formats.write_gaussians(tmp_path / f"a{suffix}", g)
@@ -110,7 +110,7 @@ def test_opaque_and_clear_stay_finite(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".splat", ".spz"])
 def test_what_the_format_cannot_hold_is_refused(tmp_path, suffix):
-    g = scenes.random_gaussians(3, 0)
+    g = format_files.random_gaussians(3, 0)
     g.means[1, 1] = float("nan")
     path = tmp_path / f"a{suffix}"
     with pytest.raises(ValueError, match="found 1 of 3 that are not"):
@@ -126,7 +126,7 @@ def test_empty_scenes(tmp_path):
 
 
 def test_positions_beyond_24_bits_are_refused(tmp_path):
-    g = scenes.random_gaussians(3, 0)
+    g = format_files.random_gaussians(3, 0)
     g.means[0, 0] = 1e8
     with pytest.raises(ValueError, match=r"a\.spz: expected positions within 8388607"):
         formats.write_gaussians(tmp_path / "a.spz", g)

@@ -6,9 +6,9 @@ import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
+import format_files
 import numpy as np
 import pytest
-import scenes
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -101,7 +101,7 @@ def check(read: Callable[[], object], named: Path, size: int) -> None:
 @pytest.fixture(scope="module")
 def seeds(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("seeds")
-    g = scenes.random_gaussians(20, 1)
+    g = format_files.random_gaussians(20, 1)
     for suffix in (".ply", ".splat", ".spz"):
         formats.write_gaussians(folder / f"scene{suffix}", g)
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
@@ -115,7 +115,7 @@ def seeds(tmp_path_factory) -> Path:
         + np.ones((3, len(names)), ">f4").tobytes()
     )
     formats.write_points(folder / "points.ply", torch.randn(9, 3), torch.rand(9, 3))
-    scenes.write_transforms(folder / "nerf", {"w": 24, "h": 16, "k1": 0.01, "ply_file_path": "points.ply"})
+    format_files.write_transforms(folder / "nerf", {"w": 24, "h": 16, "k1": 0.01, "ply_file_path": "points.ply"})
     shutil.copy(folder / "points.ply", folder / "nerf")
     cameras = b'[{"id": 0, "img_name": "a", "width": 24, "height": 16, "position": [0, 1, 2], '
     cameras += b'"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 20.5, "fy": 21.5}]'
@@ -123,11 +123,14 @@ def seeds(tmp_path_factory) -> Path:
     for text in (False, True):
         root = folder / ("colmap_text" if text else "colmap")
         camera = ("OPENCV", 24, 16, (20.0, 21.0, 12.0, 8.0, 0.01, 0.0, 0.0, 0.0))
-        scenes.write_colmap(root / "sparse" / "0", text=text, camera=camera)
+        format_files.write_colmap(root / "sparse" / "0", text=text, camera=camera)
         for name in ("a.png", "b.png"):
-            scenes.write_photo(root / "images" / name)
+            format_files.write_photo(root / "images" / name)
+    shutil.copy(format_files.GOLDEN / "supersplat.compressed.ply", folder)
+    for i in range(2):
+        format_files.write_photo(folder / "nerf" / "masks" / f"{i:04d}.png")
     for suffix in ("png", "jpg", "webp", "tif", "bmp"):
-        scenes.write_photo(folder / "pictures" / f"photo.{suffix}")
+        format_files.write_photo(folder / "pictures" / f"photo.{suffix}")
     return folder
 
 
@@ -149,7 +152,9 @@ fuzzed = settings(
 )
 
 
-@pytest.mark.parametrize("name", ["scene.ply", "scene.splat", "scene.spz", "ascii.ply", "faces.ply"])
+@pytest.mark.parametrize(
+    "name", ["scene.ply", "scene.splat", "scene.spz", "ascii.ply", "faces.ply", "supersplat.compressed.ply"]
+)
 @given(damage=anything)
 @fuzzed
 def test_scenes(seeds, name, damage):
@@ -163,11 +168,18 @@ def test_points(seeds, name, damage):
     fuzz(seeds, name, formats.read_points, damage)
 
 
-@pytest.mark.parametrize("name", ["nerf/transforms.json", "nerf/points.ply", "nerf/images/0001.png"])
+@pytest.mark.parametrize(
+    "name", ["nerf/transforms.json", "nerf/points.ply", "nerf/images/0001.png", "nerf/masks/0001.png"]
+)
 @given(damage=anything)
 @fuzzed
 def test_transforms(seeds, name, damage):
-    fuzz(seeds, name, lambda path: formats.read_capture(seeds / "nerf"), damage)
+    def read(path: Path) -> None:
+        capture = formats.read_capture(seeds / "nerf")
+        for i in range(len(capture)):
+            capture.image(i), capture.mask(i)
+
+    fuzz(seeds, name, read, damage)
 
 
 @pytest.mark.parametrize("name", ["nerf/transforms.json", "cameras.json"])

@@ -1,8 +1,8 @@
 """3DGS .ply: bit for bit round trips, the layouts that other programs write, and refusals in one line."""
 
+import format_files
 import numpy as np
 import pytest
-import scenes
 import torch
 
 from splatgraft import formats
@@ -46,24 +46,24 @@ def write(path, columns, *, kind="binary_little_endian", before="", before_data=
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("n", [0, 1, 5000])  # 5000 is more than one chunk of the reader
 def test_round_trip_is_bit_for_bit(tmp_path, n, degree):
-    g = scenes.random_gaussians(n, degree) if n else empty(degree)
+    g = format_files.random_gaussians(n, degree) if n else empty(degree)
     formats.write_gaussians(tmp_path / "a.ply", g)
     back = formats.read_gaussians(tmp_path / "a.ply")
-    assert scenes.equal(back, g)
+    assert format_files.equal(back, g)
     formats.write_gaussians(tmp_path / "b.ply", back)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_values_that_are_not_finite_survive(tmp_path):
-    g = scenes.random_gaussians(8, 1)
+    g = format_files.random_gaussians(8, 1)
     g.means[0, 0], g.opacity_logits[1], g.sh[2, 1, 1] = float("nan"), float("inf"), -float("inf")
     g.log_scales[3] = torch.tensor([-0.0, 1e-42, -3e38])  # signed zero, a denormal, the edge of the range
     formats.write_gaussians(tmp_path / "a.ply", g)
-    assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+    assert format_files.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
 
 
 def test_written_file_has_the_original_codes_layout(tmp_path):
-    g = scenes.random_gaussians(3, 3)
+    g = format_files.random_gaussians(3, 3)
     formats.write_gaussians(tmp_path / "a.ply", g)
     header, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(45))]
@@ -78,24 +78,24 @@ def test_written_file_has_the_original_codes_layout(tmp_path):
 @pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
 @pytest.mark.parametrize("degree", [0, 3])
 def test_any_order_extra_properties_and_no_normals(tmp_path, kind, degree):
-    g = scenes.random_gaussians(20, degree)
+    g = format_files.random_gaussians(20, degree)
     columns = columns_of(g)
     names = list(columns)
     np.random.default_rng(0).shuffle(names)
     mixed = {name: columns[name] for name in names}
     mixed = {"label": np.arange(20, dtype="i4"), "red": np.zeros(20, "u1"), **mixed, "f_extra": columns["x"]}
     write(tmp_path / "a.ply", mixed, kind=kind)
-    assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+    assert format_files.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
 
 
 def test_wider_types_become_float32(tmp_path):
-    g = scenes.random_gaussians(20, 1)
+    g = format_files.random_gaussians(20, 1)
     write(tmp_path / "a.ply", {name: column.astype("f8") for name, column in columns_of(g).items()})
-    assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+    assert format_files.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
 
 
 def test_other_elements_are_skipped(tmp_path):
-    g = scenes.random_gaussians(20, 1)
+    g = format_files.random_gaussians(20, 1)
     for kind, order in (("binary_little_endian", "<"), ("binary_big_endian", ">")):
         faces = np.array(3, "u1").tobytes() + np.array([0, 1, 2], order + "i4").tobytes()
         write(
@@ -107,15 +107,15 @@ def test_other_elements_are_skipped(tmp_path):
             after="element extra 1\nproperty short a\n",
             after_data=b"\0\0",
         )
-        assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+        assert format_files.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
 
 
 def test_windows_line_ends_in_the_header(tmp_path):
-    g = scenes.random_gaussians(5, 0)
+    g = format_files.random_gaussians(5, 0)
     formats.write_gaussians(tmp_path / "a.ply", g)
     header, data = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     (tmp_path / "a.ply").write_bytes(header.replace(b"\n", b"\r\n") + b"end_header\r\n" + data)
-    assert scenes.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+    assert format_files.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
 
 
 def refusal(path):
@@ -134,7 +134,7 @@ def test_point_cloud_is_told_apart(tmp_path):
 
 @pytest.mark.parametrize("missing", ["opacity", "scale_1", "rot_3", "f_dc_0", "y"])
 def test_missing_property_is_named(tmp_path, missing):
-    columns = columns_of(scenes.random_gaussians(3, 0))
+    columns = columns_of(format_files.random_gaussians(3, 0))
     del columns[missing]
     write(tmp_path / "a.ply", columns)
     assert missing in refusal(tmp_path / "a.ply")
@@ -142,14 +142,14 @@ def test_missing_property_is_named(tmp_path, missing):
 
 @pytest.mark.parametrize("rest", [[0], [0, 1, 2], list(range(44)), [*range(8), 10], list(range(72))])
 def test_incomplete_bands_are_refused(tmp_path, rest):
-    columns = columns_of(scenes.random_gaussians(3, 0)) | {f"f_rest_{i}": np.zeros(3, "f4") for i in rest}
+    columns = columns_of(format_files.random_gaussians(3, 0)) | {f"f_rest_{i}": np.zeros(3, "f4") for i in rest}
     write(tmp_path / "a.ply", columns)
     assert "f_rest" in refusal(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("change", [-1, -1000, 4])
 def test_length_must_be_what_the_header_says(tmp_path, change):
-    formats.write_gaussians(tmp_path / "a.ply", scenes.random_gaussians(30, 2))
+    formats.write_gaussians(tmp_path / "a.ply", format_files.random_gaussians(30, 2))
     data = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(data[:change] if change < 0 else data + bytes(change))
     assert "bytes" in refusal(tmp_path / "a.ply")
@@ -175,7 +175,7 @@ def test_other_files(tmp_path, name, data):
 
 def test_failed_write_keeps_the_earlier_file(tmp_path, monkeypatch):
     path = tmp_path / "a.ply"
-    formats.write_gaussians(path, scenes.random_gaussians(3, 0, seed=1))
+    formats.write_gaussians(path, format_files.random_gaussians(3, 0, seed=1))
     before = path.read_bytes()
 
     def fail(*arguments):
@@ -183,7 +183,7 @@ def test_failed_write_keeps_the_earlier_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(torch, "cat", fail)
     with pytest.raises(OSError, match="disk full"):
-        formats.write_gaussians(path, scenes.random_gaussians(3, 0, seed=2))
+        formats.write_gaussians(path, format_files.random_gaussians(3, 0, seed=2))
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
 

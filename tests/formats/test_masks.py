@@ -1,8 +1,8 @@
 """Which mask belongs to which photograph."""
 
+import format_files
 import numpy as np
 import pytest
-import scenes
 import torch
 from PIL import Image
 
@@ -11,24 +11,24 @@ from splatgraft import formats
 
 @pytest.mark.parametrize("names", [("0000.png", "0001.png"), ("0000.png.png", "0001.jpg"), ("0000.png", None)])
 def test_masks_by_stem(tmp_path, names):
-    scenes.write_transforms(tmp_path, {})
+    format_files.write_transforms(tmp_path, {})
     for name in filter(None, names):
-        scenes.write_photo(tmp_path / "masks" / name)
+        format_files.write_photo(tmp_path / "masks" / name)
     found = formats.read_capture(tmp_path).mask_paths
     assert tuple(path.name if path else None for path in found) == names
 
 
 def test_masks_in_folders(tmp_path):
-    scenes.write_colmap(tmp_path / "sparse", names=("left/0.jpg", "right/0.jpg"))
+    format_files.write_colmap(tmp_path / "sparse", names=("left/0.jpg", "right/0.jpg"))
     for side in ("left", "right"):
-        scenes.write_photo(tmp_path / "images" / side / "0.jpg")
-        scenes.write_photo(tmp_path / "masks" / side / "0.png")
+        format_files.write_photo(tmp_path / "images" / side / "0.jpg")
+        format_files.write_photo(tmp_path / "masks" / side / "0.png")
     found = formats.read_capture(tmp_path).mask_paths
     assert [path.parent.name for path in found] == ["left", "right"]
 
 
 def test_no_masks(tmp_path):
-    scenes.write_transforms(tmp_path, {})
+    format_files.write_transforms(tmp_path, {})
     capture = formats.read_capture(tmp_path)
     assert capture.mask_paths == ()
     assert capture.mask(0) is None
@@ -36,17 +36,17 @@ def test_no_masks(tmp_path):
 
 @pytest.mark.parametrize("names", [("other.png",), ("0000.png", "0000.jpg"), ()])
 def test_refusals(tmp_path, names):
-    scenes.write_transforms(tmp_path, {})
+    format_files.write_transforms(tmp_path, {})
     (tmp_path / "masks").mkdir()
     for name in names:
-        scenes.write_photo(tmp_path / "masks" / name)
+        format_files.write_photo(tmp_path / "masks" / name)
     with pytest.raises(ValueError, match=r"masks: expected .*found"):
         formats.read_capture(tmp_path)
 
 
 def test_mask_of_another_shape_is_refused(tmp_path):
-    scenes.write_transforms(tmp_path, {})
-    scenes.write_photo(tmp_path / "masks" / "0000.png", 16, 24)
+    format_files.write_transforms(tmp_path, {})
+    format_files.write_photo(tmp_path / "masks" / "0000.png", 16, 24)
     with pytest.raises(ValueError, match=r"masks/0000\.png: expected 24x16 px.*found 16x24"):
         formats.read_capture(tmp_path)
 
@@ -54,7 +54,7 @@ def test_mask_of_another_shape_is_refused(tmp_path):
 def test_mask_that_varies_in_alpha_only(tmp_path):
     rgba = np.zeros((16, 24, 4), np.uint8)
     rgba[:8, :, 3] = 255
-    scenes.write_transforms(tmp_path, {})
+    format_files.write_transforms(tmp_path, {})
     (tmp_path / "masks").mkdir()
     Image.fromarray(rgba).save(tmp_path / "masks" / "0000.png")
     mask = formats.read_capture(tmp_path).mask(0)
@@ -63,7 +63,7 @@ def test_mask_that_varies_in_alpha_only(tmp_path):
 
 
 def test_photographs_alpha_is_the_mask_and_black_what_it_hides(tmp_path):
-    scenes.write_transforms(tmp_path, {})
+    format_files.write_transforms(tmp_path, {})
     rgba = np.random.default_rng(0).integers(0, 256, (16, 24, 4), dtype=np.uint8)
     opaque = rgba.copy()
     opaque[..., 3] = 255
@@ -81,7 +81,7 @@ def test_photographs_alpha_is_the_mask_and_black_what_it_hides(tmp_path):
 
 
 def test_alpha_that_is_full_everywhere_is_no_mask(tmp_path):
-    scenes.write_transforms(tmp_path, {})
+    format_files.write_transforms(tmp_path, {})
     for i in range(2):
         Image.fromarray(np.full((16, 24, 4), 255, np.uint8)).save(tmp_path / "images" / f"{i:04d}.png")
     assert formats.read_capture(tmp_path).mask_paths == ()

@@ -1,8 +1,8 @@
 """Point clouds: round trip, colour types, refusals."""
 
+import format_files
 import numpy as np
 import pytest
-import scenes
 import torch
 
 from splatgraft import formats
@@ -38,7 +38,7 @@ def test_original_codes_input_with_normals(tmp_path):
 def test_without_colour_is_grey_and_gaussians_give_their_mean_colour(tmp_path):
     write(tmp_path / "a.ply", np.zeros((4, 3), "<f4"), XYZ)
     assert formats.read_points(tmp_path / "a.ply")[1].unique().tolist() == [0.5]
-    g = scenes.random_gaussians(9, 2)
+    g = format_files.random_gaussians(9, 2)
     formats.write_gaussians(tmp_path / "g.ply", g)
     points, colors = formats.read_points(tmp_path / "g.ply")
     assert torch.equal(points, g.means)

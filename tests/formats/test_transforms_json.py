@@ -3,9 +3,9 @@
 import json
 import math
 
+import format_files
 import numpy as np
 import pytest
-import scenes
 import torch
 
 from splatgraft import formats
@@ -16,7 +16,7 @@ def test_opengl_axes_become_opencv_axes(tmp_path):
     # an OpenGL camera at (1, 2, 3) without rotation looks along -z with y up
     pose = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     frames = [{"file_path": "a.png", "transform_matrix": pose}]
-    path = scenes.write_transforms(tmp_path, {"w": 24, "h": 16, "frames": frames})
+    path = format_files.write_transforms(tmp_path, {"w": 24, "h": 16, "frames": frames})
     cameras = formats.read_cameras(path)
     assert cameras.centers.tolist() == [[1, 2, 3]]
     ahead, above = torch.tensor([1.0, 2, 2, 1]), torch.tensor([1.0, 3, 2, 1])
@@ -25,7 +25,7 @@ def test_opengl_axes_become_opencv_axes(tmp_path):
 
 
 def test_blender_keys_and_missing_suffixes(tmp_path):
-    path = scenes.write_transforms(tmp_path, {}, size=(40, 30))
+    path = format_files.write_transforms(tmp_path, {}, size=(40, 30))
     meta = json.loads(path.read_text())
     del meta["fl_x"]
     meta["camera_angle_x"] = 0.8
@@ -42,7 +42,7 @@ def test_blender_keys_and_missing_suffixes(tmp_path):
 
 
 def test_nerfstudio_keys_for_each_frame(tmp_path):
-    path = scenes.write_transforms(tmp_path, {"w": 24, "h": 16, "applied_transform": [[1, 0, 0, 9]], "k1": 0.0})
+    path = format_files.write_transforms(tmp_path, {"w": 24, "h": 16, "applied_transform": [[1, 0, 0, 9]], "k1": 0.0})
     meta = json.loads(path.read_text())
     meta["frames"][1] |= {"fl_x": 30, "fl_y": 31, "cx": 11, "cy": 9, "k1": 0.1, "p2": 0.01}
     path.write_text(json.dumps(meta))
@@ -73,9 +73,9 @@ def test_cameras_round_trip_bit_for_bit(tmp_path):
 @pytest.mark.parametrize("factor", [1.0, 0.5])
 def test_capture_round_trip(tmp_path, content, factor):
     formats.write_points(tmp_path / "cloud.ply", torch.randn(7, 3), torch.randint(0, 256, (7, 3)) / 255)
-    scenes.write_transforms(tmp_path, {**content, "ply_file_path": "cloud.ply"})
+    format_files.write_transforms(tmp_path, {**content, "ply_file_path": "cloud.ply"})
     for i in range(2):
-        scenes.write_photo(tmp_path / "masks" / f"{i:04d}.png", seed=9 + i)
+        format_files.write_photo(tmp_path / "masks" / f"{i:04d}.png", seed=9 + i)
     capture = formats.read_capture(tmp_path).resized(factor)
     (tmp_path / "deeper" / "copy").mkdir(parents=True)
     formats.write_capture(tmp_path / "deeper" / "copy", capture)
@@ -92,18 +92,18 @@ def test_capture_round_trip(tmp_path, content, factor):
 
 
 def test_nearly_rigid_poses_are_made_rigid(tmp_path):
-    rotation = np.round(scenes.rotation_and_quaternion(3)[0], 4)
+    rotation = np.round(format_files.rotation_and_quaternion(3)[0], 4)
     pose = np.eye(4)
     pose[:3, :3] = rotation
     frames = [{"file_path": "a.png", "transform_matrix": pose.tolist()}]
-    cameras = formats.read_cameras(scenes.write_transforms(tmp_path, {"w": 24, "h": 16, "frames": frames}))
+    cameras = formats.read_cameras(format_files.write_transforms(tmp_path, {"w": 24, "h": 16, "frames": frames}))
     found = cameras.world_from_camera[0, :3, :3].double()
     assert (found.T @ found - torch.eye(3)).abs().max() < 1e-6  # float32
     assert np.abs(found.numpy() @ np.diag([1, -1, -1]) - rotation).max() < 1e-4  # what the rounding took
 
 
 def test_cameras_json_of_the_original_code(tmp_path):
-    rotation, _ = scenes.rotation_and_quaternion(1)
+    rotation, _ = format_files.rotation_and_quaternion(1)
     entry = {"id": 0, "img_name": "a.jpg", "width": 24, "height": 16, "position": [1, 2, 3], "fx": 30.0, "fy": 31.0}
     (tmp_path / "cameras.json").write_text(json.dumps([{**entry, "rotation": rotation.tolist()}]))
     cameras = formats.read_cameras(tmp_path / "cameras.json")
@@ -144,7 +144,7 @@ MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
     ],
 )
 def test_refusals(tmp_path, frame, content, told):
-    path = scenes.write_transforms(tmp_path, content)
+    path = format_files.write_transforms(tmp_path, content)
     meta = json.loads(path.read_text())
     if meta["frames"] and isinstance(meta["frames"], list):
         meta["frames"][0] |= frame

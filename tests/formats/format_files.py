@@ -10,6 +10,8 @@ from PIL import Image
 
 from splatgraft.gaussians import Gaussians
 
+GOLDEN = Path(__file__).parent / "golden"
+
 
 def random_gaussians(n: int = 40, degree: int = 3, seed: int = 0) -> Gaussians:
     g = torch.Generator().manual_seed(seed)
