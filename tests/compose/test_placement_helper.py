@@ -10,8 +10,6 @@ from splatgraft.compose import (
     PlaceOptions,
     RestOptions,
     compose,
-    estimate_up,
-    focus_point,
     hidden_fraction,
     object_base,
     place_object,
@@ -19,6 +17,7 @@ from splatgraft.compose import (
     support_below,
 )
 from splatgraft.gaussians import Gaussians, concatenate, empty, quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.orbit import estimate_up, focus_point
 from splatgraft.similarity import Similarity
 
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -124,7 +123,7 @@ def test_outward_looking_cameras_are_refused():
     poses = inward.world_from_camera.clone()
     poses[:, :3, 0] *= -1
     poses[:, :3, 2] *= -1
-    with pytest.raises(ValueError, match="name the point"):
+    with pytest.raises(ValueError, match="name the place"):
         focus_point(pinhole(poses, 150.0, width=160, height=120))
 
 

@@ -3,7 +3,6 @@
 from splatgraft.compose.assemble import compose
 from splatgraft.compose.base import ObjectBase, object_base
 from splatgraft.compose.checks import hidden_fraction
-from splatgraft.compose.orientation import estimate_up, focus_point
 from splatgraft.compose.place import Placed, PlaceOptions, place_object
 from splatgraft.compose.rest import RestOptions, rest_on_surface
 from splatgraft.compose.suggest import Suggestion, suggest_place
@@ -20,8 +19,6 @@ __all__ = [
     "Suggestion",
     "Support",
     "compose",
-    "estimate_up",
-    "focus_point",
     "hidden_fraction",
     "object_base",
     "place_object",

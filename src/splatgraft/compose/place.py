@@ -7,11 +7,11 @@ import torch
 from splatgraft.cameras import Cameras
 from splatgraft.compose.base import ObjectBase, object_base
 from splatgraft.compose.checks import hidden_fraction
-from splatgraft.compose.orientation import estimate_up
 from splatgraft.compose.rest import RestOptions, rest_on_surface
 from splatgraft.compose.suggest import size_in_view, suggest_place
 from splatgraft.compose.support import Support
 from splatgraft.gaussians import Gaussians
+from splatgraft.orbit import estimate_up
 from splatgraft.similarity import Similarity
 
 

@@ -10,8 +10,8 @@ from splatgraft.cameras import Cameras
 from splatgraft.compose.base import ObjectBase
 from splatgraft.compose.checks import project, spread_cameras, visible_points
 from splatgraft.compose.height_map import HeightMap, height_map
-from splatgraft.compose.orientation import focus_point
 from splatgraft.gaussians import Gaussians
+from splatgraft.orbit import focus_point
 
 _VIEWS = 12
 _IMAGE_SHARE = 0.3
