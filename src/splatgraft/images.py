@@ -84,7 +84,7 @@ def read_alpha(path: Path) -> Float[Tensor, "h w"]:
     image = _open(path)
     if not image.has_transparency_data:
         return torch.ones(image.height, image.width)
-    return torch.from_numpy(np.array(image.convert("RGBA").getchannel("A"))).float() / 255
+    return torch.from_numpy(np.array(image.convert("RGBA").getchannel("A"))).float().div_(255)
 
 
 def read_mask(path: Path) -> Float[Tensor, "h w"]:
@@ -96,18 +96,18 @@ def read_mask(path: Path) -> Float[Tensor, "h w"]:
     if image.has_transparency_data:
         alpha = np.array(image.convert("RGBA").getchannel("A"))
         if alpha.min() < alpha.max():
-            return torch.from_numpy(alpha).float() / 255
+            return torch.from_numpy(alpha).float().div_(255)
     if image.mode in _GREY_SCALES:
         return _grey(image)
-    return torch.from_numpy(np.array(image.convert("RGB").convert("L"))).float() / 255
+    return torch.from_numpy(np.array(image.convert("RGB").convert("L"))).float().div_(255)
 
 
 def _rgb(image: Image.Image) -> Float[Tensor, "h w 3"]:
     if image.mode in _GREY_SCALES:
         return _grey(image)[..., None].expand(-1, -1, 3).contiguous()
     if not image.has_transparency_data:
-        return torch.from_numpy(np.array(image.convert("RGB"))).float() / 255
-    values = torch.from_numpy(np.array(image.convert("RGBA"))).float() / 255
+        return torch.from_numpy(np.array(image.convert("RGB"))).float().div_(255)
+    values = torch.from_numpy(np.array(image.convert("RGBA"))).float().div_(255)
     return values[..., :3] * values[..., 3:]
 
 

@@ -75,7 +75,7 @@ def write_colmap(
         seen = [(1.5, 2.5, -1)] if i % 2 else []
         record = struct.pack("<I7dI", i + 1, *numbers, 7) + name.encode() + b"\0" + struct.pack("<Q", len(seen))
         records.append(record + b"".join(struct.pack("<ddq", *observation) for observation in seen))
-    cloud = [(i + 1, (0.5 * i, 1.0, -2.0), (10 * i, 20, 255)) for i in range(points)]
+    cloud = [(i + 1, (0.5 * i, 1.0, -2.0), (10 * i % 256, 20, 255)) for i in range(points)]
     if text:
         head = "# comment\n"
         numbers = " ".join(map(repr, parameters))

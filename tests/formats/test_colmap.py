@@ -84,7 +84,11 @@ def test_the_largest_model_counts(tmp_path):
 
 def test_images_in_folders_keep_apart(tmp_path):
     with_photos(tmp_path, names=("left/0.png", "right/0.png"))
-    assert formats.read_capture(tmp_path).cameras.names == ("left/0.png", "right/0.png")
+    capture = formats.read_capture(tmp_path)
+    assert capture.cameras.names == ("left_0.png", "right_0.png")
+    (tmp_path / "copy").mkdir()
+    formats.write_capture(tmp_path / "copy", capture)
+    assert formats.read_capture(tmp_path / "copy").cameras.names == capture.cameras.names
 
 
 def refusal(path):

@@ -113,6 +113,27 @@ def test_cameras_json_of_the_original_code(tmp_path):
     assert cameras.names == ("a.jpg",)
 
 
+def test_links_keep_their_names(tmp_path):
+    scenes_folder = tmp_path / "capture"
+    format_files.write_transforms(scenes_folder, {})
+    (scenes_folder / "images" / "0000.png").rename(tmp_path / "stored.png")
+    (scenes_folder / "images" / "0000.png").symlink_to(tmp_path / "stored.png")
+    (tmp_path / "copy").mkdir()
+    formats.write_capture(tmp_path / "copy", formats.read_capture(scenes_folder))
+    assert formats.read_capture(tmp_path / "copy").cameras.names == ("0000.png", "0001.png")
+
+
+def test_names_cannot_lead_out_of_a_folder(tmp_path):
+    path = format_files.write_transforms(tmp_path, {"w": 24, "h": 16})
+    path.write_text(path.read_text().replace("images/0000.png", "../../a/..").replace("images/0001.png", "/etc/none"))
+    assert formats.read_cameras(path).names == ("a", "none")
+
+
+def test_no_cameras_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match=r"y\.json: expected at least one camera"):
+        formats.write_cameras(tmp_path / "y.json", some_cameras()[[]])
+
+
 SCALED = (np.eye(4) * np.array([2, 2, 2, 1])).tolist()
 MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
 

@@ -112,12 +112,11 @@ def _distortion(view: View, source: Path) -> Distortion | None:
 
 
 def _unique_names(views: Sequence[View], source: Path) -> tuple[str, ...]:
-    """File names, or whole paths where two folders share a file name."""
-    short = tuple(Path(v.image_path or v.name).name for v in views)
-    if len(set(short)) == len(short):
-        return short
-    whole = tuple(v.name for v in views)
-    if len(set(whole)) < len(whole):
-        twice = next(name for name in whole if whole.count(name) > 1)
-        raise ValueError(f"{source}: expected each image once, found {twice} twice")
-    return whole
+    """File names; where folders share one, with as many folders in front as it takes. Each could name a file itself."""
+    parts = [[p for p in Path(v.image_path or v.name).parts if p not in ("..", ".", "/")] for v in views]
+    for depth in range(1, 1 + max(map(len, parts), default=0)):
+        names = tuple("_".join(part[-depth:]) for part in parts)
+        if len(set(names)) == len(names):
+            return names
+    twice = next((view.name for i, view in enumerate(views) if parts[i] in parts[:i]), views[0].name)
+    raise ValueError(f"{source}: expected each image once, found {twice} twice")

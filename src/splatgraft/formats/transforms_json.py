@@ -151,7 +151,8 @@ def write_capture(folder: Path, posed_images: PosedImages) -> None:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+    """A link keeps its own name: only the folders are resolved."""
+    return (Path(os.path.relpath(path.parent.resolve(), folder.resolve())) / path.name).as_posix()
 
 
 def _frame(cameras: Cameras, index: int, distortion: Distortion | None) -> dict[str, Any]:
@@ -173,6 +174,8 @@ def _frame(cameras: Cameras, index: int, distortion: Distortion | None) -> dict[
 
 def _dump(path: Path, shared: dict[str, Any], frames: list[dict[str, Any]]) -> None:
     """Keys on which all frames agree are written once, as nerfstudio does."""
+    if not frames:
+        raise ValueError(f"{path}: expected at least one camera to write, found none")
     same = [k for k in ("w", "h", "fl_x", "fl_y", "cx", "cy", *_COEFFICIENTS) if k in frames[0]]
     if all(frame.get(k) == frames[0].get(k) for frame in frames for k in (*same, *_COEFFICIENTS)):
         shared = {**shared, **{k: frames[0][k] for k in same}}
