@@ -1,0 +1,142 @@
+"""Adam that moves only the Gaussians a view sees, fused for the CPU. Knows nothing about images or fields' meaning.
+
+Sparse updates follow Taming 3DGS (Mallick et al. 2024, Sec. 4.4). Each Gaussian counts its own steps, so that the bias
+correction (Kingma & Ba 2015, Alg. 1) is right for those seen seldom and for those born late.
+"""
+
+from dataclasses import dataclass, replace
+from typing import no_type_check
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Running means of the gradients and of their squares, by field; each shaped as its field."""
+
+    first: dict[str, Tensor]
+    """Mean gradient."""
+    second: dict[str, Tensor]
+    """Mean squared gradient."""
+    steps: Int[Tensor, "n"]
+    """Steps that each Gaussian has taken, int32."""
+
+    def select(self, which: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "Moments":
+        """The moments of the chosen Gaussians."""
+        return Moments(
+            {k: v[which] for k, v in self.first.items()},
+            {k: v[which] for k, v in self.second.items()},
+            self.steps[which],
+        )
+
+    def forget(self, which: Int[Tensor, "m"]) -> "Moments":
+        """Copies in which the chosen Gaussians start anew."""
+        out = Moments(
+            {k: v.clone() for k, v in self.first.items()},
+            {k: v.clone() for k, v in self.second.items()},
+            self.steps.clone(),
+        )
+        for tensor in (*out.first.values(), *out.second.values(), out.steps):
+            tensor[which] = 0
+        return out
+
+    def padded(self, field: str, columns: int) -> "Moments":
+        """The second axis of one field's moments grown to `columns` with zeros."""
+
+        def grow(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+            old = tensors[field]
+            new = old.new_zeros(old.shape[0], columns, *old.shape[2:])
+            new[:, : old.shape[1]] = old
+            return tensors | {field: new}
+
+        return replace(self, first=grow(self.first), second=grow(self.second))
+
+
+def no_moments(tensors: dict[str, Tensor], count: int) -> Moments:
+    """Moments of tensors that have not moved yet, for `count` Gaussians."""
+    device = next(iter(tensors.values())).device
+    return Moments(
+        {k: torch.zeros_like(v) for k, v in tensors.items()},
+        {k: torch.zeros_like(v) for k, v in tensors.items()},
+        torch.zeros(count, dtype=torch.int32, device=device),
+    )
+
+
+def step(
+    values: dict[str, Tensor],
+    gradients: dict[str, Tensor],
+    *,
+    moments: Moments,
+    rates: dict[str, Float[Tensor, "c"]],
+    visible: Bool[Tensor, "n"],
+) -> bool:
+    """Move `values` and `moments` in place where `visible`; False where a gradient was not finite (that row stays)."""
+    moments.steps[visible] += 1
+    update = _step_numba if visible.device.type == "cpu" else _step_torch
+    n = len(visible)
+    finite = True
+    for name, value in values.items():
+        rows = tuple(t.reshape(n, -1) for t in (value, gradients[name], moments.first[name], moments.second[name]))
+        finite &= update(rows, moments.steps, rates[name], visible)
+    return finite
+
+
+_Rows = tuple[Float[Tensor, "n c"], Float[Tensor, "n c"], Float[Tensor, "n c"], Float[Tensor, "n c"]]
+"""Value, gradient, first and second moment."""
+
+
+def _step_numba(rows: _Rows, steps: Int[Tensor, "n"], rates: Float[Tensor, "c"], visible: Bool[Tensor, "n"]) -> bool:
+    arrays = tuple(t.contiguous().numpy() for t in rows)
+    return bool(_update_rows(arrays, steps.numpy(), rates.numpy(), visible.numpy()) == 0)
+
+
+# divisions follow numpy, since a check for zero would be a branch in the loop; no denominator is 0
+@numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy")
+@no_type_check
+def _update_rows(rows, steps, rates, visible):
+    value, gradient, first, second = rows
+    n, columns = value.shape
+    one = np.float32(1)
+    b1, b2 = np.float32(BETA_1), np.float32(BETA_2)
+    bad = 0
+    for i in numba.prange(n):
+        if not visible[i]:
+            continue
+        correct_1 = one / (one - b1 ** np.float32(steps[i]))
+        correct_2 = one / (one - b2 ** np.float32(steps[i]))
+        row_bad = 0
+        for j in range(columns):
+            if not abs(gradient[i, j]) < np.float32(1e18):  # its square would leave float32; also catches nan
+                row_bad = 1
+        bad += row_bad
+        if row_bad == 0:
+            for j in range(columns):
+                g = gradient[i, j]
+                m = b1 * first[i, j] + (one - b1) * g
+                v = b2 * second[i, j] + (one - b2) * g * g
+                first[i, j] = m
+                second[i, j] = v
+                value[i, j] -= rates[j] * m * correct_1 / (np.sqrt(v * correct_2) + np.float32(EPSILON))
+    return bad
+
+
+def _step_torch(rows: _Rows, steps: Int[Tensor, "n"], rates: Float[Tensor, "c"], visible: Bool[Tensor, "n"]) -> bool:
+    """The same on any device, in torch operations."""
+    value, gradient, first, second = rows
+    which = torch.nonzero(visible).flatten()
+    g = gradient[which]
+    good = (g.abs() < 1e18).all(1)
+    which, g = which[good], g[good]
+    m = BETA_1 * first[which] + (1 - BETA_1) * g
+    v = BETA_2 * second[which] + (1 - BETA_2) * g * g
+    first[which], second[which] = m, v
+    count = steps[which].to(g.dtype)[:, None]
+    scale = (v / (1 - BETA_2**count)).sqrt() + EPSILON
+    value[which] -= rates.to(g) * (m / (1 - BETA_1**count)) / scale
+    return bool(good.all())

@@ -1,0 +1,207 @@
+"""The loop that fits Gaussians to images: render, loss, gradient, sparse Adam. Knows nothing about captures or files.
+
+Everything that step i does follows from the state after step i - 1, the seed and i, so a run that was killed and
+resumed ends bit for bit where an uninterrupted one ends.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.cameras import Cameras
+from splatgraft.fitting import adam
+from splatgraft.fitting.photometric import l1_dssim
+from splatgraft.fitting.rates import Rates
+from splatgraft.gaussians import Gaussians
+from splatgraft.progress import Checkpoint, NoCheckpoint, Progress, silent
+from splatgraft.rendering import RenderOptions, render
+
+Loss = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], Float[Tensor, ""]]
+"""Of the rendered and the wanted image."""
+
+_REPORT_EVERY = 10
+_CHECKPOINT_SECONDS = 30.0
+
+
+@runtime_checkable
+@runtime_checkable
+class Views(Protocol):
+    """The images to fit."""
+
+    def __len__(self) -> int:
+        """Number of views."""
+        ...
+
+    def at(self, index: int, done: float) -> tuple[Cameras, Float[Tensor, "h w 3"]]:
+        """One camera and the image it should see, after the share `done` in [0, 1] of all steps."""
+        ...
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """`Views` that stay the same throughout."""
+
+    cameras: Cameras
+    """One per image; sizes may differ."""
+    images: tuple[Float[Tensor, "_ _ 3"], ...]
+    """sRGB."""
+
+    def __len__(self) -> int:
+        """Number of views."""
+        return len(self.images)
+
+    def at(self, index: int, done: float) -> tuple[Cameras, Float[Tensor, "h w 3"]]:
+        """One camera and its image."""
+        return self.cameras[index], self.images[index]
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How long, how fast and by what measure to fit."""
+
+    iterations: int
+    """Steps; each sees one view."""
+    rates: Rates
+    """Learning rates; fields with rate 0 stay as they are."""
+    loss: Loss = l1_dssim
+    """What to make small."""
+    seed: int = 0
+    """Of the order of views, and whatever the control draws."""
+    rendering: RenderOptions = field(default_factory=RenderOptions)
+    """Background, low-pass and near plane."""
+
+
+@dataclass(frozen=True)
+class FitState:
+    """All that the next step depends on, beside options and views."""
+
+    iteration: int
+    """Steps done."""
+    gaussians: Gaussians
+    """As fitted so far."""
+    moments: adam.Moments
+    """Of the fields that are fitted."""
+    memory: dict[str, Tensor] = field(default_factory=dict)
+    """What the control keeps between steps."""
+
+    def choose(self, which: Tensor) -> "FitState":
+        """The state of the chosen Gaussians alone (indices or mask); `memory` is emptied."""
+        return replace(self, gaussians=self.gaussians.select(which), moments=self.moments.select(which), memory={})
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the last step saw, for the control."""
+
+    camera: Cameras
+    """The view's camera."""
+    visible: Bool[Tensor, "n"]
+    """Gaussians that the view reaches."""
+    gradients: dict[str, Tensor]
+    """Of the loss, by field."""
+    rate_of_means: float
+    """World units."""
+
+
+Control = Callable[[FitState, Step], FitState]
+"""Called after every step; may add, move and remove Gaussians, and keep tensors in `memory`."""
+
+
+def keep(state: FitState, step: Step) -> FitState:
+    """The `Control` that changes nothing."""
+    return state
+
+
+def fit(
+    gaussians: Gaussians,
+    views: Views,
+    *,
+    options: FitOptions,
+    control: Control = keep,
+    progress: Progress = silent,
+    checkpoint: Checkpoint = NoCheckpoint(),
+) -> Gaussians:
+    """The Gaussians whose chosen fields make renders of `views` look like their images.
+
+    Raises: ValueError where there is no view, or where loss or gradients stop being finite.
+    """
+    if len(views) == 0:
+        raise ValueError("fit: expected at least one view, found none")
+    names = options.rates.active()
+    saved = checkpoint.load()
+    state = _start(gaussians, names) if saved is None else _unpacked(saved, gaussians.device)
+    last_save, recent = time.monotonic(), 0.0
+    while state.iteration < options.iterations:
+        done = state.iteration / options.iterations
+        camera, image = views.at(_view_of(state.iteration, len(views), options.seed), done)
+        leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
+        drawn = render(replace(state.gaussians, **leaves), camera, options=options.rendering)
+        assert drawn.color is not None
+        loss = options.loss(drawn.color[0], image)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise _diverged(state, f"a loss of {value}")
+        seen = drawn.visible[0]
+        gradients = dict(zip(names, torch.autograd.grad(loss, list(leaves.values())), strict=True))
+        values = {name: leaf.detach() for name, leaf in leaves.items()}
+        columns = {name: v[0].numel() if len(v) else 1 for name, v in values.items()}
+        rates = {name: options.rates.at(name, done, columns[name]) for name in names}
+        if not adam.step(values, gradients, moments=state.moments, rates=rates, visible=seen):
+            raise _diverged(state, "a gradient that is not finite")
+        rate = options.rates.means_at(done) if "means" in names else 0.0
+        state = control(replace(state, iteration=state.iteration + 1), Step(camera, seen, gradients, rate))
+        recent = value if recent == 0 else 0.95 * recent + 0.05 * value
+        if state.iteration % _REPORT_EVERY == 0 or state.iteration == options.iterations:
+            message = f"loss {recent:.4f}, {state.gaussians.count / 1000:.1f}k Gaussians"
+            progress(state.iteration, options.iterations, message)
+        if time.monotonic() - last_save > _CHECKPOINT_SECONDS and not isinstance(checkpoint, NoCheckpoint):
+            checkpoint.save(_packed(state))
+            last_save = time.monotonic()
+    return state.gaussians
+
+
+def _diverged(state: FitState, found: str) -> ValueError:
+    return ValueError(
+        f"fit: expected finite numbers, found {found} at step {state.iteration} (the last checkpoint stands); "
+        "lower the learning rates or look for broken images and cameras"
+    )
+
+
+def _view_of(iteration: int, count: int, seed: int) -> int:
+    """Every view once per round, each round in its own random order."""
+    generator = torch.Generator().manual_seed((seed * 1_000_003 + iteration // count) % 2**62)
+    return int(torch.randperm(count, generator=generator)[iteration % count])
+
+
+def _start(gaussians: Gaussians, names: tuple[str, ...]) -> FitState:
+    own = gaussians.map(lambda tensor: tensor.detach().clone().contiguous())
+    return FitState(0, own, adam.no_moments({name: getattr(own, name) for name in names}, own.count))
+
+
+def _packed(state: FitState) -> dict[str, Any]:
+    return {
+        "iteration": state.iteration,
+        "gaussians": {f.name: getattr(state.gaussians, f.name) for f in fields(Gaussians)},
+        "first": state.moments.first,
+        "second": state.moments.second,
+        "steps": state.moments.steps,
+        "memory": state.memory,
+    }
+
+
+def _unpacked(saved: dict[str, Any], device: torch.device) -> FitState:
+    def placed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {name: tensor.to(device).clone() for name, tensor in tensors.items()}
+
+    return FitState(
+        saved["iteration"],
+        Gaussians(**placed(saved["gaussians"])),
+        adam.Moments(placed(saved["first"]), placed(saved["second"]), saved["steps"].to(device).clone()),
+        placed(saved["memory"]),
+    )
