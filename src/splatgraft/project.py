@@ -1,4 +1,4 @@
-"""Where results lie, how a result replaces an earlier one whole, and what makes it stale. Knows no scenes and no steps."""
+"""Where results lie, how one replaces an earlier one whole, and what makes it stale. Knows no scenes and no steps."""
 
 import hashlib
 import json
@@ -214,7 +214,7 @@ def replacing(job: Job) -> Generator[Path]:
             peak_memory_bytes=peak_memory_bytes(),
         )
         with whole_file(folder / STEP_FILE) as stream:
-            stream.write((json.dumps(asdict(record), indent=1) + "\n").encode())
+            stream.write(_one_line_each(asdict(record)).encode())
 
 
 @contextmanager
@@ -265,6 +265,11 @@ class FolderCheckpoint:
     def drop(self) -> None:
         """Forget all of it: the job is done, or it is another one now."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _one_line_each(fields: Mapping[str, Any]) -> str:
+    """JSON with one field per line."""
+    return "{\n" + ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in fields.items()) + "\n}\n"
 
 
 def _entries(files: Iterable[Path], known: tuple[Entry, ...]) -> tuple[Entry, ...]:

@@ -1,4 +1,4 @@
-"""Tables of a TOML file become frozen dataclasses; what does not fit is told by file and key. Knows no particular key."""
+"""TOML tables become frozen dataclasses; what does not fit is told by file and key. Knows no particular key."""
 
 import tomllib
 import types
@@ -84,25 +84,26 @@ def _convert(value: Any, hint: Any, table: Table, key: str) -> Any:
     """`value` as `hint` wants it."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        wanted = [a for a in arguments if a is not types.NoneType]
-        for argument in wanted[:-1]:
-            try:
-                return _convert(value, argument, table, key)
-            except ValueError:
-                continue
-        return _convert(value, wanted[-1], table, key)
-    if origin is Literal and value in arguments:
-        return value
+        return _convert_any(value, [a for a in arguments if a is not types.NoneType], table, key)
     if origin is tuple and isinstance(value, list):
         kinds = arguments[:1] * len(value) if arguments[-1] is ... else arguments
         if len(kinds) == len(value):
             return tuple(_convert(v, kind, table, key) for v, kind in zip(value, kinds, strict=True))
     if hint is Path and isinstance(value, str):
         return table.folder / Path(value).expanduser()
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+    if hint is float and type(value) is int:
         return float(value)
-    if hint in (int, str, bool) and type(value) is hint:
+    if (origin is Literal and value in arguments) or (hint in (int, float, str, bool) and type(value) is hint):
         return value
     wanted = " or ".join(map(repr, arguments)) if origin is Literal else getattr(hint, "__name__", str(hint))
-    wanted = str(hint) if origin is tuple else wanted
-    raise ValueError(f"{table.where} {key}: expected {wanted}, found {value!r}")
+    raise ValueError(f"{table.where} {key}: expected {str(hint) if origin is tuple else wanted}, found {value!r}")
+
+
+def _convert_any(value: Any, hints: list[Any], table: Table, key: str) -> Any:
+    """`value` as the first of `hints` that it fits."""
+    for hint in hints[:-1]:
+        try:
+            return _convert(value, hint, table, key)
+        except ValueError:
+            continue
+    return _convert(value, hints[-1], table, key)

@@ -41,15 +41,14 @@ class Consolidate:
     """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache where not given."""
     low_pass: Literal["classic", "antialiased"] = "classic"
     """As the scene was trained."""
-    seed: int = 0
-    """Of the order of views."""
     device: Device = "auto"
     """Where to compute."""
 
     def inputs(self) -> Inputs:
         """The scene, the cameras and the harmonised images."""
         views = ViewFolder.open(self.views)
-        return {"scene": (self.scene,), "cameras": views.files()[:1], "images": (*self._images(views), *self._trust(views))}
+        images = (*self._images(views), *self._trust(views))
+        return {"scene": (self.scene,), "cameras": views.files()[:1], "images": images}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make scene.ply."""
@@ -77,7 +76,6 @@ class Consolidate:
             polish_passes=self.passes,
             reference=replace(standard.reference, iterations=self.iterations),
             rendering=RenderOptions(low_pass=self.low_pass),
-            seed=self.seed,
         )
 
     def _loss(self) -> ImageLoss:

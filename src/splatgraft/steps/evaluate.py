@@ -2,15 +2,12 @@
 
 import os
 import platform
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from splatgraft.compose import estimate_up
 from splatgraft.evaluate import (
-    ComparedView,
     Report,
     ReportView,
     StepTime,
@@ -25,6 +22,7 @@ from splatgraft.evaluate import (
 )
 from splatgraft.image_losses import lpips_vgg
 from splatgraft.images import write_image
+from splatgraft.orbit import estimate_up
 from splatgraft.project import RESULTS_IN_ORDER, SCENE_FILE, read_record
 from splatgraft.steps.evaluated_scenes import EvaluatedScenes, Pictures, TrueViews, truth_files
 from splatgraft.steps.step import Context, Device, Inputs, choose_device
@@ -87,7 +85,7 @@ class Evaluate:
             write_animation(folder / "turntable.gif", turntable)
         report = Report(
             title="Object transfer: before and after",
-            subtitle=f"{int(scenes.is_object.sum()):,} Gaussians of the object among {scenes.result.count:,} of the scene.",
+            subtitle=f"{int(scenes.is_object.sum()):,} Gaussians of the object among {scenes.result.count:,} in all.",
             metrics=metrics,
             changes={key: sum(c[key] for c in changes) / len(changes) for key in changes[0]} if changes else {},
             not_measured=missing,

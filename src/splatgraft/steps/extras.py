@@ -28,5 +28,5 @@ EXTRAS = {
 
 def extra_of(module: str) -> str | None:
     """The extra that brings `module`, or None."""
-    top = module.split(".")[0]
+    top = module.split(".", maxsplit=1)[0]
     return next((name for name, extra in EXTRAS.items() if top in extra.packages), None)

@@ -1,7 +1,7 @@
-"""The steps of one project and which reads which other's folder. Does no work itself; project_file.py reads the TOML."""
+"""The steps of one project, and which reads which other's folder. Does no work itself and reads no TOML."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 

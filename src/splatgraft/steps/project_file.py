@@ -1,4 +1,4 @@
-"""project.toml: one table per capture and one per step, whose keys are the command's options. Knows no folder of results."""
+"""project.toml: a table per capture and per step, whose keys are the options of the command. Knows no results."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

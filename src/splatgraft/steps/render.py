@@ -14,7 +14,8 @@ from splatgraft.gaussians import Gaussians
 from splatgraft.harmonize import HarmonizerInputs
 from splatgraft.images import write_image
 from splatgraft.posed_images import PosedImages
-from splatgraft.rendering import Output, RenderOptions, render
+from splatgraft.rendering import RenderOptions, render
+from splatgraft.rendering.interface import Output
 from splatgraft.steps.selection_file import read_selection
 from splatgraft.steps.step import Context, Device, Inputs, choose_device
 from splatgraft.steps.view_images import ViewFolder, file_stems

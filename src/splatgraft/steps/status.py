@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.table import Table
-
 from splatgraft.project import Record, read_record, why_stale
 from splatgraft.steps.flow import Flow, read_flow
 from splatgraft.steps.step import Positional, job_of
@@ -23,14 +21,10 @@ class Status:
     def execute(self, terminal: Terminal) -> int:
         """Print one line per step."""
         flow = read_flow(self.project, self.out)
-        table = Table(box=None, pad_edge=False)
-        for heading in ("step", "state", "seconds", "memory", "folder"):
-            table.add_column(heading, overflow="fold")
+        terminal.result(f"{'step':<20} {'seconds':>8} {'memory':>9}  state")
         for name, reason in reasons(flow).items():
-            folder = flow.steps[name].out
-            seconds, memory = _cost(read_record(folder))
-            table.add_row(name, f"stale: {reason}" if reason else "up to date", seconds, memory, str(folder))
-        terminal.print(table)
+            seconds, memory = _cost(read_record(flow.steps[name].out))
+            terminal.result(f"{name:<20} {seconds:>8} {memory:>9}  {f'stale: {reason}' if reason else 'up to date'}")
         return 0
 
 

@@ -1,4 +1,4 @@
-"""What every step is, and the one way to do it: locked, timed, resumed, its folder replaced whole. Knows no algorithm."""
+"""What every step is, and the one way to do it: locked, timed, resumed, replaced whole. Knows no algorithm."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass

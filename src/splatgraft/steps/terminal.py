@@ -4,7 +4,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
 from splatgraft.progress import Progress
@@ -26,21 +26,22 @@ class Terminal:
         """One line for whoever reads standard output."""
         self._results.print(str(text), markup=False)
 
-    def print(self, renderable: object) -> None:
-        """A table or text for standard output."""
-        self._results.print(renderable)
-
     @contextmanager
     def bar(self, name: str) -> Generator[Progress]:
         """A bar called `name` that the given function moves; where there is no terminal, one line at the end."""
         columns = (
             TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
+            BarColumn(bar_width=24),
             TimeElapsedColumn(),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[message]}"),
+            TextColumn("{task.fields[message]}", markup=False),
         )
-        with Bars(*columns, console=self._errors, transient=False) as bars:
-            task = bars.add_task(f"{name:<16}", total=None, message="")
-            yield lambda done, total, message: bars.update(task, completed=done, total=total, message=message)
+        with Bars(*columns, console=self._errors) as bars:
+            task = bars.add_task(f"{name:<20}", total=None, message="")
+
+            def move(done: int, total: int, message: str) -> None:
+                bars.update(task, completed=done, total=total, message=f"{done}/{total} {message}")
+
+            yield move
+            shown = bars.tasks[0]
+            bars.update(task, total=shown.total or 1, completed=shown.total or 1)

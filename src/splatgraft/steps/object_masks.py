@@ -1,0 +1,74 @@
+"""Where `segment` gets its 2D masks from: files, GrabCut in a box, or a network. Knows nothing about lifting them."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from splatgraft.gaussians import Gaussians
+from splatgraft.images import list_images, write_image
+from splatgraft.posed_images import PosedImages
+from splatgraft.progress import Progress
+from splatgraft.segment.box import Box, default_box
+from splatgraft.segment.grabcut import grabcut_masks, refine_masks
+from splatgraft.steps.lazy_images import LazySequence
+from splatgraft.steps.view_images import file_stems
+
+MaskSource = Literal["files", "grabcut", "birefnet"]
+
+
+def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> PosedImages:
+    """The views of `capture` that have a mask: in `folder` by name, or as the capture itself says.
+
+    Raises: ValueError where none has.
+    """
+    paths = capture.mask_paths
+    if folder is not None:
+        if not folder.is_dir():
+            raise ValueError(f"{folder}: expected a folder of masks, found none")
+        by_stem = {mask.stem: mask for mask in list_images(folder)}
+        names = [Path(name) for name in capture.cameras.names]
+        paths = tuple(by_stem.get(name.stem) or by_stem.get(name.name) for name in names)
+    with_mask = torch.tensor([mask is not None for mask in paths], dtype=torch.bool)
+    if not with_mask.any():
+        raise ValueError(
+            f"{folder or path}: expected masks named like the images ({capture.cameras.names[0]}), found none; "
+            "give --masks FOLDER, or --mask-source grabcut (with --box), or --mask-source birefnet"
+        )
+    return _with_masks(capture, paths, with_mask)
+
+
+def read_masks(capture: PosedImages) -> LazySequence:
+    """The masks of a capture whose views all have one, read when asked for."""
+
+    def read(index: int) -> Tensor:
+        mask = capture.mask(index)
+        assert mask is not None
+        return mask
+
+    return LazySequence(len(capture), read)
+
+
+def cut_masks(
+    capture: PosedImages, scene: Gaussians, *, box: Box | None, folder: Path, progress: Progress
+) -> PosedImages:
+    """The capture with masks that GrabCut finds, written to `folder`: first in a box, then as the views agree.
+
+    Raises: ValueError where the box is not seen, or none can be guessed.
+    """
+    images = LazySequence(len(capture), capture.image)
+    box = default_box(capture) if box is None else box
+    masks = grabcut_masks(images, capture.cameras, box, capture.points, progress=progress)
+    masks = refine_masks(masks, images, capture.cameras, scene, progress=progress)
+    folder.mkdir()
+    paths = tuple(folder / f"{stem}.png" for stem in file_stems(capture.cameras))
+    for path, mask in zip(paths, masks, strict=True):
+        write_image(path, mask)
+    return _with_masks(capture, paths, torch.ones(len(capture), dtype=torch.bool))
+
+
+def _with_masks(capture: PosedImages, paths: tuple[Path | None, ...], which: Bool[Tensor, "v"]) -> PosedImages:
+    return replace(capture, mask_paths=paths).select(which)

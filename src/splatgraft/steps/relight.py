@@ -1,0 +1,69 @@
+"""The command `relight`: a composite becomes one whose object has the light of its new place."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from splatgraft.composite import Composite
+from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
+from splatgraft.project import IS_OBJECT_FILE, LIGHT_FILE, SCENE_FILE
+from splatgraft.relight.layers import Relit
+from splatgraft.relight.transfer import RelightOptions, SourceScene, relight
+from splatgraft.steps.composite_folder import placement_files, read_composite
+from splatgraft.steps.selection_file import write_selection
+from splatgraft.steps.step import Context, Inputs
+
+
+@dataclass(frozen=True)
+class Relight:
+    """Give the object the light of its new place, and the place its shadow; no training, no views."""
+
+    target: Path
+    """The scene that receives the object, a .ply."""
+    placement: Path
+    """placement.json that names the objects: the one in the composite's folder."""
+    cameras: Path
+    """The target's cameras, a transforms.json: they tell what is up."""
+    out: Path = Path("relit")
+    """Folder for scene.ply, is_object.npy and light.txt."""
+    surroundings: Path | None = None
+    """The source without the object, a .ply: the light that is to be taken off. Without it brightness is kept."""
+    object_cameras: Path | None = None
+    """The source's cameras, a transforms.json."""
+    light: Literal["transfer", "off"] = "transfer"
+    """Whether light is transferred; off pastes the object as it was captured (the paper's configuration)."""
+    options: RelightOptions = field(default_factory=RelightOptions)
+
+    def inputs(self) -> Inputs:
+        """Scenes, placement and cameras."""
+        source = tuple(path for path in (self.surroundings, self.object_cameras) if path is not None)
+        placement = placement_files(self.placement)
+        return {"target": (self.target,), "placement": placement, "cameras": (self.cameras,), "source": source}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the relit composite, and say in words what was found."""
+        composite = read_composite(self.target, self.placement)
+        if self.light == "off":
+            gaussians, is_object = composite.bake()
+            sentences = ("The light transfer was off: the object is pasted as it was captured.",)
+        else:
+            relit = self._relit(composite)
+            gaussians, is_object, sentences = relit.bake(), relit.is_object, relit.report
+        write_gaussians(folder / SCENE_FILE, gaussians)
+        write_selection(folder / IS_OBJECT_FILE, is_object)
+        (folder / LIGHT_FILE).write_text("\n".join(sentences) + "\n")
+        for sentence in sentences:
+            context.terminal.say(sentence)
+
+    def _relit(self, composite: Composite) -> Relit:
+        source = None
+        if self.surroundings is not None:
+            if self.object_cameras is None:
+                raise ValueError("--surroundings: expected --object-cameras beside it, found none")
+            source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
+        # only the first object is known to come from these surroundings; further ones keep their mean brightness
+        sources = [source if index == 0 else None for index in range(len(composite.objects))]
+        return relight(composite, read_cameras(self.cameras), sources=sources, options=self.options)
+
+
+COMMAND = Relight

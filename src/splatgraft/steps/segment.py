@@ -1,0 +1,79 @@
+"""The command `segment`: a scene and 2D masks become the object's Gaussians and the scene without them."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from splatgraft.formats import read_capture, read_gaussians, write_gaussians
+from splatgraft.gaussians import Gaussians
+from splatgraft.posed_images import PosedImages
+from splatgraft.project import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
+from splatgraft.segment.box import Box
+from splatgraft.segment.lift import LiftOptions, lift_masks
+from splatgraft.segment.select import SelectOptions, select_object
+from splatgraft.steps.capture_files import capture_inputs
+from splatgraft.steps.object_masks import MaskSource, cut_masks, read_masks, with_mask_folder
+from splatgraft.steps.selection_file import write_selection
+from splatgraft.steps.step import Context, Device, Inputs, choose_device
+from splatgraft.whole_file import whole_file
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Lift 2D masks of the object to the Gaussians of a scene."""
+
+    scene: Path
+    """The reconstruction, a .ply."""
+    capture: Path
+    """The posed images that it was made of."""
+    out: Path = Path("object")
+    """Folder for object.ply, surroundings.ply (the scene without it), selection.npy, feature.npy; masks/ where made."""
+    mask_source: MaskSource = "files"
+    """files: masks/ beside the images, or --masks. grabcut: from a box around the object. birefnet: from a network."""
+    masks: Path | None = None
+    """Folder of masks named like the images, white where the object is; views without one are left out."""
+    box: tuple[float, float, float, float, float, float] | None = None
+    """Least x, y, z, then greatest, around the object in the source's world; grabcut guesses it where not given."""
+    threshold: float = 0.75
+    """Least share of a Gaussian that the masks must give to the object."""
+    keep: Literal["largest", "all"] = "largest"
+    """Whether pieces that do not touch the largest are dropped."""
+    device: Device = "auto"
+    """Where to compute."""
+    options: LiftOptions = field(default_factory=LiftOptions)
+
+    def inputs(self) -> Inputs:
+        """The scene, the capture and the masks."""
+        capture = read_capture(self.capture)
+        if self.mask_source == "files":
+            capture = with_mask_folder(capture, self.masks, self.capture)
+        files = capture_inputs(self.capture, capture, masks=self.mask_source == "files")
+        return {"scene": (self.scene,), **files}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the object."""
+        device = choose_device(self.device, context.terminal)
+        scene = read_gaussians(self.scene).to(device)
+        box = None if self.box is None else Box(torch.tensor(self.box[:3]), torch.tensor(self.box[3:]))
+        views = self._masked_views(scene, folder, box, context)
+        masks = read_masks(views)
+        feature = lift_masks(scene, views.cameras.to(device), masks, self.options, progress=context.progress)
+        selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=self.keep))
+        context.terminal.say(f"object: {int(selection.sum()):,} of {scene.count:,} Gaussians")
+        write_gaussians(folder / OBJECT_FILE, scene.select(selection).to("cpu"))
+        write_gaussians(folder / SURROUNDINGS_FILE, scene.select(~selection).to("cpu"))
+        write_selection(folder / SELECTION_FILE, selection)
+        with whole_file(folder / "feature.npy") as stream:
+            np.save(stream, feature.cpu().numpy())
+
+    def _masked_views(self, scene: Gaussians, folder: Path, box: Box | None, context: Context) -> PosedImages:
+        capture = read_capture(self.capture)
+        if self.mask_source == "files":
+            return with_mask_folder(capture, self.masks, self.capture)
+        return cut_masks(capture, scene, box=box, folder=folder / "masks", progress=context.progress)
+
+
+COMMAND = Segment
