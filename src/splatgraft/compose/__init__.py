@@ -8,6 +8,7 @@ from splatgraft.compose.rest import RestOptions, rest_on_surface
 from splatgraft.compose.suggest import Suggestion, suggest_place
 from splatgraft.compose.support import Support, support_below
 from splatgraft.composite import Composite, PlacedObject
+from splatgraft.orbit import estimate_up
 
 __all__ = [
     "Composite",
@@ -19,6 +20,7 @@ __all__ = [
     "Suggestion",
     "Support",
     "compose",
+    "estimate_up",
     "hidden_fraction",
     "object_base",
     "place_object",
