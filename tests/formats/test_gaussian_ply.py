@@ -62,6 +62,14 @@ def test_values_that_are_not_finite_survive(tmp_path):
     assert format_files.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
 
 
+def test_every_bit_pattern_survives(tmp_path):
+    g = format_files.random_gaussians(6000, 3).map(  # nan with payloads, infinities, denormals among them
+        lambda t: torch.from_numpy(np.random.default_rng(t.numel()).integers(0, 2**32, t.shape, "u4").view("f4"))
+    )
+    formats.write_gaussians(tmp_path / "a.ply", g)
+    assert format_files.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
+
+
 def test_written_file_has_the_original_codes_layout(tmp_path):
     g = format_files.random_gaussians(3, 3)
     formats.write_gaussians(tmp_path / "a.ply", g)

@@ -1,6 +1,7 @@
 """Reading and writing files, by suffix and by what lies in a folder. Holds no format itself."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 from splatgraft.cameras import Cameras
@@ -33,7 +34,8 @@ def read_gaussians(path: Path) -> Gaussians:
 
     Raises: ValueError where the suffix is another, or the file is not what its suffix says.
     """
-    return _by_suffix(path, _READERS)(path)
+    with _readable(path):
+        return _by_suffix(path, _READERS)(path)
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
@@ -58,8 +60,9 @@ def read_capture(path: Path) -> PosedImages:
 
     Raises: ValueError where nothing of these is there, or what is there is broken.
     """
-    transforms = _transforms_path(path)
-    return transforms_json.read_capture(transforms) if transforms else colmap.read_capture(path)
+    with _readable(path):
+        transforms = _transforms_path(path)
+        return transforms_json.read_capture(transforms) if transforms else colmap.read_capture(path)
 
 
 def write_capture(folder: Path, posed_images: PosedImages) -> None:
@@ -72,15 +75,25 @@ def read_cameras(path: Path) -> Cameras:
 
     Raises: ValueError where nothing of these is there, or what is there is broken.
     """
-    if cameras_json.is_cameras_json(path):
-        return cameras_json.read_cameras(path)
-    transforms = _transforms_path(path)
-    return transforms_json.read_cameras(transforms) if transforms else colmap.read_cameras(path)
+    with _readable(path):
+        if cameras_json.is_cameras_json(path):
+            return cameras_json.read_cameras(path)
+        transforms = _transforms_path(path)
+        return transforms_json.read_cameras(transforms) if transforms else colmap.read_cameras(path)
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:
     """Write a transforms.json of cameras alone."""
     transforms_json.write_cameras(path, cameras)
+
+
+@contextmanager
+def _readable(path: Path) -> Generator[None]:
+    """What the system refuses (rights, impossible names) told like any other bad file."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(f"{error.filename or path}: expected a readable file, found {error.strerror}") from error
 
 
 def _transforms_path(path: Path) -> Path | None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from splatgraft.cameras import Cameras
 from splatgraft.distortion import Distortion
 from splatgraft.formats.masks import with_masks
-from splatgraft.formats.views import View, same_shape
+from splatgraft.formats.views import MAX_SIDE, View, same_shape
 from splatgraft.images import stored_size
 from splatgraft.posed_images import PosedImages
 
@@ -49,6 +49,8 @@ def fitted_to_file(view: View, source: Path) -> View:
     if view.image_path is None:
         return view
     (width, height), (file_width, file_height) = view.size, stored_size(view.image_path)
+    if max(file_width, file_height) > MAX_SIDE:
+        raise ValueError(f"{view.image_path}: expected sides up to {MAX_SIDE} px, found {file_width}x{file_height}")
     if (width, height) == (file_width, file_height):
         return view
     if not same_shape((width, height), (file_width, file_height)):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.formats.assembly import cameras_of, fitted_to_file, posed_images_of
-from splatgraft.formats.views import View, existing_file, rigid
+from splatgraft.formats.views import MAX_SIDE, View, existing_file, rigid
 from splatgraft.posed_images import PosedImages
 
 _MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
@@ -154,8 +154,8 @@ def _camera(path: Path, model: str, size: tuple[int, int], numbers: tuple[float,
         )
     if len(numbers) != _PARAMETER_COUNTS[model]:
         raise ValueError(f"{path}: expected {_PARAMETER_COUNTS[model]} numbers for {model}, found {len(numbers)}")
-    if not (1 <= size[0] <= 65536 and 1 <= size[1] <= 65536):
-        raise ValueError(f"{path}: expected image sides from 1 to 65536 px, found {size[0]} and {size[1]}")
+    if not 1 <= min(size) <= max(size) <= MAX_SIDE:
+        raise ValueError(f"{path}: expected image sides from 1 to {MAX_SIDE} px, found {size[0]} and {size[1]}")
     if model in ("PINHOLE", "OPENCV"):
         focal, center, rest = numbers[:2], numbers[2:4], numbers[4:]
     else:

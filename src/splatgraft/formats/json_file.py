@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from splatgraft.formats.views import MAX_SIDE
+
 _LONGEST = 60
 
 
@@ -36,11 +38,11 @@ def number(path: Path, entry: dict[str, Any], key: str, default: float | None = 
 def whole_side(path: Path, entry: dict[str, Any], key: str) -> int:
     """An image side, pixels.
 
-    Raises: ValueError where the value is no whole number from 1 to 65536.
+    Raises: ValueError where the value is no whole number from 1 to `MAX_SIDE`.
     """
     value = number(path, entry, key)
-    if not (value.is_integer() and 1 <= value <= 65536):
-        raise ValueError(f"{path}: expected a whole number from 1 to 65536 for '{key}', found {value:g}")
+    if not (value.is_integer() and 1 <= value <= MAX_SIDE):
+        raise ValueError(f"{path}: expected a whole number from 1 to {MAX_SIDE} for '{key}', found {value:g}")
     return int(value)
 
 

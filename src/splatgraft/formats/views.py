@@ -8,6 +8,9 @@ import numpy as np
 _RIGID_TOLERANCE = 1e-3
 """Largest entry of R^T R - I: room for matrices printed with four digits."""
 
+MAX_SIDE = 32766
+"""Longest image side, pixels: OpenCV cannot undistort longer ones."""
+
 
 @dataclass(frozen=True)
 class View:
