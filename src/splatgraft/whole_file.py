@@ -17,7 +17,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")
     if path.is_dir():
         raise ValueError(f"{path}: expected a file name to write, found a folder")
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f".{path.name}.partial")  # one name, so that the next write clears what a kill left
     try:
         with partial.open("wb") as stream:
             yield stream
