@@ -31,6 +31,7 @@ class Beams:
     """Whether the bundle is a dominant source, or a piece of the ambient light."""
 
     def __len__(self) -> int:
+        """Number of bundles k."""
         return len(self.is_source)
 
 

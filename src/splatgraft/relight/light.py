@@ -140,7 +140,7 @@ def light_from_json(text: str, *, name: str = "light.json") -> Light:
         raise ValueError(f"{name}: expected JSON, found {error}") from error
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         found = record.get("format") if isinstance(record, dict) else type(record).__name__
-        raise ValueError(f"{name}: expected \"format\": \"{FORMAT}\", found {found!r}")
+        raise ValueError(f'{name}: expected "format": "{FORMAT}", found {found!r}')
     unknown = sorted(set(record) - {"format", "sources", "ambient_sh", "coverage", "unseen_up"})
     if unknown:
         raise ValueError(f"{name}: expected sources, ambient_sh, coverage and unseen_up, found {unknown[0]!r}")

@@ -127,7 +127,7 @@ def _splat(geometry, rgb, view, limits, maps):  # noqa: PLR0912, PLR0915  (one k
             u = (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z + radius) * per_unit
             v = (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z + radius) * per_unit
             c = covariances[i]
-            reach = _CUTOFF * np.sqrt(max(c[0, 0], max(c[1, 1], c[2, 2])) * 3) * per_unit + 1
+            reach = _CUTOFF * np.sqrt(max(c[0, 0], c[1, 1], c[2, 2]) * 3) * per_unit + 1
             if u < -reach or v < -reach or u > size + reach or v > size + reach:
                 continue
             # rows of F C, then F C F^T for (u, v) and the depth column

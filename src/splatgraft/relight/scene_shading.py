@@ -1,0 +1,172 @@
+"""What an object does to the light on the scene around it: shadow and bounce ratios per Gaussian.
+
+Debevec 1998: S = (light with the object) / (light without it). Knows nothing about files, and not where light is from.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.gaussians import Gaussians
+from splatgraft.images import linear_from_srgb
+from splatgraft.relight.beams import ambient_pairs, source_pairs
+from splatgraft.relight.cast import Beams, Occlusion, cast, occlusion_from_maps
+from splatgraft.relight.directions import frames_along
+from splatgraft.relight.visibility import DepthMaps, Window, splat_depth_maps, visibility
+from splatgraft.spherical_harmonics import rgb_from_dc
+
+SOURCE_SIZE, AMBIENT_SIZE = 512, 256
+_DEAD_ZONE = 0.004  # changes of linear light below half an 8-bit step of a mid grey are left out
+_DARKEST = 0.04  # no shadow is darker: there is always some light that no map follows
+
+
+@dataclass(frozen=True)
+class Ball:
+    """Where an object is: the ball that holds all but its stray Gaussians."""
+
+    center: Float[Tensor, "3"]
+    radius: float
+
+
+def ball_of(gaussians: Gaussians) -> Ball:
+    """The ball around the opacity-weighted middle that holds 99% of the opaque Gaussians and their width."""
+    opaque = gaussians.opacities > 0.1
+    means = gaussians.means[opaque] if bool(opaque.any()) else gaussians.means
+    scales = (gaussians.scales[opaque] if bool(opaque.any()) else gaussians.scales).max(1).values
+    low, high = torch.quantile(means, 0.01, dim=0), torch.quantile(means, 0.99, dim=0)
+    center = 0.5 * (low + high)
+    reach = (means - center).norm(dim=1) + scales
+    return Ball(center=center, radius=float(1.05 * torch.quantile(reach, 0.99)))
+
+
+@dataclass(frozen=True)
+class ObjectMaps:
+    """An object as all bundles of a light see it."""
+
+    ambient_maps: DepthMaps
+    """One per ambient bundle; opposites are each other's back."""
+    occlusions: tuple[tuple[Beams, Occlusion, float], ...]
+    """For sources, if any, and ambient light: the bundles, what the object blocks of them, and the depth bias."""
+
+
+def map_object(gaussians: Gaussians, ball: Ball, beams: Beams) -> ObjectMaps:
+    """Depth maps of an object (already in the world) for every bundle, with its colours for the bounce."""
+    rgb = linear_from_srgb(rgb_from_dc(gaussians.sh[:, 0]).clamp(0, 1))
+    sources, front, back = source_pairs(beams)
+    around, around_front, around_back = ambient_pairs(beams)
+    occlusions = []
+    if len(sources):
+        both = torch.cat([sources.directions, -sources.directions])
+        window = Window(center=ball.center, radius=ball.radius, frames=frames_along(both))
+        maps = splat_depth_maps(gaussians, window, size=SOURCE_SIZE, linear_rgb=rgb)
+        occlusions.append((sources, occlusion_from_maps(maps, front, back), 2 * maps.texel))
+    window = Window(center=ball.center, radius=ball.radius, frames=frames_along(around.directions))
+    maps = splat_depth_maps(gaussians, window, size=AMBIENT_SIZE, linear_rgb=rgb)
+    occlusions.append((around, occlusion_from_maps(maps, around_front, around_back), maps.texel))
+    return ObjectMaps(maps, tuple(occlusions))
+
+
+def self_visibility(
+    maps: ObjectMaps, gaussians: Gaussians, normals: Float[Tensor, "m 3"], beams: Beams
+) -> Float[Tensor, "m k"]:
+    """Share of every bundle of `beams` that an object lets through to its own Gaussians.
+
+    `beams` may belong to another light than the maps were made for: its sources are then mapped anew. An ambient
+    bundle that is blocked still brings a third: light between the object's own parts.
+    """
+    window = maps.ambient_maps.window
+    around = visibility(maps.ambient_maps, gaussians.means, normals, bias=2 * maps.ambient_maps.texel)
+    around = 1 / 3 + 2 / 3 * around
+    sources, _, _ = source_pairs(beams)
+    if not len(sources):
+        return around
+    lit = Window(center=window.center, radius=window.radius, frames=frames_along(sources.directions))
+    fronts = splat_depth_maps(gaussians, lit, size=AMBIENT_SIZE)
+    return torch.cat([visibility(fronts, gaussians.means, normals, bias=2.5 * fronts.texel), around], 1)
+
+
+@dataclass(frozen=True)
+class SceneMaps:
+    """The scene's own depth maps around a place: they do not change when an object moves there."""
+
+    region: Ball
+    """Where they hold."""
+    source_maps: DepthMaps | None
+    """One per bundle of a source; None without sources."""
+    ambient_maps: DepthMaps
+    """One per ambient bundle."""
+
+
+def map_scene(scene: Gaussians, region: Ball, beams: Beams) -> SceneMaps:
+    """Depth maps of `scene` for every bundle. Only what is in the region blocks: the light is from beyond it."""
+    maps: list[DepthMaps | None] = []
+    near = (scene.means - region.center).norm(dim=1) < 1.5 * region.radius + 3 * scene.scales.max(1).values
+    scene = scene.select(near)
+    for part, size in ((source_pairs(beams)[0], SOURCE_SIZE), (ambient_pairs(beams)[0], AMBIENT_SIZE)):
+        window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
+        reach = (-region.radius, region.radius)
+        maps.append(splat_depth_maps(scene, window, size=size, depth_range=reach) if len(part) else None)
+    return SceneMaps(region=region, source_maps=maps[0], ambient_maps=maps[1])
+
+
+def scene_visibility(
+    maps: SceneMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]
+) -> Float[Tensor, "m k"]:
+    """Share of every bundle that the scene itself lets through to `points`: the guard against darkening twice.
+
+    An ambient bundle that is blocked still brings half: the light of the blocker itself.
+    """
+    around = 0.5 + 0.5 * visibility(maps.ambient_maps, points, normals, bias=1.5 * maps.ambient_maps.texel)
+    if maps.source_maps is None:
+        return around
+    return torch.cat([visibility(maps.source_maps, points, normals, bias=2.5 * maps.source_maps.texel), around], 1)
+
+
+@dataclass(frozen=True)
+class SceneRatio:
+    """Per receiver, the change that an object makes to the light on it."""
+
+    shadow: Float[Tensor, "m 3"]
+    """Share of linear light left, in (0, 1]; exactly 1 out of reach."""
+    bounce: Float[Tensor, "m 3"]
+    """Light from the object, as a share of the light before."""
+
+
+def scene_ratio(
+    maps: ObjectMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], *, arrives: Float[Tensor, "m k"]
+) -> SceneRatio:
+    """Ratio at `points`; `arrives` is the share of each bundle that the scene lets through."""
+    before, after, bounce = torch.zeros(3, len(points), 3).unbind(0)
+    column = 0
+    for part, occlusion, bias in maps.occlusions:
+        share = arrives[:, column : column + len(part)].contiguous()
+        column += len(part)
+        sums = cast(occlusion, part, points, normals, arrives=share, bias=bias)
+        before, after, bounce = before + sums[0], after + sums[1], bounce + sums[2]
+    total = before.clamp_min(1e-9)
+    ratio = (after / total).clamp(_DARKEST, 1)
+    lost = _beyond_dead_zone(1 - ratio)
+    gained = _beyond_dead_zone((bounce / total).clamp(0, 1))
+    return SceneRatio(shadow=1 - lost, bounce=gained)
+
+
+def _beyond_dead_zone(change: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+    """`change` with small values taken to exactly 0, without a step: full from three times the zone on."""
+    strongest = change.max(1, keepdim=True).values
+    return change * ((strongest - _DEAD_ZONE) / (2 * _DEAD_ZONE)).clamp(0, 1)
+
+
+def reachable(points: Float[Tensor, "m 3"], ball: Ball, beams: Beams, *, farthest: float) -> Bool[Tensor, "m"]:
+    """Points within `farthest` of the object that some bundle's shadow cone may touch."""
+    away = points - ball.center
+    distance = away.norm(dim=1)
+    near = distance < 3.5 * ball.radius
+    for direction, softness, source in zip(beams.directions, beams.softness, beams.is_source, strict=True):
+        if source:
+            along = -(away @ direction)
+            aside = (distance**2 - along**2).clamp_min(0).sqrt()
+            spread = torch.tan(softness.clamp_max(1.2)) * (along + ball.radius).clamp_min(0)
+            near |= (along > -ball.radius) & (aside < ball.radius + spread)
+    return near & (distance < farthest)

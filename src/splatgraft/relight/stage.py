@@ -1,0 +1,90 @@
+"""The scene around the place of an object, prepared once: its normals, light and depth maps. Knows no objects.
+
+What is kept stays valid while objects move within the inner half of the region; then it is made anew.
+"""
+
+from dataclasses import dataclass, replace
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatgraft.cameras import Cameras
+from splatgraft.gaussians import Gaussians
+from splatgraft.relight.beams import beams_of
+from splatgraft.relight.cache import RelightCache
+from splatgraft.relight.estimate_light import light_of
+from splatgraft.relight.light import Light
+from splatgraft.relight.normals import Normals, estimate_normals
+from splatgraft.relight.place_light import light_at, panorama_at, up_of
+from splatgraft.relight.scene_shading import Ball, SceneMaps, map_scene, scene_visibility
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a scene that waits for objects."""
+
+    scene: Gaussians
+    """All of it, erased Gaussians left out."""
+    members: Int[Tensor, "m"]
+    """Positions of the scene's Gaussians around the place."""
+    normals: Normals
+    """Of the members."""
+    light: Light
+    """At the place."""
+    maps: SceneMaps
+    """The scene's own depth maps for the bundles of `light`."""
+    arrives: Float[Tensor, "m k"]
+    """Share of every bundle that reaches the members past the scene."""
+
+
+def set_stage(
+    scene: Gaussians, cameras: Cameras, *, place: Ball, reach: float, light: Light | None, cache: RelightCache
+) -> tuple[Stage | None, str | None]:
+    """The stage around `place`, `reach` of its radii wide, or a sentence that says why there is none.
+
+    `light` is estimated where none is given.
+    """
+    region = _region(scene, place, reach, cache)
+    members = cache.get("members", (scene, region), lambda: _members(scene, region))
+    normals = cache.get("normals", (members, cameras), lambda: estimate_normals(scene.select(members), cameras))
+    if light is None:
+        light, problem = _estimated(scene, cameras, place, region, cache)
+        if light is None:
+            return None, problem
+    lit = light
+    maps = cache.get("maps", (scene, region, lit.sources), lambda: map_scene(scene, region, beams_of(lit)))
+    points = scene.means[members]
+    arrives = cache.get("arrives", (maps, normals), lambda: scene_visibility(maps, points, normals.vectors))
+    return Stage(scene=scene, members=members, normals=normals, light=lit, maps=maps, arrives=arrives), None
+
+
+def _region(scene: Gaussians, place: Ball, reach: float, cache: RelightCache) -> Ball:
+    kept = cache.peek("region", (scene,))
+    wanted = place.radius * reach
+    if kept is not None and 0.8 * wanted <= kept.radius <= 2 * wanted:
+        moved = float((kept.center - place.center).norm())
+        if moved < 0.5 * kept.radius:
+            return kept
+    region = Ball(place.center, 1.2 * wanted)
+    cache.put("region", (scene,), region)
+    return region
+
+
+def _members(scene: Gaussians, region: Ball) -> Int[Tensor, "m"]:
+    return ((scene.means - region.center).norm(dim=1) < region.radius).nonzero()[:, 0]
+
+
+def _estimated(
+    scene: Gaussians, cameras: Cameras, place: Ball, region: Ball, cache: RelightCache
+) -> tuple[Light | None, str | None]:
+    """The light at `place`; after a move within the region its sources are kept and the rest is looked at again."""
+    kept = cache.peek("light", (scene, region))
+    if kept is None:
+        light, problem = light_at(scene, place, cameras)
+        if light is not None:
+            cache.put("light", (scene, region), light)
+        return light, problem
+    panorama, problem = panorama_at(scene, place)
+    if panorama is None:
+        return None, problem
+    return replace(light_of(panorama, up_of(cameras)), sources=kept.sources), None

@@ -1,0 +1,213 @@
+"""The physical light transfer, whole: two lights, then an object's shading, shadow, bounce and gloss in layers.
+
+Values in, values out: knows nothing about files or views.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.cameras import Cameras
+from splatgraft.composite import Composite
+from splatgraft.gaussians import Gaussians, concatenate
+from splatgraft.relight.beams import beams_of
+from splatgraft.relight.cache import RelightCache
+from splatgraft.relight.cast import Beams
+from splatgraft.relight.layers import Relit, unchanged
+from splatgraft.relight.light import Light
+from splatgraft.relight.normals import Normals, estimate_normals
+from splatgraft.relight.object_shading import irradiance, shade_ratio, unknown_origin_ratio
+from splatgraft.relight.place_light import light_at, up_of
+from splatgraft.relight.receivers import Receivers, shade_receivers
+from splatgraft.relight.scene_shading import (
+    Ball,
+    ObjectMaps,
+    SceneRatio,
+    ball_of,
+    map_object,
+    reachable,
+    scene_ratio,
+    scene_visibility,
+    self_visibility,
+)
+from splatgraft.relight.stage import Stage, set_stage
+
+
+@dataclass(frozen=True)
+class SourceScene:
+    """The capture that an object comes from, without the object."""
+
+    gaussians: Gaussians
+    """In the object's own frame."""
+    cameras: Cameras
+    """That saw it, in the same frame."""
+
+
+@dataclass(frozen=True)
+class RelightOptions:
+    """What may be asked of a transfer."""
+
+    reach: float = 8.0
+    """Shadows are followed this many object radii far."""
+    most_added: float = 0.3
+    """At most this share of the composite's Gaussians is added by splitting."""
+
+
+@dataclass(frozen=True)
+class _Actor:
+    """One placed object, ready to be lit; world frame."""
+
+    gaussians: Gaussians
+    ball: Ball
+    normals: Normals
+    maps: ObjectMaps
+    arrives: Float[Tensor, "n k"]
+    """Share of every bundle that the scene lets through to it."""
+
+
+def relight(
+    composite: Composite,
+    cameras: Cameras,
+    *,
+    sources: Sequence[SourceScene | None] = (),
+    light: Light | None = None,
+    options: RelightOptions = RelightOptions(),
+    cache: RelightCache | None = None,
+) -> Relit:
+    """Light `composite` as one scene: no training, no views.
+
+    `cameras` are the target's. `sources` holds, per object, the scene it was taken from; without it the object keeps
+    its mean brightness. A `light` given by the user replaces the estimate. `cache` serves moves of the same objects.
+    Where a transfer is impossible, the copy-paste result with a plain reason.
+
+    Raises: ValueError where `sources` is neither empty nor one per object.
+    """
+    if len(sources) not in (0, len(composite.objects)):
+        raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")
+    baked, is_object = composite.bake()
+    placed = [(p, s) for p, s in zip_longest(composite.objects, sources) if p.gaussians.count]
+    if not placed:
+        return unchanged(baked, is_object, report=("No object is placed: nothing to light.",))
+    cache = cache or RelightCache()
+    scene = cache.get("scene", (composite.target, composite.erased), lambda: composite.target.select(~composite.erased))
+    objects = [p.in_target() for p, _ in placed]
+    balls = [ball_of(g) for g in objects]
+    place = Ball(torch.stack([b.center for b in balls]).mean(0), max(b.radius for b in balls))
+    stage, problem = set_stage(scene, cameras, place=place, reach=options.reach, light=light, cache=cache)
+    if stage is None:
+        return unchanged(baked, is_object, report=(f"{problem} The object is pasted as it is.",))
+    beams = beams_of(stage.light)
+    report = [stage.light.describe(up_of(cameras)) + (", as given." if light is not None else ".")]
+    actors, shades = [], []
+    for i, ((one, source), gaussians, ball) in enumerate(zip(placed, objects, balls, strict=True)):
+        normals = estimate_normals(gaussians, cameras)
+        arrives = scene_visibility(stage.maps, gaussians.means, normals.vectors)
+        actor = _Actor(gaussians, ball, normals, map_object(gaussians, ball, beams), arrives)
+        before = None
+        if source is not None:
+            key = (one.gaussians, source.gaussians)
+            before, problem = cache.get(f"origin {i}", key, lambda o=one.gaussians, s=source: _origin_light(o, s))
+            story = problem if before is None else before.describe(up_of(source.cameras)) + "."
+            report.append(f"Where object {i + 1} comes from: {story}")
+            before = before.rotated(one.target_from_object.rotation) if before is not None else None
+        actors.append(actor)
+        shades.append(_shade(actor, beams, before))
+    return _assembled(stage, actors, shades, beams, options=options, baked=baked, report=report)
+
+
+def _origin_light(own: Gaussians, source: SourceScene) -> tuple[Light | None, str | None]:
+    """The light on an object where it was captured; its own shadow there helps to tell."""
+    return light_at(source.gaussians, ball_of(own), source.cameras, also=own)
+
+
+def _shade(actor: _Actor, beams: Beams, before: Light | None) -> Float[Tensor, "n 3"]:
+    normals = actor.normals.vectors
+    own = self_visibility(actor.maps, actor.gaussians, normals, beams)
+    now = irradiance(beams, normals, arrives=own * actor.arrives)
+    if before is None:
+        return unknown_origin_ratio(now, actor.normals, actor.gaussians.opacities)
+    then_beams = beams_of(before)
+    own = self_visibility(actor.maps, actor.gaussians, normals, then_beams)
+    then = irradiance(then_beams, normals, arrives=own)
+    return shade_ratio(now, then, actor.normals, actor.gaussians.opacities)
+
+
+def _assembled(  # noqa: PLR0913
+    stage: Stage,
+    actors: list[_Actor],
+    shades: list[Float[Tensor, "n 3"]],
+    beams: Beams,
+    *,
+    options: RelightOptions,
+    baked: Gaussians,
+    report: list[str],
+) -> Relit:
+    """Objects on the scene, objects on each other, and all layers in one list."""
+    lit, ratio = _on_scene(stage, actors, beams, budget=int(options.most_added * baked.count), degree=baked.sh_degree)
+    scene_count = stage.scene.count
+    rest = torch.ones(scene_count, dtype=torch.bool)
+    rest[lit.origin] = False
+    rest_index = rest.nonzero()[:, 0]
+    on_objects = [_on_object(i, actors) for i in range(len(actors))]
+    object_rows = torch.arange(scene_count, baked.count)
+    gaussians = concatenate([baked.select(rest_index), lit.gaussians, baked.select(object_rows)])
+    count = gaussians.count - len(object_rows)
+    ones, zeros = torch.ones(len(rest_index), 3), torch.zeros(len(rest_index), 3)
+    origin = torch.cat([rest_index, lit.origin, object_rows])
+    # the order of the baked composite, pieces where their whole was
+    order = origin.argsort(stable=True)
+    return Relit(
+        gaussians=gaussians.select(order),
+        is_object=order >= count,
+        origin=origin[order],
+        shade=torch.cat([torch.ones(count, 3), *shades])[order],
+        shadow=torch.cat([ones, ratio.shadow, *[r.shadow for r in on_objects]])[order],
+        bounce=torch.cat([zeros, ratio.bounce, *[r.bounce for r in on_objects]])[order],
+        gloss=torch.zeros_like(gaussians.sh),
+        light=stage.light,
+        report=tuple(report),
+    )
+
+
+def _on_scene(
+    stage: Stage, actors: list[_Actor], beams: Beams, *, budget: int, degree: int
+) -> tuple[Receivers, SceneRatio]:
+    """The members that some object reaches, split where needed, and the product of all objects' ratios on them."""
+    points = stage.scene.means[stage.members]
+    reached = torch.zeros(len(points), dtype=torch.bool)
+    for actor in actors:
+        reached |= reachable(points, actor.ball, beams, farthest=stage.maps.region.radius)
+    receivers = Receivers(
+        gaussians=stage.scene.select(stage.members[reached]).with_sh_degree(degree),
+        normals=stage.normals.vectors[reached],
+        arrives=stage.arrives[reached],
+        trust=torch.ones(int(reached.sum())),
+        origin=stage.members[reached],
+    )
+    shadow: Tensor | None = None
+    bounce: Tensor | None = None
+    for actor in actors:
+        receivers, parents, ratio = shade_receivers(receivers, actor.maps, budget=budget // len(actors))
+        if shadow is None or bounce is None:
+            shadow, bounce = ratio.shadow, ratio.bounce
+        else:
+            shadow, bounce = shadow[parents] * ratio.shadow, bounce[parents] + ratio.bounce
+    assert shadow is not None
+    assert bounce is not None
+    return receivers, SceneRatio(shadow=shadow, bounce=bounce)
+
+
+def _on_object(index: int, actors: list[_Actor]) -> SceneRatio:
+    """What all other objects take from and give to one."""
+    actor = actors[index]
+    shadow = torch.ones(actor.gaussians.count, 3)
+    bounce = torch.zeros(actor.gaussians.count, 3)
+    for other in actors:
+        if other is not actor:
+            ratio = scene_ratio(other.maps, actor.gaussians.means, actor.normals.vectors, arrives=actor.arrives)
+            shadow, bounce = shadow * ratio.shadow, bounce + ratio.bounce
+    return SceneRatio(shadow=shadow, bounce=bounce)
