@@ -6,10 +6,10 @@ flows to the image alone. Nothing is downloaded: LPIPS reads weights that are al
 
 import math
 import pickle
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
 
 import torch
 import torch.nn.functional as F
@@ -23,12 +23,8 @@ _VGG_LAYERS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 _VGG_CHANNELS = (64, 128, 256, 512, 512)
 
 
-class ImageLoss(Protocol):
-    """A distance from `image` to `target`, differentiable in `image`."""
-
-    def __call__(self, image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-        """The scalar distance."""
-        ...
+ImageLoss = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], Float[Tensor, ""]]
+"""A distance from the first image to the second, differentiable in the first."""
 
 
 def l1(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
@@ -78,9 +74,9 @@ def _magnitudes(image: Float[Tensor, "h w 3"], window: Float[Tensor, "s s"]) -> 
 class LpipsVgg:
     """LPIPS of Zhang 2018 (version 0.1, VGG-16, linear heads) in plain torch: call it with an image and a target."""
 
-    convolutions: tuple[tuple[tuple[Float[Tensor, "o i 3 3"], Float[Tensor, "o"]], ...], ...]
+    convolutions: tuple[tuple[tuple[Float[Tensor, "_ _ 3 3"], Float[Tensor, "_"]], ...], ...]
     """Weights and biases of VGG-16's 13 convolutions, one tuple per resolution."""
-    heads: tuple[Float[Tensor, "1 c 1 1"], ...]
+    heads: tuple[Float[Tensor, "1 _ 1 1"], ...]
     """Non-negative channel weights of the five taps."""
 
     def __call__(self, image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
@@ -106,14 +102,15 @@ class LpipsVgg:
         for level, convolutions in enumerate(self.convolutions):
             x = F.max_pool2d(x, 2) if level else x
             for weight, bias in convolutions:
-                x = F.relu(F.conv2d(x, weight, bias, padding=1))
+                x = F.relu(F.conv2d(x, weight.to(x), bias.to(x), padding=1))
             taps.append((x / ((x**2).sum(1, keepdim=True) + 1e-20).sqrt())[0])
         return tuple(taps)
 
     def distance(self, features: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> Float[Tensor, ""]:
         """The distance between the features of two images of one size."""
         parts = [
-            F.conv2d(((a - b) ** 2)[None], head).mean() for a, b, head in zip(features, wanted, self.heads, strict=True)
+            F.conv2d(((a - b) ** 2)[None], head.to(a)).mean()
+            for a, b, head in zip(features, wanted, self.heads, strict=True)
         ]
         return torch.stack(parts).sum()
 

@@ -30,7 +30,7 @@ def narrow(views: Views, unchanged_below: float) -> Views:
 
 
 def _seen_changed(views: Views, unchanged_below: float) -> Bool[Tensor, "n"]:
-    seen = torch.zeros(views.composite.count, 2)
+    seen = torch.zeros(views.composite.count, 2, device=views.composite.device)
     for index in range(len(views)):
         view = views[index]
         picture = view.render(views.composite.sh).clamp(0, 1)

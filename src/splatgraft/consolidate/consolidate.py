@@ -48,6 +48,7 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
             Corrections(views, None),
             options.reference,
             loss=options.loss,
+            seed=options.seed,
             progress=progress,
             checkpoint=checkpoint,
         )
@@ -64,7 +65,7 @@ def _fast(composite: Gaussians, views: Views, options: ConsolidateOptions, progr
     sh = solve(prior, corrections, options.solve, progress=progress)
     if options.polish_passes:
         polish = replace(options.polish, iterations=options.polish_passes * len(views))
-        sh = descend(sh, corrections, polish, loss=options.loss, progress=progress)
+        sh = descend(sh, corrections, polish, loss=options.loss, seed=options.seed, progress=progress)
     colors = composite.sh.clone()
     colors[moving] = sh
     return replace(composite, sh=colors)

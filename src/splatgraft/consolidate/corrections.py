@@ -28,7 +28,7 @@ class Corrections:
         if self.options is None:
             return
         image = self.views.target(index)
-        known = self._of_view[index] or no_nuisance(*image.shape[:2], self.options)
+        known = self._of_view[index] or no_nuisance(image, self.options)
         self._of_view[index] = refine(known, image, render.detach(), self.views.weight(index), self.options)
 
     def center(self) -> None:

@@ -16,12 +16,13 @@ from splatgraft.image_losses import ImageLoss
 from splatgraft.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 
-def descend(
+def descend(  # noqa: PLR0913 - the last two are the services of every long stage
     sh: Float[Tensor, "m k 3"],
     corrections: Corrections,
     options: DescentOptions,
     *,
     loss: ImageLoss,
+    seed: int = 0,
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Float[Tensor, "m k 3"]:
@@ -39,10 +40,10 @@ def descend(
     if saved is not None:
         start, sh = int(saved["iteration"]), saved["sh"].clone()
         moments = adam.Moments({"sh": saved["first"].clone()}, {"sh": saved["second"].clone()}, saved["steps"].clone())
-    shares = torch.full((3 * sh.shape[1],), options.rest_ratio)
+    shares = torch.full((3 * sh.shape[1],), options.rest_ratio, device=sh.device)
     shares[:3] = 1.0
     for iteration in range(start, options.iterations):
-        index = _view_of(iteration, len(views), options.seed)
+        index = _view_of(iteration, len(views), seed)
         view, leaf = views[index], sh.detach().requires_grad_()
         picture = view.render(leaf)
         corrections.refine(index, picture)

@@ -44,11 +44,12 @@ class Nuisance:
         return _warp(image, _spread(self.flow, h, w)) * _spread(self.log_gain, h, w).exp()
 
 
-def no_nuisance(height: int, width: int, options: NuisanceOptions) -> Nuisance:
+def no_nuisance(image: Float[Tensor, "h w 3"], options: NuisanceOptions) -> Nuisance:
     """No error at all, on the grids of an image of that size."""
-    flow = torch.zeros(_knots(height, options.flow_cell_px), _knots(width, options.flow_cell_px), 2)
-    log_gain = torch.zeros(_knots(height, options.tint_cell_px), _knots(width, options.tint_cell_px), 3)
-    return Nuisance(flow=flow, log_gain=log_gain)
+    (a, b), (c, d) = (
+        [_knots(n, cell) for n in image.shape[:2]] for cell in (options.flow_cell_px, options.tint_cell_px)
+    )
+    return Nuisance(flow=image.new_zeros(a, b, 2), log_gain=image.new_zeros(c, d, 3))
 
 
 @torch.no_grad()
@@ -61,7 +62,7 @@ def refine(
 ) -> Nuisance:
     """One Gauss-Newton step of tint, then flow, towards the least robust error between corrected image and render."""
     h, w = image.shape[:2]
-    confidence = torch.ones(h, w) if weight is None else weight
+    confidence = image.new_ones(h, w) if weight is None else weight
     warped = _warp(image, _spread(nuisance.flow, h, w))
     tinted = warped * _spread(nuisance.log_gain, h, w).exp()
     log_gain = _refine_tint(nuisance.log_gain, tinted, render, confidence, options)
@@ -86,7 +87,7 @@ def _refine_tint(
     for channel in range(3):
         slope, knots = tinted[..., channel], log_gain[..., channel]
         ridge = (options.residual_sigma / options.tint_sigma) ** 2 * _support(trust, slope.numel(), knots.numel())
-        normal = _normal_matrix(trust * slope**2, rows, columns) + ridge * torch.eye(knots.numel())
+        normal = _normal_matrix(trust * slope**2, rows, columns) + ridge * torch.eye(knots.numel(), device=knots.device)
         right = rows.T @ (trust * slope * residual[..., channel]) @ columns
         step = torch.linalg.solve(normal, right.flatten() - ridge * knots.flatten())
         channels.append(knots + step.reshape(knots.shape))
@@ -117,7 +118,9 @@ def _refine_flow(
     )
     knots = flow.permute(2, 0, 1).flatten()
     ridge = (options.residual_sigma / options.flow_sigma_px) ** 2 * _support(trust, xx.numel(), len(knots) // 2)
-    step = torch.linalg.solve(normal + ridge * torch.eye(len(knots)), right.flatten() - ridge * knots)
+    step = torch.linalg.solve(
+        normal + ridge * torch.eye(len(knots), device=knots.device), right.flatten() - ridge * knots
+    )
     moved = (knots + step).reshape(2, *flow.shape[:2]).permute(1, 2, 0)
     return moved.clamp(-4 * options.flow_sigma_px, 4 * options.flow_sigma_px)
 
@@ -155,17 +158,17 @@ def _knots(length: int, cell_px: float) -> int:
 def _grid_bases(
     grid: Float[Tensor, "a b c"], image: Float[Tensor, "h w 3"]
 ) -> tuple[Float[Tensor, "h a"], Float[Tensor, "w b"]]:
-    return _tents(image.shape[0], grid.shape[0]), _tents(image.shape[1], grid.shape[1])
+    return _tents(image.shape[0], grid.shape[0], like=grid), _tents(image.shape[1], grid.shape[1], like=grid)
 
 
-def _tents(length: int, knots: int) -> Float[Tensor, "length knots"]:
+def _tents(length: int, knots: int, *, like: Tensor) -> Float[Tensor, "length knots"]:
     """Linear interpolation from knots at the two ends and evenly between to pixel centres."""
-    position = (torch.arange(length) + 0.5) / length * (knots - 1)
-    return (1 - (position[:, None] - torch.arange(knots)).abs()).clamp_min(0)
+    position = (torch.arange(length, dtype=like.dtype, device=like.device) + 0.5) / length * (knots - 1)
+    return (1 - (position[:, None] - torch.arange(knots, device=like.device)).abs()).clamp_min(0)
 
 
 def _spread(grid: Float[Tensor, "a b c"], height: int, width: int) -> Float[Tensor, "h w c"]:
-    rows, columns = _tents(height, grid.shape[0]), _tents(width, grid.shape[1])
+    rows, columns = _tents(height, grid.shape[0], like=grid), _tents(width, grid.shape[1], like=grid)
     return torch.stack([rows @ channel @ columns.T for channel in grid.unbind(-1)], -1)
 
 
@@ -174,7 +177,8 @@ def _warp(image: Float[Tensor, "h w 3"], flow: Float[Tensor, "h w 2"]) -> Float[
     if not flow.any():
         return image
     h, w = image.shape[:2]
-    x, y = torch.arange(w) + 0.5 + flow[..., 0], torch.arange(h)[:, None] + 0.5 + flow[..., 1]
+    x = torch.arange(w, device=flow.device) + 0.5 + flow[..., 0]
+    y = torch.arange(h, device=flow.device)[:, None] + 0.5 + flow[..., 1]
     grid = torch.stack([2 * x / w - 1, 2 * y / h - 1], -1)[None]
     planes = image.permute(2, 0, 1)[None]
     sampled = F.grid_sample(planes, grid, mode="bicubic", padding_mode="border", align_corners=False)
@@ -182,7 +186,7 @@ def _warp(image: Float[Tensor, "h w 3"], flow: Float[Tensor, "h w 2"]) -> Float[
 
 
 def _blur(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    taps = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
+    taps = image.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
     planes = F.pad(image.permute(2, 0, 1)[:, None], (2, 2, 2, 2), mode="replicate")
     planes = F.conv2d(F.conv2d(planes, taps.reshape(1, 1, 1, 5)), taps.reshape(1, 1, 5, 1))
     return planes[:, 0].permute(1, 2, 0)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -12,6 +12,7 @@ from splatgraft.image_losses import ImageLoss, windowed_fourier
 from splatgraft.rendering import RenderOptions
 
 
+@runtime_checkable
 class ImageSequence(Protocol):
     """Images by index, read when asked for; a list of tensors is one."""
 
@@ -68,8 +69,6 @@ class DescentOptions:
     """Learning rate of the higher bands over that of band 0 (3DGS: 1/20)."""
     final_ratio: float = 1.0
     """Last learning rate over the first, approached along a cosine; 1 keeps it constant, as the paper does."""
-    seed: int = 0
-    """Order of the views."""
     save_every: int = 500
     """Iterations between two checkpoints."""
 
@@ -98,3 +97,5 @@ class ConsolidateOptions:
     """Tile lists and bases kept between passes; what does not fit is computed again in each pass."""
     rendering: RenderOptions = field(default_factory=RenderOptions)
     """How the scene is drawn."""
+    seed: int = 0
+    """Order of the views."""

@@ -121,7 +121,7 @@ class Views:
         directions = torch.nn.functional.normalize(scene.means - camera.centers, dim=-1)
         still = None
         if any(self.rendering.background):
-            still = (1 - operator.alpha)[..., None] * torch.tensor(self.rendering.background)
+            still = (1 - operator.alpha)[..., None] * operator.alpha.new_tensor(self.rendering.background)
         if self.moving is not None:
             colors = spherical_harmonics.colors(scene.sh, directions)
             colors[self.moving] = 0
