@@ -133,12 +133,12 @@ def _cut(
 
 
 def _largest_blob(mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Crumbs under a fiftieth of the largest blob fall away, as do holes of that size."""
+    """Crumbs under a fiftieth of the largest blob fall away, and holes under a thousandth of the object are filled."""
     for value in (1, 0):
         count, labels, stats, _ = cv2.connectedComponentsWithStats((mask == value).astype(np.uint8), connectivity=4)
         if count > 1:
             areas = stats[1:, cv2.CC_STAT_AREA]
-            limit = areas.max() / 50 if value == 1 else int((mask == 1).sum()) / 50
+            limit = areas.max() / 50 if value == 1 else int((mask == 1).sum()) / 1000
             small = np.flatnonzero(areas < limit) + 1
             mask = np.where(np.isin(labels, small), 1 - value, mask).astype(np.uint8)
     return mask.astype(np.float32)
