@@ -45,10 +45,12 @@ E0, E1, E2, E3, E4 = (float32(x) for x in (0.99999994, 0.9999898, 0.49976337, 0.
 def _shape(splats, s, x0, y0):
     """Centre in the tile, the quadratic's a, b, c and constant over 16, first and one past the last row."""
     mx, my = splats[s, MX] - x0 - HALF, splats[s, MY] - y0 - HALF
+    # a thousandth of a pixel covers rounding, and every pixel is tested by itself; truncation is floor above 0
     reach = splats[s, REACH_Y] + float32(1e-3)
-    top, bottom = math.ceil(max(my - reach, ZERO)), math.floor(min(my + reach, float32(TILE - 1)))
+    top = int(max(my - reach + ONE, ZERO))
+    bottom = int(max(min(my + reach + ONE, float32(TILE)), ZERO))
     a, b, c = -HALF * SIXTEENTH * splats[s, CA], -SIXTEENTH * splats[s, CB], -HALF * SIXTEENTH * splats[s, CC]
-    return mx, my, a, b, c, SIXTEENTH * splats[s, LOG_OPACITY], int(top), int(bottom) + 1
+    return mx, my, a, b, c, SIXTEENTH * splats[s, LOG_OPACITY], top, bottom
 
 
 @njit(cache=True)

@@ -61,7 +61,7 @@ def _tile_span(splat, row, tiles_x):
     # a thousandth of a pixel covers the rounding here; the kernels test every pixel exactly
     first = (splat[MX] + left - 1e-3) / TILE
     last = (splat[MX] + right + 1e-3) / TILE
-    return int(max(math.floor(min(first, 1e6)), 0)), int(min(math.floor(max(last, -1.0)) + 1, tiles_x))
+    return int(max(min(first, 1e6), 0.0)), int(max(min(last + 1.0, float(tiles_x)), 0.0))
 
 
 @njit(cache=True)
@@ -70,7 +70,8 @@ def _tile_rows(splat, tiles_y):
     """First and one past the last tile row that the ellipse can meet."""
     top = (splat[MY] - splat[REACH_Y] - 1e-3) / TILE
     bottom = (splat[MY] + splat[REACH_Y] + 1e-3) / TILE
-    return int(max(math.floor(min(top, 1e6)), 0)), int(min(math.floor(max(bottom, -1.0)) + 1, tiles_y))
+    # truncation is floor, as nothing is below 0
+    return int(max(min(top, 1e6), 0.0)), int(max(min(bottom + 1.0, float(tiles_y)), 0.0))
 
 
 @njit(cache=True, parallel=True)
