@@ -16,6 +16,7 @@ from splatgraft.compose import (
     rest_on_surface,
     support_below,
 )
+from splatgraft.compose.facing import facing_yaw_deg
 from splatgraft.gaussians import Gaussians, concatenate, empty, quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.orbit import estimate_up, focus_point
 from splatgraft.similarity import Similarity
@@ -244,3 +245,17 @@ def test_an_object_in_the_wall_is_reported():
 def test_an_empty_object_has_no_base():
     with pytest.raises(ValueError, match="found an empty one"):
         object_base(empty(), up=UP)
+
+
+def directions(*degrees):
+    angle = torch.deg2rad(torch.tensor(degrees))
+    return torch.stack([angle.cos(), angle.sin(), torch.full_like(angle, 0.5)], -1)
+
+
+def test_the_photographed_side_is_turned_to_the_cameras():
+    arc, other = directions(0.0, 20.0, 40.0), directions(100.0, 120.0, 140.0)
+    assert facing_yaw_deg(arc, other, up=UP) == pytest.approx(100, abs=10)  # flat optimum, 5 degree steps
+    assert facing_yaw_deg(arc, other, up=-UP) == pytest.approx(-100, abs=10)
+    assert facing_yaw_deg(arc, arc, up=UP) == 0
+    ring = directions(*[15.0 * i for i in range(24)])
+    assert facing_yaw_deg(ring, other, up=UP) == 0

@@ -1,12 +1,13 @@
 """The placement helper: base, place, size and upright rest in one call. Knows nothing about light or files."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
 from splatgraft.cameras import Cameras
 from splatgraft.compose.base import ObjectBase, object_base
 from splatgraft.compose.checks import hidden_fraction
+from splatgraft.compose.facing import facing_yaw_deg
 from splatgraft.compose.rest import RestOptions, rest_on_surface
 from splatgraft.compose.suggest import size_in_view, suggest_place
 from splatgraft.compose.support import Support
@@ -23,8 +24,8 @@ class PlaceOptions:
     """The object stands on the surface below this point of the target; None finds a visible, level place."""
     scale: float | None = None
     """Size in the target over size in the source; None guesses from the views, for captures have no common unit."""
-    yaw_deg: float = 0.0
-    """Turn about the vertical, counterclockwise seen from above."""
+    yaw_deg: float | None = None
+    """Turn about the vertical, counterclockwise seen from above; None turns photographed sides to the cameras."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Added to where it stands, world units of the target."""
 
@@ -69,8 +70,12 @@ def place_object(
     else:
         point = torch.tensor(options.point)
         scale = options.scale if options.scale is not None else size_in_view(base, point, cameras=target_cameras)
-    rest = RestOptions(scale=scale, yaw_deg=options.yaw_deg, offset=options.offset)
+    rest = RestOptions(scale=scale, yaw_deg=options.yaw_deg or 0.0, offset=options.offset)
     move, support = rest_on_surface(target, base, point=point, up=up, options=rest)
+    if options.yaw_deg is None:
+        seen_from = (source_cameras.centers - base.point) @ move.rotation.T
+        yaw = facing_yaw_deg(seen_from, target_cameras.centers - support.point, up=support.normal)
+        move, support = rest_on_surface(target, base, point=point, up=up, options=replace(rest, yaw_deg=yaw))
     hidden = hidden_fraction(target, move.gaussians(object_), cameras=target_cameras)
     return Placed(
         target_from_object=move,

@@ -18,8 +18,8 @@ class TurntableOptions:
 
     frames: int = 60
     """Pictures in one loop."""
-    zoom: float = 1.0
-    """Focal length over the captured cameras' median."""
+    zoom: float = 1.25
+    """Focal length over the captured cameras' median: the object is nearer the middle than in the capture."""
     full_circle_gap_deg: float = 75.0
     """Where no captured camera stands over a wider angle than this, the path is an arc, there and back."""
 
