@@ -21,15 +21,16 @@ ROOM = Path(__file__).parents[1] / "data" / "room"
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("capture", nargs="?", type=Path, default=ROOM)
-    parser.add_argument("--iterations", type=int, default=ReconstructOptions.iterations)
-    parser.add_argument("--budget", type=int, default=ReconstructOptions.budget)
-    parser.add_argument("--resolution", type=float, default=1.0)
+    parser.add_argument("--quality", choices=["draft", "standard", "full"], default="standard")
+    parser.add_argument("--iterations", type=int)
+    parser.add_argument("--budget", type=int)
+    parser.add_argument("--resolution", type=float)
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     capture = read_capture(args.capture)
     options = ReconstructOptions(
-        iterations=args.iterations, budget=args.budget, resolution=args.resolution, eval_every=8
+        quality=args.quality, iterations=args.iterations, budget=args.budget, resolution=args.resolution, eval_every=8
     )
     begin, begin_cpu = time.perf_counter(), time.process_time()
 
@@ -39,7 +40,7 @@ def main() -> None:
 
     gaussians = reconstruct(capture, options, progress=say)
     seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
-    served = capture.resized(args.resolution)
+    served = options.served(capture)
     tested = [i for i in range(len(served)) if held_out(len(served))[i]]
     with torch.no_grad():
         pairs = [(render(gaussians, served.cameras[i]).color[0].clamp(0, 1), served.image(i)) for i in tested]

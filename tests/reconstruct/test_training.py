@@ -146,8 +146,21 @@ def test_memory_is_asked_for_before_the_start(capture, monkeypatch):
     options = ReconstructOptions(iterations=10, budget=1_000_000)
     assert predict_memory(capture, options) > predict_memory(capture, replace(options, budget=1000))
     monkeypatch.setattr(memory_module, "available_memory", lambda device: 10**8)
-    with pytest.raises(ValueError, match=r"lower --resolution .* or --budget"):
+    with pytest.raises(ValueError, match=r"lower --resolution or --budget \(1000000\)"):
         reconstruct(capture, options)
+
+
+def test_quality_chooses_what_is_not_given():
+    assert ReconstructOptions(quality="draft").all_iterations == 1000
+    assert ReconstructOptions(quality="full", iterations=7).all_iterations == 7
+    assert ReconstructOptions(quality="full").most_gaussians > ReconstructOptions().most_gaussians
+
+
+def test_large_photographs_are_served_smaller_unless_told(capture):
+    large = replace(capture, cameras=capture.cameras.resized(40.0))
+    assert ReconstructOptions(quality="draft").served(large).cameras.width == 640
+    assert ReconstructOptions(quality="draft", resolution=1.0).served(large).cameras.width == 1920
+    assert ReconstructOptions(quality="draft").served(capture).cameras.width == 48
 
 
 def test_too_few_views_and_odd_options_are_named(capture):

@@ -21,11 +21,11 @@ _BYTES_PER_GAUSSIAN = 1200
 
 def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
     """Peak bytes of `reconstruct`, an upper estimate."""
-    pixels = (capture.cameras.sizes.prod(1).double() * options.resolution**2).tolist()
+    pixels = options.served(capture).cameras.sizes.prod(1).double().tolist()
     pyramid = 3 * sum(pixels) * (1 + 1 / 2 + 1 / 4 + 1 / 16 if options.coarse_to_fine else 1)
     largest = max(pixels, default=0.0)
     numbers = 11 + 3 * coefficient_count(options.sh_degree)
-    gaussians = options.budget * (4 * numbers * _COPIES + _BYTES_PER_GAUSSIAN)
+    gaussians = options.most_gaussians * (4 * numbers * _COPIES + _BYTES_PER_GAUSSIAN)
     decoding = 24 * max(_file_pixels(capture), largest)
     return int(_BASE + pyramid + max(decoding, largest * _BYTES_PER_PIXEL) + gaussians)
 
@@ -43,7 +43,7 @@ def require_memory(capture: PosedImages, options: ReconstructOptions) -> None:
     if free is not None and needed > free:
         raise ValueError(
             f"reconstruct: expected {needed / 2**30:.1f} GiB of free memory, found {free / 2**30:.1f} GiB; "
-            f"lower --resolution ({options.resolution:g}) or --budget ({options.budget})"
+            f"lower --resolution or --budget ({options.most_gaussians})"
         )
 
 

@@ -37,7 +37,7 @@ def reconstruct(
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
-    """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023), at most `options.budget` of them.
+    """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023), at most `options.most_gaussians`.
 
     Raises: ValueError where there are too few views, too little memory, or the fit stops being finite.
     """
@@ -46,16 +46,16 @@ def reconstruct(
         capture = capture.select(~held_out(len(capture), options.eval_every))
     if len(capture) < 2:
         raise ValueError(f"reconstruct: expected at least 2 views to fit, found {len(capture)}")
-    capture = capture.resized(options.resolution)
+    capture = options.served(capture)
     start = _start(capture, options, progress).to(options.device)
     schedule = _COARSE_TO_FINE if options.coarse_to_fine else _AS_IT_IS
     views = read_pyramid(capture, schedule, device=options.device, progress=progress)
     control = _Control(
-        options.sh_degree, max(1, options.iterations // 30), _density(options, start.count, capture.cameras)
+        options.sh_degree, max(1, options.all_iterations // 30), _density(options, start.count, capture.cameras)
     )
     fit_options = FitOptions(
-        iterations=options.iterations,
-        rates=_rates(capture.cameras, options.iterations),
+        iterations=options.all_iterations,
+        rates=_rates(capture.cameras, options.all_iterations),
         seed=options.seed,
         rendering=RenderOptions(background=options.background),
     )
@@ -83,20 +83,20 @@ class _Control:
 def _start(capture: PosedImages, options: ReconstructOptions, progress: Progress) -> Gaussians:
     points, colors = capture.points, capture.point_colors
     if len(points) < _FEWEST_POINTS:
-        count = max(options.budget // 4, 1)
+        count = max(options.most_gaussians // 4, 1)
         found = f"{len(points)} sparse points" if len(points) else "no sparse points"
-        progress(0, options.iterations, f"{found}: starting from {count} random ones where the cameras look")
+        progress(0, options.all_iterations, f"{found}: starting from {count} random ones where the cameras look")
         points = random_points(capture.cameras, count=count, seed=options.seed)
         colors = torch.rand(count, 3, generator=torch.Generator().manual_seed(options.seed))
-    opacity = _PUBLISHED_OPACITY if options.iterations >= PUBLISHED_ITERATIONS else _SHORT_RUN_OPACITY
-    start = from_points(points, colors, count=options.budget, seed=options.seed)
+    opacity = _PUBLISHED_OPACITY if options.all_iterations >= PUBLISHED_ITERATIONS else _SHORT_RUN_OPACITY
+    start = from_points(points, colors, count=options.most_gaussians, seed=options.seed)
     return replace(start, opacity_logits=torch.full_like(start.opacity_logits, opacity).logit())
 
 
 def _density(options: ReconstructOptions, first_count: int, cameras: Cameras) -> Density:
-    n = options.iterations
+    n = options.all_iterations
     return Density(
-        budget=options.budget,
+        budget=options.most_gaussians,
         first_count=first_count,
         every=max(1, min(100, n // 20)),
         full_at=int(0.6 * n),

@@ -45,7 +45,7 @@ class Reconstruct:
         scene = reconstruct(capture, options, progress=context.progress, checkpoint=context.checkpoint)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
         if options.eval_every:
-            metrics = _held_out_metrics(scene, capture.resized(options.resolution), options)
+            metrics = _held_out_metrics(scene, options.served(capture), options)
             context.terminal.say(f"held out: {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}")
             (folder / METRICS_FILE).write_text(json.dumps(metrics, indent=1))
 
