@@ -182,7 +182,8 @@ def _metric_row(metrics: dict, row: tuple[str, str, str, str, bool, str], reason
     head = f'<tr><th scope="row">{title} <em>{unit}</em><small>{words}</small></th>'
     before, after = metrics["copy_paste"].get(name), metrics["result"].get(name)
     if before is None and after is None:
-        why = reasons.get(name, "no view has such a region")
+        asked = name in metrics["result"]
+        why = reasons.get(name, "no view has such a region" if asked else "it was not asked for")
         return f'{head}<td colspan="3" class="missing">not measured: {escape(why)}</td></tr>'
     cells = "".join(f"<td>{'-' if value is None else form.format(value)}</td>" for value in (before, after))
     if before is None or after is None:

@@ -7,7 +7,7 @@ from typing import Literal
 from splatgraft.composite import Composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.project import IS_OBJECT_FILE, LIGHT_FILE, SCENE_FILE
-from splatgraft.relight.layers import Relit
+from splatgraft.relight.exposure import relight_by_gain
 from splatgraft.relight.transfer import RelightOptions, SourceScene, relight
 from splatgraft.steps.composite_folder import placement_files, read_composite
 from splatgraft.steps.selection_file import write_selection
@@ -30,8 +30,9 @@ class Relight:
     """The source without the object, a .ply: the light that is to be taken off. Without it brightness is kept."""
     object_cameras: Path | None = None
     """The source's cameras, a transforms.json."""
-    light: Literal["transfer", "off"] = "transfer"
-    """Whether light is transferred; off pastes the object as it was captured (the paper's configuration)."""
+    light: Literal["transfer", "gain", "off"] = "transfer"
+    """transfer: shading and shadows; gain: exposure and white balance of the object alone; off: the object as it was
+    captured (the paper's configuration)."""
     options: RelightOptions = field(default_factory=RelightOptions)
 
     def inputs(self) -> Inputs:
@@ -46,8 +47,14 @@ class Relight:
         if self.light == "off":
             gaussians, is_object = composite.bake()
             sentences = ("The light transfer was off: the object is pasted as it was captured.",)
+        elif self.light == "gain":
+            adjusted, sentences = relight_by_gain(
+                composite, read_cameras(self.cameras), sources=self._sources(composite)
+            )
+            gaussians, is_object = adjusted.bake()
         else:
-            relit = self._relit(composite)
+            cameras, sources = read_cameras(self.cameras), self._sources(composite)
+            relit = relight(composite, cameras, sources=sources, options=self.options)
             gaussians, is_object, sentences = relit.bake(), relit.is_object, relit.report
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_selection(folder / IS_OBJECT_FILE, is_object)
@@ -55,15 +62,14 @@ class Relight:
         for sentence in sentences:
             context.terminal.say(sentence)
 
-    def _relit(self, composite: Composite) -> Relit:
+    def _sources(self, composite: Composite) -> list[SourceScene | None]:
         source = None
         if self.surroundings is not None:
             if self.object_cameras is None:
                 raise ValueError("--surroundings: expected --object-cameras beside it, found none")
             source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
         # only the first object is known to come from these surroundings; further ones keep their mean brightness
-        sources = [source if index == 0 else None for index in range(len(composite.objects))]
-        return relight(composite, read_cameras(self.cameras), sources=sources, options=self.options)
+        return [source if index == 0 else None for index in range(len(composite.objects))]
 
 
 COMMAND = Relight
