@@ -1,5 +1,6 @@
 """The CPU renderer against the plain-torch reference, and the properties a renderer has of itself."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 
 import pytest
@@ -200,3 +201,11 @@ def test_degenerate_gaussians_do_no_harm(numbers, low_pass):
     assert all(getattr(picture, name).isfinite().all() for name in ["color", "alpha", "depth", "normal"])
     (picture.color.sum() + picture.alpha.sum() + picture.depth.sum() + picture.normal.sum()).backward()
     assert all(getattr(scene, field.name).grad.isfinite().all() for field in fields(Gaussians))
+
+
+def test_two_threads_may_draw_at_once():
+    scene = random_scene(200, 1, seed=9)
+    expected = rendering.render(scene, camera()).color
+    with ThreadPoolExecutor(2) as pool:
+        pictures = list(pool.map(lambda _: rendering.render(scene, camera()).color, range(8)))
+    assert all(torch.equal(picture, expected) for picture in pictures)

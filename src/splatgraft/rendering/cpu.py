@@ -1,11 +1,12 @@
 """Rendering on the CPU: numba kernels behind torch autograd. Knows nothing about files or training."""
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
@@ -86,11 +87,13 @@ class _TileLists:
     depths: np.ndarray
     """(n,) along the optical axis; set where visible."""
     start: np.ndarray
+    """(tiles + 1,) where each tile's list begins in `entries`."""
     entries: np.ndarray
+    """(e,) splats, tile after tile."""
     slots: np.ndarray
+    """(e,) a place for each entry's sums, so that those of one splat lie together."""
     first: np.ndarray
-    drawn: np.ndarray
-    """(n,) whether any tile lists the Gaussian."""
+    """(m + 1,) where each splat's slots begin."""
 
     @staticmethod
     def of(view: _View, means: np.ndarray, log_scales: np.ndarray, quaternions: np.ndarray, logits: np.ndarray):
@@ -98,16 +101,41 @@ class _TileLists:
         cpu_project.project(means, log_scales, quaternions, logits, view.numbers, view.antialiased, splats, depths)
         order = cpu_tiles.depth_order(splats, depths)
         packed, start, entries, slots, first = cpu_tiles.bin_splats(splats, order, view.width, view.height)
-        drawn = np.zeros(len(means), np.bool_)
-        drawn[order[np.diff(first) > 0]] = True
-        return _TileLists(order, packed, depths, start, entries, slots, first, drawn)
+        return _TileLists(order, packed, depths, start, entries, slots, first)
 
-    def blend(self, values: np.ndarray, view: _View) -> tuple[np.ndarray, np.ndarray]:
+    @cached_property
+    def drawn(self) -> np.ndarray:
+        """(n,) whether any tile lists the Gaussian."""
+        out = np.zeros(len(self.depths), np.bool_)
+        out[self.order[np.diff(self.first) > 0]] = True
+        return out
+
+    def shown(self, view: _View) -> "_TileLists":
+        """Lists of what has weight in some pixel of the tile; drawn to their ends they give the same pictures."""
+        ones = np.ones((1, view.height, view.width), np.float32)
+        shown = self.gather(ones, cpu_blend.MIN_TRANSMITTANCE)[:, 0] > 0
+        listed = shown[self.slots]
+        shown_before, listed_before = (np.concatenate([[0], np.cumsum(x)]).astype(np.int32) for x in (shown, listed))
+        return replace(
+            self,
+            start=listed_before[self.start],
+            entries=self.entries[listed],
+            slots=shown_before[self.slots[listed]],
+            first=shown_before[self.first],
+        )
+
+    def blend(self, values: np.ndarray, view: _View, least: np.float32) -> tuple[np.ndarray, np.ndarray]:
         """Blended `values (n, c)` as (c, h, w), and alpha (h, w)."""
         image = np.empty((values.shape[1], view.height, view.width), np.float32)
         alpha = np.empty((view.height, view.width), np.float32)
-        cpu_blend.blend(self.splats, self.start, self.entries, values[self.order], image, alpha)
+        cpu_blend.blend(self.splats, self.start, self.entries, values[self.order], image, alpha, least)
         return image, alpha
+
+    def gather(self, image: np.ndarray, least: np.float32) -> np.ndarray:
+        """For every slot (e, c) the sum over pixels of weight times `image (c, h, w)`."""
+        sums = np.empty((len(self.entries), len(image)), np.float32)
+        cpu_blend.blend_transpose(self.splats, self.start, self.entries, self.slots, image, sums, least)
+        return sums
 
     def sum_slots(self, sums: np.ndarray) -> np.ndarray:
         """Entries' sums (e, c) gathered to Gaussians (n, c)."""
@@ -134,7 +162,7 @@ class _Splat(torch.autograd.Function):
                 columns.append(np.empty((len(means), 3), np.float32))
                 cpu_project.normals(means, log_scales, quaternions, lists.drawn, view.numbers, columns[-1])
             values = np.concatenate([*columns, features], 1)
-            image, alpha = lists.blend(values, view)
+            image, alpha = lists.blend(values, view, cpu_blend.MIN_TRANSMITTANCE)
         ctx.view, ctx.outputs, ctx.lists = view, outputs, lists
         ctx.save_for_backward(*fields)
         ctx.blended = values, image, alpha
@@ -156,7 +184,7 @@ class _Splat(torch.autograd.Function):
             sums = np.empty((len(lists.entries), cpu_blend.MOMENTS + values.shape[1]), np.float32)
             cpu_blend.blend_backward(
                 lists.splats, lists.start, lists.entries, lists.slots, values[lists.order],
-                image, alpha, _array(grad_image), _array(grad_alpha), sums,
+                image, alpha, _array(grad_image), _array(grad_alpha), sums, cpu_blend.MIN_TRANSMITTANCE,
             )  # fmt: skip
             totals = lists.sum_slots(sums)
             if "color" in places:
@@ -171,42 +199,40 @@ class _Splat(torch.autograd.Function):
 
 
 class CpuViewOperator:
-    """`ViewOperator` on the CPU; the tile lists are made once."""
+    """`ViewOperator` on the CPU; tile lists are made once, of what is seen, and drawn to their ends."""
 
     def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> None:
-        """Project, sort and list once."""
+        """Project, sort, list, and drop what is hidden."""
         self._view = _View.of(camera, options)
-        self._n = gaussians.count
         with _KERNELS:
-            self._lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
-            _, alpha = self._lists.blend(np.empty((self._n, 0), np.float32), self._view)
-        self.alpha: Float[Tensor, "h w"] = torch.from_numpy(alpha)
-        self.visible: Bool[Tensor, n] = torch.from_numpy(self._lists.drawn)
+            lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
+            self._lists = lists.shown(self._view)
+            _, alpha = self._lists.blend(np.empty((gaussians.count, 0), np.float32), self._view, cpu_blend.ALL)
+        self.alpha = torch.from_numpy(alpha)
+        self.visible = torch.from_numpy(self._lists.drawn)
 
     def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
         """W values, over black; differentiable in `values`."""
-        return _Blend.apply(self, values)
+        return _Blend.apply(self._lists, self._view, values)
 
     def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
         """W^T image."""
-        planes, lists = _array(image.permute(2, 0, 1)), self._lists
-        sums = np.empty((len(lists.entries), len(planes)), np.float32)
-        with _KERNELS:
-            cpu_blend.blend_transpose(lists.splats, lists.start, lists.entries, lists.slots, planes, sums)
-            return torch.from_numpy(lists.sum_slots(sums))
+        return _transpose(self._lists, image)
 
-    def _forward(self, values: Tensor) -> Tensor:
-        with _KERNELS:
-            image, _ = self._lists.blend(_array(values), self._view)
-        return torch.from_numpy(image).permute(1, 2, 0)
+
+def _transpose(lists: _TileLists, image: Tensor) -> Tensor:
+    with _KERNELS:
+        return torch.from_numpy(lists.sum_slots(lists.gather(_array(image.permute(2, 0, 1)), cpu_blend.ALL)))
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, operator: CpuViewOperator, values: Tensor) -> Tensor:
-        ctx.operator = operator
-        return operator._forward(values)
+    def forward(ctx, lists: _TileLists, view: _View, values: Tensor) -> Tensor:
+        ctx.lists = lists
+        with _KERNELS:
+            image, _ = lists.blend(_array(values), view, cpu_blend.ALL)
+        return torch.from_numpy(image).permute(1, 2, 0)
 
     @staticmethod
     def backward(ctx, grad):
-        return None, ctx.operator.blend_transpose(grad)
+        return None, None, _transpose(ctx.lists, grad)

@@ -30,7 +30,9 @@ PIXELS = TILE * TILE
 BATCH = 32
 RGB = 3
 MAX_ALPHA = float32(0.99)
-MIN_TRANSMITTANCE = float32(1e-4)
+MIN_TRANSMITTANCE = np.float32(1e-4)
+ALL = np.float32(0)
+"""A least transmittance that draws every list to its end."""
 MOMENTS = 6
 
 ONE, ZERO, HALF = float32(1), float32(0), float32(0.5)
@@ -68,17 +70,17 @@ def _alpha(across, dx, along, down):
 
 @njit(cache=True)
 @no_type_check
-def _saturated(work):
-    """Whether no pixel of the tile lets through anything worth drawing."""
+def _saturated(work, least):
+    """Whether no pixel of the tile lets through as much as `least`."""
     most = load(work, 0)
     for y in range(1, TILE):
         most = larger(most, load(work, y * TILE))
-    return largest(most) < MIN_TRANSMITTANCE
+    return largest(most) < least
 
 
 @njit(cache=True)
 @no_type_check
-def _blend_rgb(splats, entries, values, x0, y0, work):
+def _blend_rgb(splats, entries, values, x0, y0, work, least):
     """Planes of `work`: transmittance, red, green, blue."""
     for k in range(entries.shape[0]):
         s = entries[k]
@@ -95,13 +97,13 @@ def _blend_rgb(splats, entries, values, x0, y0, work):
             store(work, at + PIXELS, load(work, at + PIXELS) + weight * red)
             store(work, at + 2 * PIXELS, load(work, at + 2 * PIXELS) + weight * green)
             store(work, at + 3 * PIXELS, load(work, at + 3 * PIXELS) + weight * blue)
-        if k % BATCH == BATCH - 1 and _saturated(work):
+        if k % BATCH == BATCH - 1 and _saturated(work, least):
             break
 
 
 @njit(cache=True)
 @no_type_check
-def _blend_any(splats, entries, values, x0, y0, work):
+def _blend_any(splats, entries, values, x0, y0, work, least):
     """Planes of `work`: transmittance, then the channels."""
     for k in range(entries.shape[0]):
         s = entries[k]
@@ -117,7 +119,7 @@ def _blend_any(splats, entries, values, x0, y0, work):
             for channel in range(values.shape[1]):
                 at += PIXELS
                 store(work, at, load(work, at) + weight * values[s, channel])
-        if k % BATCH == BATCH - 1 and _saturated(work):
+        if k % BATCH == BATCH - 1 and _saturated(work, least):
             break
 
 
@@ -133,16 +135,19 @@ def _open_tile(tile, width, planes):
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def blend(splats, start, entries, values, image, alpha):
-    """Fill `image (c, h, w)` with blended `values (m, c)` over black, and `alpha (h, w)`."""
+def blend(splats, start, entries, values, image, alpha, least):
+    """Fill `image (c, h, w)` with blended `values (m, c)` over black, and `alpha (h, w)`.
+
+    A tile is done when every pixel's transmittance is below `least`; tested once per batch of splats.
+    """
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = _open_tile(tile, alpha.shape[1], 1 + channels)
         listed = entries[start[tile] : start[tile + 1]]
         if channels == RGB:
-            _blend_rgb(splats, listed, values, float32(x0), float32(y0), work)
+            _blend_rgb(splats, listed, values, float32(x0), float32(y0), work, least)
         else:
-            _blend_any(splats, listed, values, float32(x0), float32(y0), work)
+            _blend_any(splats, listed, values, float32(x0), float32(y0), work, least)
         for y in range(y0, min(y0 + TILE, alpha.shape[0])):
             for x in range(x0, min(x0 + TILE, alpha.shape[1])):
                 at = (y - y0) * TILE + x - x0
@@ -162,7 +167,7 @@ def _read(image, x0, y0, work, plane):
 
 @njit(cache=True)
 @no_type_check
-def _gather_rgb(splats, entries, slots, x0, y0, work, sums):
+def _gather_rgb(splats, entries, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, red, green, blue."""
     for k in range(entries.shape[0]):
         mx, my, a, b, c, d, top, bottom = _shape(splats, entries[k], x0, y0)
@@ -180,14 +185,14 @@ def _gather_rgb(splats, entries, slots, x0, y0, work, sums):
             blue = blue + weight * load(work, at + 3 * PIXELS)
         slot = slots[k]
         sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(red), total(green), total(blue)
-        if k % BATCH == BATCH - 1 and _saturated(work):
+        if k % BATCH == BATCH - 1 and _saturated(work, least):
             return k + 1
     return entries.shape[0]
 
 
 @njit(cache=True)
 @no_type_check
-def _gather_any(splats, entries, slots, x0, y0, work, sums):
+def _gather_any(splats, entries, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, the channels of the image, one for sums (at most 256 channels in rows)."""
     channels = sums.shape[1]
     column = np.empty(channels * TILE, np.float32)
@@ -207,14 +212,14 @@ def _gather_any(splats, entries, slots, x0, y0, work, sums):
                 store(column, channel * TILE, load(column, channel * TILE) + weight * load(work, at))
         for channel in range(channels):
             sums[slots[k], channel] = total(load(column, channel * TILE))
-        if k % BATCH == BATCH - 1 and _saturated(work):
+        if k % BATCH == BATCH - 1 and _saturated(work, least):
             return k + 1
     return entries.shape[0]
 
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def blend_transpose(splats, start, entries, slots, image, sums):
+def blend_transpose(splats, start, entries, slots, image, sums, least):
     """Fill `sums (e, c)`: for every entry, the sum over its pixels of weight times `image (c, h, w)`."""
     channels = image.shape[0]
     for tile in prange(start.shape[0] - 1):
@@ -223,9 +228,9 @@ def blend_transpose(splats, start, entries, slots, image, sums):
         for c in range(channels):
             _read(image[c], x0, y0, work, 1 + c)
         if channels == RGB:
-            used = _gather_rgb(splats, listed, places, float32(x0), float32(y0), work, sums)
+            used = _gather_rgb(splats, listed, places, float32(x0), float32(y0), work, sums, least)
         else:
-            used = _gather_any(splats, listed, places, float32(x0), float32(y0), work, sums)
+            used = _gather_any(splats, listed, places, float32(x0), float32(y0), work, sums, least)
         for k in range(used, listed.shape[0]):
             sums[places[k]] = ZERO
 
@@ -248,7 +253,7 @@ def _pull(uncapped, alpha, before, value, left):
 
 @njit(cache=True)
 @no_type_check
-def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums):
+def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, rest, gradients of alpha, red, green, blue."""
     for k in range(entries.shape[0]):
         s, slot = entries[k], slots[k]
@@ -279,14 +284,14 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums):
         sums[slot, MOMENTS] = total(sum_red)
         sums[slot, MOMENTS + 1] = total(sum_green)
         sums[slot, MOMENTS + 2] = total(sum_blue)
-        if k % BATCH == BATCH - 1 and _saturated(work):
+        if k % BATCH == BATCH - 1 and _saturated(work, least):
             return k + 1
     return entries.shape[0]
 
 
 @njit(cache=True)
 @no_type_check
-def _backward_any(splats, entries, slots, values, x0, y0, work, sums):
+def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, rest, gradients of alpha and of the channels."""
     channels = values.shape[1]
     column = np.empty(channels * TILE, np.float32)
@@ -317,14 +322,14 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums):
         _write_moments(sums, slot, dx, s0, sy, syy)
         for channel in range(channels):
             sums[slot, MOMENTS + channel] = total(load(column, channel * TILE))
-        if k % BATCH == BATCH - 1 and _saturated(work):
+        if k % BATCH == BATCH - 1 and _saturated(work, least):
             return k + 1
     return entries.shape[0]
 
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def blend_backward(splats, start, entries, slots, values, image, alpha, grad_image, grad_alpha, sums):
+def blend_backward(splats, start, entries, slots, values, image, alpha, grad_image, grad_alpha, sums, least):
     """Fill `sums (e, 6 + c)`: for every entry its moments, as `unproject` takes them, and its values' gradients."""
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
@@ -341,9 +346,9 @@ def blend_backward(splats, start, entries, slots, values, image, alpha, grad_ima
                     rest += grad_image[c, y, x] * image[c, y, x]
                 work[PIXELS + (y - y0) * TILE + x - x0] = rest
         if channels == RGB:
-            used = _backward_rgb(splats, listed, places, values, float32(x0), float32(y0), work, sums)
+            used = _backward_rgb(splats, listed, places, values, float32(x0), float32(y0), work, sums, least)
         else:
-            used = _backward_any(splats, listed, places, values, float32(x0), float32(y0), work, sums)
+            used = _backward_any(splats, listed, places, values, float32(x0), float32(y0), work, sums, least)
         for k in range(used, listed.shape[0]):
             sums[places[k]] = ZERO
 

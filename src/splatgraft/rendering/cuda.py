@@ -4,7 +4,7 @@ from collections.abc import Callable
 from collections.abc import Set as AbstractSet
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft import spherical_harmonics
@@ -50,9 +50,8 @@ class CudaViewOperator:
     def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> None:
         """Freeze geometry and opacity."""
         self._gaussians, self._camera, self._options = gaussians.map(Tensor.detach), camera, options
-        _, alpha, visible = self._draw(gaussians.means.new_zeros(gaussians.count, 1))
-        self.alpha: Float[Tensor, "h w"] = alpha
-        self.visible: Bool[Tensor, n] = visible
+        _, self.alpha, _ = self._draw(gaussians.means.new_zeros(gaussians.count, 1))
+        self.visible = (self.blend_transpose(torch.ones_like(self.alpha)[..., None]) > 0)[:, 0]
 
     def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
         """W values, over black; differentiable in `values`."""

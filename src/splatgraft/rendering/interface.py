@@ -49,7 +49,9 @@ class ViewOperator(Protocol):
     """The fixed linear map W from Gaussian values to pixels of one view: geometry and opacity are frozen."""
 
     alpha: Float[Tensor, "h w"]
+    """Accumulated opacity in [0, 1]."""
     visible: Bool[Tensor, "n"]
+    """Which Gaussians have weight in some pixel."""
 
     def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
         """W values, over black. Differentiable in `values`."""
