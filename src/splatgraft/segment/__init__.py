@@ -5,6 +5,7 @@ from splatgraft.segment.box import Box, default_box
 from splatgraft.segment.grabcut import GrabcutOptions, grabcut_masks, refine_masks
 from splatgraft.segment.lift import LiftOptions, lift_masks
 from splatgraft.segment.select import SelectOptions, select_object
+from splatgraft.segment.solidify import SolidifyOptions, solidify_object
 
 __all__ = [
     "BiRefNet",
@@ -12,10 +13,12 @@ __all__ = [
     "GrabcutOptions",
     "LiftOptions",
     "SelectOptions",
+    "SolidifyOptions",
     "default_box",
     "grabcut_masks",
     "lift_masks",
     "load_birefnet",
     "refine_masks",
     "select_object",
+    "solidify_object",
 ]
