@@ -110,7 +110,7 @@ def test_both_forms_of_adam_agree_and_leave_unseen_rows_alone():
             seen[0] = False
             steps[seen] += 1
             gradient = torch.randn(40, 3, generator=generator)
-            assert update((value, gradient, first, second), steps, torch.tensor([0.1, 0.2, 0.0]), seen)
+            assert update(((value,), (gradient,), (first,), (second,)), steps, (torch.tensor([0.1, 0.2, 0.0]),), seen)
         results.append(value)
     assert torch.equal(results[0][0], start[0])
     assert torch.equal(results[0][:, 2], start[:, 2])
@@ -124,8 +124,8 @@ def test_a_gradient_that_is_not_finite_moves_nothing(bad):
         value, gradient = torch.ones(3, 2), torch.ones(3, 2)
         gradient[1, 0] = bad
         seen = torch.ones(3, dtype=torch.bool)
-        rows = (value, gradient, torch.zeros(3, 2), torch.zeros(3, 2))
-        assert not update(rows, torch.ones(3, dtype=torch.int32), torch.full((2,), 0.1), seen)
+        rows = ((value,), (gradient,), (torch.zeros(3, 2),), (torch.zeros(3, 2),))
+        assert not update(rows, torch.ones(3, dtype=torch.int32), (torch.full((2,), 0.1),), seen)
         assert torch.equal(value[1], torch.ones(2))
 
 

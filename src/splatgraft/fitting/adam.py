@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
+_FAST = {"contract", "nsz", "arcp", "reassoc"}
+_PART = 1024
 
 
 @dataclass(frozen=True)
@@ -80,32 +82,39 @@ def step(
     moments.steps[visible] += 1
     update = _step_numba if visible.device.type == "cpu" else _step_torch
     n = len(visible)
-    finite = True
-    for name, value in values.items():
-        rows = tuple(t.reshape(n, -1) for t in (value, gradients[name], moments.first[name], moments.second[name]))
-        finite &= update(rows, moments.steps, rates[name], visible)
-    return finite
+    names = tuple(values)
+    rows = tuple(
+        tuple(tensors[name].reshape(n, -1).contiguous() for name in names)
+        for tensors in (values, gradients, moments.first, moments.second)
+    )
+    return update(rows, moments.steps, tuple(rates[name] for name in names), visible)
 
 
-_Rows = tuple[Float[Tensor, "n c"], Float[Tensor, "n c"], Float[Tensor, "n c"], Float[Tensor, "n c"]]
-"""Value, gradient, first and second moment."""
+_Fields = tuple[Float[Tensor, "n _"], ...]
+_Rates = tuple[Float[Tensor, "_"], ...]
+_Rows = tuple[_Fields, ...]
+"""Values, gradients, first and second moments, each of all fields."""
 
 
-def _step_numba(rows: _Rows, steps: Int[Tensor, "n"], rates: Float[Tensor, "c"], visible: Bool[Tensor, "n"]) -> bool:
-    arrays = tuple(t.contiguous().numpy() for t in rows)
-    return bool(_update_rows(arrays, steps.numpy(), rates.numpy(), visible.numpy()) == 0)
+def _step_numba(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bool[Tensor, "n"]) -> bool:
+    if len(visible) == 0:
+        return True
+    arrays = [tuple(tensor.numpy() for tensor in fields) for fields in rows]
+    return _update_rows(*arrays, steps.numpy(), tuple(rate.numpy() for rate in rates), visible.numpy()) == 0
 
 
-# divisions follow numpy, since a check for zero would be a branch in the loop; no denominator is 0
-@numba.njit(parallel=True, cache=True, fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy")
+# divisions follow numpy, since a check for zero would be a branch in the loop
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 @no_type_check
-def _update_rows(rows, steps, rates, visible):
-    value, gradient, first, second = rows
-    n, columns = value.shape
+def _update_part(value, gradient, moments, part, rate):
+    """Update the rows that `part` = (first, last, steps, visible) names; returns how many have no finite gradient."""
+    first, second = moments
+    begin, end, steps, visible = part
+    columns = value.shape[1]
     one = np.float32(1)
     b1, b2 = np.float32(BETA_1), np.float32(BETA_2)
     bad = 0
-    for i in numba.prange(n):
+    for i in range(begin, end):
         if not visible[i]:
             continue
         correct_1 = one / (one - b1 ** np.float32(steps[i]))
@@ -122,21 +131,36 @@ def _update_rows(rows, steps, rates, visible):
                 v = b2 * second[i, j] + (one - b2) * g * g
                 first[i, j] = m
                 second[i, j] = v
-                value[i, j] -= rates[j] * m * correct_1 / (np.sqrt(v * correct_2) + np.float32(EPSILON))
+                value[i, j] -= rate[j] * m * correct_1 / (np.sqrt(v * correct_2) + np.float32(EPSILON))
     return bad
 
 
-def _step_torch(rows: _Rows, steps: Int[Tensor, "n"], rates: Float[Tensor, "c"], visible: Bool[Tensor, "n"]) -> bool:
+@numba.njit(parallel=True, cache=True)
+@no_type_check
+def _update_rows(values, gradients, firsts, seconds, steps, rates, visible):  # noqa: PLR0913, PLR0917
+    """All fields in one launch."""
+    n = len(visible)
+    bad = 0
+    for part in numba.prange((n + _PART - 1) // _PART):
+        rows = (part * _PART, min(n, (part + 1) * _PART), steps, visible)
+        for f in range(len(values)):
+            bad += _update_part(values[f], gradients[f], (firsts[f], seconds[f]), rows, rates[f])
+    return bad
+
+
+def _step_torch(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bool[Tensor, "n"]) -> bool:
     """The same on any device, in torch operations."""
-    value, gradient, first, second = rows
-    which = torch.nonzero(visible).flatten()
-    g = gradient[which]
-    good = (g.abs() < 1e18).all(1)
-    which, g = which[good], g[good]
-    m = BETA_1 * first[which] + (1 - BETA_1) * g
-    v = BETA_2 * second[which] + (1 - BETA_2) * g * g
-    first[which], second[which] = m, v
-    count = steps[which].to(g.dtype)[:, None]
-    scale = (v / (1 - BETA_2**count)).sqrt() + EPSILON
-    value[which] -= rates.to(g) * (m / (1 - BETA_1**count)) / scale
-    return bool(good.all())
+    finite = True
+    seen = torch.nonzero(visible).flatten()
+    for value, gradient, first, second, rate in zip(*rows, rates, strict=True):
+        good = (gradient[seen].abs() < 1e18).all(1)
+        which = seen[good]
+        g = gradient[which]
+        m = BETA_1 * first[which] + (1 - BETA_1) * g
+        v = BETA_2 * second[which] + (1 - BETA_2) * g * g
+        first[which], second[which] = m, v
+        count = steps[which].to(g.dtype)[:, None]
+        scale = (v / (1 - BETA_2**count)).sqrt() + EPSILON
+        value[which] -= rate.to(g) * (m / (1 - BETA_1**count)) / scale
+        finite &= bool(good.all())
+    return finite
