@@ -82,7 +82,7 @@ def test_the_cache_changes_time_alone(relit):
     assert torch.equal(a.sh, b.sh)
 
 
-class Killed(Exception):
+class KilledError(Exception):
     pass
 
 
@@ -103,9 +103,9 @@ def test_a_killed_descent_resumes_to_the_same_bits(relit):
 
     def die(done, total, message):
         if done == 19:
-            raise Killed
+            raise KilledError
 
-    with pytest.raises(Killed):
+    with pytest.raises(KilledError):
         consolidate(relit.composite, relit.cameras, relit.images, ADAM, progress=die, checkpoint=memory)
     assert memory.state["iteration"] == 16
     resumed = consolidate(relit.composite, relit.cameras, relit.images, ADAM, checkpoint=memory)
@@ -115,8 +115,20 @@ def test_a_killed_descent_resumes_to_the_same_bits(relit):
 def test_missing_and_misshapen_images_are_named(relit):
     with pytest.raises(ValueError, match="one image per camera, found 7 for 8"):
         consolidate(relit.composite, relit.cameras, relit.images[:7])
-    with pytest.raises(ValueError, match="view_0000: expected a image of 48x48, found 20x48"):
+    with pytest.raises(ValueError, match="view_0000: expected image pixels 48x48, found 20x48"):
         consolidate(relit.composite, relit.cameras, [image[:, :20] for image in relit.images])
+
+
+def test_numbers_that_are_not_finite_are_refused(relit):
+    images = [image.clone() for image in relit.images]
+    images[3][5, 5] = float("nan")
+    with pytest.raises(ValueError, match="view_0003: expected finite image pixels"):
+        consolidate(relit.composite, relit.cameras, images)
+
+
+def test_no_views_are_refused(relit):
+    with pytest.raises(ValueError, match="at least one view"):
+        consolidate(relit.composite, relit.cameras[[]], [])
 
 
 MEASURE = """

@@ -22,7 +22,7 @@ def test_equals_dense_ridge_regression():
     generator = torch.Generator().manual_seed(4)
     images = [torch.rand(32, 32, 3, generator=generator) for _ in range(5)]
     weights = [torch.rand(32, 32, generator=generator) for _ in range(5)]
-    options = SolveOptions(rounds=1, steps=120, prior_px=0.5, band_ridge=(0.1, 0.1, 0.1))
+    options = SolveOptions(rounds=1, steps=120, prior_px=0.5, band_ridges=(0.1,))
     prior = scene.sh.clone()
     views = views_of(scene, cameras, images, weights)
     found = solve(prior, Corrections(views, None), options)

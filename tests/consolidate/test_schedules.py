@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -11,7 +13,7 @@ def test_schedules_run_from_full_noise_to_a_tenth():
     geometric = geometric_schedule()
     assert geometric[0] == 1.0
     assert geometric[-1] == pytest.approx(0.1)
-    ratios = [b / a for a, b in zip(geometric, geometric[1:], strict=False)]
+    ratios = [b / a for a, b in pairwise(geometric)]
     assert ratios == pytest.approx([0.1**0.25] * 4)
     assert linear_schedule(1) == geometric_schedule(1) == (1.0,)
 

@@ -27,11 +27,12 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
 
     Paper: section Multi-View Consolidation. Higher bands start from zero. `images` and `weights` (confidence per pixel,
     (h, w) in [0, 1]) are read one at a time. Memory above the inputs, for n Gaussians with k coefficients:
-    4 n (k^2 + 21 k) bytes for `fast`, 4 n 18 k for `adam`, plus `options.cache_bytes`, plus what the tile lists of two
+    4 n (k^2 + 30 k) bytes for `fast`, 4 n 18 k for `adam`, plus `options.cache_bytes`, plus what the tile lists of two
     views and a few images take; it does not grow with the number of views. With `fast`, Gaussians that no changed
     pixel sees keep all their colours, exactly. The same inputs and seed give the same result.
 
-    Raises: ValueError where there is not one image per camera, or one has another size than its camera.
+    Raises: ValueError where there is no camera, not one image per camera, or one has another size than its camera or
+    numbers that are not finite.
     """
     _check_counts(cameras, images, weights)
     views = Views(
@@ -72,6 +73,8 @@ def _fast(composite: Gaussians, views: Views, options: ConsolidateOptions, progr
 
 
 def _check_counts(cameras: Cameras, images: ImageSequence, weights: ImageSequence | None) -> None:
+    if len(cameras) == 0:
+        raise ValueError("consolidate: expected at least one view, found none")
     for kind, sequence in (("image", images), ("weight", weights)):
         if sequence is not None and len(sequence) != len(cameras):
             raise ValueError(f"consolidate: expected one {kind} per camera, found {len(sequence)} for {len(cameras)}")

@@ -28,10 +28,9 @@ def descend(  # noqa: PLR0913 - the last two are the services of every long stag
 ) -> Float[Tensor, "m k 3"]:
     """Colours after `options.iterations` steps of Adam over views in shuffled order, from `sh`.
 
-    Gaussians move when the view sees them. A view's error is refined at each visit, against the
-    render that the step needs anyway.
+    Gaussians move when the view sees them.
 
-    Raises: ValueError where a gradient is not finite: an image holds numbers that are not.
+    Raises: ValueError where a gradient is not finite, which a loss that divides can cause.
     """
     views, start = corrections.views, 0
     sh = sh.clone().contiguous()
@@ -46,16 +45,13 @@ def descend(  # noqa: PLR0913 - the last two are the services of every long stag
         index = _view_of(iteration, len(views), seed)
         view, leaf = views[index], sh.detach().requires_grad_()
         picture = view.render(leaf)
-        corrections.refine(index, picture)
         picture, target = _confident(picture, corrections.target(index), views.weight(index))
         value = loss(picture, target)
         (gradient,) = torch.autograd.grad(value, leaf)
         rates = options.rate * _decay(iteration / options.iterations, options.final_ratio) * shares
         if not adam.step({"sh": sh}, {"sh": gradient}, moments=moments, rates={"sh": rates}, visible=view.visible):
-            raise ValueError(
-                f"consolidate: expected finite gradients, found others in view {views.cameras.names[index]} "
-                f"at iteration {iteration}"
-            )
+            name = views.cameras.names[index]
+            raise ValueError(f"consolidate: expected finite gradients, found others in {name} at iteration {iteration}")
         if (iteration + 1) % options.save_every == 0:
             checkpoint.save(
                 {

@@ -48,13 +48,15 @@ class SolveOptions:
     """The linear part of the fast road: colours by conjugate gradient on the normal equations."""
 
     rounds: int = 3
-    """How often the images are corrected by their nuisances and the equations set up again."""
+    """How often the images are corrected and the equations solved again, from the last solution; at least 2."""
     steps: int = 6
     """Steps of conjugate gradient per round; each blends and gathers every view once."""
     prior_px: float = 0.1
     """Weight of the composite's colour in every Gaussian, pixels: decides only what no view sees."""
-    band_ridge: tuple[float, float, float] = (0.02, 0.05, 0.1)
-    """Weight of zero for the bands 1 to 3, as a share of the pixels that the Gaussian is seen in."""
+    band_ridges: tuple[float, ...] = (0.003, 0.02, 0.1)
+    """Weights of zero for the higher bands to choose from, as shares of the pixels that the Gaussian is seen in.
+
+    What predicts views left out best depends on how much the views disagree. Fewer than ten views: the middle one."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +87,9 @@ class ConsolidateOptions:
     """Solve a tint and a flow per view beside the colours; None: take every view at its word. `fast` only."""
     solve: SolveOptions = field(default_factory=SolveOptions)
     """The linear part of `fast`."""
-    polish_passes: int = 4
+    polish_passes: int = 12
     """Descent of `fast` after the equations: passes over all views."""
-    polish: DescentOptions = field(default_factory=lambda: DescentOptions(rate=0.0025, final_ratio=0.02))
+    polish: DescentOptions = field(default_factory=lambda: DescentOptions(rate=0.03, rest_ratio=0.1, final_ratio=0.02))
     """Rates of that descent; its number of iterations is `polish_passes` times the number of views."""
     reference: DescentOptions = field(default_factory=DescentOptions)
     """The descent of `adam`."""

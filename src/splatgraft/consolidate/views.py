@@ -134,14 +134,14 @@ class Views:
     def target(self, index: int) -> Float[Tensor, "h w 3"]:
         """The harmonised image of a view.
 
-        Raises: ValueError where its size is not the camera's.
+        Raises: ValueError where its size is not the camera's, or numbers are not finite.
         """
         return self._sized(self.images[index], index, "image")
 
     def weight(self, index: int) -> Float[Tensor, "h w"] | None:
         """The confidence in each pixel of a view in [0, 1], None where all count fully.
 
-        Raises: ValueError where its size is not the camera's.
+        Raises: ValueError where its size is not the camera's, or numbers are not finite.
         """
         return None if self.weights is None else self._sized(self.weights[index], index, "weight")
 
@@ -149,7 +149,9 @@ class Views:
         width, height = self.cameras.sizes[index].tolist()
         if tuple(image.shape[:2]) != (height, width):
             found = f"{image.shape[1]}x{image.shape[0]}"
-            raise ValueError(f"{self.cameras.names[index]}: expected a {kind} of {width}x{height}, found {found}")
+            raise ValueError(f"{self.cameras.names[index]}: expected {kind} pixels {width}x{height}, found {found}")
+        if not bool(image.isfinite().all()):
+            raise ValueError(f"{self.cameras.names[index]}: expected finite {kind} pixels, found others")
         return image
 
 
