@@ -3,6 +3,8 @@ SHELL := /bin/bash
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 STAMP := .venv/.installed
+# threads of torch and numba that spin while they wait take the cores from each other
+export OMP_WAIT_POLICY ?= passive
 
 .PHONY: install demo test clean
 .DEFAULT_GOAL := install

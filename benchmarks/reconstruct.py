@@ -4,8 +4,11 @@ Every 8th view is held out. The last line reads psnr=.. seconds=.. gaussians=..
 """
 
 import argparse
+import os
 import time
 from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as cli.py does; read when torch and numba load
 
 import torch
 
