@@ -1,7 +1,7 @@
 """The program that runs pycolmap (its only importer) in a process of its own. Knows nothing about splatgraft.
 
 A process of its own, since pycolmap's bundled zlib corrupts the heap of one that also loads Pillow, and since its C++
-checks end the process. Takes a job as JSON on stdin; writes the largest model as JSON; says what it does on stdout.
+checks end the process. Takes a job as JSON; writes the largest model as JSON; says what it does on stdout.
 """
 
 import json
@@ -75,4 +75,4 @@ def largest(models: list[Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(json.loads(sys.stdin.read()))
+    main(json.loads(sys.argv[1]))

@@ -141,15 +141,15 @@ def _run(job: dict[str, Any], advance: Callable[[int, str], None]) -> dict[str, 
     program = Path(__file__).with_name("colmap_process.py")
     log = Path(job["output"]).with_suffix(".log")
     effort = "thorough" if job["thorough"] else "quick"
-    with log.open("w") as errors:
-        process = subprocess.Popen(
-            [sys.executable, str(program)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True
-        )
+    command = [sys.executable, str(program), json.dumps(job)]
+    with (
+        log.open("w") as errors,
+        subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, text=True
+        ) as process,
+    ):
         try:
-            assert process.stdin is not None
             assert process.stdout is not None
-            process.stdin.write(json.dumps(job))
-            process.stdin.close()
             for line in process.stdout:
                 done, _, message = line.strip().partition(" ")
                 if done.isdigit():
@@ -157,7 +157,6 @@ def _run(job: dict[str, Any], advance: Callable[[int, str], None]) -> dict[str, 
             code = process.wait()
         except BaseException:
             process.kill()
-            process.wait()
             raise
     output = Path(job["output"])
     if code != 0 or not output.is_file():

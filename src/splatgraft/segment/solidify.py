@@ -52,7 +52,7 @@ def solidify_object(
     scene: Gaussians,
     selection: Bool[Tensor, "n"],
     cameras: Cameras,
-    photographs: Sequence[tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]],
+    photographs: Sequence[tuple[Float[Tensor, "_ _ 3"], Float[Tensor, "_ _"]]],
     *,
     options: SolidifyOptions = SolidifyOptions(),
     progress: Progress = silent,
