@@ -1,5 +1,6 @@
 """Where `segment` gets its 2D masks from: files, GrabCut in a box, or a network. Knows nothing about lifting them."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -12,9 +13,8 @@ from splatgraft.gaussians import Gaussians
 from splatgraft.images import list_images, write_image
 from splatgraft.posed_images import PosedImages
 from splatgraft.progress import Progress
-from splatgraft.segment.box import Box, default_box
-from splatgraft.segment.grabcut import grabcut_masks, refine_masks
-from splatgraft.steps.lazy_images import LazySequence
+from splatgraft.segment import Box, default_box, grabcut_masks, load_birefnet, refine_masks
+from splatgraft.steps.lazy_sequence import LazySequence
 from splatgraft.steps.view_images import file_stems
 
 MaskSource = Literal["files", "grabcut", "birefnet"]
@@ -41,7 +41,7 @@ def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> P
     return _with_masks(capture, paths, with_mask)
 
 
-def read_masks(capture: PosedImages) -> LazySequence:
+def read_masks(capture: PosedImages) -> LazySequence[Tensor]:
     """The masks of a capture whose views all have one, read when asked for."""
 
     def read(index: int) -> Tensor:
@@ -62,7 +62,24 @@ def cut_masks(
     images = LazySequence(len(capture), capture.image)
     box = default_box(capture) if box is None else box
     masks = grabcut_masks(images, capture.cameras, box, capture.points, progress=progress)
-    masks = refine_masks(masks, images, capture.cameras, scene, progress=progress)
+    return _written(capture, refine_masks(masks, images, capture.cameras, scene, progress=progress), folder)
+
+
+def network_masks(capture: PosedImages, *, weights: Path | None, folder: Path, progress: Progress) -> PosedImages:
+    """The capture with masks of what BiRefNet takes for the foreground, written to `folder`.
+
+    Raises: ValueError where a package or the weights are missing.
+    """
+    network = load_birefnet() if weights is None else load_birefnet(weights)
+
+    def read(index: int) -> Tensor:
+        progress(index + 1, len(capture), "masks from the network")
+        return network.mask(capture.image(index))
+
+    return _written(capture, LazySequence(len(capture), read), folder)
+
+
+def _written(capture: PosedImages, masks: Iterable[Tensor], folder: Path) -> PosedImages:
     folder.mkdir()
     paths = tuple(folder / f"{stem}.png" for stem in file_stems(capture.cameras))
     for path, mask in zip(paths, masks, strict=True):

@@ -11,11 +11,18 @@ from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.gaussians import Gaussians
 from splatgraft.posed_images import PosedImages
 from splatgraft.project import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
-from splatgraft.segment.box import Box
-from splatgraft.segment.lift import LiftOptions, lift_masks
-from splatgraft.segment.select import SelectOptions, select_object
+from splatgraft.segment import (
+    Box,
+    LiftOptions,
+    SelectOptions,
+    SolidifyOptions,
+    lift_masks,
+    select_object,
+    solidify_object,
+)
 from splatgraft.steps.capture_files import capture_inputs
-from splatgraft.steps.object_masks import MaskSource, cut_masks, read_masks, with_mask_folder
+from splatgraft.steps.lazy_sequence import LazySequence
+from splatgraft.steps.object_masks import MaskSource, cut_masks, network_masks, read_masks, with_mask_folder
 from splatgraft.steps.selection_file import write_selection
 from splatgraft.steps.step import Context, Device, Inputs, choose_device
 from splatgraft.whole_file import whole_file
@@ -37,10 +44,14 @@ class Segment:
     """Folder of masks named like the images, white where the object is; views without one are left out."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Least x, y, z, then greatest, around the object in the source's world; grabcut guesses it where not given."""
+    birefnet: Path | None = None
+    """An .onnx file of BiRefNet; fetched once from its hub where not given."""
     threshold: float = 0.75
     """Least share of a Gaussian that the masks must give to the object."""
     keep: Literal["largest", "all"] = "largest"
     """Whether pieces that do not touch the largest are dropped."""
+    solidify: int = SolidifyOptions.iterations
+    """Steps that make the object look whole when it stands alone; 0 leaves its Gaussians as they are in the scene."""
     device: Device = "auto"
     """Where to compute."""
     options: LiftOptions = field(default_factory=LiftOptions)
@@ -51,7 +62,8 @@ class Segment:
         if self.mask_source == "files":
             capture = with_mask_folder(capture, self.masks, self.capture)
         files = capture_inputs(self.capture, capture, masks=self.mask_source == "files")
-        return {"scene": (self.scene,), **files}
+        weights = () if self.birefnet is None else (self.birefnet,)
+        return {"scene": (self.scene,), "weights": weights, **files}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the object."""
@@ -63,7 +75,12 @@ class Segment:
         feature = lift_masks(scene, views.cameras.to(device), masks, self.options, progress=context.progress)
         selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=self.keep))
         context.terminal.say(f"object: {int(selection.sum()):,} of {scene.count:,} Gaussians")
-        write_gaussians(folder / OBJECT_FILE, scene.select(selection).to("cpu"))
+        chosen = scene.select(selection)
+        if self.solidify:
+            photographs = LazySequence(len(views), lambda index: (views.image(index), masks[index]))
+            options, cameras = SolidifyOptions(iterations=self.solidify), views.cameras.to(device)
+            chosen = solidify_object(scene, selection, cameras, photographs, options=options, progress=context.progress)
+        write_gaussians(folder / OBJECT_FILE, chosen.to("cpu"))
         write_gaussians(folder / SURROUNDINGS_FILE, scene.select(~selection).to("cpu"))
         write_selection(folder / SELECTION_FILE, selection)
         with whole_file(folder / "feature.npy") as stream:
@@ -73,7 +90,10 @@ class Segment:
         capture = read_capture(self.capture)
         if self.mask_source == "files":
             return with_mask_folder(capture, self.masks, self.capture)
-        return cut_masks(capture, scene, box=box, folder=folder / "masks", progress=context.progress)
+        made = folder / "masks"
+        if self.mask_source == "grabcut":
+            return cut_masks(capture, scene, box=box, folder=made, progress=context.progress)
+        return network_masks(capture, weights=self.birefnet, folder=made, progress=context.progress)
 
 
 COMMAND = Segment
