@@ -43,7 +43,7 @@ def _spread(builder, value):
 def _define(symbol, instruction: str) -> None:
     """Let rows and float32 scalars meet in the operator `symbol`."""
 
-    @infer_global(symbol)
+    @infer_global(symbol)  # pyright: ignore[reportOptionalCall]
     class _Template(ConcreteTemplate):
         cases = (
             signature(_ROW, _ROW, _ROW),
