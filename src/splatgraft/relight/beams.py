@@ -22,7 +22,7 @@ def beams_of(light: Light) -> Beams:
 
     What a source's confidence leaves is given back as even light, so an unsure source casts a weaker shadow.
     """
-    directions, irradiance, softness = [], [], []
+    directions, irradiance, softness, within = [], [], [], []
     budget = SOURCE_BEAMS
     for i, source in enumerate(light.sources[:SOURCE_BEAMS]):
         later = min(len(light.sources), SOURCE_BEAMS) - i - 1
@@ -32,6 +32,7 @@ def beams_of(light: Light) -> Beams:
         for direction in _disk(source, parts):
             directions.append(direction)
             irradiance.append(rgb)
+            within.append(source.blockers_within)
             softness.append(source.softness / math.sqrt(parts) if parts > 1 else source.softness)
     doubt = sum((torch.tensor(s.irradiance) * (1 - s.confidence) for s in light.sources), torch.zeros(3))
     around = even_pairs(AMBIENT_COUNT)
@@ -43,6 +44,7 @@ def beams_of(light: Light) -> Beams:
         ),
         softness=torch.tensor(softness + [math.acos(1 - 2 / AMBIENT_COUNT)] * AMBIENT_COUNT),
         is_source=(True,) * len(directions) + (False,) * AMBIENT_COUNT,
+        blockers_within=(*within, *(math.inf,) * AMBIENT_COUNT),
     )
 
 
@@ -64,6 +66,7 @@ def _part(beams: Beams, *, source: bool) -> tuple[Beams, Int[Tensor, "k"], Int[T
         irradiance=beams.irradiance[which],
         softness=beams.softness[which],
         is_source=(source,) * count,
+        blockers_within=tuple(beams.blockers_within[int(i)] for i in which.nonzero()[:, 0]),
     )
     front = torch.arange(count)
     return part, front, front + count if source else (front + count // 2) % max(count, 1)

@@ -29,6 +29,8 @@ class Beams:
     """Radius of the cone that a bundle fills, radians."""
     is_source: tuple[bool, ...]
     """Whether the bundle is a dominant source, or a piece of the ambient light."""
+    blockers_within: tuple[float, ...]
+    """World units; what is farther towards the light lets it through."""
 
     def __len__(self) -> int:
         """Number of bundles k."""

@@ -34,6 +34,8 @@ class LightSource:
     """How sure it is that this light is there, in [0, 1]; scales its shadow."""
     name: str = "light"
     """What a report calls it: sun, window, lamp."""
+    blockers_within: float = math.inf
+    """Only what is nearer than this, world units, can block it: beyond lies what it comes through, as a window."""
 
     @property
     def softness(self) -> float:
@@ -117,6 +119,7 @@ def light_to_json(light: Light) -> str:
             "uncertainty_deg": round(s.uncertainty_deg, 4),
             "confidence": round(s.confidence, 4),
         }
+        | ({"blockers_within": round(s.blockers_within, 4)} if math.isfinite(s.blockers_within) else {})
         for s in light.sources
     ]
     record = {
@@ -161,7 +164,15 @@ def light_from_json(text: str, *, name: str = "light.json") -> Light:
 def _source(entry: object, where: str) -> LightSource:
     if not isinstance(entry, dict):
         raise ValueError(f"{where}: expected an object with direction and irradiance, found {entry!r:.60}")
-    known = {"name", "direction", "irradiance", "angular_radius_deg", "uncertainty_deg", "confidence"}
+    known = {
+        "name",
+        "direction",
+        "irradiance",
+        "angular_radius_deg",
+        "uncertainty_deg",
+        "confidence",
+        "blockers_within",
+    }
     unknown = sorted(set(entry) - known)
     if unknown:
         raise ValueError(f"{where}: expected only {', '.join(sorted(known))}, found {unknown[0]!r}")
@@ -180,11 +191,12 @@ def _source(entry: object, where: str) -> LightSource:
         uncertainty_deg=_scalar(entry, "uncertainty_deg", 0.0, (0, 90), where),
         confidence=_scalar(entry, "confidence", 1.0, (0, 1), where),
         name=name,
+        blockers_within=_scalar(entry, "blockers_within", math.inf, (0, math.inf), where),
     )
 
 
 def _scalar(entry: dict, key: str, default: float, bounds: tuple[float, float], where: str) -> float:
-    return _numbers([entry.get(key, default)], 1, f"{where}.{key}", bounds)[0]
+    return _numbers([entry[key]], 1, f"{where}.{key}", bounds)[0] if key in entry else default
 
 
 def _numbers(values: object, count: int, where: str, bounds: tuple[float, float]) -> list[float]:

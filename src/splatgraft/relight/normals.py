@@ -8,15 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba import njit, prange
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.gaussians import Gaussians
+from splatgraft.rendering import render
 
 NEIGHBOURS = 16
+_VIEWERS, _VIEWER_WIDTH = 12, 128
 
 
 @dataclass(frozen=True)
@@ -30,25 +32,56 @@ class Normals:
 
 
 def estimate_normals(gaussians: Gaussians, cameras: Cameras) -> Normals:
-    """Normals turned towards the cameras that have each Gaussian in view; confidence 0 where none has."""
+    """Normals turned towards the cameras that see each Gaussian, not behind others; less sure where none does."""
     n = gaussians.count
     if n == 0:
         return Normals(vectors=torch.zeros(0, 3), confidence=torch.zeros(0))
     means = gaussians.means.double().numpy()
     k = min(NEIGHBOURS, n)
     _, neighbours = cKDTree(means, balanced_tree=False, compact_nodes=False).query(means, k=k, workers=2)
-    poses = cameras.camera_from_world.double().numpy()
-    focal = (torch.stack([cameras.intrinsics[:, 0, 0], cameras.intrinsics[:, 1, 1]], 1) / cameras.sizes).double()
+    neighbours = neighbours.reshape(n, k).astype(np.int32)
+    cloud = (means, gaussians.covariances.double().numpy(), gaussians.opacities.double().numpy())
+    towards, seen = _towards_viewers(gaussians, cameras)
     out = np.zeros((n, 4), np.float32)
-    _estimate(
-        (means, gaussians.covariances.double().numpy(), gaussians.opacities.double().numpy()),
-        neighbours.reshape(n, k).astype(np.int32),
-        (poses, focal.numpy().reshape(-1, 2)),
-        out,
-    )
-    smooth = _agree(out, neighbours.reshape(n, k).astype(np.int32))
-    result = torch.from_numpy(smooth)
-    return Normals(vectors=result[:, :3].contiguous(), confidence=result[:, 3].contiguous())
+    _estimate(cloud, neighbours, towards.double().numpy(), out)
+    result = torch.from_numpy(_agree(out, neighbours))
+    confidence = result[:, 3] * torch.where(seen, 1.0, 0.5)
+    return Normals(vectors=result[:, :3].contiguous(), confidence=confidence)
+
+
+def raised(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Where the surface is seen: a Gaussian's own thickness above its centre."""
+    half = torch.einsum("nij,ni->nj", gaussians.rotations, normals) * gaussians.scales
+    return gaussians.means + 1.5 * half.norm(dim=1, keepdim=True) * normals
+
+
+def _towards_viewers(gaussians: Gaussians, cameras: Cameras) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+    """Sum of unit vectors to the cameras that see each Gaussian (to all, where none does), and whether any does."""
+    total, everyone = torch.zeros(2, gaussians.count, 3).unbind(0)
+    count = len(cameras)
+    for i in sorted({round(j * (count - 1) / max(_VIEWERS - 1, 1)) for j in range(min(_VIEWERS, count))}):
+        camera = cameras[i].resized(_VIEWER_WIDTH / int(cameras.sizes[i, 0]))
+        pose = camera.camera_from_world[0]
+        in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+        z = in_camera[:, 2].clamp_min(1e-6)
+        to_camera = torch.nn.functional.normalize(camera.centers[0] - gaussians.means, dim=1)
+        everyone += to_camera
+        f, c = camera.intrinsics[0].diagonal()[:2], camera.intrinsics[0, :2, 2]
+        pixel = (in_camera[:, :2] / z[:, None] * f + c).floor().long()
+        width, height = camera.sizes[0].tolist()
+        inside = (in_camera[:, 2] > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
+        if not bool(inside.any()):
+            continue
+        seen = render(gaussians, camera, outputs=frozenset({"depth"}))
+        assert seen.depth is not None
+        column, row = pixel[inside].unbind(1)
+        surface = torch.where(seen.alpha[0] > 0.5, seen.depth[0], torch.inf)[row, column]
+        slack = 0.005 * z[inside] + 2 * gaussians.scales[inside].mean(1)
+        visible = torch.zeros_like(inside)
+        visible[inside] = z[inside] < surface + slack
+        total += to_camera * visible[:, None]
+    seen_at_all = total.norm(dim=1) > 0
+    return torch.where(seen_at_all[:, None], total, everyone), seen_at_all
 
 
 @njit(cache=True)
@@ -79,9 +112,8 @@ def _shortest_axis(m):
 
 
 @njit(cache=True, parallel=True)
-def _estimate(cloud, neighbours, views, out):
+def _estimate(cloud, neighbours, towards, out):
     means, covariances, opacities = cloud
-    poses, focal = views
     for i in prange(len(means)):
         total = 0.0
         center = np.zeros(3)
@@ -93,7 +125,6 @@ def _estimate(cloud, neighbours, views, out):
         for j in neighbours[i]:
             weight = opacities[j] / max(total, 1e-12)
             away = means[j] - center
-            # a neighbour much larger than the neighbourhood says nothing about its place
             for r in range(3):
                 for c in range(3):
                     mixture[r, c] += weight * (covariances[j, r, c] + away[r] * away[c])
@@ -101,25 +132,11 @@ def _estimate(cloud, neighbours, views, out):
         scale = mixture[0, 0] + mixture[1, 1] + mixture[2, 2] + 1e-30
         own_scale = own[0, 0] + own[1, 1] + own[2, 2] + 1e-30
         normal, flatness = _shortest_axis(mixture / scale + 0.5 * own / own_scale)
-        towards = 0.0
-        seen = 0
-        for v in range(len(poses)):
-            p = poses[v]
-            x = p[0, 0] * means[i, 0] + p[0, 1] * means[i, 1] + p[0, 2] * means[i, 2] + p[0, 3]
-            y = p[1, 0] * means[i, 0] + p[1, 1] * means[i, 1] + p[1, 2] * means[i, 2] + p[1, 3]
-            z = p[2, 0] * means[i, 0] + p[2, 1] * means[i, 1] + p[2, 2] * means[i, 2] + p[2, 3]
-            if z > 0 and abs(x / z) * focal[v, 0] < 0.5 and abs(y / z) * focal[v, 1] < 0.5:
-                nx = p[0, 0] * normal[0] + p[0, 1] * normal[1] + p[0, 2] * normal[2]
-                ny = p[1, 0] * normal[0] + p[1, 1] * normal[1] + p[1, 2] * normal[2]
-                nz = p[2, 0] * normal[0] + p[2, 1] * normal[1] + p[2, 2] * normal[2]
-                towards -= (nx * x + ny * y + nz * z) / np.sqrt(x * x + y * y + z * z)
-                seen += 1
-        if seen == 0:
-            flatness = 0.0
-        if towards < 0:
+        if normal[0] * towards[i, 0] + normal[1] * towards[i, 1] + normal[2] * towards[i, 2] < 0:
             normal = -normal
         out[i, 0], out[i, 1], out[i, 2] = normal[0], normal[1], normal[2]
-        out[i, 3] = min(1.0, max(0.0, flatness))
+        # twice as wide as thick is a surface
+        out[i, 3] = min(1.0, max(0.0, 2 * flatness))
 
 
 @njit(cache=True, parallel=True)

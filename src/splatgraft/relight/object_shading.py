@@ -51,6 +51,6 @@ def _floored(values: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Flo
 
 def _safe(log_ratio: Float[Tensor, "n 3"], normals: Normals, opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
     middle = _mean(log_ratio, opacities)
-    trust = normals.confidence.clamp(0, 1).sqrt()[:, None]
+    trust = (1.6 * normals.confidence).clamp(0, 1)[:, None]
     spread = ((log_ratio - middle) * trust).clamp(-math.log(_SPAN), math.log(_SPAN))
     return (middle + spread).exp()

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.cameras import Cameras
+from splatgraft.cameras import Cameras, look_at, pinhole
 from splatgraft.gaussians import Gaussians, concatenate
 from splatgraft.relight.estimate_light import light_of
 from splatgraft.relight.light import Light, LightSource
@@ -48,7 +48,26 @@ def light_at(
     near = (whole.means - ball.center).norm(dim=1) < 1.4 * radius
     whole = whole.select(near)
     voted = vote(whole, estimate_normals(whole, cameras), center=ball.center, radius=radius, up=up)
-    return combine(panorama, voted, up), None
+    light = combine(panorama, voted, up, asked_within=radius)
+    return _through_windows(light, scene, ball), None
+
+
+def _through_windows(light: Light, scene: Gaussians, ball: Ball) -> Light:
+    """Sources that are seen from the place get the distance to what is seen there: that does not block them."""
+    sources = []
+    for source in light.sources:
+        if math.isfinite(source.blockers_within):
+            sources.append(source)
+            continue
+        direction = torch.tensor(source.direction)
+        helper = torch.tensor([0.0, 0.0, 1.0]) if abs(source.direction[2]) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
+        pose = look_at(ball.center[None], ball.center + direction, helper)
+        seen = render(scene, pinhole(pose, 32.0, width=16, height=16), outputs=frozenset({"depth"}))
+        assert seen.depth is not None
+        there = (seen.alpha > 0.5) & (seen.depth > ball.radius)
+        distance = float(seen.depth[there].quantile(0.25)) if bool(there.any()) else math.inf
+        sources.append(replace(source, blockers_within=0.7 * distance))
+    return replace(light, sources=tuple(sources))
 
 
 def panorama_at(scene: Gaussians, ball: Ball) -> tuple[Panorama | None, str | None]:
@@ -69,15 +88,18 @@ def panorama_at(scene: Gaussians, ball: Ball) -> tuple[Panorama | None, str | No
     return panorama, None
 
 
-def combine(panorama: Panorama, voted: Vote | None, up: Float[Tensor, "3"]) -> Light:
-    """One light from both answers: sources that the panorama shows, that the shadows demand, or both."""
+def combine(panorama: Panorama, voted: Vote | None, up: Float[Tensor, "3"], *, asked_within: float) -> Light:
+    """One light from both answers: sources that the panorama shows, that the shadows demand, or both.
+
+    A source that only shadows speak for is blocked by what they were cast by: things `asked_within` that distance.
+    """
     seen = light_of(panorama, up)
     patches = [s for s in seen.sources if float(torch.tensor(s.direction) @ up) > math.sin(_LOWEST)]
     ambient = float(replace(seen, sources=()).irradiance(up[None]).mean())
     main: LightSource | None = None
     used: set[int] = set()
     if voted is not None and voted.confidence > 0.1:
-        main = _from_vote(voted, ambient)
+        main = replace(_from_vote(voted, ambient), blockers_within=asked_within)
         for i, patch in enumerate(patches):
             apart = math.acos(max(-1.0, min(1.0, float(torch.tensor(patch.direction) @ voted.direction))))
             if apart < max(2.5 * voted.uncertainty, math.radians(15)) + math.radians(patch.angular_radius_deg):
@@ -127,6 +149,7 @@ def _fused(voted: LightSource, patch: LightSource, apart: float) -> LightSource:
         uncertainty_deg=math.hypot(error, disagreement),
         confidence=1 - (1 - voted.confidence) * 0.4,
         name=_name(patch),
+        blockers_within=math.inf,
     )
 
 

@@ -52,7 +52,7 @@ def shade_receivers(
         ratio, variation = _extended_ratio(pending, maps, smallest=smallest)
         axis = variation.argmax(1)
         wanted = variation.max(1).values
-        wanted = torch.where(wanted * pending.gaussians.opacities > _VARIATION, wanted, 0)
+        wanted = torch.where((wanted > _VARIATION) & (pending.gaussians.opacities > 0.05), wanted, 0)
         room = budget // 4  # one becomes five
         if round_ == _ROUNDS or room == 0 or not bool((wanted > 0).any()):
             done.append((pending, which, ratio))

@@ -10,12 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.gaussians import Gaussians
-from splatgraft.images import linear_from_srgb
 from splatgraft.relight.beams import ambient_pairs, source_pairs
 from splatgraft.relight.cast import Beams, Occlusion, cast, occlusion_from_maps
 from splatgraft.relight.directions import frames_along
-from splatgraft.relight.visibility import DepthMaps, Window, splat_depth_maps, visibility
-from splatgraft.spherical_harmonics import rgb_from_dc
+from splatgraft.relight.normals import raised
+from splatgraft.relight.visibility import DepthMaps, Window, occluders_of, splat_depth_maps, visibility
 
 SOURCE_SIZE, AMBIENT_SIZE = 512, 256
 _DEAD_ZONE = 0.004  # changes of linear light below half an 8-bit step of a mid grey are left out
@@ -53,17 +52,17 @@ class ObjectMaps:
 
 def map_object(gaussians: Gaussians, ball: Ball, beams: Beams) -> ObjectMaps:
     """Depth maps of an object (already in the world) for every bundle, with its colours for the bounce."""
-    rgb = linear_from_srgb(rgb_from_dc(gaussians.sh[:, 0]).clamp(0, 1))
+    occluders = occluders_of(gaussians)
     sources, front, back = source_pairs(beams)
     around, around_front, around_back = ambient_pairs(beams)
     occlusions = []
     if len(sources):
         both = torch.cat([sources.directions, -sources.directions])
         window = Window(center=ball.center, radius=ball.radius, frames=frames_along(both))
-        maps = splat_depth_maps(gaussians, window, size=SOURCE_SIZE, linear_rgb=rgb)
+        maps = splat_depth_maps(occluders, window, size=SOURCE_SIZE, with_color=True)
         occlusions.append((sources, occlusion_from_maps(maps, front, back), 2 * maps.texel))
     window = Window(center=ball.center, radius=ball.radius, frames=frames_along(around.directions))
-    maps = splat_depth_maps(gaussians, window, size=AMBIENT_SIZE, linear_rgb=rgb)
+    maps = splat_depth_maps(occluders, window, size=AMBIENT_SIZE, with_color=True)
     occlusions.append((around, occlusion_from_maps(maps, around_front, around_back), maps.texel))
     return ObjectMaps(maps, tuple(occlusions))
 
@@ -77,14 +76,15 @@ def self_visibility(
     bundle that is blocked still brings a third: light between the object's own parts.
     """
     window = maps.ambient_maps.window
-    around = visibility(maps.ambient_maps, gaussians.means, normals, bias=2 * maps.ambient_maps.texel)
+    points = raised(gaussians, normals)
+    around = visibility(maps.ambient_maps, points, normals, bias=2 * maps.ambient_maps.texel)
     around = 1 / 3 + 2 / 3 * around
     sources, _, _ = source_pairs(beams)
     if not len(sources):
         return around
     lit = Window(center=window.center, radius=window.radius, frames=frames_along(sources.directions))
-    fronts = splat_depth_maps(gaussians, lit, size=AMBIENT_SIZE)
-    return torch.cat([visibility(fronts, gaussians.means, normals, bias=2.5 * fronts.texel), around], 1)
+    fronts = splat_depth_maps(occluders_of(gaussians), lit, size=AMBIENT_SIZE, with_color=False)
+    return torch.cat([visibility(fronts, points, normals, bias=2.5 * fronts.texel), around], 1)
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,12 @@ def map_scene(scene: Gaussians, region: Ball, beams: Beams) -> SceneMaps:
     """Depth maps of `scene` for every bundle. Only what is in the region blocks: the light is from beyond it."""
     maps: list[DepthMaps | None] = []
     near = (scene.means - region.center).norm(dim=1) < 1.5 * region.radius + 3 * scene.scales.max(1).values
-    scene = scene.select(near)
+    occluders = occluders_of(scene.select(near))
     for part, size in ((source_pairs(beams)[0], SOURCE_SIZE), (ambient_pairs(beams)[0], AMBIENT_SIZE)):
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
-        reach = (-region.radius, region.radius)
-        maps.append(splat_depth_maps(scene, window, size=size, depth_range=reach) if len(part) else None)
+        nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
+        seen = splat_depth_maps(occluders, window, size=size, with_color=False, nearest=nearest)
+        maps.append(seen if len(part) else None)
     return SceneMaps(region=region, source_maps=maps[0], ambient_maps=maps[1])
 
 

@@ -14,7 +14,7 @@ from splatgraft.relight.beams import beams_of
 from splatgraft.relight.cache import RelightCache
 from splatgraft.relight.estimate_light import light_of
 from splatgraft.relight.light import Light
-from splatgraft.relight.normals import Normals, estimate_normals
+from splatgraft.relight.normals import Normals, estimate_normals, raised
 from splatgraft.relight.place_light import light_at, panorama_at, up_of
 from splatgraft.relight.scene_shading import Ball, SceneMaps, map_scene, scene_visibility
 
@@ -53,7 +53,7 @@ def set_stage(
             return None, problem
     lit = light
     maps = cache.get("maps", (scene, region, lit.sources), lambda: map_scene(scene, region, beams_of(lit)))
-    points = scene.means[members]
+    points = raised(scene.select(members), normals.vectors)
     arrives = cache.get("arrives", (maps, normals), lambda: scene_visibility(maps, points, normals.vectors))
     return Stage(scene=scene, members=members, normals=normals, light=lit, maps=maps, arrives=arrives), None
 

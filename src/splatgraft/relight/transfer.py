@@ -19,7 +19,7 @@ from splatgraft.relight.cache import RelightCache
 from splatgraft.relight.cast import Beams
 from splatgraft.relight.layers import Relit, unchanged
 from splatgraft.relight.light import Light
-from splatgraft.relight.normals import Normals, estimate_normals
+from splatgraft.relight.normals import Normals, estimate_normals, raised
 from splatgraft.relight.object_shading import irradiance, shade_ratio, unknown_origin_ratio
 from splatgraft.relight.place_light import light_at, up_of
 from splatgraft.relight.receivers import Receivers, shade_receivers
@@ -105,7 +105,7 @@ def relight(
     actors, shades = [], []
     for i, ((one, source), gaussians, ball) in enumerate(zip(placed, objects, balls, strict=True)):
         normals = estimate_normals(gaussians, cameras)
-        arrives = scene_visibility(stage.maps, gaussians.means, normals.vectors)
+        arrives = scene_visibility(stage.maps, raised(gaussians, normals.vectors), normals.vectors)
         actor = _Actor(gaussians, ball, normals, map_object(gaussians, ball, beams), arrives)
         before = None
         if source is not None:

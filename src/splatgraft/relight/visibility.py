@@ -12,6 +12,8 @@ from numba import njit, prange
 from torch import Tensor
 
 from splatgraft.gaussians import Gaussians
+from splatgraft.images import linear_from_srgb
+from splatgraft.spherical_harmonics import rgb_from_dc
 
 FAR = np.float32(1e30)
 _BINS = 4096
@@ -36,6 +38,27 @@ class Window:
 
 
 @dataclass(frozen=True)
+class Occluders:
+    """What Gaussians' maps need of them, computed once for many maps."""
+
+    means: Float[Tensor, "n 3"]
+    covariances: Float[Tensor, "n 3 3"]
+    opacities: Float[Tensor, "n"]
+    linear_rgb: Float[Tensor, "n 3"]
+    """Mean colour, linear."""
+
+
+def occluders_of(gaussians: Gaussians) -> Occluders:
+    """The Gaussians as things that block light."""
+    return Occluders(
+        means=gaussians.means,
+        covariances=gaussians.covariances,
+        opacities=gaussians.opacities,
+        linear_rgb=linear_from_srgb(rgb_from_dc(gaussians.sh[:, 0]).clamp(0, 1)),
+    )
+
+
+@dataclass(frozen=True)
 class DepthMaps:
     """What k far lights see of some occluders."""
 
@@ -56,29 +79,22 @@ class DepthMaps:
 
 
 def splat_depth_maps(
-    occluders: Gaussians,
-    window: Window,
-    *,
-    size: int,
-    linear_rgb: Float[Tensor, "n 3"] | None = None,
-    depth_range: tuple[float, float] | None = None,
+    occluders: Occluders, window: Window, *, size: int, with_color: bool, nearest: Float[Tensor, "k"] | None = None
 ) -> DepthMaps:
     """Depth maps of `occluders`, `size` pixels square; blended front to back as the renderer does.
 
-    `depth_range` keeps only occluders whose centre lies in it, in depths from the window's centre.
+    Colour is kept where `with_color` asks for it. Occluders at a depth below `nearest` (that is, farther than
+    -`nearest` from the window's centre towards that light) are left out.
     """
     k = len(window.frames)
-    lowest, highest = depth_range or (-float(FAR), float(FAR))
-    with_color = linear_rgb is not None
-    rgb = linear_rgb if linear_rgb is not None else torch.zeros(1, 3)
     first = np.full((k, size, size), FAR, np.float32)
     alpha = np.zeros((k, size, size), np.float32)
     mean = np.zeros((k, size, size), np.float32)
     color = np.zeros((k if with_color else 0, size, size, 3), np.float32)
     geometry = (_array(occluders.means), _array(occluders.covariances), _array(occluders.opacities))
     view = (_array(window.frames), _array(window.center), np.float32(window.radius))
-    limits = np.array([lowest, highest], np.float32)
-    _splat(geometry, _array(rgb), view, limits, (first, alpha, mean, color))
+    limits = _array(nearest) if nearest is not None else np.full(k, -FAR, np.float32)
+    _splat(geometry, _array(occluders.linear_rgb), view, limits, (first, alpha, mean, color))
     return DepthMaps(
         window=window,
         first=torch.from_numpy(first),
@@ -122,7 +138,7 @@ def _splat(geometry, rgb, view, limits, maps):  # noqa: PLR0912, PLR0915  (one k
             x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
             opacity = opacities[i]
             depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
-            if opacity < 0.02 or depth < limits[0] or depth > limits[1]:
+            if opacity < 0.02 or depth < limits[k]:
                 continue
             u = (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z + radius) * per_unit
             v = (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z + radius) * per_unit

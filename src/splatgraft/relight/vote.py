@@ -1,11 +1,11 @@
 """Where a scene's dominant light comes from, told by the shadows that the scene casts on itself.
 
-For each of some 500 directions the scene is shadow-mapped from there; the direction whose visibility times cosine best
+For each of some 300 directions the scene is shadow-mapped from there; the direction whose visibility times cosine best
 explains the brightness within groups of one material wins. Knows nothing about panoramas, objects or files.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -15,15 +15,17 @@ from splatgraft.gaussians import Gaussians
 from splatgraft.images import linear_from_srgb
 from splatgraft.relight.directions import even_directions, frames_along
 from splatgraft.relight.normals import Normals
-from splatgraft.relight.visibility import Window, splat_depth_maps, visibility
+from splatgraft.relight.visibility import Occluders, Window, occluders_of, splat_depth_maps, visibility
 from splatgraft.spherical_harmonics import rgb_from_dc
 
-_DIRECTIONS = 1024  # on the sphere; those above the horizon, about half, are tried
+_DIRECTIONS = 512  # on the sphere; those above the horizon, about half, are tried
 _LOWEST = math.radians(5)
-_RECEIVERS = 6000
-_OCCLUDERS = 40000
-_GROUPS = 48
+_RECEIVERS = 4000
+_OCCLUDERS = 16000
+_GROUPS = 20
 _MAP_SIZE = 128
+_HIDDEN = 0.6  # openness below which a point is inside something
+_STRENGTHS = (0.3, 0.8, 2.0, 5.0)
 
 
 @dataclass(frozen=True)
@@ -65,14 +67,14 @@ def vote(
     directions = even_directions(_DIRECTIONS)
     directions = directions[directions @ up > math.sin(_LOWEST)]
     lit = _lit(occluders, points, facing, directions, center=center, radius=radius)
-    fit = _Fit.of(brightness, ambient, groups, weight)
-    scores = fit.explained(lit)
+    fit = _Fit.of(brightness, ambient, groups, weight * (ambient > _HIDDEN))
+    scores, _ = fit.explained(lit)
     best = int(scores.argmax())
     # finer: a cap of directions around the best
     finer = _cap(directions[best], math.radians(7), 48)
     finer = finer[finer @ up > math.sin(_LOWEST)]
     lit_finer = _lit(occluders, points, facing, finer, center=center, radius=radius)
-    directions, scores = torch.cat([directions, finer]), torch.cat([scores, fit.explained(lit_finer)])
+    directions, scores = torch.cat([directions, finer]), torch.cat([scores, fit.explained(lit_finer)[0]])
     lit = torch.cat([lit, lit_finer], 1)
     top = float(scores.max())
     # the top of the curve is the estimate, its width the doubt
@@ -83,11 +85,12 @@ def vote(
     nearest = int((directions @ direction).argmax())
     typical = float(scores.median())
     contrast = (top - typical) / max(top, 1e-9)
-    significance = top / (top + 0.06)
-    confidence = significance * min(1.0, 1.6 * contrast) * math.exp(-((uncertainty / math.radians(35)) ** 2))
+    # measured on synthetic scenes: the less the best direction explains, the farther it is from the truth
+    uncertainty = math.hypot(uncertainty, math.radians(3 + 22 * math.exp(-top / 0.15)))
+    confidence = top / (top + 0.08) * min(1.0, 1.6 * contrast)
     return Vote(
         direction=direction,
-        uncertainty=max(uncertainty, math.radians(2)),
+        uncertainty=uncertainty,
         strength=fit.strength(lit[:, nearest]),
         confidence=confidence,
         explained=top,
@@ -104,20 +107,20 @@ def _receivers(scene: Gaussians, normals: Normals, center: Float[Tensor, "3"], r
     return chosen[torch.randperm(len(chosen), generator=generator)[:_RECEIVERS]]
 
 
-def _occluders(scene: Gaussians, center: Float[Tensor, "3"], radius: float) -> Gaussians:
+def _occluders(scene: Gaussians, center: Float[Tensor, "3"], radius: float) -> Occluders:
     near = (scene.means - center).norm(dim=1) < 1.3 * radius
     chosen = (near & (scene.opacities > 0.1)).nonzero()[:, 0]
     if len(chosen) <= _OCCLUDERS:
-        return scene.select(chosen)
+        return occluders_of(scene.select(chosen))
     generator = torch.Generator().manual_seed(0)
     part = scene.select(chosen[torch.randperm(len(chosen), generator=generator)[:_OCCLUDERS]])
     # fewer, wider: together they cover the same area
     grown = part.log_scales + 0.5 * math.log(len(chosen) / _OCCLUDERS)
-    return Gaussians(part.means, grown, part.quaternions, part.opacity_logits, part.sh)
+    return occluders_of(replace(part, log_scales=grown))
 
 
 def _lit(
-    occluders: Gaussians,
+    occluders: Occluders,
     points: Float[Tensor, "m 3"],
     normals: Float[Tensor, "m 3"],
     directions: Float[Tensor, "d 3"],
@@ -127,13 +130,15 @@ def _lit(
 ) -> Float[Tensor, "m d"]:
     """Visibility times cosine."""
     window = Window(center=center, radius=radius, frames=frames_along(directions))
-    maps = splat_depth_maps(occluders, window, size=_MAP_SIZE, depth_range=(-radius, radius))
+    maps = splat_depth_maps(
+        occluders, window, size=_MAP_SIZE, with_color=False, nearest=torch.full((len(directions),), -radius)
+    )
     cosine = (normals @ directions.T).clamp_min(0)
     return visibility(maps, points, normals, bias=1.5 * maps.texel) * cosine
 
 
 def _openness(
-    occluders: Gaussians,
+    occluders: Occluders,
     points: Float[Tensor, "m 3"],
     normals: Float[Tensor, "m 3"],
     *,
@@ -150,7 +155,7 @@ def _materials(brightness: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]) 
     """k-means on chromaticity and normal: brightness itself is left out, or lit and shaded would part."""
     log_rgb = brightness.clamp_min(1e-3).log()
     chroma = torch.stack([log_rgb[:, 0] - log_rgb[:, 1], log_rgb[:, 2] - log_rgb[:, 1]], 1)
-    features = torch.cat([chroma / 0.25, normals / 0.5], 1)
+    features = torch.cat([chroma / 0.5, normals / 0.6], 1)
     generator = torch.Generator().manual_seed(0)
     count = min(_GROUPS, max(2, len(features) // 60))
     middles = features[torch.randperm(len(features), generator=generator)[:count]]
@@ -165,11 +170,14 @@ def _materials(brightness: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]) 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Least squares of brightness on (ambient, lit) in every group at once."""
+    """The model log B = log albedo of the group + log(ambient + strength * lit), one strength for all groups.
+
+    One strength leaves chance one degree of freedom: an own one per group would let textures vote.
+    """
 
     member: Float[Tensor, "g m"]
-    """Weight of each receiver in its group, divided by the group's mean brightness squared."""
-    brightness: Float[Tensor, "m 3"]
+    """Weight of each receiver in its group."""
+    log_rgb: Float[Tensor, "m 3"]
     ambient: Float[Tensor, "m"]
 
     @staticmethod
@@ -177,43 +185,36 @@ class _Fit:
         brightness: Float[Tensor, "m 3"], ambient: Float[Tensor, "m"], groups: Int[Tensor, "m"], weight: Tensor
     ) -> "_Fit":
         count = int(groups.max()) + 1
+        # what is almost black says nothing about light
+        weight = weight * brightness.mean(1) / (brightness.mean(1) + 0.02)
         member = torch.nn.functional.one_hot(groups, count).T.float() * weight
-        mean = (member @ brightness.mean(1)) / member.sum(1).clamp_min(1e-9)
-        # no receiver counts for more than three times its group's mean: glints are not light on a surface
-        limit = 3 * mean[groups]
-        brightness = brightness * (limit / brightness.mean(1).clamp_min(1e-6)).clamp_max(1)[:, None]
-        return _Fit(member / mean.clamp_min(1e-3)[:, None] ** 2, brightness, ambient)
+        log_rgb = brightness.clamp_min(0.004).log()
+        middle = (member @ log_rgb) / member.sum(1, keepdim=True).clamp_min(1e-9)
+        # a factor of 4 from the group's mean is a glint or another material
+        away = (log_rgb - middle[groups]).clamp(-math.log(4), math.log(4))
+        return _Fit(member, middle[groups] + away, ambient)
 
-    def _sums(self, lit: Float[Tensor, "m d"]) -> tuple[Tensor, Tensor, Tensor]:
-        a = self.ambient[:, None]
-        return self.member @ (a * a), self.member @ (a * lit), self.member @ (lit * lit)
+    def _residual(self, values: Float[Tensor, "m d"]) -> Float[Tensor, "d"]:
+        """Weighted squares around each group's mean."""
+        total = self.member.sum(1, keepdim=True).clamp_min(1e-9)
+        sums = self.member @ values
+        return self.member.sum(0) @ (values * values) - (sums * sums / total).sum(0)
 
-    def explained(self, lit: Float[Tensor, "m d"]) -> Float[Tensor, "d"]:
-        """Share of the squared error of the ambient-only model that a light from each direction removes."""
-        b, a = self.brightness.mean(1, keepdim=True), self.ambient[:, None]
-        aa, ax, xx = self._sums(lit)
-        ba, bx, bb = self.member @ (b * a), self.member @ (b * lit), self.member @ (b * b)
-        residual = bb - ba * ba / aa.clamp_min(1e-12)
-        slope_variance = (xx - ax * ax / aa.clamp_min(1e-12)).clamp_min(0)
-        covariance = (bx - ba * ax / aa.clamp_min(1e-12)).clamp_min(0)
-        # a group in which hardly anything is lit differently has nothing to say: the ridge is 1% of its weight
-        ridge = 0.01 * xx + 0.003 * aa
-        gain = covariance**2 / (slope_variance + ridge)
-        return gain.sum(0) / residual.sum().clamp_min(1e-12)
+    def explained(self, lit: Float[Tensor, "m d"]) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
+        """Share of the ambient-only model's error that a light removes, and the strength that removes most."""
+        value = self.log_rgb.mean(1)
+        without = self._residual((value - self.ambient.log())[:, None])
+        tried = [
+            self._residual(value[:, None] - (self.ambient[:, None] + strength * lit).log()) for strength in _STRENGTHS
+        ]
+        residual, which = torch.stack(tried).min(0)
+        return (1 - residual / without.clamp_min(1e-12)).clamp_min(0), torch.tensor(_STRENGTHS)[which]
 
     def strength(self, lit: Float[Tensor, "m"]) -> Float[Tensor, "3"]:
-        """Irradiance facing the light over ambient irradiance, per channel: a mean over groups by what they know."""
-        x, a = lit[:, None], self.ambient[:, None]
-        aa, ax, xx = self._sums(x)
-        ba, bx = self.member @ (self.brightness * a), self.member @ (self.brightness * x)
-        determinant = (aa * xx - ax * ax).clamp_min(1e-12)
-        shade, light = (ba * xx - bx * ax) / determinant, (bx * aa - ba * ax) / determinant
-        ratio = (light / shade.clamp_min(0.05 * ba / aa.clamp_min(1e-12))).clamp(0, 12)
-        known = (xx - ax * ax / aa.clamp_min(1e-12)).clamp_min(0)
-        known = known * (aa > 0)
-        # a mean of log(1 + ratio), so that one group without a shaded part does not decide
-        log_ratio = (known * (1 + ratio).log()).sum(0) / known.sum().clamp_min(1e-12)
-        return log_ratio.exp() - 1
+        """Irradiance facing the light over ambient irradiance, per channel."""
+        fine = torch.logspace(-1, 1.3, 24)
+        modelled = (self.ambient[:, None] + lit[:, None] * fine).log()
+        return torch.stack([fine[self._residual(self.log_rgb[:, c : c + 1] - modelled).argmin()] for c in range(3)])
 
 
 def _cap(axis: Float[Tensor, "3"], radius: float, count: int) -> Float[Tensor, "n 3"]:
