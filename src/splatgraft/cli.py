@@ -18,6 +18,7 @@ COMMANDS = {
     "harmonize": "make the light of each rendered view agree",
     "consolidate": "fit the colours of the scene to the harmonised views",
     "evaluate": "compare, picture and report",
+    "synth": "render training pairs and benchmark scenes with Blender",
     "doctor": "say what is installed, what is missing and how to get it",
 }
 
@@ -59,7 +60,8 @@ def _dispatch(words: list[str]) -> int:
     if not words or words[0] not in COMMANDS:
         found = words[0] if words else "nothing"
         raise ValueError(f"splatgraft: expected a command among {', '.join(COMMANDS)}; found {found}")
-    command, rest = words[0], words[1:]
+    length = 2 if " ".join(words[:2]) in COMMANDS else 1
+    command, rest = "_".join(words[:length]), words[length:]
     if command not in ("init", "run", "status", "doctor") and len(rest) == 1 and rest[0].endswith(".toml"):
         command, rest = "run", [rest[0], "--to", command]  # `reconstruct project.toml`: the project up to there
 
@@ -68,7 +70,7 @@ def _dispatch(words: list[str]) -> int:
     module = importlib.import_module(f"splatgraft.steps.{command}")
     options = tyro.cli(
         module.COMMAND,
-        prog=f"splatgraft {command}",
+        prog=f"splatgraft {' '.join(words[:length])}",
         args=rest,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
@@ -83,7 +85,7 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _help() -> str:
-    lines = [f"  {name:<12} {sentence}" for name, sentence in COMMANDS.items()]
+    lines = [f"  {name:<18} {sentence}" for name, sentence in COMMANDS.items()]
     head = "usage: splatgraft COMMAND [OPTIONS]; `splatgraft COMMAND --help` says more\n\ncommands:"
     tail = (
         "\n`splatgraft reconstruct project.toml` does that project up to there."

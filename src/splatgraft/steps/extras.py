@@ -20,6 +20,7 @@ EXTRAS = {
     "flux": Extra("the paper's image model", {"diffusers": "diffusers", "transformers": "transformers"}),
     "editor": Extra("the placement editor in a browser", {"viser": "viser"}),
     "blender": Extra("made-up scenes with ground truth", {"bpy": "bpy"}),
+    "ray": Extra("rendering and evaluating on many machines", {"ray": "ray"}),
     "birefnet": Extra(
         "object masks from a network", {"onnxruntime": "onnxruntime", "huggingface_hub": "huggingface_hub"}
     ),

@@ -244,7 +244,9 @@ def _done(job: Job, folder: Path) -> bool:
 def _render_size(text: str, samples: int) -> RenderSize:
     parts = text.split("x")
     if len(parts) != 2 or not all(part.isdigit() and int(part) >= 16 for part in parts) or samples < 1:
-        raise ValueError(f"--size, --samples: expected such as 704x496 and at least one sample, found {text}, {samples}")
+        raise ValueError(
+            f"--size, --samples: expected such as 704x496 and at least one sample, found {text}, {samples}"
+        )
     return RenderSize(int(parts[0]), int(parts[1]), samples)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,8 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
         )
         for sun in suns
     ]
-    ordered = sorted([*sources, *seen.sources], key=lambda source: -source.luminance)
+    patches = [replace(source, uncertainty_deg=0.0) for source in seen.sources]
+    ordered = sorted([*sources, *patches], key=lambda source: -source.luminance)
     return Light(sources=tuple(ordered), ambient=seen.ambient, coverage=1.0, unseen_up=0.0)
 
 

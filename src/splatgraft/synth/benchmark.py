@@ -2,13 +2,15 @@
 
 Six indoor, three outdoor. `<out>/<scene>/` holds `source/` (the object on a stage in its own light), `target/` (the
 scene without it), `ground_truth/` (the scene with it, from the target's cameras), all captures with transforms.json;
-`placement.json` and `true_light.json`. The object stands at one place in both worlds, turned about the vertical by
-the pose's angle, so that the placement is known exactly. Knows nothing about transfers.
+`placement.json`; `probe.npy` and `suns.json`, the true light at the object's place. The object stands at one place in
+both worlds, turned about the vertical by the pose's angle, so that the placement is known exactly. Knows nothing about
+transfers.
 """
 
 import json
 import math
 import random
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from torch import Tensor
 
 from splatgraft import images
 from splatgraft.cameras import Cameras
-from splatgraft.formats import write_capture
+from splatgraft.formats import read_capture, write_capture
 from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.posed_images import PosedImages
 from splatgraft.similarity import Similarity
@@ -135,6 +137,7 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
         takes=(
             Take("target", scene=True, passes=("color", "depth")),
             Take("ground_truth", scene=True, object="object", passes=seen),
+            Take("light", scene=True, probe=(place.location[0], place.location[1], place.location[2] + height / 2)),
         ),
         size=size.render,
         provenance=provenance,
@@ -188,31 +191,30 @@ def sparse_points(
     return torch.from_numpy(np.concatenate(points)).float(), torch.from_numpy(np.concatenate(colors)).float()
 
 
-def _gather(rendered: Path, take: str, out: Path, *, masks: bool, points: bool) -> None:
-    """Lay one take out as a capture: images/, masks/, transforms.json, points.ply."""
-    (out / "images").mkdir(parents=True, exist_ok=True)
+def _gather(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
+    """Lay one take out as a capture: images/, a folder a pass, transforms.json, points.ply."""
     count = len(json.loads((rendered / "cameras.json").read_text())["poses"])
-    names = tuple(f"{i:04d}.png" for i in range(count))
-    for name in names:
-        images.write_image(out / "images" / name, images.read_rgb(rendered / take / name))
-    mask_paths: tuple[Path | None, ...] = ()
-    if masks:
-        (out / "masks").mkdir(exist_ok=True)
-        for name in names:
-            mask = images.read_rgb(rendered / take / f"{name[:4]}_mask.png")[..., 0]
-            images.write_image(out / "masks" / name, (mask > 0.5).float())
-        mask_paths = tuple(out / "masks" / name for name in names)
-    cameras = _cameras(rendered, names)
+    stems = tuple(f"{i:04d}" for i in range(count))
+    for folder, suffix, ending in _PASS_FILES:
+        if folder in passes:
+            (out / folder).mkdir(parents=True, exist_ok=True)
+            for stem in stems:
+                shutil.copyfile(rendered / take / f"{stem}{suffix}", out / folder / f"{stem}{ending}")
+    cameras = _cameras(rendered, tuple(f"{stem}.png" for stem in stems))
     found, colors = sparse_points(rendered / take, cameras) if points else (torch.zeros(0, 3), torch.zeros(0, 3))
-    paths = tuple(out / "images" / name for name in names)
-    write_capture(out, PosedImages(paths, cameras, found, colors, mask_paths))
+    image_paths = tuple(out / "images" / f"{stem}.png" for stem in stems)
+    mask_paths = tuple(out / "masks" / f"{stem}.png" for stem in stems) if "masks" in passes else ()
+    write_capture(out, PosedImages(image_paths, cameras, found, colors, mask_paths))
+
+
+_PASS_FILES = (("images", ".png", ".png"), ("masks", "_mask.png", ".png"), ("depth", "_depth.npy", ".npy"))
 
 
 def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out: Path) -> None:
-    """Lay out one rendered scene as captures with its placement and its true light."""
-    _gather(source_render, "source", out / "source", masks=True, points=True)
-    _gather(target_render, "target", out / "target", masks=False, points=True)
-    _gather(target_render, "ground_truth", out / "ground_truth", masks=True, points=False)
+    """Lay out one rendered scene as captures with its placement and what is known of its light."""
+    _gather(source_render, "source", out / "source", passes=("images", "masks"), points=True)
+    _gather(target_render, "target", out / "target", passes=("images",), points=True)
+    _gather(target_render, "ground_truth", out / "ground_truth", passes=("images", "masks", "depth"), points=False)
     scene = make_scene(which.kind, which.seed)
     angle = math.radians(which.pose_deg)
     c, s = math.cos(angle), math.sin(angle)
@@ -220,4 +222,37 @@ def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out:
     center = torch.tensor(scene.places[0].location)
     moved = Similarity(scale=1.0, rotation=rotation, translation=center - rotation @ center)
     write_placement(out / "placement.json", Placement((ObjectPlacement(moved),)))
-    (out / "true_light.json").write_text(json.dumps(scene.notes, indent=1) + "\n")
+    shutil.copyfile(target_render / "light" / "0000.npy", out / "probe.npy")
+    shutil.copyfile(target_render / "light" / "suns.json", out / "suns.json")
+    record = {"kind": which.kind, "pose_deg": which.pose_deg, "seed": which.seed, **scene.notes}
+    (out / "scene.json").write_text(json.dumps(record, indent=1) + "\n")
+
+
+def fault(folder: Path) -> str | None:
+    """What is wrong with a gathered scene, in a line, or None: missing, broken, black, burnt out, no object in it."""
+    try:
+        truth, target = read_capture(folder / "ground_truth"), read_capture(folder / "target")
+        source = read_capture(folder / "source")
+        for capture, masked in ((truth, True), (target, False), (source, True)):
+            for index in range(len(capture)):
+                wrong = _view_fault(capture, index, masked=masked)
+                if wrong:
+                    return wrong
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def _view_fault(capture: PosedImages, index: int, *, masked: bool) -> str | None:
+    path, image = capture.image_paths[index], capture.image(index)
+    mean, deviation, burnt = float(image.mean()), float(image.std()), float((image > 0.995).float().mean())
+    if mean < 0.02 or deviation < 0.01 or burnt > 0.6:
+        return (
+            f"{path}: expected a lit picture, found mean {mean:.3f}, deviation {deviation:.3f}, {burnt:.0%} burnt out"
+        )
+    mask = capture.mask(index) if masked else None
+    if masked and mask is None:
+        return f"{path}: expected a mask beside it, found none"
+    if mask is not None and not 0.001 <= float(mask.mean()) <= 0.7:
+        return f"{capture.mask_paths[index]}: expected a mask of 0.1% to 70%, found {float(mask.mean()):.2%}"
+    return None

@@ -1,15 +1,15 @@
-"""Render jobs: what to render, and running it in Blender processes side by side. Knows not what a job is for."""
+"""Render jobs: what to render, and rendering it in a Blender process. Knows not what a job is for."""
 
 import json
 import subprocess
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from splatgraft.progress import Progress, silent
-from splatgraft.synth.scene import Camera, Part, Scene, World
+from splatgraft.synth.scene import Camera, Part, Scene, Vector, World
+from splatgraft.workers import Task
 
 Pass = Literal["color", "depth", "normal", "albedo", "mask"]
 _WORKER = Path(__file__).parent / "blender" / "worker.py"
@@ -47,6 +47,11 @@ class Take:
     cameras: tuple[int, ...] | None = None
     stops: float = 0.0
     """Exposure on top of the group's, in photographic stops."""
+    probe: Vector | None = None
+    """Instead of pictures: the light that arrives at this point, `0000.npy` (64, 128, 3) and `suns.json`.
+
+    The panorama is linear light, scaled as the pictures are: row 0 is straight up, the middle column +x, and columns
+    run to the right seen from inside; small suns are left out of it and listed by themselves."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,8 @@ class Job:
     def files(self, out: Path) -> Iterator[Path]:
         """The marks that say which pictures are done, one for each take and camera."""
         for take in self.takes:
-            for i in range(len(self.cameras)) if take.cameras is None else take.cameras:
+            every = (0,) if take.probe is not None else range(len(self.cameras))
+            for i in every if take.cameras is None else take.cameras:
                 yield out / take.name / f"{i:04d}.done"
 
     def is_done(self, out: Path) -> bool:
@@ -125,18 +131,6 @@ def check_blender(blender_python: Path) -> str:
     return found[-1].removeprefix("version ")
 
 
-def render_all(
-    jobs: Sequence[tuple[Job, Path]], blender_python: Path, *, processes: int = 2, progress: Progress = silent
-) -> list[str]:
-    """Render many jobs with a few processes at a time; returns what went wrong, a line a job, and goes on past it."""
-    failures: list[str] = []
-    with ThreadPoolExecutor(processes) as pool:
-        running = [(out, pool.submit(render_job, job, out, blender_python)) for job, out in jobs]
-        for done, (out, future) in enumerate(running, 1):
-            error = future.exception()
-            if isinstance(error, ValueError):
-                failures.append(str(error))
-            elif error is not None:
-                raise error
-            progress(done, len(running), out.name)
-    return failures
+def render_tasks(jobs: Sequence[tuple[Job, Path]], blender_python: Path) -> list[Task]:
+    """One task a job, for `run_tasks`."""
+    return [Task(out.name, partial(render_job, job, out, blender_python)) for job, out in jobs]

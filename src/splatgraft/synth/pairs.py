@@ -13,7 +13,7 @@ One folder a scene and camera arc, `<out>/<scene>_<arc>/`:
 
 import json
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -62,31 +62,33 @@ class PairPlan:
     """Model files that take turns with generated objects."""
 
 
-def plan(options: PairPlan) -> Iterator[Job]:
-    """One job a scene, each determined by its number and the seed alone."""
-    for number in range(options.scenes):
-        rng = random.Random(f"pairs-{options.seed}-{number}")
-        kind = options.kinds[number % len(options.kinds)]
-        scene = make_scene(kind, options.seed * 100_003 + number)
-        place = scene.places[0]
-        things, heights = {}, []
-        for i in range(options.objects):
-            if options.models and rng.random() < 0.5:
-                made = objects.from_file(Path(rng.choice(options.models)), place)
-            else:
-                made = objects.make(rng.randrange(2**31), place)
-            heights.append(max(part.location[2] + part.size[2] / 2 for part in made))
-            things[f"object{i}"] = objects.standing_at(made, place.location, rng.uniform(0, 6.283))
-        takes = [Take("background", scene=True)]
-        for name in things:
-            takes.append(Take(name, scene=True, object=name, passes=("color", "mask", "depth", "normal", "albedo")))
-            for light in range(options.lights):
-                world = World("environment", path=rng.choice(options.maps), rotation=rng.uniform(0, 6.283))
-                alone = f"{name}_light{light}"
-                takes.append(Take(alone, scene=False, object=name, world=world, exposure_group=alone))
-        cameras = views.arc(scene, place, max(heights), number)
-        provenance = {"kind": kind, "seed": str(options.seed), "number": str(number), "licence": "own render"}
-        yield Job(scene, things, cameras, tuple(takes), options.size, number, provenance)
+def plan(options: PairPlan, number: int) -> Job:
+    """The job of scene `number`, determined by it and the seed alone.
+
+    Raises: ValueError where the scene leaves no room for an arc of cameras.
+    """
+    rng = random.Random(f"pairs-{options.seed}-{number}")
+    kind = options.kinds[number % len(options.kinds)]
+    scene = make_scene(kind, options.seed * 100_003 + number)
+    place = scene.places[0]
+    things, heights = {}, []
+    for i in range(options.objects):
+        if options.models and rng.random() < 0.5:
+            made = objects.from_file(Path(rng.choice(options.models)), place)
+        else:
+            made = objects.make(rng.randrange(2**31), place)
+        heights.append(max(part.location[2] + part.size[2] / 2 for part in made))
+        things[f"object{i}"] = objects.standing_at(made, place.location, rng.uniform(0, 6.283))
+    takes = [Take("background", scene=True)]
+    for name in things:
+        takes.append(Take(name, scene=True, object=name, passes=("color", "mask", "depth", "normal", "albedo")))
+        for light in range(options.lights):
+            world = World("environment", path=rng.choice(options.maps), rotation=rng.uniform(0, 6.283))
+            alone = f"{name}_light{light}"
+            takes.append(Take(alone, scene=False, object=name, world=world, exposure_group=alone))
+    cameras = views.arc(scene, place, max(heights), number)
+    provenance = {"kind": kind, "seed": str(options.seed), "number": str(number), "licence": "own render"}
+    return Job(scene, things, cameras, tuple(takes), options.size, number, provenance)
 
 
 def folder_of(job: Job) -> str:

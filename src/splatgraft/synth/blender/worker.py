@@ -14,26 +14,27 @@ import time
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
 import bpy
-import build
+import contents
 import numpy as np
 import passes
+import probe
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 
 
 def _populate(job):
-    build.clear()
+    contents.clear()
     scene_things, objects = [], {}
     for i, part in enumerate(job["scene"]["parts"]):
-        scene_things += build.add_part(part, f"part{i:03d}")
+        scene_things += contents.add_part(part, f"part{i:03d}")
     for i, lamp in enumerate(job["scene"]["lamps"]):
-        scene_things.append(build.add_lamp(lamp, f"lamp{i:02d}"))
+        scene_things.append(contents.add_lamp(lamp, f"lamp{i:02d}"))
     for key, parts in job["objects"].items():
-        things = [thing for part in parts for thing in build.add_part(part, key)]
+        things = [thing for part in parts for thing in contents.add_part(part, key)]
         for i, thing in enumerate(things):
             thing.name = f"{key}_{i:03d}"
         objects[key] = things
-    cameras = [build.add_camera(camera, f"camera{i:04d}") for i, camera in enumerate(job["cameras"])]
+    cameras = [contents.add_camera(camera, f"camera{i:04d}") for i, camera in enumerate(job["cameras"])]
     bpy.context.view_layer.update()
     return scene_things, objects, cameras
 
@@ -47,7 +48,7 @@ def _show(take, job, things, worlds):
             thing.hide_render = key != take["object"]
     key = json.dumps(take.get("world") or job["scene"]["world"], sort_keys=True)
     if key not in worlds:
-        worlds[key] = build.make_world(json.loads(key))
+        worlds[key] = contents.make_world(json.loads(key))
     bpy.context.scene.world = worlds[key]
     bpy.context.scene.render.film_transparent = not take["scene"]
 
@@ -102,6 +103,11 @@ def _write(folder, name, take, arrays, exposure):
             passes.write_png(path + ".png", arrays[kind])
 
 
+def _done(folder, index, seconds):
+    with open(os.path.join(folder, f"{index:04d}.done"), "w") as out:
+        out.write(f"{seconds:.2f}\n")
+
+
 def main(path):
     """Render what the job at `path` still lacks."""
     with open(path) as source:
@@ -118,11 +124,23 @@ def main(path):
     for take in job["takes"]:
         folder = os.path.join(job["out"], take["name"])
         os.makedirs(folder, exist_ok=True)
-        chosen = take.get("cameras", range(len(cameras)))
+        chosen = take.get("cameras", [0] if take.get("probe") else range(len(cameras)))
         todo = [i for i in chosen if not os.path.exists(os.path.join(folder, f"{i:04d}.done"))]
         if not todo:
             continue
         _show(take, job, (scene_things, objects), worlds)
+        if take.get("probe"):
+            exposure = _exposure(job, take, cameras)
+            world = take.get("world") or job["scene"]["world"]
+            panorama, suns = probe.measure(job["scene"], world, take["probe"], scene_things)
+            passes.write_npy(os.path.join(folder, "0000.npy"), (panorama * exposure).astype(np.float32))
+            for sun in suns:
+                sun["irradiance"] = [value * exposure for value in sun["irradiance"]]
+            with open(os.path.join(folder, "suns.json"), "w") as out:
+                json.dump(suns, out, indent=1)
+            _done(folder, 0, 0.0)
+            passes.configure(job["width"], job["height"], job["samples"], job.get("seed", 0))
+            continue
         matte = [thing.name for thing in objects.get(take["object"], [])]
         exposure = _exposure(job, take, cameras) * 2.0 ** take.get("stops", 0.0)
         for i in todo:
@@ -131,8 +149,7 @@ def main(path):
             if not np.isfinite(arrays["color"]).all():
                 raise ValueError(f"{folder}/{i:04d}: expected finite colours, found {math.nan}")
             _write(folder, f"{i:04d}", take, arrays, exposure)
-            with open(os.path.join(folder, f"{i:04d}.done"), "w") as out:
-                out.write(f"{time.time() - begin:.2f}\n")
+            _done(folder, i, time.time() - begin)
             print(f"rendered {take['name']} {i:04d} {time.time() - begin:.1f} s", flush=True)
 
 

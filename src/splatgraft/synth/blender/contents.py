@@ -263,7 +263,7 @@ def make_world(world):
     background.inputs["Color"].default_value = (*world["color"], 1.0)
     if world["kind"] == "sky":
         sky = nodes.new("ShaderNodeTexSky")
-        sky.sky_type = "NISHITA"
+        sky.sky_type, sky.sun_disc = "NISHITA", world.get("sun_disc", True)
         sky.sun_elevation, sky.sun_size, sky.dust_density = world["sun_elevation"], world["sun_size"], world["haze"]
         # the node turns clockwise from +y, seen from above
         sky.sun_rotation = math.pi / 2 - world["sun_azimuth"]
