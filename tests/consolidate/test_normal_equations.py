@@ -3,8 +3,10 @@ from dataclasses import replace
 import torch
 from conftest import ball, ring
 
+from splatgraft.consolidate.changes import reset_bands
 from splatgraft.consolidate.corrections import Corrections
-from splatgraft.consolidate.normal_equations import solve
+from splatgraft.consolidate.normal_equations import _choose, _set_up, solve
+from splatgraft.consolidate.nuisance import NuisanceOptions
 from splatgraft.consolidate.options import SolveOptions
 from splatgraft.consolidate.views import Views
 from splatgraft.rendering import RenderOptions, render
@@ -55,3 +57,34 @@ def test_an_unseen_gaussian_keeps_its_prior():
     found = solve(prior, Corrections(views_of(scene, cameras, images), None), SolveOptions())
     assert torch.equal(found[50:], prior[50:])
     assert not torch.equal(found[:50], prior[:50])
+
+
+def test_the_ridge_follows_how_much_the_views_disagree():
+    scene, cameras = ball(200, degree=2, seed=6), ring(12)
+    images = render(scene, cameras).color
+    prior = reset_bands(scene.sh)
+    options = SolveOptions(band_ridges=(0.001, 0.1, 10.0))
+
+    def chosen(pictures) -> float:
+        corrections = Corrections(views_of(scene, cameras, list(pictures)), None)
+        equations = _set_up(prior, corrections.views, 0.1, options.prior_px)
+        return _choose(prior, corrections, equations, options)
+
+    # the scene has higher bands, and views that agree show them; a gain of 40% per view drowns them
+    gains = torch.exp(0.4 * torch.randn(12, 1, 1, 3, generator=torch.Generator().manual_seed(7)))
+    assert chosen(images) < chosen(images * gains)
+
+
+def test_tints_are_taken_off_before_the_colours_are_fitted():
+    scene, cameras = ball(300, degree=1, seed=9), ring(12)
+    images = render(scene, cameras).color
+    gains = torch.exp(0.1 * torch.randn(12, 1, 1, 3, generator=torch.Generator().manual_seed(10)))
+    gains /= gains.log().mean(0, keepdim=True).exp()  # the mean gain is the scene's
+    prior = reset_bands(scene.sh)
+
+    def error(nuisance) -> float:
+        corrections = Corrections(views_of(scene, cameras, list(images * gains)), nuisance)
+        found = replace(scene, sh=solve(prior, corrections, SolveOptions()))
+        return float((render(found, cameras).color - images).square().mean().sqrt())
+
+    assert error(NuisanceOptions()) < error(None)

@@ -68,8 +68,8 @@ def solve(
     trials = len(options.band_ridges) if len(corrections.views) >= 2 * _JUDGE_EVERY else 0
     total = options.rounds + trials + 1
     progress(0, total, "setting up the equations")
-    middle = options.band_ridges[len(options.band_ridges) // 2]
-    equations = _set_up(prior, corrections.views, middle, options.prior_px)
+    # the strongest first: colours that hardly turn with the view cannot take a view's own error for a highlight
+    equations = _set_up(prior, corrections.views, max(options.band_ridges), options.prior_px)
     sh, error = prior, 0.0
     for turn in range(options.rounds):
         residual, error = _residual(sh, corrections, equations.which, refine=turn > 0)

@@ -56,7 +56,7 @@ class SolveOptions:
     band_ridges: tuple[float, ...] = (0.003, 0.02, 0.1)
     """Weights of zero for the higher bands to choose from, as shares of the pixels that the Gaussian is seen in.
 
-    What predicts views left out best depends on how much the views disagree. Fewer than ten views: the middle one."""
+    What predicts views left out best depends on how much the views disagree. Fewer than ten views: the largest."""
 
 
 @dataclass(frozen=True)
