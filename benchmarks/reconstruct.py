@@ -45,8 +45,11 @@ def main() -> None:
     seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     served = options.served(capture)
     tested = [i for i in range(len(served)) if held_out(len(served))[i]]
-    with torch.no_grad():
-        pairs = [(render(gaussians, served.cameras[i]).color[0].clamp(0, 1), served.image(i)) for i in tested]
+    pairs = []
+    for i in tested:
+        picture = render(gaussians, served.cameras[i]).color
+        assert picture is not None
+        pairs.append((picture[0].clamp(0, 1), served.image(i)))
     similarity = sum(float(ssim(a, b)) for a, b in pairs) / len(pairs)
     decibel = sum(float(psnr(a, b)) for a, b in pairs) / len(pairs)
     print(f"{len(tested)} views held out, ssim {similarity:.4f}, {cpu:.0f} CPU-seconds")

@@ -99,8 +99,9 @@ _Rows = tuple[_Fields, ...]
 def _step_numba(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bool[Tensor, "n"]) -> bool:
     if len(visible) == 0:
         return True
-    arrays = [tuple(tensor.numpy() for tensor in fields) for fields in rows]
-    return _update_rows(*arrays, steps.numpy(), tuple(rate.numpy() for rate in rates), visible.numpy()) == 0
+    values, gradients, firsts, seconds = (tuple(tensor.numpy() for tensor in fields) for fields in rows)
+    numbers = tuple(rate.numpy() for rate in rates)
+    return _update_rows(values, gradients, (firsts, seconds), (steps.numpy(), visible.numpy()), numbers) == 0
 
 
 # divisions follow numpy, since a check for zero would be a branch in the loop
@@ -137,8 +138,10 @@ def _update_part(value, gradient, moments, part, rate):
 
 @numba.njit(parallel=True, cache=True)
 @no_type_check
-def _update_rows(values, gradients, firsts, seconds, steps, rates, visible):  # noqa: PLR0913, PLR0917
-    """All fields in one launch."""
+def _update_rows(values, gradients, moments, counts, rates):
+    """All fields in one launch; `counts` = (steps, visible)."""
+    firsts, seconds = moments
+    steps, visible = counts
     n = len(visible)
     bad = 0
     for part in numba.prange((n + _PART - 1) // _PART):

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
@@ -32,7 +32,7 @@ def from_points(points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"], *, c
     n = len(points)
     array = points.double().numpy()
     neighbours = min(4, n)
-    distances = cKDTree(array).query(array, k=neighbours)[0].reshape(n, -1)[:, 1:] if n > 1 else np.full((n, 1), 1.0)
+    distances = KDTree(array).query(array, k=neighbours)[0].reshape(n, -1)[:, 1:] if n > 1 else np.full((n, 1), 1.0)
     spacing = np.sqrt((distances**2).mean(1))
     # a stray point far from all others would start as a cloud that covers every image
     spacing = spacing.clip(max(1e-7, 1e-3 * float(np.median(spacing))), 10 * float(np.median(spacing)) + 1e-7)
