@@ -65,7 +65,8 @@ def default_box(capture: PosedImages) -> Box:
         )
     kept = near[_largest_group(near, 0.15 * radius)]
     lower, upper = kept.quantile(torch.tensor([0.01, 0.99]).to(kept), 0)
-    margin = 0.1 * (upper - lower).max()
+    # ends without texture have no points
+    margin = 0.2 * (upper - lower).max()
     lower, upper = lower - margin, upper + margin
     if plane is not None and float(plane.normal[2]) > 0.99:
         # the support itself stays outside: it would be taken for the object's colour
