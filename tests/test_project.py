@@ -67,11 +67,16 @@ def test_fingerprint_moves_with_inputs_and_options(tmp_path: Path, image: Path) 
     assert len(names) == 4
 
 
-def test_a_failed_run_leaves_the_earlier_result_and_nothing_else(tmp_path: Path) -> None:
-    finish(job(tmp_path / "scene"), "earlier")
-    with pytest.raises(RuntimeError, match="in the middle"), replacing(job(tmp_path / "scene")) as folder:
+def fail_in_the_middle(wanted: Job) -> None:
+    with replacing(wanted) as folder:
         (folder / "scene.ply").write_text("half")
         raise RuntimeError("in the middle")
+
+
+def test_a_failed_run_leaves_the_earlier_result_and_nothing_else(tmp_path: Path) -> None:
+    finish(job(tmp_path / "scene"), "earlier")
+    with pytest.raises(RuntimeError, match="in the middle"):
+        fail_in_the_middle(job(tmp_path / "scene"))
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
     assert (tmp_path / "scene" / "scene.ply").read_text() == "earlier"
 

@@ -61,7 +61,7 @@ def _build(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
         elif is_dataclass(hint):
             nested = field.default_factory() if field.default_factory is not MISSING else None
             # what the outer class chose for the inner one stands where the table is silent
-            chosen = {key: getattr(nested, key) for key in _keys(hint) - set(table.values)} if nested else {}
+            chosen = {key: getattr(nested, key) for key in _keys(type(nested)) - set(table.values)} if nested else {}
             values[field.name] = _build(hint, table, chosen)  # pyright: ignore[reportArgumentType]
         elif field.name in table.values:
             values[field.name] = _convert(table.values[field.name], hint, table, field.name)

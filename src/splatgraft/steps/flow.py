@@ -66,7 +66,7 @@ class Flow:
         Raises: ValueError where there is no such step.
         """
         wanted = set(self.steps) if name is None else self.named(name)
-        for other in reversed(self.steps):
+        for other in reversed(list(self.steps)):
             wanted |= set(self.before(other)) if other in wanted else set()
         return {other: step for other, step in self if other in wanted}
 

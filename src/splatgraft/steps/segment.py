@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -13,6 +12,7 @@ from splatgraft.posed_images import PosedImages
 from splatgraft.project import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
 from splatgraft.segment import (
     Box,
+    Keep,
     LiftOptions,
     SelectOptions,
     SolidifyOptions,
@@ -48,8 +48,8 @@ class Segment:
     """An .onnx file of BiRefNet; fetched once from its hub where not given."""
     threshold: float = 0.75
     """Least share of a Gaussian that the masks must give to the object."""
-    keep: Literal["largest", "all"] = "largest"
-    """Whether pieces that do not touch the largest are dropped."""
+    keep: Keep = "substantial"
+    """Which separate pieces stay: those with at least a twentieth of the largest one's opacity, the largest, or all."""
     solidify: int = SolidifyOptions.iterations
     """Steps that make the object look whole when it stands alone; 0 leaves its Gaussians as they are in the scene."""
     device: Device = "auto"

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, get_args
+from typing import Annotated, Any, Literal, Protocol, get_args, runtime_checkable
 
 import torch
 import tyro
@@ -31,6 +31,7 @@ class Context:
     """The result's final place: what an earlier run left there is still whole while this one works."""
 
 
+@runtime_checkable
 class Step(Protocol):
     """A frozen dataclass: paths of inputs, options, `out`; its fields are the command's arguments."""
 

@@ -66,12 +66,11 @@ def write_true_light(scene: Path) -> None:
     (scene / TRUE_LIGHT_FILE).write_text(light_to_json(light_from_probe(panorama, suns)))
 
 
-def read_true_light(scene: Path) -> Light:
-    """The true light of a gathered scene.
+def read_true_light(path: Path) -> Light:
+    """The true light that `write_true_light` wrote.
 
     Raises: ValueError where there is none.
     """
-    path = scene / TRUE_LIGHT_FILE
     if not path.is_file():
         raise ValueError(f"{path}: expected the scene's true light, found none")
     return light_from_json(path.read_text(), name=str(path))
