@@ -54,7 +54,7 @@ def main(options: Lift) -> None:
     bce, bce_s, bce_cpu_s = timed(scene, training, LiftOptions(method="bce", iterations=options.iterations))
     print(f"cross-entropy, {options.iterations} iterations: {bce_s:.2f} s ({bce_cpu_s:.2f} CPU-s)")
 
-    for keep in ("all", "largest"):
+    for keep in ("all", "largest", "substantial"):
         objects = [select_object(scene, feature, SelectOptions(keep=keep)) for feature in (closed, bce)]
         scores = [mean_iou(scene, chosen, tests) for chosen in objects]
         print(f"pieces kept: {keep}; chosen {[int(o.sum()) for o in objects]}, held-out IoU {scores}")

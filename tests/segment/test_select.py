@@ -1,6 +1,7 @@
 """Selection: threshold, box, largest piece; and the box itself."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -30,6 +31,16 @@ def test_a_distant_crumb_falls_away(ball):
     assert not chosen[BALL:].any()
     assert chosen[:BALL].float().mean() > 0.95
     assert select_object(both, torch.ones(both.count), SelectOptions(keep="all")).all()
+
+
+def test_a_second_part_of_the_object_stays_unless_the_largest_alone_is_wanted(ball):
+    away = Similarity(scale=0.5, rotation=torch.eye(3), translation=torch.tensor([3.0, 0, 0]))
+    fainter = replace(ball, opacity_logits=ball.opacity_logits - 0.5)
+    both = concatenate([ball, away.gaussians(fainter)])
+    assert select_object(both, torch.ones(2 * BALL))[BALL:].float().mean() > 0.95
+    alone = select_object(both, torch.ones(2 * BALL), SelectOptions(keep="largest"))
+    assert alone[:BALL].float().mean() > 0.95
+    assert not alone[BALL:].any()
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])

@@ -4,13 +4,14 @@ from splatgraft.segment.birefnet import BiRefNet, load_birefnet
 from splatgraft.segment.box import Box, default_box
 from splatgraft.segment.grabcut import GrabcutOptions, grabcut_masks, refine_masks
 from splatgraft.segment.lift import LiftOptions, lift_masks
-from splatgraft.segment.select import SelectOptions, select_object
+from splatgraft.segment.select import Keep, SelectOptions, select_object
 from splatgraft.segment.solidify import SolidifyOptions, solidify_object
 
 __all__ = [
     "BiRefNet",
     "Box",
     "GrabcutOptions",
+    "Keep",
     "LiftOptions",
     "SelectOptions",
     "SolidifyOptions",

@@ -14,7 +14,9 @@ from torch import Tensor
 from splatgraft.gaussians import Gaussians
 from splatgraft.segment.box import Box
 
+Keep = Literal["substantial", "largest", "all"]
 _NEIGHBOURS = 16
+_SUBSTANTIAL = 0.05
 
 
 @dataclass(frozen=True)
@@ -25,14 +27,14 @@ class SelectOptions:
     """Least feature (section 3.1 of the paper, after its sigmoid)."""
     box: Box | None = None
     """Where centres must lie, world units."""
-    keep: Literal["largest", "all"] = "largest"
-    """Whether pieces that do not touch the largest are dropped."""
+    keep: Keep = "substantial"
+    """Which pieces stay: those with at least a twentieth of the largest one's opacity, the largest alone, or all."""
 
 
 def select_object(
     gaussians: Gaussians, feature: Float[Tensor, "n"], options: SelectOptions = SelectOptions()
 ) -> Bool[Tensor, "n"]:
-    """The Gaussians at or above the threshold, inside the box, in the largest piece (by opacity).
+    """The Gaussians at or above the threshold, inside the box, in the pieces to keep.
 
     Raises: ValueError where none is left.
     """
@@ -48,19 +50,21 @@ def select_object(
             raise ValueError("object: expected some of its Gaussians inside the box, found all outside")
     if options.keep == "all":
         return chosen
+    mass = mass_of_piece(gaussians.select(chosen))
+    least = mass.max() * (_SUBSTANTIAL if options.keep == "substantial" else 1)
     kept = torch.zeros_like(chosen)
-    kept[torch.nonzero(chosen)[:, 0][largest_piece(gaussians.select(chosen))]] = True
+    kept[torch.nonzero(chosen)[:, 0][mass >= least]] = True
     return kept
 
 
-def largest_piece(gaussians: Gaussians) -> Bool[Tensor, "n"]:
-    """The connected piece with the greatest sum of opacities; two touch if their 2-sigma spheres do.
+def mass_of_piece(gaussians: Gaussians) -> Float[Tensor, "n"]:
+    """For each Gaussian the sum of opacities of the connected piece it is in; two touch if their 2-sigma spheres do.
 
     Only the 16 nearest of each are asked, which is where touching ones are.
     """
     n = gaussians.count
     if n <= 1:
-        return torch.ones(n, dtype=torch.bool, device=gaussians.device)
+        return gaussians.opacities.detach()
     means = gaussians.means.detach().double().cpu().numpy()
     # the middle scale: a needle reaches far along one axis only
     radii = 2 * gaussians.scales.detach().double().cpu().numpy().clip(1e-12)
@@ -71,4 +75,4 @@ def largest_piece(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     graph = coo_array((np.ones(len(rows), bool), (rows, neighbour[near])), shape=(n, n))
     _, label = connected_components(graph, directed=False)
     mass = np.bincount(label, weights=gaussians.opacities.detach().double().cpu().numpy())
-    return torch.from_numpy(label == mass.argmax()).to(gaussians.device)
+    return torch.from_numpy(mass[label]).to(gaussians.means)
