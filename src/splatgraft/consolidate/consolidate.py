@@ -27,7 +27,7 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
 
     Paper: section Multi-View Consolidation. Higher bands start from zero. `images` and `weights` (confidence per pixel,
     (h, w) in [0, 1]) are read one at a time. Memory above the inputs, for n Gaussians with k coefficients:
-    4 n (k^2 + 30 k) bytes for `fast`, 4 n 18 k for `adam`, plus `options.cache_bytes`, plus what the tile lists of two
+    4 n (k^2 + 50 k) bytes for `fast`, 4 n 24 k for `adam`, plus `options.cache_bytes`, plus what the tile lists of two
     views and a few images take; it does not grow with the number of views. With `fast`, Gaussians that no changed
     pixel sees keep all their colours, exactly. The same inputs and seed give the same result.
 
