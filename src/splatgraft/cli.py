@@ -18,6 +18,7 @@ COMMANDS = {
     "harmonize": "make the light of each rendered view agree",
     "consolidate": "fit the colours of the scene to the harmonised views",
     "evaluate": "compare, picture and report",
+    "evaluate benchmark": "measure methods on scenes with a known truth",
     "synth": "render training pairs and benchmark scenes with Blender",
     "doctor": "say what is installed, what is missing and how to get it",
 }

@@ -80,32 +80,37 @@ class ViewFiles:
 
 def page_html(report: "Report", views: Sequence[ViewFiles], *, turntable: str | None) -> str:
     """The whole page."""
-    here = files("splatgraft.evaluate")
     sections = [
-        _viewer(views) if views else "",
+        viewer(views) if views else "",
         _turntable(turntable) if turntable else "",
         _numbers(report),
         _prose("Light", "light", report.light.splitlines()),
         _steps(report.steps, report.machine),
         _list("What to know before trusting this", report.limits),
     ]
+    return framed(report.title, report.subtitle, "".join(sections), views=views)
+
+
+def framed(title: str, subtitle: str, sections: str, *, views: Sequence[ViewFiles]) -> str:
+    """A page around HTML `sections`, with looks and behaviour inside; `views` is what a `viewer` on it shows."""
+    here = files("splatgraft.evaluate")
     data = json.dumps([{**asdict(view), "files": dict(view.files)} for view in views]).replace("<", "\\u003c")
     return f"""<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(report.title)}</title>
+<title>{escape(title)}</title>
 <style>
 {(here / "page.css").read_text(encoding="utf-8")}</style>
 </head>
 <body>
 <header>
-<h1>{escape(report.title)}</h1>
-<p>{escape(report.subtitle)}</p>
+<h1>{escape(title)}</h1>
+<p>{escape(subtitle)}</p>
 </header>
 <main>
-{"".join(sections)}</main>
+{sections}</main>
 <footer>Made by splatgraft. This page and the files beside it are all there is; it loads nothing
 from elsewhere.</footer>
 <script type="application/json" id="views">{data}</script>
@@ -116,7 +121,8 @@ from elsewhere.</footer>
 """
 
 
-def _viewer(views: Sequence[ViewFiles]) -> str:
+def viewer(views: Sequence[ViewFiles]) -> str:
+    """Two pictures of one view with a slider between them, and thumbnails of all views."""
     first = views[0]
     labels = list(first.files)
     left, right = labels[0], labels[min(1, len(labels) - 1)]

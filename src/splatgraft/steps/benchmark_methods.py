@@ -204,11 +204,27 @@ def result_of(
 def _prior_of(prior: Prior, ready: ReadyScene, terminal: Terminal) -> tuple[Path, float]:
     out = ready.work / "priors" / prior
     placement = ready.composite / PLACEMENT_FILE
-    paths = {"surroundings": ready.surroundings, "object_cameras": ready.source_cameras}
     if prior == "true-light":
         if ready.given.light is None:
             raise ValueError(f"{ready.given.name}: expected a true light, found none")
-        step = RelightTruly(ready.target, placement, ready.cameras, light=ready.given.light, out=out, **paths)
-        return out / SCENE_FILE, fresh(step, terminal)
+        truly = RelightTruly(
+            ready.target,
+            placement,
+            ready.cameras,
+            light=ready.given.light,
+            out=out,
+            surroundings=ready.surroundings,
+            object_cameras=ready.source_cameras,
+        )
+        return out / SCENE_FILE, fresh(truly, terminal)
     kind = "gain" if prior == "gain" else "transfer"
-    return out / SCENE_FILE, fresh(Relight(ready.target, placement, ready.cameras, out, light=kind, **paths), terminal)
+    step = Relight(
+        ready.target,
+        placement,
+        ready.cameras,
+        out,
+        light=kind,
+        surroundings=ready.surroundings,
+        object_cameras=ready.source_cameras,
+    )
+    return out / SCENE_FILE, fresh(step, terminal)

@@ -56,7 +56,8 @@ class GivenScene:
             raise ValueError(f"{folder}: expected {', '.join(parts)}; found no {Path(missing[0]).name}")
         light = folder / TRUE_LIGHT_FILE
         known = light if light.is_file() else None
-        return GivenScene(folder.name, *parts.values(), known)
+        source, target, truth, placement = parts.values()
+        return GivenScene(folder.name, source, target, truth, placement, known)
 
     @staticmethod
     def of_published(scene: PublishedScene) -> "GivenScene":

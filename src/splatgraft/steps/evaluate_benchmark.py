@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 
@@ -26,7 +26,7 @@ from splatgraft.reconstruct import ReconstructOptions
 from splatgraft.steps.benchmark_measure import MeasureMethod, truth_of
 from splatgraft.steps.benchmark_methods import Method, result_of
 from splatgraft.steps.benchmark_scene import GivenScene, fresh, ready_scene
-from splatgraft.steps.step import Positional
+from splatgraft.steps.step import Device, Positional
 from splatgraft.steps.terminal import Terminal
 from splatgraft.workers import Task, run_tasks
 
@@ -77,6 +77,11 @@ class EvaluateBenchmark:
         terminal.result(self.out / "index.html")
         return 1 if found.not_run else 0
 
+    @property
+    def device(self) -> Device:
+        """Where to compute."""
+        return cast(Device, self.options.device)
+
     def work(self, scene: GivenScene) -> Path:
         """Everything made of one scene."""
         return self.out / "scenes" / scene.name
@@ -105,7 +110,7 @@ def _measure_scene(command: EvaluateBenchmark, scene: GivenScene, methods: list[
     """Run and measure all methods on one scene; a method that cannot run leaves a file that says why."""
     terminal = Terminal()
     terminal.say(f"scene {scene.name}")
-    ready = ready_scene(scene, command.work(scene), command.options, device=command.options.device, terminal=terminal)
+    ready = ready_scene(scene, command.work(scene), command.options, device=command.device, terminal=terminal)
     for method in methods:
         out = command.measured(scene, method)
         reason = out.with_name(f"{out.name}.{_NOT_RUN_FILE}")
@@ -114,11 +119,11 @@ def _measure_scene(command: EvaluateBenchmark, scene: GivenScene, methods: list[
             result, seconds = None, {}
             if method.pictures is None:
                 result, seconds = result_of(
-                    method, ready, weights=command.weights, device=command.options.device, terminal=terminal
+                    method, ready, weights=command.weights, device=command.device, terminal=terminal
                 )
             shown = None if method.pictures is None else method.pictures / scene.name
             step = MeasureMethod(
-                scene.truth, scene.target, ready.target, out, result, shown, command.weights, lpips, command.options.device
+                scene.truth, scene.target, ready.target, out, result, shown, command.weights, lpips, command.device
             )
             fresh(step, terminal)
             times = {**({} if method.pictures else ready.seconds), **seconds}
@@ -138,7 +143,7 @@ def _missing_weights(folder: Path | None) -> dict[str, str]:
     try:
         inception_features(folder)
     except ValueError as error:
-        missing |= {"fid": str(error), "kid": str(error)}
+        missing["fid and kid"] = str(error)
     return missing
 
 
@@ -167,14 +172,14 @@ def _collected(
     notes = [
         f"Every 8th view is held out of reconstruction, harmonisation and consolidation; {_span(counts)} per scene.",
         f"{len(given)} scenes, quality {command.options.quality}, {os.cpu_count()} cores of {platform.machine()}, "
-        f"torch on {'CUDA' if torch.cuda.is_available() and command.options.device != 'cpu' else 'the CPU'}.",
+        f"torch on {'CUDA' if torch.cuda.is_available() and command.device != 'cpu' else 'the CPU'}.",
     ]
     if floors:
         own = sum(floors) / len(floors)
         notes.append(f"The truth's own neighbouring views disagree by {own:.4f} (gloss, render noise).")
-    if "fid" not in missing:
+    if "fid and kid" not in missing:
         notes.append("FID and KID are over the held-out views of all scenes; with so few pictures they are biased.")
-    pooled = {} if "fid" in missing else _distributions(command, given, methods)
+    pooled = {} if "fid and kid" in missing else _distributions(command, given, methods)
     return Benchmark(tuple(rows), tuple(not_run), missing, tuple(notes), pooled)
 
 

@@ -102,7 +102,7 @@ def shelf(rng: random.Random, palette: Palette, width: Number = 0.9, height: Num
             if rng.random() < 0.12:
                 size = rng.uniform(0.08, 0.14)
                 parts.append(
-                    Part("sphere", (size,) * 3, (x + size / 2, 0, z + thick / 2 + size / 2), palette.anything())
+                    Part("sphere", (size, size, size), (x + size / 2, 0, z + thick / 2 + size / 2), palette.anything())
                 )
                 x += size + 0.04
                 continue
@@ -249,7 +249,7 @@ def tabletop(rng: random.Random, palette: Palette, top: Part) -> Parts:
             )
         elif kind == "ball":
             size = rng.uniform(0.06, 0.1)
-            parts.append(Part("sphere", (size,) * 3, (x, y, size / 2), palette.anything()))
+            parts.append(Part("sphere", (size, size, size), (x, y, size / 2), palette.anything()))
         else:
             wide = rng.uniform(0.14, 0.24) if kind == "bowl" else 0.085
             tall = wide * 0.38 if kind == "bowl" else 0.095

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatgraft.synth.palette import Palette, tone
-from splatgraft.synth.scene import Material, Number, Part, Place, Vector, add, rotate_z
+from splatgraft.synth.scene import Material, Number, Part, Pattern, Place, Shape, Vector, add, rotate_z
 
 
 def _profile(rng: random.Random) -> tuple[tuple[float, float], ...]:
@@ -46,14 +46,16 @@ def _surface(rng: random.Random, palette: Palette) -> Material:
         return palette.wood(scale=rng.uniform(2, 5))
     if kind == "stone":
         return replace(palette.stone(), scale=rng.uniform(3, 7))
-    pattern = rng.choice(["speckle", "stripes", "checker", "rug", "painting", "brick"])
+    patterns: list[Pattern] = ["speckle", "stripes", "checker", "rug", "painting", "brick"]
+    pattern = rng.choice(patterns)
     finer = 4 if pattern in ("rug", "painting", "brick") else 1
     scale = rng.uniform(1.0, 2.5) * finer
     return Material(pattern, a, b, rng.uniform(0.15, 0.9), scale=scale, bump=rng.uniform(0, 0.4))
 
 
 def _primitive(rng: random.Random, palette: Palette, width: Number, height: Number) -> Part:
-    shape = rng.choice(["turned", "turned", "extruded", "blob", "box", "sphere", "cylinder", "cushion"])
+    shapes: list[Shape] = ["turned", "turned", "extruded", "blob", "box", "sphere", "cylinder", "cushion"]
+    shape = rng.choice(shapes)
     material, size, at = _surface(rng, palette), (width, width, height), (0.0, 0.0, height / 2)
     if shape == "turned":
         return Part("turned", size, at, material, profile=_profile(rng))

@@ -65,7 +65,8 @@ def _walls(rng: random.Random, palette: Palette, shell: _Shell, kind: str) -> Pa
         box((shell.window_width, t, shell.sill), (shell.window_center, y, shell.sill / 2), wall, 0),
         box((shell.window_width, t, top), (shell.window_center, y, h - top / 2), wall, 0),
     ]
-    frame = Material("plain", *[((0.8, 0.8, 0.78), (0.2, 0.13, 0.08), (0.03, 0.03, 0.03))[rng.randrange(3)]] * 2, 0.35)
+    frame_color = ((0.8, 0.8, 0.78), (0.2, 0.13, 0.08), (0.03, 0.03, 0.03))[rng.randrange(3)]
+    frame = Material("plain", frame_color, frame_color, 0.35)
     middle = shell.sill + shell.window_height / 2
     bars = [
         box((0.05, 0.06, shell.window_height), (shell.window_center + s * shell.window_width / 2, y, middle), frame)
