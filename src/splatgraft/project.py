@@ -235,6 +235,16 @@ def locked(folder: Path) -> Generator[None]:
         lock.release()
 
 
+def clear_leftovers(folder: Path) -> None:
+    """Remove what killed runs left beside a result that needs no further one.
+
+    Raises: ValueError where another process is at work on it.
+    """
+    with locked(folder):
+        for kind in ("new", "old", "checkpoint"):
+            shutil.rmtree(folder.with_name(f".{folder.name}.{kind}"), ignore_errors=True)
+
+
 class FolderCheckpoint:
     """A `Checkpoint` and a place for files, both kept between killed runs of one job and dropped for any other."""
 

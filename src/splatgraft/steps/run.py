@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatgraft.project import locked, why_stale
+from splatgraft.project import clear_leftovers, locked, why_stale
 from splatgraft.steps.flow import read_flow
 from splatgraft.steps.step import Positional, job_of, perform
 from splatgraft.steps.terminal import Terminal
@@ -33,6 +33,8 @@ class Run:
                 terminal.say(f"{name:<20} {reason or 'up to date'}")
                 if reason:
                     perform(step, terminal, name=name)
+                else:
+                    clear_leftovers(step.out)
         terminal.say("results:")
         for name, path in flow.results():
             if name in wanted:
