@@ -35,9 +35,8 @@ def main() -> None:
     views = room_capture.cameras[[0, 9, 18, 27]]
     images = [harmonizer.harmonize(view_of(scene, room, index, room_capture)).image for index in (0, 9, 18, 27)]
     result = consolidate(scene, views, images)
-    print(
-        f"{result.count} Gaussians, {int((result.sh != scene.sh).flatten(1).any(1).sum())} of another colour than before"
-    )
+    changed = int((result.sh != scene.sh).flatten(1).any(1).sum())
+    print(f"{result.count} Gaussians, {changed} of another colour than before")
 
 
 def view_of(scene: Gaussians, room: Gaussians, index: int, capture: PosedImages) -> HarmonizerInputs:

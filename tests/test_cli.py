@@ -44,8 +44,9 @@ def test_each_command_explains_itself(command: str, capsys: pytest.CaptureFixtur
     ],
 )
 def test_bad_data_is_one_line_that_names_the_file(
-    words: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     assert main([word.replace("{tmp}", str(tmp_path)) for word in words]) == 2
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -53,6 +54,7 @@ def test_bad_data_is_one_line_that_names_the_file(
     assert printed.err.startswith("splatgraft: ")
     assert line.replace("{tmp}", str(tmp_path)) in printed.err
     assert "Traceback" not in printed.err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:

@@ -58,12 +58,12 @@ def test_only_content_and_options_make_stale(tmp_path: Path, image: Path) -> Non
 
 def test_fingerprint_moves_with_inputs_and_options(tmp_path: Path, image: Path) -> None:
     names = {
-        job(tmp_path, (image,)).fingerprint(),
-        job(tmp_path, (image,), a=1).fingerprint(),
-        job(tmp_path).fingerprint(),
+        job(tmp_path, (image,)).fingerprint,
+        job(tmp_path, (image,), a=1).fingerprint,
+        job(tmp_path).fingerprint,
     }
     image.write_text("changed")
-    names.add(job(tmp_path, (image,)).fingerprint())
+    names.add(job(tmp_path, (image,)).fingerprint)
     assert len(names) == 4
 
 
@@ -97,7 +97,7 @@ def test_files_that_no_step_wrote_are_never_replaced(tmp_path: Path) -> None:
 
 def test_missing_input_and_damaged_record_are_told_by_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"gone.png: expected an input file, found No such file"):
-        job(tmp_path / "scene", (tmp_path / "gone.png",)).fingerprint()
+        FolderCheckpoint(job(tmp_path / "scene", (tmp_path / "gone.png",)))
     finish(job(tmp_path / "scene"))
     for damaged in ("{", "[]", "{}", '{"inputs": 3}'):
         (tmp_path / "scene" / "step.json").write_text(damaged)

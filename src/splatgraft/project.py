@@ -7,6 +7,7 @@ import time
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -136,12 +137,21 @@ class Job:
     options: Mapping[str, Any]
     """Plain JSON values that the result depends on."""
 
+    @cached_property
+    def entries(self) -> Mapping[str, tuple[Entry, ...]]:
+        """The input files as they are when this is first asked for, by role.
+
+        Raises: ValueError where one is missing.
+        """
+        return {role: _entries(files, ()) for role, files in self.inputs.items()}
+
+    @property
     def fingerprint(self) -> str:
         """A name for this very job: it changes with every input byte and every option.
 
         Raises: ValueError where an input file is missing.
         """
-        content = {role: [(e[0], e[3]) for e in _entries(files, ())] for role, files in self.inputs.items()}
+        content = {role: [(e[0], e[3]) for e in entries] for role, entries in self.entries.items()}
         text = json.dumps([self.step, content, self.options], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -194,7 +204,7 @@ def replacing(job: Job) -> Generator[Path]:
 
     Raises: ValueError where the folder holds what no step wrote, or an input is missing.
     """
-    inputs = {role: _entries(files, ()) for role, files in job.inputs.items()}
+    inputs = job.entries
     if job.folder.exists() and not job.folder.is_dir():
         raise ValueError(f"{job.folder}: expected a folder for the result, found a file")
     if job.folder.is_dir() and any(job.folder.iterdir()) and read_record(job.folder) is None:
@@ -251,7 +261,7 @@ class FolderCheckpoint:
     def __init__(self, job: Job) -> None:
         """Open what an earlier run of the same job left, or start empty."""
         self.folder = job.folder.with_name(f".{job.folder.name}.checkpoint")
-        key, name = self.folder / "job", job.fingerprint()
+        key, name = self.folder / "job", job.fingerprint
         if not key.is_file() or key.read_text() != name:
             self.drop()
             self.folder.mkdir(parents=True)

@@ -35,7 +35,7 @@ class Consolidate:
     """What each view may get wrong by itself, solved beside the colours (fast only)."""
     iterations: int = 10_000
     """Of adam."""
-    passes: int = 4
+    passes: int = 12
     """Of fast's descent over all views."""
     lpips_weights: Path | None = None
     """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache where not given."""

@@ -69,6 +69,7 @@ def perform(step: Step, terminal: Terminal, *, name: str = "") -> Path:
     Raises: ValueError where another run works on the same folder, or the inputs are bad.
     """
     job = job_of(step)
+    _ = job.entries  # what is missing is said before anything is touched
     with locked(job.folder):
         checkpoint = FolderCheckpoint(job)
         with terminal.bar(name or job.step) as progress, replacing(job) as folder:
