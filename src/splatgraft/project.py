@@ -165,9 +165,9 @@ def read_record(folder: Path) -> Record | None:
     if not path.is_file():
         return None
     try:
-        fields = json.loads(path.read_text())
-        fields["inputs"] = {role: tuple(tuple(e) for e in files) for role, files in fields["inputs"].items()}
-        return Record(**{**fields, "outputs": tuple(fields["outputs"])})
+        found: dict[str, Any] = json.loads(path.read_text())
+        inputs = {role: tuple(tuple(e) for e in files) for role, files in found.pop("inputs").items()}
+        return Record(inputs=inputs, outputs=tuple(found.pop("outputs")), **found)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected the record of a step, found {type(error).__name__}: {error}") from error
 

@@ -1,4 +1,4 @@
-"""Folders that appear whole or not at all: written beside their place, then swapped. Knows nothing about what is in them."""
+"""Folders that appear whole or not at all: written beside their place, then swapped. Knows nothing of their content."""
 
 import ctypes
 import os

@@ -14,7 +14,7 @@ def main(job: dict[str, Any]) -> None:
     """Features, matches, mapping; the model goes to job["output"]."""
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # pyright: ignore[reportAttributeAccessIssue]
     pycolmap.set_random_seed(job["seed"])
     photos, database, device = Path(job["photos"]), Path(job["database"]), pycolmap.Device.cpu
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
