@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.level_plane import dominant_level_plane
@@ -87,7 +87,7 @@ def _visible_radius(capture: PosedImages, focus: Float[Tensor, "3"]) -> float:
 
 def _largest_group(points: Float[Tensor, "m 3"], reach: float) -> Bool[Tensor, "m"]:
     """The largest set of points connected by steps shorter than `reach`."""
-    pairs = cKDTree(points.numpy()).query_pairs(reach, output_type="ndarray")
+    pairs = KDTree(points.numpy()).query_pairs(reach, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
     _, label = connected_components(graph, directed=False)
     return torch.from_numpy(label == np.bincount(label).argmax())

@@ -128,7 +128,8 @@ def _cut(
         # nothing to tell apart: all object or none of it
         return torch.from_numpy((prior % 2).astype(np.float32))
     cv2.setRNGSeed(0)
-    cv2.grabCut(lab, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), options.iterations, cv2.GC_INIT_WITH_MASK)
+    nowhere = (0, 0, 0, 0)  # the rectangle, which starting from a mask leaves aside
+    cv2.grabCut(lab, labels, nowhere, np.zeros((1, 65)), np.zeros((1, 65)), options.iterations, cv2.GC_INIT_WITH_MASK)
     return torch.from_numpy(_largest_blob((labels % 2).astype(np.uint8)))
 
 

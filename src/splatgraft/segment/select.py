@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.gaussians import Gaussians
@@ -69,7 +69,8 @@ def mass_of_piece(gaussians: Gaussians) -> Float[Tensor, "n"]:
     # the middle scale: a needle reaches far along one axis only
     radii = 2 * gaussians.scales.detach().double().cpu().numpy().clip(1e-12)
     radii = np.median(radii, axis=1)
-    distance, neighbour = cKDTree(means).query(means, k=min(_NEIGHBOURS + 1, n))
+    distance, neighbour = KDTree(means).query(means, k=min(_NEIGHBOURS + 1, n))
+    neighbour = np.asarray(neighbour)
     near = distance <= radii[:, None] + radii[neighbour]
     rows = np.broadcast_to(np.arange(n)[:, None], near.shape)[near]
     graph = coo_array((np.ones(len(rows), bool), (rows, neighbour[near])), shape=(n, n))
