@@ -53,7 +53,7 @@ class Occlusion:
 def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tensor, "k"]) -> Occlusion:
     """Pyramids of the maps `front`, completed by the opposite maps `back` (mirrored in u, depth negated)."""
     alpha = maps.alpha[front]
-    first = torch.where(maps.first < FAR / 2, maps.first, maps.mean)
+    first = torch.where(maps.first < float(FAR) / 2, maps.first, maps.mean)
     lit_side = first[front]
     far_side = torch.maximum(-first[back].flip(2), lit_side)
     planes = [alpha, alpha * lit_side, alpha * 0.5 * (lit_side + far_side)]
@@ -121,8 +121,10 @@ def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one ker
     frames, irradiance, softness, points, normals, arrives = arrays
     radius, bias = place[3], place[4]
     texel = 2 * radius / size
-    search, taps = 8, 24
+    # many ambient bundles average their own noise away; few dominant ones need finer filters
+    search, taps = 8, 24 if len(frames) < 16 else 12
     disk = np.empty((search + taps, 2), np.float32)  # Vogel spirals
+    search_gap, tap_gap = np.float32(0.8), np.float32(2 / np.sqrt(taps))
     for t in range(search + taps):
         count, j = (search, t) if t < search else (taps, t - search)
         r, angle = np.sqrt((j + 0.5) / count), j * 2.399963
@@ -150,7 +152,7 @@ def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one ker
                             break
                         width = spread * max(np.float32(0), distance / found)
                     # the level whose pixels are about as wide as the gap between taps
-                    gap = width / texel * (np.float32(0.8) if t < search else np.float32(0.4))
+                    gap = width / texel * (search_gap if t < search else tap_gap)
                     level_size, level_start, scale = size, 0, np.float32(1)
                     while level_size > 4 and gap > scale * np.float32(1.5):
                         level_start += level_size * level_size

@@ -69,7 +69,7 @@ def bright_patches(panorama: Panorama) -> tuple[list[Patch], Bool[Tensor, "6 s s
     labels = np.zeros(bright.shape, np.int32)
     count = 0
     for face in range(6):
-        found, n = ndimage.label(bright[face].numpy(), structure=np.ones((3, 3)))
+        found, n = ndimage.label(bright[face].numpy(), structure=np.ones((3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
         labels[face] = np.where(found > 0, found + count, 0)
         count += n
     groups: list[Bool[Tensor, "6 s s"]] = [torch.from_numpy(labels == i) for i in range(1, count + 1)]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numba import njit, prange
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
@@ -18,7 +18,7 @@ from splatgraft.gaussians import Gaussians
 from splatgraft.rendering import render
 
 NEIGHBOURS = 16
-_VIEWERS, _VIEWER_WIDTH = 12, 128
+_VIEWERS, _VIEWER_WIDTH = 8, 128
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def estimate_normals(gaussians: Gaussians, cameras: Cameras) -> Normals:
         return Normals(vectors=torch.zeros(0, 3), confidence=torch.zeros(0))
     means = gaussians.means.double().numpy()
     k = min(NEIGHBOURS, n)
-    _, neighbours = cKDTree(means, balanced_tree=False, compact_nodes=False).query(means, k=k, workers=2)
+    _, neighbours = KDTree(means, balanced_tree=False, compact_nodes=False).query(means, k=k, workers=2)
     neighbours = neighbours.reshape(n, k).astype(np.int32)
     cloud = (means, gaussians.covariances.double().numpy(), gaussians.opacities.double().numpy())
     towards, seen = _towards_viewers(gaussians, cameras)

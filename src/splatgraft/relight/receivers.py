@@ -45,8 +45,9 @@ def shade_receivers(
     receivers: Receivers, maps: ObjectMaps, *, budget: int
 ) -> tuple[Receivers, Int[Tensor, "j"], SceneRatio]:
     """Receivers, some split (at most `budget` added); which one each was; their ratios, averaged over their extent."""
-    smallest = 2 * maps.ambient_maps.texel
-    done: list[tuple[Receivers, Int[Tensor, i], SceneRatio]] = []
+    # narrower ones are finer than an edge that matters at the size of the object
+    smallest = 5 * maps.ambient_maps.texel
+    done: list[tuple[Receivers, Tensor, SceneRatio]] = []
     pending, which = receivers, torch.arange(len(receivers.origin))
     for round_ in range(_ROUNDS + 1):
         ratio, variation = _extended_ratio(pending, maps, smallest=smallest)

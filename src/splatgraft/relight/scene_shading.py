@@ -109,7 +109,9 @@ def map_scene(scene: Gaussians, region: Ball, beams: Beams) -> SceneMaps:
         nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
         seen = splat_depth_maps(occluders, window, size=size, with_color=False, nearest=nearest)
         maps.append(seen if len(part) else None)
-    return SceneMaps(region=region, source_maps=maps[0], ambient_maps=maps[1])
+    of_sources, of_ambient = maps
+    assert of_ambient is not None
+    return SceneMaps(region=region, source_maps=of_sources, ambient_maps=of_ambient)
 
 
 def scene_visibility(

@@ -15,36 +15,24 @@ from splatgraft.cameras import Cameras
 from splatgraft.composite import Composite
 from splatgraft.gaussians import Gaussians, concatenate
 from splatgraft.relight.beams import beams_of
+from splatgraft.relight.body import Body, SourceScene, set_body
 from splatgraft.relight.cache import RelightCache
 from splatgraft.relight.cast import Beams
 from splatgraft.relight.layers import Relit, unchanged
 from splatgraft.relight.light import Light
-from splatgraft.relight.normals import Normals, estimate_normals, raised
+from splatgraft.relight.normals import raised
 from splatgraft.relight.object_shading import irradiance, shade_ratio, unknown_origin_ratio
-from splatgraft.relight.place_light import light_at, up_of
+from splatgraft.relight.place_light import up_of
 from splatgraft.relight.receivers import Receivers, shade_receivers
 from splatgraft.relight.scene_shading import (
     Ball,
-    ObjectMaps,
     SceneRatio,
     ball_of,
-    map_object,
     reachable,
     scene_ratio,
     scene_visibility,
-    self_visibility,
 )
 from splatgraft.relight.stage import Stage, set_stage
-
-
-@dataclass(frozen=True)
-class SourceScene:
-    """The capture that an object comes from, without the object."""
-
-    gaussians: Gaussians
-    """In the object's own frame."""
-    cameras: Cameras
-    """That saw it, in the same frame."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +47,9 @@ class RelightOptions:
 
 @dataclass(frozen=True)
 class _Actor:
-    """One placed object, ready to be lit; world frame."""
+    """One object on the stage."""
 
-    gaussians: Gaussians
-    ball: Ball
-    normals: Normals
-    maps: ObjectMaps
+    body: Body
     arrives: Float[Tensor, "n k"]
     """Share of every bundle that the scene lets through to it."""
 
@@ -94,8 +79,7 @@ def relight(
         return unchanged(baked, is_object, report=("No object is placed: nothing to light.",))
     cache = cache or RelightCache()
     scene = cache.get("scene", (composite.target, composite.erased), lambda: composite.target.select(~composite.erased))
-    objects = [p.in_target() for p, _ in placed]
-    balls = [ball_of(g) for g in objects]
+    balls = [ball_of(p.in_target()) for p, _ in placed]
     place = Ball(torch.stack([b.center for b in balls]).mean(0), max(b.radius for b in balls))
     stage, problem = set_stage(scene, cameras, place=place, reach=options.reach, light=light, cache=cache)
     if stage is None:
@@ -103,37 +87,23 @@ def relight(
     beams = beams_of(stage.light)
     report = [stage.light.describe(up_of(cameras)) + (", as given." if light is not None else ".")]
     actors, shades = [], []
-    for i, ((one, source), gaussians, ball) in enumerate(zip(placed, objects, balls, strict=True)):
-        normals = estimate_normals(gaussians, cameras)
-        arrives = scene_visibility(stage.maps, raised(gaussians, normals.vectors), normals.vectors)
-        actor = _Actor(gaussians, ball, normals, map_object(gaussians, ball, beams), arrives)
-        before = None
-        if source is not None:
-            key = (one.gaussians, source.gaussians)
-            before, problem = cache.get(f"origin {i}", key, lambda o=one.gaussians, s=source: _origin_light(o, s))
-            story = problem if before is None else before.describe(up_of(source.cameras)) + "."
-            report.append(f"Where object {i + 1} comes from: {story}")
-            before = before.rotated(one.target_from_object.rotation) if before is not None else None
+    for i, (one, source) in enumerate(placed):
+        body = set_body(one, source, cameras, light=stage.light, index=i, cache=cache)
+        if body.story is not None:
+            report.append(f"Where object {i + 1} comes from: {body.story}")
+        facing = body.normals.vectors
+        actor = _Actor(body, scene_visibility(stage.maps, raised(body.gaussians, facing), facing))
         actors.append(actor)
-        shades.append(_shade(actor, beams, before))
+        shades.append(_shade(actor, beams))
     return _assembled(stage, actors, shades, beams, options=options, baked=baked, report=report)
 
 
-def _origin_light(own: Gaussians, source: SourceScene) -> tuple[Light | None, str | None]:
-    """The light on an object where it was captured; its own shadow there helps to tell."""
-    return light_at(source.gaussians, ball_of(own), source.cameras, also=own)
-
-
-def _shade(actor: _Actor, beams: Beams, before: Light | None) -> Float[Tensor, "n 3"]:
-    normals = actor.normals.vectors
-    own = self_visibility(actor.maps, actor.gaussians, normals, beams)
-    now = irradiance(beams, normals, arrives=own * actor.arrives)
-    if before is None:
-        return unknown_origin_ratio(now, actor.normals, actor.gaussians.opacities)
-    then_beams = beams_of(before)
-    own = self_visibility(actor.maps, actor.gaussians, normals, then_beams)
-    then = irradiance(then_beams, normals, arrives=own)
-    return shade_ratio(now, then, actor.normals, actor.gaussians.opacities)
+def _shade(actor: _Actor, beams: Beams) -> Float[Tensor, "n 3"]:
+    body = actor.body
+    now = irradiance(beams, body.normals.vectors, arrives=body.own * actor.arrives)
+    if body.then is None:
+        return unknown_origin_ratio(now, body.normals, body.gaussians.opacities)
+    return shade_ratio(now, body.then, body.normals, body.gaussians.opacities)
 
 
 def _assembled(  # noqa: PLR0913
@@ -180,7 +150,7 @@ def _on_scene(
     points = stage.scene.means[stage.members]
     reached = torch.zeros(len(points), dtype=torch.bool)
     for actor in actors:
-        reached |= reachable(points, actor.ball, beams, farthest=stage.maps.region.radius)
+        reached |= reachable(points, actor.body.ball, beams, farthest=stage.maps.region.radius)
     receivers = Receivers(
         gaussians=stage.scene.select(stage.members[reached]).with_sh_degree(degree),
         normals=stage.normals.vectors[reached],
@@ -191,7 +161,7 @@ def _on_scene(
     shadow: Tensor | None = None
     bounce: Tensor | None = None
     for actor in actors:
-        receivers, parents, ratio = shade_receivers(receivers, actor.maps, budget=budget // len(actors))
+        receivers, parents, ratio = shade_receivers(receivers, actor.body.maps, budget=budget // len(actors))
         if shadow is None or bounce is None:
             shadow, bounce = ratio.shadow, ratio.bounce
         else:
@@ -204,10 +174,11 @@ def _on_scene(
 def _on_object(index: int, actors: list[_Actor]) -> SceneRatio:
     """What all other objects take from and give to one."""
     actor = actors[index]
-    shadow = torch.ones(actor.gaussians.count, 3)
-    bounce = torch.zeros(actor.gaussians.count, 3)
+    shadow = torch.ones(actor.body.gaussians.count, 3)
+    bounce = torch.zeros(actor.body.gaussians.count, 3)
     for other in actors:
         if other is not actor:
-            ratio = scene_ratio(other.maps, actor.gaussians.means, actor.normals.vectors, arrives=actor.arrives)
+            points, facing = actor.body.gaussians.means, actor.body.normals.vectors
+            ratio = scene_ratio(other.body.maps, points, facing, arrives=actor.arrives)
             shadow, bounce = shadow * ratio.shadow, bounce + ratio.bounce
     return SceneRatio(shadow=shadow, bounce=bounce)
