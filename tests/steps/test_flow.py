@@ -1,6 +1,7 @@
 """The whole job on a tiny scene, through the commands: done once, redone only where stale, whole after every kill."""
 
 import hashlib
+import json
 import os
 import random
 import shutil
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_project import write_project
+from tiny_project import ball, photograph, plane, write_project
 
 from splatgraft.cli import main
 from splatgraft.formats import read_gaussians
@@ -133,6 +134,20 @@ def test_a_project_that_cannot_be_says_so_in_one_line(project: Path, capsys: pyt
         printed = capsys.readouterr()
         assert printed.out == ""
         assert line in printed.err.splitlines()[-1]
+
+
+def test_views_of_a_ground_truth_that_no_step_saw_are_measured_apart(project: Path) -> None:
+    truth = project.parents[1] / "photos" / "truth"
+    photograph(truth, plane((0.5, 0.45, 0.6)), ball())
+    (truth / "points.ply").unlink()
+    options = f'[render]\neval = true\n[evaluate]\nground_truth = "{truth}"\n'
+    project.write_text(project.read_text().replace("[evaluate]\n", options))
+    assert main(["run", str(project)]) == 0
+    assert len(list((project.parent / "harmonized" / "images").iterdir())) == 7
+    metrics = json.loads((project.parent / "report" / "metrics.json").read_text())
+    assert metrics["views"] == "held out"
+    assert metrics["view_count"] == 1
+    assert [row["held_out"] for row in metrics["per_view"]] == [True] + [False] * 7
 
 
 def test_no_masks_and_no_box_names_the_choices(project: Path, capsys: pytest.CaptureFixture[str]) -> None:

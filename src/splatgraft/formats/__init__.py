@@ -17,6 +17,7 @@ __all__ = [
     "read_cameras",
     "read_capture",
     "read_gaussians",
+    "read_images",
     "read_points",
     "write_cameras",
     "write_capture",
@@ -63,6 +64,16 @@ def read_capture(path: Path) -> PosedImages:
     with _readable(path):
         transforms = _transforms_path(path)
         return transforms_json.read_capture(transforms) if transforms else colmap.read_capture(path)
+
+
+def read_images(path: Path) -> PosedImages:
+    """Posed photographs without their points: what a ground truth is, where no points file need be there.
+
+    Raises: ValueError where nothing of these is there, or what is there is broken.
+    """
+    with _readable(path):
+        transforms = _transforms_path(path)
+        return transforms_json.read_images(transforms) if transforms else colmap.read_capture(path)
 
 
 def write_capture(folder: Path, posed_images: PosedImages) -> None:

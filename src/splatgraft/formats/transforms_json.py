@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +30,20 @@ def read_capture(path: Path) -> PosedImages:
 
     Raises: ValueError where the file or one that it names is missing or broken.
     """
-    meta = _load(path)
-    points, colors = torch.zeros(0, 3), torch.zeros(0, 3)
-    if meta.get("ply_file_path") is not None:
-        points, colors = read_points(path.parent / text(path, meta, "ply_file_path"))
-    return posed_images_of(_views(path, meta), path, folder=path.parent, points=points, colors=colors)
+    images, meta = read_images(path), _load(path)
+    if meta.get("ply_file_path") is None:
+        return images
+    points, colors = read_points(path.parent / text(path, meta, "ply_file_path"))
+    return replace(images, points=points, point_colors=colors)
+
+
+def read_images(path: Path) -> PosedImages:
+    """The capture without its points, whose file need not be there.
+
+    Raises: ValueError where the file or an image that it names is missing or broken.
+    """
+    none = torch.zeros(0, 3)
+    return posed_images_of(_views(path, _load(path)), path, folder=path.parent, points=none, colors=none)
 
 
 def read_cameras(path: Path) -> Cameras:

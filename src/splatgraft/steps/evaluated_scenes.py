@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.evaluate import ComparedView, Truth
-from splatgraft.formats import read_cameras, read_capture, read_gaussians
+from splatgraft.formats import read_cameras, read_gaussians, read_images
 from splatgraft.gaussians import Gaussians
 from splatgraft.posed_images import PosedImages
 from splatgraft.project import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
@@ -100,12 +100,12 @@ class TrueViews(Sequence[ComparedView]):
         self, scenes: EvaluatedScenes, truth: Path, *, target_capture: Path | None, harmonized: Path | None
     ) -> None:
         """Raises: ValueError where the truth has no masks or the target no image of the same name."""
-        self._scenes, self._truth = scenes, read_capture(truth)
+        self._scenes, self._truth = scenes, read_images(truth)
         if target_capture is None:
             raise ValueError("--ground-truth: expected --target-capture, the images without the object, found none")
         if not self._truth.mask_paths or None in self._truth.mask_paths:
             raise ValueError(f"{truth}: expected a mask for every view of the ground truth, found some missing")
-        self._target = read_capture(target_capture)
+        self._target = read_images(target_capture)
         self._backgrounds = _matched(self._truth, self._target, target_capture)
         seen = read_cameras(harmonized / CAMERAS_FILE).names if harmonized is not None else self._target.cameras.names
         self._seen = {Path(name).stem for name in seen}
@@ -147,7 +147,7 @@ def truth_files(truth: Path | None, target_capture: Path | None) -> tuple[Path, 
     files: list[Path] = []
     for path in (truth, target_capture):
         if path is not None:
-            for part in capture_inputs(path, read_capture(path), masks=True).values():
+            for part in capture_inputs(path, read_images(path), masks=True).values():
                 files += part
     return tuple(files)
 

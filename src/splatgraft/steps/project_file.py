@@ -41,6 +41,9 @@ capture = {target}
 # [harmonize]
 # method = "none"
 
+# [render]
+# eval = true                # keep every 8th view of the target from all later steps, for [evaluate]
+
 # [evaluate]
 # ground_truth = "truth"     # images of the target's views with the object really there
 """

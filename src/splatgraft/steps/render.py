@@ -13,7 +13,7 @@ from splatgraft.formats import read_cameras, read_gaussians, write_capture
 from splatgraft.gaussians import Gaussians
 from splatgraft.harmonize import HarmonizerInputs
 from splatgraft.images import write_image
-from splatgraft.posed_images import PosedImages
+from splatgraft.posed_images import PosedImages, held_out
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.rendering.interface import Output
 from splatgraft.steps.selection_file import read_selection
@@ -35,6 +35,8 @@ class Render:
     """is_object.npy of a composite: also write background/, mask/, depth/ and normal/."""
     prior: Path | None = None
     """The relit composite: what prior/ shows; the composite itself where not given."""
+    eval: bool = False
+    """Leave out every 8th camera, so that `evaluate` has views that no later step has seen."""
     low_pass: Literal["classic", "antialiased"] = "classic"
     """As the scene was trained: mip-splatting and gsplat's antialiased mode want `antialiased`."""
     device: Device = "auto"
@@ -51,6 +53,8 @@ class Render:
         """Make the pictures, one camera at a time."""
         device = choose_device(self.device, context.terminal)
         scene, cameras = read_gaussians(self.scene).to(device), read_cameras(self.cameras).to(device)
+        if self.eval:
+            cameras = cameras[~held_out(len(cameras))]
         options = RenderOptions(low_pass=self.low_pass)
         if self.is_object is None:
             return _render_plain(scene, cameras, folder=folder, options=options, context=context)
