@@ -8,7 +8,7 @@ from typing import Any
 from splatgraft.project import (
     CAMERAS_FILE,
     IS_OBJECT_FILE,
-    LIGHT_FILE,
+    LIGHT_TEXT_FILE,
     OBJECT_FILE,
     PLACEMENT_FILE,
     PROJECT_FILE,
@@ -112,7 +112,7 @@ def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:
     draw = {"scene": composite, "cameras": cameras, "prior": relit, "is_object": layout.composite / IS_OBJECT_FILE}
     fit = {"scene": relit, "views": layout.views, "images": layout.harmonized}
     judge = {"result": layout.result / SCENE_FILE, "composite": layout.composite, "cameras": cameras}
-    judge |= {"target_capture": target_capture, "views": layout.views, "light": layout.relit / LIGHT_FILE}
+    judge |= {"target_capture": target_capture, "views": layout.views, "light": layout.relit / LIGHT_TEXT_FILE}
     judge |= {"project": layout.root}
     plan: list[tuple[type[Any], dict[str, Path], Path]] = [
         (Segment, lift, layout.object),

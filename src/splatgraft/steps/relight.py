@@ -6,8 +6,9 @@ from typing import Literal
 
 from splatgraft.composite import Composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
-from splatgraft.project import IS_OBJECT_FILE, LIGHT_FILE, SCENE_FILE
+from splatgraft.project import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_TEXT_FILE, SCENE_FILE
 from splatgraft.relight.exposure import relight_by_gain
+from splatgraft.relight.light import Light, light_from_json, light_to_json
 from splatgraft.relight.transfer import RelightOptions, SourceScene, relight
 from splatgraft.steps.composite_folder import placement_files, read_composite
 from splatgraft.steps.selection_file import write_selection
@@ -25,7 +26,7 @@ class Relight:
     cameras: Path
     """The target's cameras, a transforms.json: they tell what is up."""
     out: Path = Path("relit")
-    """Folder for scene.ply, is_object.npy and light.txt."""
+    """Folder for scene.ply, is_object.npy, light.json and the same in words, light.txt."""
     surroundings: Path | None = None
     """The source without the object, a .ply: the light that is to be taken off. Without it brightness is kept."""
     object_cameras: Path | None = None
@@ -33,17 +34,22 @@ class Relight:
     light: Literal["transfer", "gain", "off"] = "transfer"
     """transfer: shading and shadows; gain: exposure and white balance of the object alone; off: the object as it was
     captured (the paper's configuration)."""
+    given_light: Path | None = None
+    """A light.json, as an earlier run wrote it and you may have changed it; it takes the place of the estimate."""
     options: RelightOptions = field(default_factory=RelightOptions)
 
     def inputs(self) -> Inputs:
         """Scenes, placement and cameras."""
         source = tuple(path for path in (self.surroundings, self.object_cameras) if path is not None)
         placement = placement_files(self.placement)
-        return {"target": (self.target,), "placement": placement, "cameras": (self.cameras,), "source": source}
+        light = () if self.given_light is None else (self.given_light,)
+        scenes = {"target": (self.target,), "placement": placement}
+        return scenes | {"cameras": (self.cameras,), "source": source, "light": light}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the relit composite, and say in words what was found."""
         composite = read_composite(self.target, self.placement)
+        found: Light | None = None
         if self.light == "off":
             gaussians, is_object = composite.bake()
             sentences = ("The light transfer was off: the object is pasted as it was captured.",)
@@ -54,13 +60,23 @@ class Relight:
             gaussians, is_object = adjusted.bake()
         else:
             cameras, sources = read_cameras(self.cameras), self._sources(composite)
-            relit = relight(composite, cameras, sources=sources, options=self.options)
+            relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
+            found = relit.light
             gaussians, is_object, sentences = relit.bake(), relit.is_object, relit.report
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_selection(folder / IS_OBJECT_FILE, is_object)
-        (folder / LIGHT_FILE).write_text("\n".join(sentences) + "\n")
+        (folder / LIGHT_TEXT_FILE).write_text("\n".join(sentences) + "\n")
+        if found is not None:
+            (folder / LIGHT_FILE).write_text(light_to_json(found))
         for sentence in sentences:
             context.terminal.say(sentence)
+
+    def _given(self) -> Light | None:
+        if self.given_light is None:
+            return None
+        if not self.given_light.is_file():
+            raise ValueError(f"{self.given_light}: expected a light.json, found no such file")
+        return light_from_json(self.given_light.read_text(), name=str(self.given_light))
 
     def _sources(self, composite: Composite) -> list[SourceScene | None]:
         source = None
