@@ -4,6 +4,7 @@ Depth maps of the occluder in, per-point sums out. Knows nothing about Gaussians
 """
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 import torch
@@ -106,6 +107,7 @@ def cast(
 
 
 @njit(cache=True, fastmath=True, inline="always")
+@no_type_check
 def _soft_cosine(cosine, softness):
     """Mean of max(0, cos) over a cone, to a quadratic."""
     edge = np.sin(softness)
@@ -117,6 +119,7 @@ def _soft_cosine(cosine, softness):
 
 
 @njit(cache=True, parallel=True, fastmath=True)
+@no_type_check
 def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one kernel: search, filter, sums)
     frames, irradiance, softness, points, normals, arrives = arrays
     radius, bias = place[3], place[4]

@@ -156,8 +156,8 @@ def light_from_json(text: str, *, name: str = "light.json") -> Light:
     return Light(
         sources=tuple(_source(entry, f"{name}: sources[{i}]") for i, entry in enumerate(record["sources"])),
         ambient=torch.tensor(rows),
-        coverage=_numbers([record.get("coverage", 1.0)], 1, f"{name}: coverage", (0, 1))[0],
-        unseen_up=_numbers([record.get("unseen_up", 0.0)], 1, f"{name}: unseen_up", (0, 1))[0],
+        coverage=_numbers([record.get("coverage", 1.0)], 1, f"{name}: coverage", (0.0, 1.0))[0],
+        unseen_up=_numbers([record.get("unseen_up", 0.0)], 1, f"{name}: unseen_up", (0.0, 1.0))[0],
     )
 
 
@@ -180,18 +180,18 @@ def _source(entry: object, where: str) -> LightSource:
     length = math.sqrt(sum(v * v for v in direction))
     if length < 1e-6:
         raise ValueError(f"{where}.direction: expected a vector longer than zero, found {direction}")
-    r, g, b = _numbers(entry.get("irradiance"), 3, f"{where}.irradiance", (0, 1e6))
+    r, g, b = _numbers(entry.get("irradiance"), 3, f"{where}.irradiance", (0.0, 1e6))
     name = entry.get("name", "light")
     if not isinstance(name, str):
         raise ValueError(f"{where}.name: expected a text, found {name!r:.60}")
     return LightSource(
         direction=(direction[0] / length, direction[1] / length, direction[2] / length),
         irradiance=(r, g, b),
-        angular_radius_deg=_scalar(entry, "angular_radius_deg", 3.0, (0, 90), where),
-        uncertainty_deg=_scalar(entry, "uncertainty_deg", 0.0, (0, 90), where),
-        confidence=_scalar(entry, "confidence", 1.0, (0, 1), where),
+        angular_radius_deg=_scalar(entry, "angular_radius_deg", 3.0, (0.0, 90.0), where),
+        uncertainty_deg=_scalar(entry, "uncertainty_deg", 0.0, (0.0, 90.0), where),
+        confidence=_scalar(entry, "confidence", 1.0, (0.0, 1.0), where),
         name=name,
-        blockers_within=_scalar(entry, "blockers_within", math.inf, (0, math.inf), where),
+        blockers_within=_scalar(entry, "blockers_within", math.inf, (0.0, math.inf), where),
     )
 
 

@@ -5,6 +5,7 @@ joins each one's own shortest axis, its neighbours' axes and how they lie, and s
 """
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 import torch
@@ -57,34 +58,48 @@ def raised(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor,
 
 def _towards_viewers(gaussians: Gaussians, cameras: Cameras) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
     """Sum of unit vectors to the cameras that see each Gaussian (to all, where none does), and whether any does."""
-    total, everyone = torch.zeros(2, gaussians.count, 3).unbind(0)
+    total = np.zeros((2, gaussians.count, 3), np.float32)
+    means, widths = gaussians.means.numpy(), gaussians.scales.mean(1).numpy()
     count = len(cameras)
     for i in sorted({round(j * (count - 1) / max(_VIEWERS - 1, 1)) for j in range(min(_VIEWERS, count))}):
         camera = cameras[i].resized(_VIEWER_WIDTH / int(cameras.sizes[i, 0]))
-        pose = camera.camera_from_world[0]
-        in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
-        z = in_camera[:, 2].clamp_min(1e-6)
-        to_camera = torch.nn.functional.normalize(camera.centers[0] - gaussians.means, dim=1)
-        everyone += to_camera
-        f, c = camera.intrinsics[0].diagonal()[:2], camera.intrinsics[0, :2, 2]
-        pixel = (in_camera[:, :2] / z[:, None] * f + c).floor().long()
-        width, height = camera.sizes[0].tolist()
-        inside = (in_camera[:, 2] > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
-        if not bool(inside.any()):
-            continue
         seen = render(gaussians, camera, outputs=frozenset({"depth"}))
         assert seen.depth is not None
-        column, row = pixel[inside].unbind(1)
-        surface = torch.where(seen.alpha[0] > 0.5, seen.depth[0], torch.inf)[row, column]
-        slack = 0.005 * z[inside] + 2 * gaussians.scales[inside].mean(1)
-        visible = torch.zeros_like(inside)
-        visible[inside] = z[inside] < surface + slack
-        total += to_camera * visible[:, None]
-    seen_at_all = total.norm(dim=1) > 0
-    return torch.where(seen_at_all[:, None], total, everyone), seen_at_all
+        surface = torch.where(seen.alpha[0] > 0.5, seen.depth[0], torch.inf).numpy()
+        pose, center = camera.camera_from_world[0].numpy(), camera.centers[0].numpy()
+        _look(means, widths, (pose, camera.intrinsics[0].numpy(), center), surface, total)
+    by_viewers, everyone = torch.from_numpy(total)
+    seen_at_all = by_viewers.norm(dim=1) > 0
+    return torch.where(seen_at_all[:, None], by_viewers, everyone), seen_at_all
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def _look(means, widths, camera, surface, total):
+    """Add the unit vector to `camera` where a Gaussian is seen (first plane), and everywhere (second plane)."""
+    pose, intrinsics, center = camera
+    height, width = surface.shape
+    for i in prange(len(means)):
+        x, y, z = center[0] - means[i, 0], center[1] - means[i, 1], center[2] - means[i, 2]
+        length = np.float32(np.sqrt(x * x + y * y + z * z)) + np.float32(1e-12)
+        total[1, i, 0] += x / length
+        total[1, i, 1] += y / length
+        total[1, i, 2] += z / length
+        depth = -(pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z)
+        if depth <= 0:
+            continue
+        u = -(pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z) / depth * intrinsics[0, 0] + intrinsics[0, 2]
+        v = -(pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z) / depth * intrinsics[1, 1] + intrinsics[1, 2]
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        if depth < surface[int(v), int(u)] + np.float32(0.005) * depth + 2 * widths[i]:
+            total[0, i, 0] += x / length
+            total[0, i, 1] += y / length
+            total[0, i, 2] += z / length
 
 
 @njit(cache=True)
+@no_type_check
 def _shortest_axis(m):
     """Unit eigenvector of the smallest eigenvalue of a symmetric matrix, and how much shorter it is than the next."""
     mean = (m[0, 0] + m[1, 1] + m[2, 2]) / 3
@@ -112,6 +127,7 @@ def _shortest_axis(m):
 
 
 @njit(cache=True, parallel=True)
+@no_type_check
 def _estimate(cloud, neighbours, towards, out):
     means, covariances, opacities = cloud
     for i in prange(len(means)):
@@ -140,6 +156,7 @@ def _estimate(cloud, neighbours, towards, out):
 
 
 @njit(cache=True, parallel=True)
+@no_type_check
 def _agree(normals, neighbours):
     """Average over neighbours, weighted by confidence; the length of the average says how far they agree."""
     out = np.zeros_like(normals)

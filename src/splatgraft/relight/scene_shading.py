@@ -149,9 +149,10 @@ def scene_ratio(
         sums = cast(occlusion, part, points, normals, arrives=share, bias=bias)
         before, after, bounce = before + sums[0], after + sums[1], bounce + sums[2]
     total = before.clamp_min(1e-9)
-    ratio = (after / total).clamp(_DARKEST, 1)
+    # where no light was, none can be taken
+    ratio = torch.where(before > 1e-8, after / total, 1).clamp(_DARKEST, 1)
     lost = _beyond_dead_zone(1 - ratio)
-    gained = _beyond_dead_zone((bounce / total).clamp(0, 1))
+    gained = _beyond_dead_zone(torch.where(before > 1e-8, bounce / total, 0).clamp(0, 1))
     return SceneRatio(shadow=1 - lost, bounce=gained)
 
 

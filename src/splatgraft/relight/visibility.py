@@ -4,6 +4,7 @@ Knows nothing about light, colour spaces or objects: occluders in, maps out; poi
 """
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 import torch
@@ -69,8 +70,8 @@ class DepthMaps:
     """Share of the light blocked, in [0, 1]."""
     mean: Float[Tensor, "k s s"]
     """Blended depth of what blocks; 0 where nothing does."""
-    color: Float[Tensor, "k s s 3"]
-    """Blended linear colour of the side towards the light, over black; k may be 0 where none was asked for."""
+    color: Float[Tensor, "c s s 3"]
+    """Blended linear colour of the side towards the light, over black; c is k, or 0 where none was asked for."""
 
     @property
     def texel(self) -> float:
@@ -122,6 +123,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 @njit(cache=True, parallel=True, fastmath=True)
+@no_type_check
 def _splat(geometry, rgb, view, limits, maps):  # noqa: PLR0912, PLR0915  (one kernel: projection, sort and blending)
     means, covariances, opacities = geometry
     frames, center, radius = view
@@ -215,6 +217,7 @@ def _splat(geometry, rgb, view, limits, maps):  # noqa: PLR0912, PLR0915  (one k
 
 
 @njit(cache=True, parallel=True, fastmath=True)
+@no_type_check
 def _look_up(points, normals, view, maps, bias, out):
     frames, center, radius = view
     first, alpha = maps
