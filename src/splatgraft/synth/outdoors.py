@@ -7,7 +7,7 @@ from typing import Literal
 from splatgraft.synth import furniture
 from splatgraft.synth.furniture import Parts, box, placed
 from splatgraft.synth.palette import Palette, linear, tone
-from splatgraft.synth.scene import Material, Part, Place, Scene, World, direction
+from splatgraft.synth.scene import Color, Material, Part, Place, Scene, World, direction
 
 Outdoor = Literal["terrace", "garden", "square"]
 OUTDOORS: tuple[Outdoor, ...] = ("terrace", "garden", "square")
@@ -30,11 +30,40 @@ def _tree(rng: random.Random) -> Parts:
     leaf = Material("grass", green, (green[0] * 0.5, green[1] * 0.55, green[2] * 0.4), 0.8, scale=3.0, bump=0.9)
     trunk = Part("cylinder", (0.22, 0.22, height * 0.6), (0, 0, height * 0.3), bark)
     crowns = []
-    for _ in range(rng.randint(5, 9)):
-        size = rng.uniform(0.9, 1.7)
-        place = (rng.uniform(-0.7, 0.7), rng.uniform(-0.7, 0.7), height * rng.uniform(0.6, 1.0))
-        crowns.append(Part("blob", (size, size, size * 0.85), place, leaf, seed=rng.randrange(10**6)))
+    for _ in range(rng.randint(5, 8)):
+        size = rng.uniform(1.1, 1.9)
+        place = (rng.uniform(-0.7, 0.7), rng.uniform(-0.7, 0.7), height * rng.uniform(0.62, 1.0))
+        crowns.append(Part("foliage", (size, size, size * 0.85), place, leaf, seed=rng.randrange(10**6)))
     return (trunk, *crowns)
+
+
+def _hedge(rng: random.Random) -> Parts:
+    green = tone(rng, 0.28, (0.4, 0.7), (0.18, 0.4))
+    leaf = Material("grass", green, (green[0] * 0.6, green[1] * 0.6, green[2] * 0.5), 0.7, scale=4.0)
+    height = rng.uniform(0.9, 1.8)
+    sizes = [rng.uniform(0.9, 1.3) for _ in range(5)]
+    seeds = [rng.randrange(10**6) for _ in range(2)]
+    return tuple(
+        Part(
+            "foliage", (1.3, 0.9, height), (0.75 * (i - 2), 0.1 * (size - 1.1), 0.46 * height), leaf, seed=seeds[i % 2]
+        )
+        for i, size in enumerate(sizes)
+    )
+
+
+def _meadow(rng: random.Random, lawn: Color) -> Parts:
+    """Tufts of grass around the middle, in a few shapes that repeat, paler than the ground between them."""
+    paler = (min(0.7, lawn[0] * 1.9), min(0.8, lawn[1] * 1.8), min(0.5, lawn[2] * 1.6))
+    blade = Material("plain", paler, lawn, 0.6)
+    seeds = [rng.randrange(10**6) for _ in range(4)]
+    tufts = []
+    for _ in range(900):
+        radius, angle = 0.25 + 4.0 * rng.random() ** 0.8, rng.uniform(0, 2 * math.pi)
+        kind = rng.randrange(4)
+        size = (0.06 + 0.02 * kind, 0.06 + 0.02 * kind, 0.03 + 0.015 * kind)
+        place = (radius * math.cos(angle), radius * math.sin(angle), 0.4 * size[2])
+        tufts.append(Part("tuft", size, place, blade, (0, 0, rng.choice([0.0, 1.3, 2.9, 4.4])), seed=seeds[kind]))
+    return tuple(tufts)
 
 
 def _house(rng: random.Random, palette: Palette) -> Parts:
@@ -88,18 +117,23 @@ def outdoor(seed: int, kind: Outdoor) -> Scene:
     ]
     support, place = _support(rng, palette)
     parts += placed(support, (0, 0, 0), rng.uniform(0, math.pi))
-    count = rng.randint(4, 7)
+    if kind == "garden":
+        parts += _meadow(rng, green)
+    count = rng.randint(8, 11)
     for i in range(count):
         angle = 2 * math.pi * (i + rng.uniform(-0.25, 0.25)) / count
         far, near = rng.uniform(5.5, 10.0), rng.uniform(2.7, 3.2)
         facing = angle - math.pi / 2
         where = (far * math.cos(angle), far * math.sin(angle), 0.0)
         close = (near * math.cos(angle), near * math.sin(angle), 0.0)
-        what = rng.choice(["house", "tree", "tree", "near", "wall"])
+        common = {"garden": "hedge", "terrace": "hedge", "square": "house"}[kind]
+        what = rng.choice([common, common, "house", "tree", "tree", "near", "wall"])
         if what == "house":
             parts += placed(_house(rng, palette), (where[0] * 1.3, where[1] * 1.3, 0), facing)
         elif what == "tree":
             parts += placed(_tree(rng), where, rng.uniform(0, 6))
+        elif what == "hedge":
+            parts += placed(_hedge(rng), (where[0] * 0.75, where[1] * 0.75, 0), facing)
         elif what == "wall":
             parts.append(
                 Part(

@@ -31,7 +31,9 @@ Pattern = Literal[
     "metal",
     "glass",
 ]
-Shape = Literal["box", "cushion", "cylinder", "sphere", "turned", "extruded", "blob", "torus", "tuft", "model"]
+Shape = Literal[
+    "box", "cushion", "cylinder", "sphere", "turned", "extruded", "blob", "torus", "tuft", "foliage", "model"
+]
 
 
 @dataclass(frozen=True)

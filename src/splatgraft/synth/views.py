@@ -32,9 +32,11 @@ def arc(scene: Scene, place: Place, object_height: Number, seed: int) -> tuple[C
     Raises: ValueError where no free arc is found.
     """
     rng = random.Random(f"arc-{scene.name}-{seed}")
+    # outdoors a camera that looks down sees nothing but ground
+    highest = 0.45 if scene.world.kind != "color" else 0.8
     target = (place.location[0], place.location[1], place.location[2] + 0.45 * object_height)
     for _ in range(400):
-        azimuth, elevation = rng.uniform(0, 2 * math.pi), rng.uniform(0.12, 0.8)
+        azimuth, elevation = rng.uniform(0, 2 * math.pi), rng.uniform(0.12, highest)
         distance = max(0.55, object_height * rng.uniform(2.4, 5.0))
         sweep = rng.uniform(0.25, 0.6)
         field = rng.uniform(0.8, 1.1)

@@ -1,5 +1,6 @@
 """Builds a scene of `synth.scene` (its JSON form) in Blender. Runs inside Blender; knows nothing about passes."""
 
+import json
 import math
 import os
 import random
@@ -156,6 +157,25 @@ def _tuft(part):
     return fill
 
 
+def _foliage(part):
+    """A crown or a bush: many small leaves, most of them near the outside of an uneven ellipsoid."""
+    rng = random.Random(part["seed"])
+
+    def fill(built):
+        leaf = 0.055 / max(part["size"])
+        offset = Vector((part["seed"] % 83, part["seed"] % 47, 0))
+        for _ in range(1500):
+            towards = Vector((rng.gauss(0, 1), rng.gauss(0, 1), rng.gauss(0, 1))).normalized()
+            reach = 0.5 * rng.uniform(0.35, 1.0) ** 0.4 * (0.8 + 0.35 * noise.noise(towards * 2.2 + offset))
+            turn = Euler((rng.uniform(0, 6.3), rng.uniform(0, 6.3), rng.uniform(0, 6.3))).to_matrix()
+            half = leaf * rng.uniform(0.7, 1.5)
+            corners = ((-half, 0), (0, -half * 0.55), (half, 0), (0, half * 0.55))
+            built.faces.new([built.verts.new(towards * reach + turn @ Vector((x, y, 0))) for x, y in corners])
+        _scaled(built, part["size"])
+
+    return fill
+
+
 _SHAPES = {
     "box": _box,
     "cushion": _cushion,
@@ -166,6 +186,7 @@ _SHAPES = {
     "blob": _blob,
     "torus": _torus,
     "tuft": _tuft,
+    "foliage": _foliage,
 }
 _SMOOTH = {"cushion", "cylinder", "sphere", "turned", "blob", "torus", "tuft"}
 
@@ -203,27 +224,47 @@ def _model(part):
     return meshes
 
 
-def add_part(part, name):
-    """One part as Blender objects; the list is empty for no part, longer than 1 for a model of several meshes."""
+def add_part(part, name, meshes):
+    """One part as Blender objects; the list is longer than 1 for a model of several meshes.
+
+    `meshes` remembers what was built: equal parts share their geometry and material.
+    """
     if part["shape"] == "model":
         return _model(part)
-    thing = _mesh(name, _SHAPES[part["shape"]](part))
+    key = json.dumps({k: v for k, v in part.items() if k not in ("location", "rotation")}, sort_keys=True)
+    if key in meshes:
+        thing = bpy.data.objects.new(name, meshes[key])
+        bpy.context.scene.collection.objects.link(thing)
+    else:
+        thing = _mesh(name, _SHAPES[part["shape"]](part))
+        meshes[key] = thing.data
+        _smooth(thing, part)
+        thing.data.materials.append(_material(part["material"], name, meshes))
     thing.location, thing.rotation_euler = part["location"], part["rotation"]
     if part["bevel"] > 0 and part["shape"] in ("box", "extruded", "cylinder"):
         bevel = thing.modifiers.new("bevel", "BEVEL")
         bevel.width, bevel.segments, bevel.limit_method = part["bevel"], 3, "ANGLE"
+    # a boulder far away needs no second level: fifty of them would take gigabytes
+    if part["shape"] in ("turned", "blob") and max(part["size"]) < 0.8:
+        smooth = thing.modifiers.new("smooth", "SUBSURF")
+        smooth.levels = smooth.render_levels = 1
+    return [thing]
+
+
+def _smooth(thing, part):
     if part["shape"] in _SMOOTH or part["bevel"] > 0:
         for polygon in thing.data.polygons:
             polygon.use_smooth = part["shape"] in _SMOOTH and part["shape"] != "cylinder"
     if part["shape"] == "cylinder":
         for polygon in thing.data.polygons:
             polygon.use_smooth = len(polygon.vertices) == 4
-    # a crown of leaves far away needs no second level: fifty of them would take gigabytes
-    if part["shape"] in ("turned", "blob") and max(part["size"]) < 0.8:
-        smooth = thing.modifiers.new("smooth", "SUBSURF")
-        smooth.levels = smooth.render_levels = 1
-    thing.data.materials.append(materials.make(name, part["material"]))
-    return [thing]
+
+
+def _material(described, name, known):
+    key = json.dumps(described, sort_keys=True)
+    if key not in known:
+        known[key] = materials.make(name, described)
+    return known[key]
 
 
 def add_lamp(lamp, name):

@@ -24,13 +24,13 @@ _LUMA = np.array([0.2126, 0.7152, 0.0722])
 
 def _populate(job):
     contents.clear()
-    scene_things, objects = [], {}
+    scene_things, objects, meshes = [], {}, {}
     for i, part in enumerate(job["scene"]["parts"]):
-        scene_things += contents.add_part(part, f"part{i:03d}")
+        scene_things += contents.add_part(part, f"part{i:03d}", meshes)
     for i, lamp in enumerate(job["scene"]["lamps"]):
         scene_things.append(contents.add_lamp(lamp, f"lamp{i:02d}"))
     for key, parts in job["objects"].items():
-        things = [thing for part in parts for thing in contents.add_part(part, key)]
+        things = [thing for part in parts for thing in contents.add_part(part, key, meshes)]
         for i, thing in enumerate(things):
             thing.name = f"{key}_{i:03d}"
         objects[key] = things
