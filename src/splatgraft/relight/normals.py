@@ -30,13 +30,15 @@ class Normals:
     """Unit, world frame, towards the cameras."""
     confidence: Float[Tensor, "n"]
     """0 where neighbours are a round cloud or face different ways, 1 on a plane."""
+    seen: Bool[Tensor, "n"]
+    """Whether some camera sees it, not behind others: what none sees was never given its true colour."""
 
 
 def estimate_normals(gaussians: Gaussians, cameras: Cameras) -> Normals:
     """Normals turned towards the cameras that see each Gaussian, not behind others; less sure where none does."""
     n = gaussians.count
     if n == 0:
-        return Normals(vectors=torch.zeros(0, 3), confidence=torch.zeros(0))
+        return Normals(vectors=torch.zeros(0, 3), confidence=torch.zeros(0), seen=torch.zeros(0, dtype=torch.bool))
     means = gaussians.means.double().numpy()
     k = min(NEIGHBOURS, n)
     _, neighbours = KDTree(means, balanced_tree=False, compact_nodes=False).query(means, k=k, workers=2)
@@ -47,7 +49,7 @@ def estimate_normals(gaussians: Gaussians, cameras: Cameras) -> Normals:
     _estimate(cloud, neighbours, towards.double().numpy(), out)
     result = torch.from_numpy(_agree(out, neighbours))
     confidence = result[:, 3] * torch.where(seen, 1.0, 0.5)
-    return Normals(vectors=result[:, :3].contiguous(), confidence=confidence)
+    return Normals(vectors=result[:, :3].contiguous(), confidence=confidence, seen=seen)
 
 
 def raised(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
