@@ -20,9 +20,11 @@ from splatgraft.relight import (
     light_from_json,
     light_to_json,
     relight,
+    without_shadow,
 )
 from splatgraft.relight.directions import even_directions, frames_along
 from splatgraft.relight.light import ambient_of
+from splatgraft.relight.local_gain import apply_gain
 from splatgraft.similarity import Similarity
 from splatgraft.spherical_harmonics import dc_from_rgb, rgb_from_dc
 
@@ -266,3 +268,19 @@ def test_light_json_round_trip_and_its_messages():
             light_from_json(broken, name="my.json")
         assert message in str(caught.value)
         assert "\n" not in str(caught.value)
+
+
+def test_the_old_place_loses_the_shadow_that_was_there():
+    scene, light = floor(), sun_from(-1, 0, 1)
+    normals = even_directions(3000)
+    side = light.irradiance(normals) / light.irradiance(torch.tensor([[0.0, 0.0, 1.0]]))
+    body = apply_gain(ball(), side)  # a ball that was photographed in that light
+    shaded = relight(placed((body, at(0.0, 0.0, 0.35)), target=scene), cameras(), light=light, options=WHOLE).bake()
+    around = even_directions(4000)
+    sky = surfels(20 * around, -around, width=0.7, rgb=(0.7, 0.7, 0.7))
+    source = SourceScene(concatenate([shaded.select(torch.arange(scene.count)), sky]), cameras())
+    cleared, report = without_shadow(source, at(0.0, 0.0, 0.35).gaussians(body))
+    before = (rgb_from_dc(source.gaussians.sh[: scene.count, 0]) - 0.5).abs().mean()
+    after = (rgb_from_dc(cleared.sh[: scene.count, 0]) - 0.5).abs().mean()
+    assert after < 0.6 * before  # light is estimated here, from that shadow alone
+    assert "degrees high" in report[0]

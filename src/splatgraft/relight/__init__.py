@@ -4,6 +4,7 @@ from splatgraft.relight.body import SourceScene
 from splatgraft.relight.cache import RelightCache
 from splatgraft.relight.layers import LayerWeights, Relit
 from splatgraft.relight.light import Light, LightSource, light_from_json, light_to_json
+from splatgraft.relight.old_place import without_shadow
 from splatgraft.relight.transfer import RelightOptions, relight
 
 __all__ = [
@@ -17,4 +18,5 @@ __all__ = [
     "light_from_json",
     "light_to_json",
     "relight",
+    "without_shadow",
 ]

@@ -26,7 +26,7 @@ def beams_of(light: Light) -> Beams:
     budget = SOURCE_BEAMS
     for i, source in enumerate(light.sources[:SOURCE_BEAMS]):
         later = min(len(light.sources), SOURCE_BEAMS) - i - 1
-        parts = 1 if source.softness <= _SINGLE else max(1, min(5, budget - later))
+        parts = _parts(source, budget - later)
         budget -= parts
         rgb = torch.tensor(source.irradiance) * source.confidence / parts
         for direction in _disk(source, parts):
@@ -46,6 +46,17 @@ def beams_of(light: Light) -> Beams:
         is_source=(True,) * len(directions) + (False,) * AMBIENT_COUNT,
         blockers_within=(*within, *(math.inf,) * AMBIENT_COUNT),
     )
+
+
+def main_count(light: Light) -> int:
+    """How many of the first bundles belong to the first source."""
+    if not light.sources:
+        return 0
+    return _parts(light.sources[0], SOURCE_BEAMS - min(len(light.sources), SOURCE_BEAMS) + 1)
+
+
+def _parts(source: LightSource, room: int) -> int:
+    return 1 if source.softness <= _SINGLE else max(1, min(5, room))
 
 
 def source_pairs(beams: Beams) -> tuple[Beams, Int[Tensor, "k"], Int[Tensor, "k"]]:

@@ -46,6 +46,8 @@ class Body:
     """Share of every bundle of the new light that the object lets through to itself."""
     then: Float[Tensor, "n 3"] | None
     """Linear irradiance where it was captured; None where nobody knows."""
+    before: Light | None
+    """That light, target's frame."""
     story: str | None
     """What was found out about that light."""
 
@@ -63,18 +65,19 @@ def set_body(
     ball = ball_of(gaussians)
     normals = estimate_normals(gaussians, cameras)
     maps = map_object(gaussians, ball, beams)
-    then, story = None, None
+    then, before, story = None, None, None
     if source is not None:
         before, problem = cache.get(
             f"origin {index}", (placed.gaussians, source), lambda: _origin_light(placed.gaussians, source)
         )
         story = problem if before is None else before.describe(up_of(source.cameras)) + "."
         if before is not None:
-            bundles = beams_of(before.rotated(placed.target_from_object.rotation))
+            before = before.rotated(placed.target_from_object.rotation)
+            bundles = beams_of(before)
             shares = self_visibility(maps, gaussians, normals.vectors, bundles)
             then = irradiance(bundles, normals.vectors, arrives=shares)
     own = self_visibility(maps, gaussians, normals.vectors, beams)
-    body = Body(gaussians, placed.target_from_object, ball, normals, maps, own, then, story)
+    body = Body(gaussians, placed.target_from_object, ball, normals, maps, own, then, before, story)
     cache.put(f"body {index}", key, body)
     return body
 

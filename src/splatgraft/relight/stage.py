@@ -5,16 +5,19 @@ What is kept stays valid while objects move within the inner half of the region;
 
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.gaussians import Gaussians
-from splatgraft.relight.beams import beams_of
+from splatgraft.relight.beams import beams_of, main_count
 from splatgraft.relight.cache import RelightCache
 from splatgraft.relight.estimate_light import light_of
 from splatgraft.relight.light import Light
+from splatgraft.relight.litness import lit_share
 from splatgraft.relight.normals import Normals, estimate_normals, raised
+from splatgraft.relight.object_shading import irradiance
 from splatgraft.relight.place_light import light_at, panorama_at, up_of
 from splatgraft.relight.scene_shading import Ball, SceneMaps, map_scene, scene_visibility
 
@@ -54,7 +57,11 @@ def set_stage(
     lit = light
     maps = cache.get("maps", (scene, region, lit.sources), lambda: map_scene(scene, region, beams_of(lit)))
     points = raised(scene.select(members), normals.vectors)
-    arrives = cache.get("arrives", (maps, normals), lambda: scene_visibility(maps, points, normals.vectors))
+    arrives = cache.get(
+        "arrives",
+        (maps, normals),
+        lambda: _as_it_looks(scene.select(members), normals, lit, scene_visibility(maps, points, normals.vectors)),
+    )
     return Stage(scene=scene, members=members, normals=normals, light=lit, maps=maps, arrives=arrives), None
 
 
@@ -88,3 +95,20 @@ def _estimated(
     if panorama is None:
         return None, problem
     return replace(light_of(panorama, up_of(cameras)), sources=kept.sources), None
+
+
+def _as_it_looks(
+    gaussians: Gaussians, normals: Normals, light: Light, arrives: Float[Tensor, "m k"]
+) -> Float[Tensor, "m k"]:
+    """`arrives` with the main source taken from where the scene is plainly darker than it would make it."""
+    if not light.sources:
+        return arrives
+    everything, count = beams_of(light), main_count(light)
+    of_main = torch.arange(len(everything)) < count
+    ours = replace(everything, irradiance=everything.irradiance * of_main[:, None])
+    by_main = irradiance(ours, normals.vectors, arrives=arrives).mean(1)
+    by_all = irradiance(everything, normals.vectors, arrives=arrives).mean(1)
+    share = lit_share(gaussians, normals, rest=by_all - by_main, light=by_main)
+    out = arrives.clone()
+    out[:, :count] *= share[:, None]
+    return out

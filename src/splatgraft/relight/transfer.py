@@ -18,6 +18,7 @@ from splatgraft.relight.beams import beams_of
 from splatgraft.relight.body import Body, SourceScene, set_body
 from splatgraft.relight.cache import RelightCache
 from splatgraft.relight.cast import Beams
+from splatgraft.relight.gloss import gloss_layer
 from splatgraft.relight.layers import Relit, unchanged
 from splatgraft.relight.light import Light
 from splatgraft.relight.normals import raised
@@ -123,6 +124,7 @@ def _assembled(  # noqa: PLR0913
     rest[lit.origin] = False
     rest_index = rest.nonzero()[:, 0]
     on_objects = [_on_object(i, actors) for i in range(len(actors))]
+    glosses = [_gloss(a, s, stage, baked.sh_degree) for a, s in zip(actors, shades, strict=True)]
     object_rows = torch.arange(scene_count, baked.count)
     gaussians = concatenate([baked.select(rest_index), lit.gaussians, baked.select(object_rows)])
     count = gaussians.count - len(object_rows)
@@ -137,7 +139,7 @@ def _assembled(  # noqa: PLR0913
         shade=torch.cat([torch.ones(count, 3), *shades])[order],
         shadow=torch.cat([ones, ratio.shadow, *[r.shadow for r in on_objects]])[order],
         bounce=torch.cat([zeros, ratio.bounce, *[r.bounce for r in on_objects]])[order],
-        gloss=torch.zeros_like(gaussians.sh),
+        gloss=torch.cat([torch.zeros_like(gaussians.sh[:count]), *glosses])[order],
         light=stage.light,
         report=tuple(report),
     )
@@ -169,6 +171,14 @@ def _on_scene(
     assert shadow is not None
     assert bounce is not None
     return receivers, SceneRatio(shadow=shadow, bounce=bounce)
+
+
+def _gloss(actor: _Actor, shade: Float[Tensor, "n 3"], stage: Stage, degree: int) -> Float[Tensor, "n k 3"]:
+    body = actor.body
+    gaussians = body.gaussians.with_sh_degree(degree)
+    if body.before is None:
+        return torch.zeros_like(gaussians.sh)
+    return gloss_layer(gaussians, body.normals, body.before, stage.light, ratio=shade)
 
 
 def _on_object(index: int, actors: list[_Actor]) -> SceneRatio:

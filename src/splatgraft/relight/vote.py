@@ -14,6 +14,7 @@ from torch import Tensor
 from splatgraft.gaussians import Gaussians
 from splatgraft.images import linear_from_srgb
 from splatgraft.relight.directions import even_directions, frames_along
+from splatgraft.relight.materials import group_materials
 from splatgraft.relight.normals import Normals
 from splatgraft.relight.visibility import Occluders, Window, occluders_of, splat_depth_maps, visibility
 from splatgraft.spherical_harmonics import rgb_from_dc
@@ -22,7 +23,6 @@ _DIRECTIONS = 512  # on the sphere; those above the horizon, about half, are tri
 _LOWEST = math.radians(5)
 _RECEIVERS = 4000
 _OCCLUDERS = 16000
-_GROUPS = 20
 _MAP_SIZE = 128
 # errors in visibility make a least-squares slope too small; on synthetic scenes by a median factor of 1.6
 _ATTENUATION = 1.4
@@ -64,7 +64,7 @@ def vote(
     brightness = linear_from_srgb(rgb_from_dc(scene.sh[receivers, 0]).clamp(0.01, 1))
     occluders = _occluders(scene, center, radius)
     ambient = _openness(occluders, points, facing, center=center, radius=radius)
-    groups = _materials(brightness, facing)
+    groups = group_materials(brightness, facing)
     weight = (scene.opacities * normals.confidence.clamp_min(0.05))[receivers]
     directions = even_directions(_DIRECTIONS)
     directions = directions[directions @ up > math.sin(_LOWEST)]
@@ -151,27 +151,6 @@ def _openness(
     around = even_directions(64)
     lit = _lit(occluders, points, normals, around, center=center, radius=radius)
     return 0.5 + 0.5 * lit.sum(1) / (normals @ around.T).clamp_min(0).sum(1)
-
-
-def _materials(brightness: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]) -> Int[Tensor, "m"]:
-    """k-means on chromaticity and normal: brightness itself is left out, or lit and shaded would part.
-
-    For the same reason the blue-orange axis counts little: there sun and sky differ (Finlayson 2006); green-magenta
-    tells materials apart.
-    """
-    red, green, blue = brightness.clamp_min(1e-3).log().unbind(1)
-    chroma = torch.stack([(red - blue) / 1.0, (green - 0.5 * (red + blue)) / 0.25], 1)
-    features = torch.cat([chroma, normals / 0.6], 1)
-    generator = torch.Generator().manual_seed(0)
-    count = min(_GROUPS, max(2, len(features) // 60))
-    middles = features[torch.randperm(len(features), generator=generator)[:count]]
-    label = torch.zeros(len(features), dtype=torch.long)
-    for _ in range(8):
-        label = torch.cdist(features, middles).argmin(1)
-        sums = torch.zeros_like(middles).index_add_(0, label, features)
-        counts = torch.bincount(label, minlength=count).clamp_min(1)[:, None]
-        middles = sums / counts
-    return label
 
 
 @dataclass(frozen=True)
