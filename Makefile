@@ -1,4 +1,5 @@
-# make install: the environment in .venv; make demo: the whole job on shipped data; make test: all checks.
+# make install: the environment in .venv; make demo: the whole job on shipped data; make test: all checks;
+# make blender: Blender as a Python module in .venv-blender, for `splatgraft synth --blender-python`.
 SHELL := /bin/bash
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
@@ -6,7 +7,7 @@ STAMP := .venv/.installed
 # threads of torch and numba that spin while they wait take the cores from each other
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: install demo test clean
+.PHONY: install demo test blender clean
 .DEFAULT_GOAL := install
 
 install: $(STAMP)
@@ -19,6 +20,16 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: install
 	$(BIN)/splatgraft run data/demo/project.toml --out demo
+
+# Blender's wheel is for Python 3.11 alone and 1 GiB large: an environment of its own
+BLENDER_PYTHON ?= $(shell command -v python3.11)
+blender: .venv-blender/.installed
+
+.venv-blender/.installed: constraints.txt
+	@test -n "$(BLENDER_PYTHON)" || { echo "make: expected Python 3.11 for bpy, found none; name one with BLENDER_PYTHON=..."; exit 1; }
+	$(BLENDER_PYTHON) -m venv .venv-blender
+	.venv-blender/bin/python -m pip install --quiet --disable-pip-version-check 'bpy==4.2.23' numpy==2.4.6
+	@touch $@
 
 test:
 	.ci/run

@@ -154,7 +154,7 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
     return target, source
 
 
-def _cameras(out: Path, names: tuple[str, ...]) -> Cameras:
+def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
     """The cameras of a rendered job: Blender's poses look along -z with y up, ours along +z with y down."""
     found = json.loads((out / "cameras.json").read_text())
     poses = torch.tensor(found["poses"], dtype=torch.float64)
@@ -200,7 +200,7 @@ def _gather(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], po
             (out / folder).mkdir(parents=True, exist_ok=True)
             for stem in stems:
                 shutil.copyfile(rendered / take / f"{stem}{suffix}", out / folder / f"{stem}{ending}")
-    cameras = _cameras(rendered, tuple(f"{stem}.png" for stem in stems))
+    cameras = rendered_cameras(rendered, tuple(f"{stem}.png" for stem in stems))
     found, colors = sparse_points(rendered / take, cameras) if points else (torch.zeros(0, 3), torch.zeros(0, 3))
     image_paths = tuple(out / "images" / f"{stem}.png" for stem in stems)
     mask_paths = tuple(out / "masks" / f"{stem}.png" for stem in stems) if "masks" in passes else ()

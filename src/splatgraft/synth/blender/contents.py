@@ -194,6 +194,8 @@ _SMOOTH = {"cushion", "cylinder", "sphere", "turned", "blob", "torus", "tuft"}
 def _model(part):
     """Everything in a model file, joined under one empty and scaled to the part's height."""
     before = set(bpy.data.objects)
+    if not os.path.isfile(part["path"]):
+        raise ValueError(f"{part['path']}: expected a model file, found none")
     suffix = os.path.splitext(part["path"])[1].lower()
     if suffix in (".glb", ".gltf"):
         bpy.ops.import_scene.gltf(filepath=part["path"])
