@@ -224,3 +224,18 @@ def test_a_turned_object_stands_as_the_placement_says():
     for before, after in zip(source.objects["object"], target.objects["object"], strict=True):
         moved = turn @ (np.array(before.location[:2]) - place.location[:2]) + place.location[:2]
         assert np.allclose(moved, after.location[:2], atol=1e-9)
+
+
+def test_a_sun_behind_a_wall_is_no_light_at_the_place_though_an_object_stands_around_the_probe(tmp_path):
+    sun = Lamp("sun", (1.0, 1.0, 1.0), 3.0, direction=(1, 0, -1), size=0.01)
+    open_air = floor_scene(lamps=[sun])
+    wall = Part("box", (0.1, 6, 3), (-1, 0, 1.5), GREY)
+    behind = replace(open_air, parts=(*open_air.parts, wall))
+    suns = []
+    for name, scene in (("open", open_air), ("behind", behind)):
+        things = {"ball": (ball((0, 0, 0.3), 0.25),)}
+        takes = (Take("without", scene=True), Take("light", scene=True, probe=(0.0, 0.0, 0.3)))
+        out = rendered(Job(scene, things, (Camera((0, -3, 1.6), (0, 0, 0.2)),), takes, TINY), tmp_path / name)
+        suns.append(json.loads((out / "light" / "suns.json").read_text()))
+    assert len(suns[0]) == 1
+    assert suns[1] == []

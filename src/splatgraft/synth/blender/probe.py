@@ -80,7 +80,13 @@ def _sky_sun(world, things):
 
 
 def _reaches(point, direction):
-    """Whether nothing stands between the point and the sun."""
+    """Whether nothing that is rendered stands between the point and the sun; the object around the point is not."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    hit, _, _, _, thing, _ = bpy.context.scene.ray_cast(depsgraph, Vector(point), Vector(direction))
-    return not hit or thing.hide_render
+    start, towards = Vector(point), Vector(direction).normalized()
+    while True:
+        hit, where, _, _, thing, _ = bpy.context.scene.ray_cast(depsgraph, start, towards)
+        if not hit:
+            return True
+        if not thing.hide_render:
+            return False
+        start = where + 1e-4 * towards
