@@ -1,6 +1,7 @@
 """Rows of numbers per scene and method become means, intervals and Markdown. Takes no measurement, reads no file."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -129,6 +130,7 @@ def tables(benchmark: Benchmark) -> list[Table]:
     rows = tuple((method, *(_cell(name, metrics[name]) for name in other)) for method, metrics in means.items())
     head = ("method", "shadow-ratio RMSE ↓", "disagreement of views ↓", "change of the rest ↓")
     out.append(Table("Light and consistency", head, rows))
+    out += _pose_tables(benchmark)
     out.append(_cost_table(benchmark))
     for region in ("object", "shadow", "whole"):
         per_scene = tuple(
@@ -167,6 +169,25 @@ def _region_table(means: dict[str, dict[str, Summary | None]], region: str, benc
         rows.append((method, *cells))
     titles = {"whole": "Whole image", "object": "Object", "shadow": "Shadow band", "rest": "Untouched rest"}
     return Table(titles[region], head, tuple(rows))
+
+
+def _pose_tables(benchmark: Benchmark) -> list[Table]:
+    """The same scenes with the object at several rotations, means by pose (paper, illumination consistency)."""
+    poses: dict[str, list[str]] = {}
+    for scene in benchmark.scenes:
+        if match := re.fullmatch(r".+_(p\d)", scene):
+            poses.setdefault(match[1], []).append(scene)
+    if not poses:
+        return []
+    names = ("psnr_whole", "psnr_object", "psnr_shadow", "shadow_ratio_rmse")
+    rows = []
+    for method in benchmark.methods:
+        for pose, scenes in sorted(poses.items()):
+            found = (summarize([_value(benchmark, scene, method, name) for scene in scenes]) for name in names)
+            cells = (_cell(name, value) for name, value in zip(names, found, strict=True))
+            rows.append((f"{method}, {pose.upper()}", *cells))
+    head = ("method, pose", "PSNR ↑", "object PSNR ↑", "shadow PSNR ↑", "shadow-ratio RMSE ↓")
+    return [Table("The object at several rotations", head, tuple(rows))]
 
 
 def _cost_table(benchmark: Benchmark) -> Table:

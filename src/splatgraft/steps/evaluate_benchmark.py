@@ -3,9 +3,12 @@
 import json
 import os
 import platform
+import shlex
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, cast
 
@@ -173,6 +176,7 @@ def _collected(
         f"Every 8th view is held out of reconstruction, harmonisation and consolidation; {_span(counts)} per scene.",
         f"{len(given)} scenes, quality {command.options.quality}, {os.cpu_count()} cores of {platform.machine()}, "
         f"torch on {'CUDA' if torch.cuda.is_available() and command.device != 'cpu' else 'the CPU'}.",
+        f"Made by splatgraft {version('splatgraft')}: {shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}",
     ]
     if floors:
         own = sum(floors) / len(floors)
