@@ -19,7 +19,7 @@ QUICK = ReconstructOptions(quality="draft", device="cpu", iterations=300, budget
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """A command that ran once: three of our methods, the truth itself as another program's pictures, one that cannot."""
+    """A command that ran once: three of our methods, the truth as another program's, one that cannot."""
     out = tmp_path_factory.mktemp("benchmark")
     (out / "theirs").mkdir()
     shutil.copytree(SCENES / "terrace" / "ground_truth" / "images", out / "theirs" / "terrace")

@@ -17,7 +17,8 @@ def benchmark_html(benchmark: Benchmark, views: Sequence[ViewFiles]) -> str:
         *(_section(table) for table in tables(benchmark)),
         f"<section><h2>What to know before trusting this</h2><ul>{items}</ul></section>\n",
     ]
-    count = f"{len(benchmark.methods)} methods on {len(benchmark.scenes)} scenes"
+    scenes = len(benchmark.scenes)
+    count = f"{len(benchmark.methods)} methods on {scenes} scene{'s' if scenes != 1 else ''}"
     subtitle = f"{count}; means over held-out views, then over scenes, with 95% bootstrap intervals over scenes."
     return framed("Benchmark of object transfer", subtitle, "".join(sections), views=views)
 
