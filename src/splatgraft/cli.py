@@ -20,6 +20,7 @@ COMMANDS = {
     "evaluate": "compare, picture and report",
     "evaluate benchmark": "measure methods on scenes with a known truth",
     "synth": "render training pairs and benchmark scenes with Blender",
+    "train": "train harmonisers and the object removal on pairs",
     "doctor": "say what is installed, what is missing and how to get it",
 }
 

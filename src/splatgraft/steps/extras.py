@@ -17,7 +17,11 @@ class Extra:
 EXTRAS = {
     "cuda": Extra("splatting kernels for NVIDIA GPUs", {"gsplat": "gsplat", "packaging": "packaging"}),
     "sfm": Extra("poses for photos and videos that have none", {"pycolmap": "pycolmap"}),
-    "flux": Extra("the paper's image model", {"diffusers": "diffusers", "transformers": "transformers"}),
+    "flux": Extra(
+        "the paper's image model and its training",
+        {"diffusers": "diffusers", "safetensors": "safetensors", "accelerate": "accelerate"},
+    ),
+    "text": Extra("text encoders, to embed the empty prompt once", {"transformers": "transformers"}),
     "editor": Extra("the placement editor in a browser", {"viser": "viser"}),
     "blender": Extra("made-up scenes with ground truth", {"bpy": "bpy"}),
     "ray": Extra("rendering and evaluating on many machines", {"ray": "ray"}),
