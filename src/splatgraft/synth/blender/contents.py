@@ -192,7 +192,7 @@ _SMOOTH = {"cushion", "cylinder", "sphere", "turned", "blob", "torus", "tuft"}
 
 
 def _model(part):
-    """Everything in a model file, joined under one empty and scaled to the part's height."""
+    """Everything in a model file, scaled into the part's box and standing on its floor."""
     before = set(bpy.data.objects)
     if not os.path.isfile(part["path"]):
         raise ValueError(f"{part['path']}: expected a model file, found none")
@@ -218,7 +218,9 @@ def _model(part):
     high = Vector(max(c[i] for c in corners) for i in range(3))
     scale = min(part["size"][i] / max(high[i] - low[i], 1e-6) for i in range(3))
     place = Matrix.LocRotScale(Vector(part["location"]), Euler(part["rotation"]), Vector((scale,) * 3))
-    matrix = place @ Matrix.Translation(-(low + high) / 2)
+    # what is wider than tall does not fill its box, and stands on the box's floor
+    sunk = Vector((0, 0, (part["size"][2] / scale - (high[2] - low[2])) / 2))
+    matrix = place @ Matrix.Translation(-(low + high) / 2 - sunk)
     worlds = {o: o.matrix_world.copy() for o in meshes}
     for thing in meshes:
         thing.parent = None
