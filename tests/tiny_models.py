@@ -1,0 +1,89 @@
+"""Randomly initialised models of a few thousand parameters, saved in the folder layouts of the real ones."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+HEADS, HEAD_WIDTH, TEXT, POOLED, CHANNELS = 2, 16, 24, 20, 4
+
+quiet = (pytest.mark.filterwarnings("ignore::FutureWarning"), pytest.mark.filterwarnings("ignore::DeprecationWarning"))
+
+
+def tiny_transformer(in_channels=CHANNELS * 4, seed=0, **other):
+    from diffusers import FluxTransformer2DModel
+
+    torch.manual_seed(seed)
+    return FluxTransformer2DModel(
+        in_channels=in_channels,
+        out_channels=CHANNELS * 4,
+        num_layers=1,
+        num_single_layers=2,
+        attention_head_dim=HEAD_WIDTH,
+        num_attention_heads=HEADS,
+        joint_attention_dim=TEXT,
+        pooled_projection_dim=POOLED,
+        axes_dims_rope=(4, 6, 6),
+        **other,
+    ).eval()
+
+
+def tiny_autoencoder(seed=1, channels=CHANNELS):
+    from diffusers import AutoencoderKL
+
+    torch.manual_seed(seed)
+    return AutoencoderKL(
+        block_out_channels=(8, 8, 8, 8),
+        down_block_types=("DownEncoderBlock2D",) * 4,
+        up_block_types=("UpDecoderBlock2D",) * 4,
+        latent_channels=channels,
+        norm_num_groups=4,
+        layers_per_block=1,
+        scaling_factor=0.3611,
+        shift_factor=0.1159,
+        use_quant_conv=False,
+        use_post_quant_conv=False,
+    ).eval()
+
+
+def tiny_prompt(seed=2):
+    from splatgraft.harmonize.flux.prompt import Prompt
+
+    g = torch.Generator().manual_seed(seed)
+    return Prompt(torch.randn(3, TEXT, generator=g), torch.randn(POOLED, generator=g))
+
+
+def flux_folder(folder: Path, in_channels=CHANNELS * 4, variant=None, seed=0) -> Path:
+    """FLUX.1-schnell's layout (transformer/, vae/), tiny; 48 input channels make it a harmoniser."""
+    from splatgraft.harmonize.flux.prompt import write_prompt
+
+    tiny_transformer(in_channels, seed).save_pretrained(folder / "transformer")
+    tiny_autoencoder().save_pretrained(folder / "vae")
+    write_prompt(folder / "empty_prompt.safetensors", tiny_prompt(), "tiny")
+    if variant:
+        (folder / "harmonizer.json").write_text(json.dumps({"variant": variant}))
+    return folder
+
+
+def removal_folder(folder: Path) -> Path:
+    """Stable Diffusion 2's layout (unet/, vae/), tiny."""
+    from diffusers import UNet2DConditionModel
+
+    from splatgraft.harmonize.flux.library import write_tensors
+
+    torch.manual_seed(3)
+    UNet2DConditionModel(
+        in_channels=CHANNELS,
+        out_channels=CHANNELS,
+        block_out_channels=(8, 16),
+        down_block_types=("CrossAttnDownBlock2D", "DownBlock2D"),
+        up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"),
+        layers_per_block=1,
+        cross_attention_dim=TEXT,
+        attention_head_dim=4,
+        norm_num_groups=4,
+    ).save_pretrained(folder / "unet")
+    tiny_autoencoder().save_pretrained(folder / "vae")
+    write_tensors(folder / "empty_prompt.safetensors", {"tokens": torch.randn(3, TEXT)})
+    return folder
