@@ -26,18 +26,24 @@ class Task:
 
 
 def run_tasks(
-    tasks: Sequence[Task], *, at_once: int = 1, ray_address: str | None = None, progress: Progress = silent
+    tasks: Sequence[Task],
+    *,
+    at_once: int = 1,
+    ray_address: str | None = None,
+    progress: Progress = silent,
+    gpus_each: int = 0,
 ) -> list[str]:
     """Do all tasks; what went wrong, a line a task, in the order of the tasks. One that fails does not stop the rest.
 
     `ray_address` is that of a Ray cluster (`auto`, `host:port`, `ray://host:port`), or `local` for a cluster of this
     machine's cores that lives as long as the call. All machines must see the same files under the same names.
+    `gpus_each`: GPUs that Ray keeps for a task.
 
     Raises: whatever but ValueError a task raises on this machine; ModuleNotFoundError where Ray is asked for and not
     installed.
     """
     if ray_address is not None:
-        return _through_ray(tasks, ray_address, progress)
+        return _through_ray(tasks, ray_address, progress, gpus_each)
     failures: dict[int, str] = {}
     with ThreadPoolExecutor(max(1, at_once)) as pool:
         running = {pool.submit(task.work): index for index, task in enumerate(tasks)}
@@ -56,7 +62,7 @@ def run_tasks(
     return [failures[index] for index in sorted(failures)]
 
 
-def _through_ray(tasks: Sequence[Task], address: str, progress: Progress) -> list[str]:
+def _through_ray(tasks: Sequence[Task], address: str, progress: Progress, gpus_each: int) -> list[str]:
     import ray
 
     own = not ray.is_initialized()
@@ -65,7 +71,7 @@ def _through_ray(tasks: Sequence[Task], address: str, progress: Progress) -> lis
         ray.init(**where, include_dashboard=False, log_to_driver=False, configure_logging=False)
     failures: dict[int, str] = {}
     try:
-        remote = ray.remote(_call).options(num_cpus=1, max_retries=_RETRIES)
+        remote = ray.remote(_call).options(num_cpus=1, num_gpus=gpus_each, max_retries=_RETRIES)
         running: dict[Any, int] = {remote.remote(task.work): index for index, task in enumerate(tasks)}
         while running:
             (reference, *_), _ = ray.wait(list(running))

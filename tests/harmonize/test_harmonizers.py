@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from splatgraft.harmonize import HARMONIZERS, HarmonizerInputs, make_harmonizer
+from splatgraft.harmonize import HarmonizerInputs, make_harmonizer
 
 
 def example_view(seed=0):
@@ -49,9 +49,9 @@ def test_unknown_name_lists_the_known():
         make_harmonizer("magic")
 
 
-def test_every_harmonizer_keeps_size_and_range():
+def test_harmonizers_without_weights_keep_size_and_range():
     view = example_view(1)
-    for name in HARMONIZERS:
+    for name in ("none", "reinhard"):
         image = make_harmonizer(name).harmonize(view).image
         assert image.shape == view.composite.shape
         assert image.min() >= 0

@@ -1,5 +1,6 @@
 """What every harmoniser takes and gives: the pictures of one view. Knows nothing about models or weights."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -41,4 +42,16 @@ class Harmonizer(Protocol):
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
         """The harmonised image of `view`, of the same size."""
+        ...
+
+
+@runtime_checkable
+class BatchHarmonizer(Protocol):
+    """A harmoniser that is faster on several views of one size at a time."""
+
+    views_at_once: int
+    """How many."""
+
+    def harmonize_all(self, views: Sequence[HarmonizerInputs]) -> list[Harmonized]:
+        """The harmonised images of `views`, in their order."""
         ...

@@ -15,6 +15,8 @@ from splatgraft.steps.terminal import Terminal
 Positional = Annotated[Path, tyro.conf.Positional]
 Device = Literal["auto", "cpu", "cuda"]
 Inputs = Mapping[str, tuple[Path, ...]]
+_MACHINE = ("device", "batch", "compile", "processes", "ray", "max_cost")
+"""Options that say where and how fast work is done, not what comes out."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +97,12 @@ def choose_device(wanted: str, terminal: Terminal) -> torch.device:
 
 
 def _options(value: Any) -> dict[str, Any]:
-    """All settings as plain JSON: neither paths, whose content counts, nor the device, which only changes rounding."""
+    """All settings as plain JSON: neither paths, whose content counts, nor the machine, which only changes rounding."""
     options: dict[str, Any] = {}
     for field in fields(value):
         item = getattr(value, field.name)
         if is_dataclass(item):
             options |= _options(item)
-        elif field.name != "device" and not isinstance(item, Path):
+        elif field.name not in _MACHINE and not isinstance(item, Path):
             options[field.name] = list(item) if isinstance(item, tuple) else item
     return options
