@@ -64,11 +64,11 @@ def run_tasks(
 
 def _through_ray(tasks: Sequence[Task], address: str, progress: Progress, gpus_each: int) -> list[str]:
     import ray
+    from ray.exceptions import RayTaskError, WorkerCrashedError
 
     own = not ray.is_initialized()
     if own:
-        where = {} if address == "local" else {"address": address}
-        ray.init(**where, include_dashboard=False, log_to_driver=False, configure_logging=False)
+        ray.init(address, include_dashboard=False, log_to_driver=False, configure_logging=False)
     failures: dict[int, str] = {}
     try:
         remote = ray.remote(_call).options(num_cpus=1, num_gpus=gpus_each, max_retries=_RETRIES)
@@ -78,11 +78,11 @@ def _through_ray(tasks: Sequence[Task], address: str, progress: Progress, gpus_e
             index = running.pop(reference)
             try:
                 ray.get(reference)
-            except ray.exceptions.RayTaskError as error:
+            except RayTaskError as error:
                 if not isinstance(error.cause, ValueError):
                     raise
                 failures[index] = f"{tasks[index].name}: {error.cause}"
-            except ray.exceptions.WorkerCrashedError:
+            except WorkerCrashedError:
                 failures[index] = f"{tasks[index].name}: expected a worker that lives, found {_RETRIES + 1} that died"
             progress(len(tasks) - len(running), len(tasks), tasks[index].name)
     finally:
