@@ -1,4 +1,4 @@
-"""The harmoniser `flux` on tiny random models in the real folder layouts: what loads, what is refused, what comes out."""
+"""The harmoniser `flux` on tiny models in the real folder layouts: what loads, what is refused, what comes out."""
 
 import json
 from dataclasses import replace
@@ -78,7 +78,7 @@ def test_the_variant_is_told_by_the_folder_and_changes_what_is_shown(tmp_path):
     assert FluxFolder.open(flux_folder(tmp_path / "other", WIDE)).variant("image-mask") == "image-mask"
     with pytest.raises(ValueError, match=r"other: expected harmonizer.json or a folder called .*--variant"):
         FluxFolder.open(tmp_path / "other").variant("auto")
-    with pytest.raises(ValueError, match="expected image-mask .--variant., found image-background"):
+    with pytest.raises(ValueError, match=r"expected image-mask .--variant., found image-background"):
         named.variant("image-mask")
     harmonizer = make_harmonizer("flux", options(tmp_path / "image-background"))
     changed = replace(view(), background=torch.zeros(32, 48, 3))

@@ -23,7 +23,7 @@ class Harmonize:
     out: Path = Path("harmonized")
     """Folder for images/, and confidence/ where the method says how far it trusts itself."""
     method: str = "none"
-    """none (keeps the light prior), reinhard (a baseline), flux (the paper's); lbm, ic-light, mv-colight, image-editing."""
+    """none (keeps the prior), reinhard (a baseline), flux (the paper's); lbm, ic-light, mv-colight, image-editing."""
     weights: str | None = None
     """Folder, file or hub id of the method's weights, such as nviolante/dot3d/image-mask for flux."""
     base: str | None = None

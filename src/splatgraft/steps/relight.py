@@ -8,6 +8,7 @@ from splatgraft.composite import Composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.project import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_TEXT_FILE, SCENE_FILE
 from splatgraft.relight.exposure import relight_by_gain
+from splatgraft.relight.layers import LayerWeights
 from splatgraft.relight.light import Light, light_from_json, light_to_json
 from splatgraft.relight.transfer import RelightOptions, SourceScene, relight
 from splatgraft.steps.composite_folder import placement_files, read_composite
@@ -37,6 +38,7 @@ class Relight:
     given_light: Path | None = None
     """A light.json, as an earlier run wrote it and you may have changed it; it takes the place of the estimate."""
     options: RelightOptions = field(default_factory=RelightOptions)
+    weights: LayerWeights = field(default_factory=LayerWeights)
 
     def inputs(self) -> Inputs:
         """Scenes, placement and cameras."""
@@ -62,7 +64,7 @@ class Relight:
             cameras, sources = read_cameras(self.cameras), self._sources(composite)
             relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
             found = relit.light
-            gaussians, is_object, sentences = relit.bake(), relit.is_object, relit.report
+            gaussians, is_object, sentences = relit.bake(self.weights), relit.is_object, relit.report
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_selection(folder / IS_OBJECT_FILE, is_object)
         (folder / LIGHT_TEXT_FILE).write_text("\n".join(sentences) + "\n")

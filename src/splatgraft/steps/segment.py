@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
+from splatgraft.formats.corrections import read_corrections
 from splatgraft.gaussians import Gaussians
 from splatgraft.posed_images import PosedImages
 from splatgraft.project import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
@@ -16,6 +17,7 @@ from splatgraft.segment import (
     LiftOptions,
     SelectOptions,
     SolidifyOptions,
+    corrected,
     lift_masks,
     select_object,
     solidify_object,
@@ -50,6 +52,8 @@ class Segment:
     """Least share of a Gaussian that the masks must give to the object."""
     keep: Keep = "substantial"
     """Which separate pieces stay: those with at least a twentieth of the largest one's opacity, the largest, or all."""
+    corrections: Path | None = None
+    """A .npy with one int8 per Gaussian of the scene, as the editor writes it: 1 adds it to the object, -1 removes it."""
     solidify: int = SolidifyOptions.iterations
     """Steps that make the object look whole when it stands alone; 0 leaves its Gaussians as they are in the scene."""
     device: Device = "auto"
@@ -63,7 +67,8 @@ class Segment:
             capture = with_mask_folder(capture, self.masks, self.capture)
         files = capture_inputs(self.capture, capture, masks=self.mask_source == "files")
         weights = () if self.birefnet is None else (self.birefnet,)
-        return {"scene": (self.scene,), "weights": weights, **files}
+        by_hand = {} if self.corrections is None else {"corrections": (self.corrections,)}
+        return {"scene": (self.scene,), "weights": weights, **by_hand, **files}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the object."""
@@ -74,6 +79,8 @@ class Segment:
         masks = read_masks(views)
         feature = lift_masks(scene, views.cameras.to(device), masks, self.options, progress=context.progress)
         selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=self.keep))
+        if self.corrections is not None:
+            selection = corrected(selection, read_corrections(self.corrections))
         context.terminal.say(f"object: {int(selection.sum()):,} of {scene.count:,} Gaussians")
         chosen = scene.select(selection)
         if self.solidify:

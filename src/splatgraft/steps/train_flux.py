@@ -5,7 +5,8 @@ from typing import Literal
 
 from splatgraft.steps.step import Positional
 from splatgraft.steps.terminal import Terminal
-from splatgraft.steps.train_options import DataOptions, LoopOptions
+from splatgraft.steps.train_options import DataOptions
+from splatgraft.train.settings import Loop
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,7 @@ class TrainFlux:
     base: str = "black-forest-labs/FLUX.1-schnell"
     """Folder or hub id with transformer/ and vae/; a harmoniser's folder goes on training that one."""
     data: DataOptions = field(default_factory=DataOptions)
-    loop: LoopOptions = field(default_factory=LoopOptions)
+    loop: Loop = field(default_factory=Loop)
     condition: Literal["image-mask", "image-background"] = "image-mask"
     """What joins the composite: the object's mask (the paper) or the scene without it."""
     first_layer: Literal["repeat", "zero"] = "repeat"

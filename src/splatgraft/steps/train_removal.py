@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 
 from splatgraft.steps.step import Positional
 from splatgraft.steps.terminal import Terminal
-from splatgraft.steps.train_options import DataOptions, LoopOptions
+from splatgraft.steps.train_options import DataOptions
+from splatgraft.train.settings import Loop
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,7 @@ class TrainRemoval:
     base: str = "stabilityai/stable-diffusion-2"
     """Folder or hub id with unet/ and vae/."""
     data: DataOptions = field(default_factory=DataOptions)
-    loop: LoopOptions = field(default_factory=lambda: LoopOptions(steps=260_000, batch=8, rate=1e-5))
+    loop: Loop = field(default_factory=lambda: Loop(steps=260_000, batch=8, rate=1e-5))
     no_checkpointing: bool = False
     """Keep activations instead of computing them twice: faster, several times the memory."""
     force: bool = False

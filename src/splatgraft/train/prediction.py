@@ -1,0 +1,66 @@
+"""Memory that a training takes, per option, before it begins. Pure arithmetic; knows no network but its numbers."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Size:
+    """Of a transformer and of what it is given."""
+
+    parameters: int
+    blocks: int
+    width: int
+    """Of a token."""
+    tokens: int
+    """Of one picture, text included."""
+    adapted: int = 0
+    """Sum of inputs and outputs of all adapted layers: parameters of an adaptation of rank 1."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Options that decide."""
+
+    pairs: int
+    """Per process and pass."""
+    lora: int = 0
+    adam8bit: bool = False
+    ema: bool = False
+    checkpointing: bool = True
+    shards: int = 1
+    """Processes that share weights, gradients and optimiser (FSDP, DeepSpeed stage 3)."""
+
+
+def training_bytes(size: Size, choice: Choice) -> int:
+    """Bytes on each device: weights, gradients, optimiser, average, activations.
+
+    Learning weights are float32 (4), their gradients too (4), Adam's two moments (8, or 2 in 8 bits), an average (4);
+    what does not learn is bfloat16 (2). A block keeps some 34 bytes a token and channel for its backward pass
+    (Korthikanti et al. 2022, without attention maps, which are not stored), or 2 where it is computed again.
+    """
+    learning = choice.lora * size.adapted if choice.lora else size.parameters
+    frozen = size.parameters if choice.lora else 0
+    each = 8 + (2 if choice.adam8bit else 8) + (4 if choice.ema else 0)
+    per_token = 2 * size.blocks + 34 if choice.checkpointing else 34 * size.blocks
+    activations = choice.pairs * size.tokens * size.width * per_token
+    return (learning * each + frozen * 2) // choice.shards + activations + (1 << 30)
+
+
+def table(size: Size, choice: Choice) -> list[str]:
+    """A line for each way to train, the chosen one marked."""
+    ways = {
+        "all weights, adam": (0, False),
+        "all weights, adam8bit": (0, True),
+        f"lora of rank {choice.lora or 64}": (choice.lora or 64, choice.adam8bit),
+    }
+    lines = []
+    for name, (lora, small) in ways.items():
+        way = Choice(choice.pairs, lora, small, choice.ema, choice.checkpointing, choice.shards)
+        again = Choice(choice.pairs, lora, small, choice.ema, not choice.checkpointing, choice.shards)
+        chosen = lora == choice.lora and small == choice.adam8bit
+        words = ("with", "without") if choice.checkpointing else ("without", "with")
+        lines.append(
+            f"{'* ' if chosen else '  '}{name}: {training_bytes(size, way) / 1e9:.0f} GB a device {words[0]} "
+            f"checkpointing, {training_bytes(size, again) / 1e9:.0f} {words[1]}"
+        )
+    return lines

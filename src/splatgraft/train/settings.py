@@ -1,0 +1,62 @@
+"""How long and how a training runs. Knows no network and no data."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Length, optimiser, precision and rhythm of a training."""
+
+    steps: int = 50_000
+    """Optimiser steps."""
+    batch: int = 4
+    """Pairs per optimiser step, over all processes together."""
+    accumulate: int = 1
+    """Passes that a process takes per optimiser step, to save memory."""
+    rate: float = 3e-5
+    """Learning rate of Adam."""
+    warm_up: int = 0
+    """Steps over which the rate rises from zero."""
+    clip: float = 1.0
+    """Largest norm of the gradient; 0 does not clip."""
+    ema: float = 0.0
+    """Decay of an averaged copy of the weights, which is then what is kept; 0 for none."""
+    optimizer: Literal["adam", "adam8bit"] = "adam"
+    """adam8bit needs bitsandbytes."""
+    precision: Literal["no", "bf16", "fp16"] = "bf16"
+    """Arithmetic of the network; the optimiser's weights are float32."""
+    save_every: int = 1000
+    """Steps between states from which a killed run goes on."""
+    validate_every: int = 1000
+    """Steps between validations."""
+    validation_pairs: int = 8
+    """Pairs per validation."""
+    seed: int = 0
+    """Order, noise and initial values follow from it."""
+    tensorboard: bool = False
+    """Also write for TensorBoard; needs the package tensorboard."""
+    cpu: bool = False
+    """Train on the CPU even where there is a GPU."""
+
+    def rate_at(self, step: int) -> float:
+        """Learning rate of a step, counted from 0."""
+        return self.rate * min(1.0, (step + 1) / self.warm_up) if self.warm_up else self.rate
+
+    def check(self, processes: int) -> int:
+        """Pairs per process and pass.
+
+        Raises: ValueError where the numbers make no training.
+        """
+        for name in ("steps", "batch", "accumulate", "save_every", "validate_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name.replace('_', '-')}: expected at least 1, found {getattr(self, name)}")
+        if not 0 <= self.ema < 1:
+            raise ValueError(f"--ema: expected a decay from 0 to below 1, found {self.ema}")
+        parts = processes * self.accumulate
+        if self.batch % parts:
+            raise ValueError(
+                f"--batch: expected a multiple of {parts} ({processes} processes x --accumulate {self.accumulate}), "
+                f"found {self.batch}"
+            )
+        return self.batch // parts
