@@ -2,6 +2,7 @@
 
 from splatgraft.segment.birefnet import BiRefNet, load_birefnet
 from splatgraft.segment.box import Box, default_box
+from splatgraft.segment.corrections import corrected, with_correction
 from splatgraft.segment.grabcut import GrabcutOptions, grabcut_masks, refine_masks
 from splatgraft.segment.lift import LiftOptions, lift_masks
 from splatgraft.segment.select import Keep, SelectOptions, select_object
@@ -15,6 +16,7 @@ __all__ = [
     "LiftOptions",
     "SelectOptions",
     "SolidifyOptions",
+    "corrected",
     "default_box",
     "grabcut_masks",
     "lift_masks",
@@ -22,4 +24,5 @@ __all__ = [
     "refine_masks",
     "select_object",
     "solidify_object",
+    "with_correction",
 ]

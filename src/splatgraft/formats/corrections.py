@@ -1,0 +1,36 @@
+"""corrections.npy: what a person added to the Gaussians of an object and removed from them. Knows no scenes.
+
+One int8 per Gaussian of the source scene: 1 added, -1 removed, 0 as the masks gave it.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Int8
+from torch import Tensor
+
+from splatgraft.whole_file import whole_file
+
+
+def read_corrections(path: Path) -> Int8[Tensor, "n"]:
+    """The corrections in `path`.
+
+    Raises: ValueError where the file is no one-dimensional array of -1, 0 and 1.
+    """
+    try:
+        array = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: expected a .npy of corrections, found no file") from error
+    except (ValueError, OSError, EOFError, SyntaxError, MemoryError) as error:
+        raise ValueError(f"{path}: expected a .npy of corrections, found {type(error).__name__}: {error}") from error
+    if not isinstance(array, np.ndarray) or array.dtype != np.int8 or array.ndim != 1 or (abs(array) > 1).any():
+        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+        raise ValueError(f"{path}: expected one int8 of -1, 0 or 1 per Gaussian, found {found}")
+    return torch.from_numpy(array)
+
+
+def write_corrections(path: Path, corrections: Int8[Tensor, "n"]) -> None:
+    """Write the array; the file appears whole or not at all."""
+    with whole_file(path) as stream:
+        np.save(stream, corrections.cpu().numpy())
