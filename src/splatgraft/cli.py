@@ -20,6 +20,8 @@ COMMANDS = {
     "evaluate": "compare, picture and report",
     "evaluate benchmark": "measure methods on scenes with a known truth",
     "synth": "render training pairs and benchmark scenes with Blender",
+    "synth generated": "make training pairs of pictures that FLUX paints",
+    "synth orida": "make training pairs of ORIDa's photographs",
     "train": "train harmonisers and the object removal on pairs",
     "doctor": "say what is installed, what is missing and how to get it",
 }

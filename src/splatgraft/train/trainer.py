@@ -69,8 +69,8 @@ def train(run: Training) -> Path:
             return loop.run()
         except torch.OutOfMemoryError as error:
             raise ValueError(
-                f"training: expected memory for {loop.each} pairs a pass, found too little at step {loop.step}; the last "
-                "state is kept: try --accumulate, --optimizer adam8bit or --lora"
+                f"training: expected memory for {loop.each} pairs a pass, found too little at step {loop.step}; the "
+                "last state is kept: try --accumulate, --optimizer adam8bit or --lora"
             ) from error
 
 

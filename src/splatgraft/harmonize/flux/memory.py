@@ -47,9 +47,9 @@ def choose_placement(
     Raises: ValueError where not even offloading fits.
     """
     fixed = others * 2 + _SPARE
-    for tiled in (False, True):
-        working = max(activations, decoder // 16 if tiled else decoder)
-        for precision in ("bf16", "fp8", "nf4", "offload"):
+    for precision in ("bf16", "fp8", "nf4", "offload"):
+        for tiled in (False, True):
+            working = max(activations, decoder // 16 if tiled else decoder)
             need = round(parameters * _BYTES[precision]) + fixed + working
             if need <= free and (precision != "nf4" or can_quantize):
                 return Placement(precision, tiled, _sentence(precision, tiled, need, free))
