@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 COMMANDS = {
     "init": "write a commented project.toml for two captures",
+    "edit": "place the object and see the light, in the browser",
     "run": "do what is stale in a project, resuming what was killed",
     "status": "say what is done, what is stale and why",
     "capture": "pose photos or a video, or take over poses that are there",
@@ -66,7 +67,7 @@ def _dispatch(words: list[str]) -> int:
         raise ValueError(f"splatgraft: expected a command among {', '.join(COMMANDS)}; found {found}")
     length = 2 if " ".join(words[:2]) in COMMANDS else 1
     command, rest = "_".join(words[:length]), words[length:]
-    if command not in ("init", "run", "status", "doctor") and len(rest) == 1 and rest[0].endswith(".toml"):
+    if command not in ("init", "edit", "run", "status", "doctor") and len(rest) == 1 and rest[0].endswith(".toml"):
         command, rest = "run", [rest[0], "--to", command]  # `reconstruct project.toml`: the project up to there
 
     import tyro

@@ -1,0 +1,60 @@
+"""What a person takes home: the scene in any format, a picture, the report. Knows nothing about browsers."""
+
+import shutil
+from pathlib import Path
+
+from splatgraft.editor.project_access import ProjectFiles
+from splatgraft.formats import read_gaussians, write_gaussians
+from splatgraft.project import REPORT_FILE
+from splatgraft.whole_file import whole_file
+
+EXPORTS_FOLDER = "export"
+
+
+def export_scene(files: ProjectFiles, suffix: str) -> Path:
+    """The finished scene as export/scene.SUFFIX; a .ply is the result byte for byte.
+
+    Raises: ValueError where nothing is finished yet.
+    """
+    if not files.result.is_file():
+        raise ValueError(f"{files.result}: expected a finished scene, found none yet; run the transfer first")
+    path = _folder(files) / f"scene{suffix}"
+    if suffix == files.result.suffix:
+        with files.result.open("rb") as source, whole_file(path) as stream:
+            shutil.copyfileobj(source, stream)
+    else:
+        write_gaussians(path, read_gaussians(files.result))
+    return path
+
+
+def export_turntable(files: ProjectFiles) -> Path:
+    """The turntable of the report as export/turntable.webp.
+
+    Raises: ValueError where there is none yet.
+    """
+    found = next((p for p in (files.report / "turntable.webp", files.report / "turntable.gif") if p.is_file()), None)
+    if found is None:
+        raise ValueError(f"{files.report}: expected a turntable, found none yet; run the report first")
+    return Path(shutil.copy2(found, _folder(files) / found.name))
+
+
+def report_page(files: ProjectFiles) -> Path:
+    """The report.
+
+    Raises: ValueError where there is none yet.
+    """
+    page = files.report / REPORT_FILE
+    if not page.is_file():
+        raise ValueError(f"{page}: expected a report, found none yet; run it first")
+    return page
+
+
+def picture_path(files: ProjectFiles, name: str) -> Path:
+    """Where an exported picture goes."""
+    return _folder(files) / f"{name}.png"
+
+
+def _folder(files: ProjectFiles) -> Path:
+    folder = files.root / EXPORTS_FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -1,0 +1,75 @@
+"""Who may talk to the editor: the page itself, from the machine itself, or with a token. Knows no web server.
+
+A page on another site can reach a server on loopback: its Origin gives it away. A name that was made to point here
+(DNS rebinding) shows in Host.
+"""
+
+import hmac
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs, urlsplit
+
+COOKIE = "splatgraft_token"
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the gate says to a request."""
+
+    allowed: bool
+    """Whether it may pass."""
+    reason: str = ""
+    """Why not, for the person who reads the page."""
+    cookie: str | None = None
+    """The Set-Cookie header that keeps the token."""
+
+
+@dataclass(frozen=True)
+class Gate:
+    """The rules of one server."""
+
+    hosts: tuple[str, ...] = LOOPBACK
+    """Names under which the server may be called; empty: any, which wants a token."""
+    token: str | None = None
+    """What a request must know; None: nothing, on loopback alone."""
+
+    def __post_init__(self) -> None:
+        """Raises: ValueError where anyone could come in."""
+        if not self.hosts and not self.token:
+            raise ValueError("gate: expected a token for a server that others can reach, found none")
+
+    def ask(self, headers: Mapping[str, str], path: str) -> Answer:
+        """Whether a request with these headers may pass; header names in their usual capitals."""
+        host = headers.get("Host", "")
+        if self.hosts and _name(host) not in self.hosts:
+            return Answer(False, "expected to be called by the name of this machine")
+        origin = headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+            return Answer(False, "expected a request of the editor's own page, found one of another site")
+        if headers.get("Upgrade", "").lower() == "websocket" and origin is None:
+            return Answer(False, "expected a browser, which names the page that it talks for")
+        if self.token is None:
+            return Answer(True)
+        given = parse_qs(urlsplit(path).query).get("token", [""])[0]
+        if hmac.compare_digest(given.encode(), self.token.encode()):
+            return Answer(True, cookie=f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/")
+        if hmac.compare_digest(_cookie(headers).encode(), self.token.encode()):
+            return Answer(True)
+        return Answer(False, "expected the token that `splatgraft edit` printed: open the whole address it gave")
+
+
+def _name(host: str) -> str:
+    try:
+        return (urlsplit(f"//{host}").hostname or "").lower()
+    except ValueError:
+        return ""
+
+
+def _cookie(headers: Mapping[str, str]) -> str:
+    try:
+        found = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
+    except CookieError:
+        return ""
+    return found.value if found else ""

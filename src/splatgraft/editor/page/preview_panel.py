@@ -1,0 +1,206 @@
+"""The panel with true pictures beside the live splats: two kinds, a slider between them, the target's cameras.
+
+Knows nothing about how pictures are made.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import viser
+
+from splatgraft.cameras import Cameras
+from splatgraft.editor.latest import Latest
+from splatgraft.editor.page.stage_view import view_of
+from splatgraft.editor.preview import KINDS, NEEDS_LIGHT, Kind, Size, wiped
+from splatgraft.editor.session import Session
+from splatgraft.editor.state import EditState
+from splatgraft.images import write_image
+
+if TYPE_CHECKING:
+    from splatgraft.editor.page.page import Page
+
+
+@dataclass(frozen=True)
+class _Wish:
+    session: Session
+    state: EditState
+    camera: Cameras
+    left: Kind
+    right: Kind
+    share: float
+
+
+class PreviewPanel:
+    """Asks for pictures and shows them; the newest wish counts."""
+
+    def __init__(self, page: Page) -> None:
+        """Build the panel."""
+        self._page, gui = page, page.gui
+        self._size = Size()
+        self._drawn: dict[Kind, tuple[tuple[object, ...], np.ndarray]] = {}
+        self._moving: EditState | None = None
+        self._latest = Latest(self._work, lambda error: self._say(" ".join(str(error).split())))
+        self._panel = gui.add_panel()
+        with self._panel.add_tab("True picture", viser.Icon.PHOTO):
+            self._image = gui.add_image(np.full((270, 400, 3), 40, np.uint8), format="jpeg", jpeg_quality=88)
+            self._caption = gui.add_html("")
+            self._left = gui.add_dropdown("Left", KINDS, initial_value="Copy-paste")
+            self._right = gui.add_dropdown("Right", KINDS, initial_value="Light transfer")
+            self._share = gui.add_slider("Compare", 0.0, 1.0, 0.01, 0.5)
+            self._number = gui.add_slider("Camera", 0, 1, 1, 0, hint="Step through the target's cameras")
+            self._follow = gui.add_checkbox("Follow my view", True, hint="Else the picture stays at the camera")
+        self._panel.dock_left()
+        self._panel.set_width(430)
+        for control in (self._left, self._right, self._share, self._follow):
+            control.on_update(lambda event: self.ask() if event.client is not None else None)
+        self._number.on_update(page.act(lambda _: self._to_camera()))
+        self._previous = gui.add_command("Previous camera", hotkey="ARROWLEFT")
+        self._next = gui.add_command("Next camera", hotkey="ARROWRIGHT")
+        self._previous.on_trigger(page.act(lambda _: self._step(-1)))
+        self._next.on_trigger(page.act(lambda _: self._step(1)))
+
+    def reset(self) -> None:
+        """Another project: nothing drawn yet."""
+        self._drawn = {}
+
+    def close(self) -> None:
+        """End the thread."""
+        self._latest.close()
+
+    def first_camera(self) -> Cameras | None:
+        """The camera to begin at, of the scene that the phase shows."""
+        cameras = self._cameras()
+        return None if cameras is None else cameras[0]
+
+    def moving(self, state: EditState | None) -> None:
+        """What counts while something is dragged; None: what is saved."""
+        self._moving = state
+        self.ask()
+
+    def camera_moved(self, window: int) -> None:
+        """A window's view changed."""
+        if window == self._page.guarded.seat.holder and self._follow.value:
+            self.ask()
+
+    def show(self, left: Kind, right: Kind) -> None:
+        """Compare these two."""
+        self._left.value, self._right.value = left, right
+        self.ask()
+
+    def ask(self) -> None:
+        """Draw what counts now, as soon as there is time."""
+        wish = self._wish()
+        if wish is not None:
+            self._latest.ask(wish)
+
+    def save_picture(self, path: object) -> None:
+        """Write the right picture at its camera's full size.
+
+        Raises: ValueError where there is nothing to draw.
+        """
+        wish = self._wish(width=1280)
+        if wish is None:
+            raise ValueError("picture: expected a target scene and an open window, found none")
+        import torch
+
+        pixels = wish.session.preview.picture(wish.right, wish.state, wish.camera)
+        write_image(path, torch.from_numpy(pixels.astype(np.float32) / 255))  # pyright: ignore[reportArgumentType]
+
+    def _wish(self, *, width: int | None = None) -> _Wish | None:
+        session, window = self._page.session, self._page.window()
+        if session is None or not session.files.target_scene.is_file() or self._page.phase == "Select":
+            return None
+        cameras = self._cameras()
+        if cameras is None:
+            return None
+        if self._number.max != max(1, len(cameras) - 1):
+            self._number.max = max(1, len(cameras) - 1)
+        if self._follow.value and window is not None:
+            camera = view_of(window.camera, width=width or self._size.width)
+        else:
+            camera = cameras[int(self._number.value)]
+            camera = camera.resized((width or self._size.width) / camera.width)
+        state = self._moving or session.placed_state()
+        return _Wish(session, state, camera, self._left.value, self._right.value, float(self._share.value))
+
+    def _cameras(self) -> Cameras | None:
+        session = self._page.session
+        if session is None:
+            return None
+        files = session.files
+        path = files.source_cameras if self._page.phase == "Select" else files.target_cameras
+        return session.scenes.cameras(path) if path.is_file() else None
+
+    def _to_camera(self) -> None:
+        cameras = self._cameras()
+        if cameras is not None:
+            self._follow.value = False
+            self._page.look_through(cameras[min(int(self._number.value), len(cameras) - 1)])
+
+    def _step(self, by: int) -> None:
+        cameras = self._cameras()
+        if cameras is not None:
+            self._number.value = (int(self._number.value) + by) % len(cameras)
+            self._to_camera()
+
+    def _work(self, wish: _Wish) -> None:
+        preview = wish.session.preview
+        waits = {wish.left, wish.right} & set(NEEDS_LIGHT) and not preview.is_lit(wish.state)
+        if waits:
+            # what is quick comes at once, the light when it is there
+            quick = replace(wish, **{side: _quick(getattr(wish, side)) for side in ("left", "right")})
+            self._draw(quick, note="light: at work ...")
+            if self._latest.overtaken:
+                return
+            start = time.monotonic()
+            preview.relit(wish.state)
+            self._draw(wish, note=f"light in {time.monotonic() - start:.1f} s")
+        else:
+            self._draw(wish, note="")
+
+    def _draw(self, wish: _Wish, *, note: str) -> None:
+        start = time.monotonic()
+        problems: list[str] = []
+        left, right = (self._picture(kind, wish, problems) for kind in (wish.left, wish.right))
+        spent = (time.monotonic() - start) / 2
+        self._image.image = wiped(left, right, wish.share)
+        self._size = replace(self._size, width=self._size.after(spent))
+        height, width = left.shape[:2]
+        self._say(
+            " &middot; ".join([f"{wish.left} | {wish.right}", f"{width} x {height}", *filter(None, [note]), *problems])
+        )
+
+    def _picture(self, kind: Kind, wish: _Wish, problems: list[str]) -> np.ndarray:
+        camera = wish.camera
+        key = (camera.world_from_camera.numpy().tobytes(), camera.intrinsics.numpy().tobytes(), wish.state.objects)
+        key = (
+            *key,
+            wish.state.erased,
+            wish.state.light,
+            wish.state.weights,
+            wish.session.files.result.stat().st_mtime_ns if wish.session.files.result.is_file() else 0,
+        )
+        drawn = self._drawn.get(kind)
+        if drawn is None or any(
+            a is not b and not (isinstance(a, bytes | int) and a == b) for a, b in zip(drawn[0], key, strict=True)
+        ):
+            try:
+                drawn = (key, wish.session.preview.picture(kind, wish.state, camera))
+            except ValueError as error:
+                problems.append(str(error))
+                return np.full((camera.height, camera.width, 3), 48, np.uint8)
+            self._drawn[kind] = drawn
+        return drawn[1]
+
+    def _say(self, text: str) -> None:
+        self._caption.content = (
+            f'<div class="sg-caption" style="font-size:.78em;opacity:.75;padding:0 12px">{text}</div>'
+        )
+
+
+def _quick(kind: Kind) -> Kind:
+    return "Copy-paste" if kind in NEEDS_LIGHT else kind

@@ -1,0 +1,98 @@
+"""Run: the steps of the project, with what they need and what comes out. Knows nothing about what steps do."""
+
+from __future__ import annotations
+
+import html
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import viser
+
+from splatgraft.editor import exports
+from splatgraft.editor.page.place_phase import hide_target, show_target
+from splatgraft.editor.page.server import FILES_PREFIX
+from splatgraft.harmonize import HARMONIZERS
+
+if TYPE_CHECKING:
+    from splatgraft.editor.page.page import Page
+
+
+class RunPhase:
+    """The controls of the last step."""
+
+    def __init__(self, page: Page) -> None:
+        """Build them."""
+        self._page, gui = page, page.gui
+        self._inside = False
+        self._method = gui.add_dropdown("Image model", tuple(HARMONIZERS), initial_value="none")
+        self._transfer = gui.add_button("Harmonise and consolidate", icon=viser.Icon.PLAYER_PLAY)
+        self._report = gui.add_button("Make the report too", color="gray")
+        self._steps = gui.add_html("")
+        with gui.add_folder("Take home"):
+            self._scene = gui.add_button_group("Scene", (".ply", ".spz", ".splat"))
+            self._picture = gui.add_button("Picture of this view", icon=viser.Icon.PHOTO, color="gray")
+            self._turntable = gui.add_button("Turntable", icon=viser.Icon.DOWNLOAD, color="gray")
+            self._link = gui.add_html("")
+        act = page.act
+        self._method.on_update(act(lambda _: self._set_method()))
+        self._transfer.on_click(act(lambda _: page.run("consolidate", "Harmonise and consolidate")))
+        self._report.on_click(act(lambda _: page.run("evaluate", "Make the report")))
+        self._scene.on_click(
+            act(lambda event: self._send(event, exports.export_scene(page.need().files, event.target.value)))
+        )
+        self._turntable.on_click(act(lambda event: self._send(event, exports.export_turntable(page.need().files))))
+        self._picture.on_click(act(self._send_picture))
+
+    def enter(self) -> None:
+        """Show the target, compare with the result."""
+        self._inside = True
+        session = self._page.session
+        if session is not None and session.files.target_scene.is_file():
+            show_target(self._page)
+        if session is not None and session.files.result.is_file():
+            self._page.preview.show("Copy-paste", "Result")
+        self.refresh()
+
+    def leave(self) -> None:
+        """Take it away."""
+        self._inside = False
+        hide_target(self._page)
+
+    def refresh(self) -> None:
+        """Steps and results as they are now."""
+        session = self._page.session
+        if session is None or not self._inside:
+            return
+        self._method.value = session.state.harmonizer or "none"
+        rows = []
+        for name, reason in session.reasons().items():
+            mark = "&#10003;" if reason is None else "&middot;"
+            rows.append(
+                f'<tr><td style="width:1.4em">{mark}</td><td>{name}</td><td style="opacity:.6">{html.escape(reason or "")}</td></tr>'
+            )
+        shown = shlex.join(session.project.run_command("consolidate", "")[1])
+        self._steps.content = (
+            f'<div style="font-size:.8em;line-height:1.5;padding:2px 12px"><table>{"".join(rows)}</table>'
+            f'<div style="opacity:.6;margin-top:6px">the same by command:</div><code>{html.escape(shown)}</code></div>'
+        )
+        there = (session.files.report / "index.html").is_file()
+        self._turntable.disabled = not there
+        self._scene.disabled = not session.files.result.is_file()
+        link = f'<a href="{FILES_PREFIX}index.html" target="_blank">Open the report</a>' if there else ""
+        self._link.content = f'<div style="padding:2px 12px">{link}</div>'
+
+    def _set_method(self) -> None:
+        session = self._page.need()
+        session.change(replace(session.state, harmonizer=self._method.value))
+
+    def _send_picture(self, event: viser.GuiEvent) -> None:
+        path = exports.picture_path(self._page.need().files, "view")
+        self._page.preview.save_picture(path)
+        self._send(event, path)
+
+    def _send(self, event: viser.GuiEvent, path: Path) -> None:
+        if event.client is not None:
+            event.client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
+        self._page.say(f"written: {path}")

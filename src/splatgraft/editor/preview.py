@@ -1,0 +1,191 @@
+"""True pictures of what is placed, by our own renderer: pasted, lit, finished, and what lies behind them.
+
+Knows nothing about browsers.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from splatgraft.cameras import Cameras
+from splatgraft.composite import Composite
+from splatgraft.editor.scenes import Scenes
+from splatgraft.editor.state import EditState
+from splatgraft.formats import read_capture
+from splatgraft.gaussians import Gaussians
+from splatgraft.relight import RelightCache, Relit, relight
+from splatgraft.rendering import render
+
+Kind = Literal["Copy-paste", "Light transfer", "Result", "Target alone", "Mask", "Depth", "Shadow layer", "Photograph"]
+KINDS: tuple[Kind, ...] = (
+    "Copy-paste",
+    "Light transfer",
+    "Result",
+    "Target alone",
+    "Mask",
+    "Depth",
+    "Shadow layer",
+    "Photograph",
+)
+NEEDS_LIGHT: tuple[Kind, ...] = ("Light transfer", "Shadow layer")
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large previews are made, so that one takes about as long as it may."""
+
+    width: int = 480
+    """Pixels."""
+    least: int = 160
+    """Pixels."""
+    greatest: int = 960
+    """Pixels."""
+    seconds: float = 0.3
+    """What one picture may take."""
+
+    def after(self, seconds: float) -> int:
+        """The width to take after a picture of `width` took `seconds`: time goes with the area; small changes wait."""
+        wanted = self.width * min(2.0, max(0.4, (self.seconds / max(seconds, 1e-3)) ** 0.5))
+        wanted = min(self.greatest, max(self.least, round(wanted / 16) * 16))
+        return self.width if abs(wanted - self.width) < 0.2 * self.width else wanted
+
+
+class Preview:
+    """Pictures of one project, with what moving an object leaves unchanged kept."""
+
+    def __init__(self, scenes: Scenes) -> None:
+        """Nothing made yet."""
+        self._scenes = scenes
+        self._cache = RelightCache()
+        self._made: dict[str, tuple[tuple[Any, ...], Any]] = {}
+
+    def is_lit(self, state: EditState) -> bool:
+        """Whether the light transfer of this state is there already."""
+        made = self._made.get("relit")
+        return made is not None and _same(made[0], self._light_inputs(state))
+
+    def relit(self, state: EditState) -> Relit:
+        """The light transfer of this state, in layers.
+
+        Raises: ValueError where a file is missing.
+        """
+        return self._keep("relit", self._light_inputs(state), lambda: self._relight(state))
+
+    def picture(self, kind: Kind, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        """One picture from one camera.
+
+        Raises: ValueError where what it shows is not there yet.
+        """
+        if kind == "Photograph":
+            return self._photograph(camera)
+        if kind in ("Mask", "Depth"):
+            return self._mask(state, camera) if kind == "Mask" else self._depth(state, camera)
+        if kind == "Shadow layer":
+            return self._shadow(state, camera)
+        color = render(self._scene(kind, state), camera).color
+        assert color is not None
+        return _bytes(color[0])
+
+    def _scene(self, kind: Kind, state: EditState) -> Gaussians:
+        if kind == "Result":
+            if not self._scenes.files.result.is_file():
+                raise ValueError("Result: expected a finished run, found none yet")
+            return self._scenes.gaussians(self._scenes.files.result)
+        if kind == "Light transfer":
+            relit = self.relit(state)
+            return self._keep("lit scene", (relit, state.weights), lambda: relit.bake(state.weights))
+        composite = self._composite(state)
+        if kind == "Target alone":
+            inputs = (composite.target, composite.erased)
+            return self._keep("bare", inputs, lambda: composite.target.select(~composite.erased))
+        return self._keep("pasted", (composite,), composite.bake)[0]
+
+    def _mask(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        composite = self._composite(state)
+        gaussians, is_object = self._keep("pasted", (composite,), composite.bake)
+        features = render(gaussians, camera, outputs=frozenset(), features=is_object[:, None].float()).features
+        assert features is not None
+        return _bytes(features[0].expand(-1, -1, 3))
+
+    def _depth(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        composite = self._composite(state)
+        gaussians, _ = self._keep("pasted", (composite,), composite.bake)
+        depth = render(gaussians, camera, outputs=frozenset({"depth"})).depth
+        assert depth is not None
+        near = depth[0][depth[0] > 0]
+        if not len(near):
+            return _bytes(torch.zeros(*depth[0].shape, 3))
+        # of reciprocal depth, as eyes have it; the ends are of the picture, without its few stray Gaussians
+        inverse = 1 / depth[0].clamp_min(1e-6)
+        low, high = 1 / float(near.quantile(0.98)), 1 / float(near.quantile(0.02))
+        level = ((inverse - low) / max(high - low, 1e-9)).clamp(0, 1) * (depth[0] > 0)
+        colored = cv2.applyColorMap((level * 255).byte().numpy(), cv2.COLORMAP_TURBO)
+        return np.ascontiguousarray(colored[..., ::-1])
+
+    def _shadow(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        relit = self.relit(state)
+        layers = self._keep("layers", (relit, state.weights), lambda: relit.ratio(state.weights))
+        # half grey is unchanged, so that both what is darkened and what is brightened can be seen
+        seen = render(relit.gaussians, camera, outputs=frozenset(), features=(0.5 * layers).clamp(0, 1))
+        assert seen.features is not None
+        return _bytes(seen.features[0] + 0.5 * (1 - seen.alpha[0])[..., None])
+
+    def _photograph(self, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        path = self._scenes.files.target_cameras
+        stamp = path.stat().st_mtime_ns if path.is_file() else 0
+        capture = self._keep("capture", (path, stamp), lambda: read_capture(self._scenes.files.target_capture))
+        if camera.names[0] not in capture.cameras.names:
+            raise ValueError("Photograph: expected one of the target's cameras, found a free view; step to a camera")
+        image = capture.image(capture.cameras.names.index(camera.names[0]))
+        return cv2.resize(_bytes(image), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+
+    def _relight(self, state: EditState) -> Relit:
+        cameras = self._scenes.cameras(self._scenes.files.target_cameras)
+        return relight(
+            self._composite(state),
+            cameras,
+            sources=self._scenes.source_scenes(state),
+            light=state.light,
+            cache=self._cache,
+        )
+
+    def _composite(self, state: EditState) -> Composite:
+        inputs = (self._scenes.gaussians(self._scenes.files.target_scene), state.objects, state.erased)
+        return self._keep("composite", inputs, lambda: self._scenes.composite(state))
+
+    def _light_inputs(self, state: EditState) -> tuple[Any, ...]:
+        return (self._composite(state), state.light)
+
+    def _keep(self, name: str, inputs: tuple[Any, ...], make: Any) -> Any:
+        made = self._made.get(name)
+        if made is None or not _same(made[0], inputs):
+            made = (inputs, make())
+            self._made[name] = made
+        return made[1]
+
+
+def wiped(
+    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], share: float
+) -> UInt8[np.ndarray, "h w 3"]:
+    """`left` up to `share` of the width and `right` beyond, with a line between them."""
+    width = left.shape[1]
+    at = round(min(1.0, max(0.0, share)) * width)
+    out = np.concatenate([left[:, :at], right[:, at:]], axis=1)
+    if 0 < at < width:
+        out[:, max(0, at - 1) : at + 1] = 255
+    return out
+
+
+def _same(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
+    return len(a) == len(b) and all(
+        x is y or (isinstance(x, int | float) and x == y) for x, y in zip(a, b, strict=True)
+    )
+
+
+def _bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).numpy()

@@ -1,0 +1,78 @@
+"""What the editor asks of a project: where its files are, what is stale, how to run it. Made by `steps/edit.py`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+
+@dataclass(frozen=True)
+class ProjectFiles:
+    """Where the files of one project are; most need not exist yet."""
+
+    file: Path
+    """project.toml; placement.json, light.json, erased.npy and corrections.npy lie beside it."""
+    root: Path
+    """All results; uploads and exports too."""
+    source_scene: Path
+    """The reconstruction with the object."""
+    target_scene: Path
+    """The reconstruction that receives it."""
+    source_cameras: Path
+    """transforms.json of the posed source."""
+    target_cameras: Path
+    """transforms.json of the posed target."""
+    target_capture: Path
+    """The posed target, with its photographs."""
+    object: Path
+    """The object's Gaussians."""
+    surroundings: Path
+    """The source without the object."""
+    selection: Path
+    """Which Gaussians of the source are the object."""
+    composite: Path
+    """The pasted scene."""
+    placement: Path
+    """The composite's placement.json, which names its objects."""
+    relit: Path
+    """The composite with the light transfer."""
+    light: Path
+    """light.json as estimated, or as given."""
+    result: Path
+    """The consolidated scene."""
+    report: Path
+    """The folder of index.html."""
+    transfers_light: bool
+    """Whether [relight] asks for the physical transfer."""
+
+
+@runtime_checkable
+class Project(Protocol):
+    """One project, there or about to be."""
+
+    @property
+    def file(self) -> Path:
+        """Where project.toml is or will be."""
+        ...
+
+    def files(self) -> ProjectFiles | None:
+        """Its files as project.toml says now; None where there is no project.toml yet.
+
+        Raises: ValueError where it is broken.
+        """
+        ...
+
+    def reasons(self) -> Mapping[str, str | None]:
+        """Why each step is stale, None where it is not, in the order of the flow."""
+        ...
+
+    def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
+        """Write project.toml for two captures, source first, and the scenes that were trained on them already.
+
+        Raises: ValueError where a capture is not there, or a project is.
+        """
+        ...
+
+    def run_command(self, to: str, title: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The child process that does what is stale up to the step `to`, and the words a person would type."""
+        ...

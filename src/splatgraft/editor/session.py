@@ -1,0 +1,219 @@
+"""One project while it is edited: its state with history, saved after every step, its scenes and its job.
+
+Knows nothing about browsers; `page/` shows what it holds and calls it.
+"""
+
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.editor.history import History
+from splatgraft.editor.jobs import Jobs, JobState
+from splatgraft.editor.placing import Placeable
+from splatgraft.editor.preview import Preview
+from splatgraft.editor.project_access import Project, ProjectFiles
+from splatgraft.editor.scenes import Scenes
+from splatgraft.editor.state import EditState, read_state, state_files, write_state
+from splatgraft.formats.placement import ObjectPlacement, read_placement
+from splatgraft.orbit import estimate_up
+from splatgraft.segment import Box, corrected, with_correction
+from splatgraft.similarity import Similarity
+
+EDITOR_FOLDER = ".editor"
+
+
+class Session:
+    """What the editor knows of a project that is open."""
+
+    def __init__(self, project: Project) -> None:
+        """Open it where it was left.
+
+        Raises: ValueError where there is no project.toml, or it is broken.
+        """
+        files = project.files()
+        if files is None:
+            raise ValueError(f"{project.file}: expected a project, found none")
+        self.project = project
+        self.files: ProjectFiles = files
+        self.scenes = Scenes(files)
+        self.preview = Preview(self.scenes)
+        self.jobs = Jobs(files.root / EDITOR_FOLDER)
+        self.history: History[EditState] = History(read_state(files.file))
+        self._stamps = self._read_stamps()
+        self._found: tuple[int, tuple[ObjectPlacement, ...]] = (0, ())
+        self._lock = threading.RLock()
+
+    @property
+    def state(self) -> EditState:
+        """What counts now."""
+        return self.history.present
+
+    def change(self, state: EditState) -> None:
+        """One step that can be undone, saved at once.
+
+        Raises: ValueError where the files were changed by someone else (they count then), or cannot be written.
+        """
+        with self._lock:
+            self._go(self.history.then(state))
+
+    def amend(self, state: EditState) -> None:
+        """A change that is no step of its own: it goes with the one before.
+
+        Raises: ValueError as `change`.
+        """
+        with self._lock:
+            self._go(self.history.amended(state))
+
+    def undo(self) -> bool:
+        """Back by one step; False where there is none.
+
+        Raises: ValueError as `change`.
+        """
+        with self._lock:
+            possible = bool(self.history.past)
+            self._go(self.history.undone())
+            return possible
+
+    def redo(self) -> bool:
+        """Forward by one step; False where there is none.
+
+        Raises: ValueError as `change`.
+        """
+        with self._lock:
+            possible = bool(self.history.future)
+            self._go(self.history.redone())
+            return possible
+
+    def reload(self) -> bool:
+        """Take over what someone else wrote into the files, as one step; whether there was anything.
+
+        Raises: ValueError where a file is broken now.
+        """
+        with self._lock:
+            stamps = self._read_stamps()
+            if stamps == self._stamps:
+                return False
+            found = read_state(self.files.file)
+            self.history, self._stamps = self.history.then(found), stamps
+            self._refresh_files()
+            return True
+
+    def _go(self, history: History[EditState]) -> None:
+        before = self.history.present
+        if history.present is before:
+            self.history = history
+            return
+        if self.reload():
+            raise ValueError(f"{self.files.file.name}: changed outside the editor; that counts now, please do it again")
+        write_state(self.files.file, before, history.present)
+        self.history = history
+        self._stamps = self._read_stamps()
+
+    def _refresh_files(self) -> None:
+        files = self.project.files()
+        if files is not None and files != self.files:
+            self.files, self.scenes.files = files, files
+
+    def _read_stamps(self) -> dict[Path, tuple[int, int]]:
+        paths = [path for path in state_files(self.files.file) if path.is_file()]
+        return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in paths}
+
+    # what is selected in the source
+
+    def selection(self) -> Bool[Tensor, "n"] | None:
+        """The object's Gaussians among the source's: as lifted, or what lies in the box, with corrections."""
+        if not self.files.source_scene.is_file():
+            return None
+        scene = self.scenes.gaussians(self.files.source_scene)
+        lifted, state = self.scenes.lifted(), self.state
+        if lifted is None:
+            box = self.box()
+            lifted = torch.zeros(scene.count, dtype=torch.bool) if box is None else box.contains(scene.means)
+        if state.corrections is not None and len(state.corrections) != scene.count:
+            return lifted
+        return corrected(lifted, state.corrections)
+
+    def box(self) -> Box | None:
+        """The box around the object, in the source's world."""
+        numbers = self.state.box
+        return None if numbers is None else Box(torch.tensor(numbers[:3]), torch.tensor(numbers[3:]))
+
+    def correct(self, touched: Bool[Tensor, "n"], *, add: bool) -> None:
+        """Add to the object or remove from it.
+
+        Raises: ValueError as `change`.
+        """
+        corrections = self.state.corrections
+        if corrections is not None and len(corrections) != len(touched):
+            corrections = None  # of a scene that is no more
+        self.change(replace(self.state, corrections=with_correction(corrections, touched, add=add)))
+
+    # what is placed in the target
+
+    def can_place(self) -> bool:
+        """Whether there is an object and a target."""
+        return self.files.object.is_file() and self.files.target_scene.is_file()
+
+    def objects(self) -> tuple[ObjectPlacement, ...]:
+        """The placed objects: as decided, else as `compose` placed them."""
+        if self.state.objects is not None:
+            return self.state.objects
+        if not self.can_place() or not self.files.placement.is_file():
+            return ()
+        stamp = self.files.placement.stat().st_mtime_ns
+        if self._found[0] != stamp:
+            found = read_placement(self.files.placement).objects
+            own = [_is(item.object_path, self.files.object) for item in found]
+            items = tuple(replace(item, object_path=None) if o else item for item, o in zip(found, own, strict=True))
+            self._found = (stamp, items)
+        return self._found[1]
+
+    def placed_state(self) -> EditState:
+        """The state with its objects named, wherever they come from."""
+        return self.state if self.state.objects is not None else replace(self.state, objects=self.objects())
+
+    def placeable(self, index: int) -> Placeable:
+        """A placed object with its foot.
+
+        Raises: ValueError where its file is missing or empty.
+        """
+        return self.scenes.placeable(self.objects()[index])
+
+    def up(self) -> Float[Tensor, "3"]:
+        """The target's up."""
+        return estimate_up(self.scenes.cameras(self.files.target_cameras))
+
+    def move(self, index: int, move: Similarity) -> None:
+        """Another place for one object.
+
+        Raises: ValueError as `change`.
+        """
+        item = replace(self.objects()[index], target_from_object=move)
+        self.change(self.placed_state().with_object(index, item))
+
+    # long work
+
+    def run(self, to: str, title: str) -> None:
+        """Start the steps up to `to` in a child process.
+
+        Raises: ValueError where a job is at work.
+        """
+        command, shown = self.project.run_command(to, title)
+        self.jobs.start(command, title=title, shown=shown)
+
+    def job(self) -> JobState | None:
+        """The job at work, or the last one."""
+        return self.jobs.state()
+
+    def reasons(self) -> Mapping[str, str | None]:
+        """Why each step is stale; empty where a file that must be read to know is broken."""
+        return self.project.reasons()
+
+
+def _is(path: Path | None, other: Path) -> bool:
+    return path is None or path.resolve() == other.resolve()

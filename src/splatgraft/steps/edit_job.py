@@ -1,0 +1,80 @@
+"""The child process in which the editor does long work: the command `run`, telling a state file how far it is.
+
+Not a command of its own: `python -m splatgraft.steps.edit_job FOLDER TITLE project.toml STEP [OUT]`. Knows no pages.
+"""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from splatgraft.editor.jobs import JobState, hold, write_state
+from splatgraft.progress import Progress
+from splatgraft.steps.terminal import Terminal
+
+_WRITE_EVERY = 0.2
+"""Seconds."""
+
+
+class StateTerminal(Terminal):
+    """A terminal whose bars are also written into the state of a job."""
+
+    def __init__(self, folder: Path, state: JobState) -> None:
+        """Begin with `state`."""
+        super().__init__()
+        self._folder, self.state = folder, state
+        self._written = 0.0
+
+    @contextmanager
+    def bar(self, name: str) -> Generator[Progress]:
+        """The bar of `Terminal`, told to the state file as well."""
+        now = time.time()
+        self.write(replace(self.state, step=name, done=0, total=0, message="", step_started=now))
+        with super().bar(name) as progress:
+
+            def move(done: int, total: int, message: str) -> None:
+                progress(done, total, message)
+                self.state = replace(self.state, done=done, total=total, message=f"{done}/{total} {message}")
+                if time.time() - self._written > _WRITE_EVERY:
+                    self.write(self.state)
+
+            yield move
+
+    def write(self, state: JobState) -> None:
+        """Replace the state file."""
+        self.state, self._written = state, time.time()
+        write_state(self._folder, state)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Do the run; its outcome is in the state file and in the exit status."""
+    from splatgraft.steps.run import Run
+
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    folder, title, project, to = Path(arguments[0]), arguments[1], Path(arguments[2]), arguments[3]
+    out = Path(arguments[4]) if len(arguments) > 4 else None
+    shown = ("run", str(project), "--to", to)
+    lock = hold(folder)
+    terminal = StateTerminal(folder, JobState(title, shown, os.getpid(), "running", time.time()))
+    try:
+        terminal.write(terminal.state)
+        Run(project=project, out=out, to=to).execute(terminal)
+        terminal.write(replace(terminal.state, outcome="done"))
+        return 0
+    except KeyboardInterrupt:
+        terminal.write(replace(terminal.state, outcome="cancelled"))
+        return 130
+    except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
+        terminal.write(replace(terminal.state, outcome="failed", error=" ".join(str(error).split())))
+        return 2
+    finally:
+        lock.release()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
