@@ -5,7 +5,10 @@ import sys
 
 import pytest
 
-HEAVY = ("gsplat", "diffusers", "transformers", "pycolmap", "viser", "bpy", "ray", "onnxruntime", "huggingface_hub")
+HEAVY = (
+    *("gsplat", "diffusers", "transformers", "accelerate", "safetensors", "peft", "bitsandbytes", "pycolmap", "viser"),
+    *("bpy", "ray", "onnxruntime", "huggingface_hub"),
+)
 
 
 def loaded_by(statement: str) -> set[str]:
@@ -19,7 +22,7 @@ def test_the_package_loads_nothing_heavy() -> None:
 
 
 def test_all_steps_load_no_optional_library() -> None:
-    assert not loaded_by("import splatgraft.steps.flow, splatgraft.steps.doctor") & set(HEAVY)
+    assert not loaded_by("import splatgraft.steps.flow, splatgraft.steps.doctor, splatgraft.steps.train") & set(HEAVY)
 
 
 @pytest.mark.parametrize("words", [[], ["--help"], ["--version"], ["nonsense"]])

@@ -211,6 +211,34 @@ def test_numbers_that_are_none_and_memory_that_does_not_do_are_said(tmp_path, mo
         harmonizer.harmonize(view())
 
 
+def test_the_authors_weights_are_fetched_by_id_and_their_licence_said(tmp_path, monkeypatch):
+    asked, said = [], []
+    flux_folder(tmp_path / "hub" / "image-background", WIDE)
+
+    def download(repository, patterns):
+        asked.append((repository, patterns))
+        return tmp_path / "hub"
+
+    monkeypatch.setattr("splatgraft.harmonize.flux.folder.download", download)
+    monkeypatch.setattr("splatgraft.harmonize.flux.folder.licence_of", lambda repository: "other")
+    harmonizer = make_harmonizer("flux", options("nviolante/dot3d/image-background", say=said.append))
+    assert harmonizer.network.variant == "image-background"
+    assert asked[0][0] == "nviolante/dot3d"
+    assert all(pattern.startswith("image-background/") for pattern in asked[0][1])
+    assert said[0] == "weights: nviolante/dot3d from the Hugging Face hub; licence: other, read it before use"
+
+
+def test_compiled_blocks_trace_whole_and_give_the_same(tmp_path):
+    folder = flux_folder(tmp_path / "image-mask", WIDE)
+    network = load_flux(FluxWeights(str(folder)), torch.device("cpu"), say=lambda line: None)
+    plain = make_harmonizer("flux", options(folder)).harmonize(view()).image
+    harmonizer = make_harmonizer("flux", options(folder))
+    object.__setattr__(harmonizer, "network", network)
+    # the tracer alone, which needs no compiler: a break in a block's graph would be an error
+    network.transformer.compile_repeated_blocks(backend="eager", fullgraph=True)
+    assert torch.equal(harmonizer.harmonize(view()).image, plain)
+
+
 def test_the_network_is_baked_when_it_is_loaded(tmp_path):
     folder = flux_folder(tmp_path / "image-mask", WIDE)
     network = load_flux(FluxWeights(str(folder)), torch.device("cpu"), say=lambda line: None)

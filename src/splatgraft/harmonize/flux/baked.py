@@ -1,10 +1,10 @@
 """adaLN modulations as a table: with one prompt and fixed noise levels they are constants. Changes no arithmetic.
 
-FLUX spends 3.25 of its 11.89 billion parameters on layers that turn (prompt, noise level) into scales and shifts; four
-rows of a table say the same (8.64 billion parameters remain).
+FLUX spends 3.27 of its 11.89 billion parameters on layers that turn (prompt, noise level) into scales and shifts; four
+rows of a table say the same (8.62 billion parameters remain).
 """
 
-from typing import Any
+from typing import Any, no_type_check
 
 import torch
 from jaxtyping import Float, Int
@@ -23,6 +23,7 @@ class BakedLevels(nn.Module):
         super().__init__()
         self.register_buffer("levels", torch.tensor(levels, device=device) * 1000, persistent=False)
 
+    @no_type_check  # the tests' shape checks cannot be traced by torch.compile
     def forward(self, timestep: Float[Tensor, " b"], pooled: Float[Tensor, "b p"]) -> Int[Tensor, " b"]:
         """Row of each sample; the nearest, since bfloat16 rounds 750 to 752."""
         return (timestep.float()[:, None] - self.levels).abs().argmin(1)
@@ -39,6 +40,7 @@ class BakedModulation(nn.Module):
         self.norm, self.parts = norm, parts
         self.register_buffer("table", table, persistent=False)
 
+    @no_type_check  # the tests' shape checks cannot be traced by torch.compile
     def forward(self, x: Float[Tensor, "b n d"], emb: Int[Tensor, " b"]) -> Any:
         """What the norm that was replaced returns."""
         parts = self.table[emb].chunk(self.parts, dim=1)
