@@ -42,22 +42,27 @@ class Gate:
 
     def ask(self, headers: Mapping[str, str], path: str) -> Answer:
         """Whether a request with these headers may pass; header names in their usual capitals."""
-        host = headers.get("Host", "")
-        if self.hosts and _name(host) not in self.hosts:
-            return Answer(False, "expected to be called by the name of this machine")
-        origin = headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
-            return Answer(False, "expected a request of the editor's own page, found one of another site")
-        if headers.get("Upgrade", "").lower() == "websocket" and origin is None:
-            return Answer(False, "expected a browser, which names the page that it talks for")
-        if self.token is None:
-            return Answer(True)
+        stranger = self._stranger(headers)
+        if stranger or self.token is None:
+            return Answer(not stranger, stranger)
         given = parse_qs(urlsplit(path).query).get("token", [""])[0]
         if hmac.compare_digest(given.encode(), self.token.encode()):
             return Answer(True, cookie=f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/")
         if hmac.compare_digest(_cookie(headers).encode(), self.token.encode()):
             return Answer(True)
         return Answer(False, "expected the token that `splatgraft edit` printed: open the whole address it gave")
+
+    def _stranger(self, headers: Mapping[str, str]) -> str:
+        """What shows that a request is not the page's own; nothing where it is."""
+        host = headers.get("Host", "")
+        if self.hosts and _name(host) not in self.hosts:
+            return "expected to be called by the name of this machine"
+        origin = headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+            return "expected a request of the editor's own page, found one of another site"
+        if headers.get("Upgrade", "").lower() == "websocket" and origin is None:
+            return "expected a browser, which names the page that it talks for"
+        return ""
 
 
 def _name(host: str) -> str:

@@ -37,13 +37,16 @@ def placeable(gaussians: Gaussians, cameras: Cameras, surroundings: Gaussians | 
     return Placeable(gaussians, base, cameras, surroundings)
 
 
-def suggested(target: Gaussians, item: Placeable, cameras: Cameras) -> Similarity:
-    """A visible, level place at a plausible size, as `compose` finds it.
+def suggested(
+    target: Gaussians, item: Placeable, cameras: Cameras, options: PlaceOptions = PlaceOptions()
+) -> Similarity:
+    """A visible, level place at a plausible size, or what `options` say of it, as `compose` finds it.
 
     Raises: ValueError where there is none.
     """
     both = (cameras, item.cameras)
-    return place_object(target, item.gaussians, cameras=both, surroundings=item.surroundings).target_from_object
+    placed = place_object(target, item.gaussians, cameras=both, surroundings=item.surroundings, options=options)
+    return placed.target_from_object
 
 
 def dropped(target: Gaussians, item: Placeable, move: Similarity, *, up: Float[Tensor, "3"]) -> Similarity:

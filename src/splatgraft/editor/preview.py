@@ -9,7 +9,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
@@ -21,7 +21,18 @@ from splatgraft.gaussians import Gaussians
 from splatgraft.relight import RelightCache, Relit, relight
 from splatgraft.rendering import render
 
-Kind = Literal["Copy-paste", "Light transfer", "Result", "Target alone", "Mask", "Depth", "Shadow layer", "Photograph"]
+Kind = Literal[
+    "Copy-paste",
+    "Light transfer",
+    "Result",
+    "Target alone",
+    "Mask",
+    "Depth",
+    "Shadow layer",
+    "Photograph",
+    "Source",
+    "Object alone",
+]
 KINDS: tuple[Kind, ...] = (
     "Copy-paste",
     "Light transfer",
@@ -32,6 +43,7 @@ KINDS: tuple[Kind, ...] = (
     "Shadow layer",
     "Photograph",
 )
+"""What can be compared in the target; the source has `Source` and `Object alone`."""
 NEEDS_LIGHT: tuple[Kind, ...] = ("Light transfer", "Shadow layer")
 
 
@@ -43,7 +55,7 @@ class Size:
     """Pixels."""
     least: int = 160
     """Pixels."""
-    greatest: int = 960
+    greatest: int = 800
     """Pixels."""
     seconds: float = 0.3
     """What one picture may take."""
@@ -67,7 +79,7 @@ class Preview:
     def is_lit(self, state: EditState) -> bool:
         """Whether the light transfer of this state is there already."""
         made = self._made.get("relit")
-        return made is not None and _same(made[0], self._light_inputs(state))
+        return made is not None and same_inputs(made[0], self._light_inputs(state))
 
     def relit(self, state: EditState) -> Relit:
         """The light transfer of this state, in layers.
@@ -88,6 +100,13 @@ class Preview:
         if kind == "Shadow layer":
             return self._shadow(state, camera)
         color = render(self._scene(kind, state), camera).color
+        assert color is not None
+        return _bytes(color[0])
+
+    def source_picture(self, which: Bool[Tensor, "n"] | None, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        """The source scene, or those of its Gaussians that `which` names."""
+        scene = self._scenes.gaussians(self._scenes.files.source_scene)
+        color = render(scene if which is None else scene.select(which), camera).color
         assert color is not None
         return _bytes(color[0])
 
@@ -163,7 +182,7 @@ class Preview:
 
     def _keep(self, name: str, inputs: tuple[Any, ...], make: Any) -> Any:
         made = self._made.get(name)
-        if made is None or not _same(made[0], inputs):
+        if made is None or not same_inputs(made[0], inputs):
             made = (inputs, make())
             self._made[name] = made
         return made[1]
@@ -181,9 +200,10 @@ def wiped(
     return out
 
 
-def _same(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
+def same_inputs(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
+    """Whether two lists of inputs are the very same objects; numbers and bytes count by value."""
     return len(a) == len(b) and all(
-        x is y or (isinstance(x, int | float) and x == y) for x, y in zip(a, b, strict=True)
+        x is y or (isinstance(x, int | float | bytes) and x == y) for x, y in zip(a, b, strict=True)
     )
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from splatgraft.compose import PlaceOptions
+
 
 @dataclass(frozen=True)
 class ProjectFiles:
@@ -44,6 +46,8 @@ class ProjectFiles:
     """The folder of index.html."""
     transfers_light: bool
     """Whether [relight] asks for the physical transfer."""
+    placing: PlaceOptions
+    """What [compose] says of the place, where none is decided yet."""
 
 
 @runtime_checkable

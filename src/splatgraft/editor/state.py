@@ -5,7 +5,7 @@ Knows nothing about browsers and scenes.
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ class EditState:
     """Which pieces of the selection stay."""
     light: Light | None = None
     """The light as given by hand; None: it is estimated."""
-    weights: LayerWeights = LayerWeights()
+    weights: LayerWeights = field(default_factory=LayerWeights)
     """How strong each layer of the light transfer is."""
     harmonizer: str | None = None
     """The image model."""

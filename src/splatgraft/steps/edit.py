@@ -77,6 +77,7 @@ class StepsProject:
             result=layout.result / SCENE_FILE,
             report=layout.report,
             transfers_light=relight.light == "transfer",
+            placing=compose.options,
         )
 
     def reasons(self) -> Mapping[str, str | None]:

@@ -66,8 +66,6 @@ class LightPhase:
         session = self._page.session
         if session is None or not self._inside:
             return
-        if not session.files.transfers_light:
-            self._text.content = _box("project.toml asks for no physical transfer ([relight] light): nothing to aim.")
         weights = session.state.weights
         for key, slider in self._sliders.items():
             slider.value = float(getattr(weights, key))
@@ -77,17 +75,13 @@ class LightPhase:
         self._estimate.disabled = session.state.light is None
         self._which.visible = self._strength.visible = ready and bool(light and light.sources)
         if light is None or not session.objects():
+            self._text.content = _box(html.escape(self._why_none()))
             return
         names = tuple(f"{i + 1}: {s.name}" for i, s in enumerate(light.sources[:_SHOWN]))
         if names and tuple(self._which.options) != names:
             self._which.options = names
         self._text.content = _box(html.escape(_sentences(session.state, light, self._page.need().up())))
         self._draw(light)
-
-    def light_ready(self) -> None:
-        """A light was found meanwhile."""
-        if self._inside:
-            self.refresh()
 
     def _light(self) -> Light | None:
         """As given by hand, else as the last preview found it."""
@@ -98,6 +92,17 @@ class LightPhase:
             return session.state.light
         state = session.placed_state()
         return session.preview.relit(state).light if session.preview.is_lit(state) else None
+
+    def _why_none(self) -> str:
+        session = self._page.need()
+        if not session.files.transfers_light:
+            return "project.toml asks for no physical transfer ([relight] light): there is nothing to aim."
+        if not session.objects():
+            return "No object is placed yet: see step 3."
+        state = session.placed_state()
+        return (
+            " ".join(session.preview.relit(state).report) if session.preview.is_lit(state) else "Looking for the light."
+        )
 
     def _found(self) -> None:
         session = self._page.need()

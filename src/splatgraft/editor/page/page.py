@@ -4,6 +4,7 @@ Knows nothing about how anything is computed or saved.
 """
 
 import html
+import math
 import threading
 import time
 import traceback
@@ -29,6 +30,8 @@ from splatgraft.editor.session import Session
 
 PHASES = ("Open", "Select", "Place", "Light", "Run")
 _TICK = 0.4
+_HERE = "\u25cf "
+_HISTORY = ("Undo", "Redo")
 
 
 @runtime_checkable
@@ -72,6 +75,7 @@ class Page:
         self._notices: dict[int, Any] = {}
         self._open = True
         self._last_job = ""
+        self._views: dict[str, tuple[Any, ...]] = {}
         self._build()
         guarded.on_seat = self._seats_changed
         guarded.on_large_upload = lambda name, size: self.say(
@@ -105,7 +109,7 @@ class Page:
         return None if holder is None else self.server.get_clients().get(holder)
 
     def act(self, work: Callable[[Any], None]) -> Callable[[Any], None]:
-        """A callback: errors become a sentence, the page shows what counts afterwards; our own settings are no clicks."""
+        """A callback: errors become a sentence, and the page shows what counts afterwards. What we set is no click."""
 
         def call(event: Any) -> None:
             if getattr(event, "client_id", 0) is None:
@@ -136,8 +140,7 @@ class Page:
                 self.say(" ".join(str(error).split()), bad=True)
             self._header.content = self._header_html()
             history = None if self.session is None else self.session.history
-            self._undo.disabled = history is None or not history.past
-            self._redo.disabled = history is None or not history.future
+            self._back.visible = history is not None and bool(history.past or history.future)
             self.preview.ask()
 
     def open_project(self) -> None:
@@ -149,12 +152,13 @@ class Page:
     def go(self, phase: str) -> None:
         """Turn to another phase."""
         with self._lock:
+            self._remember_view()
             self._phases[self.phase].leave()
             self._folders[self.phase].visible = False
             self.phase = phase
             self._folders[phase].visible = True
-            for name, button in self._phase_buttons.items():
-                button.color = None if name == phase else "gray"
+            self._turn.options = tuple(f"{_HERE}{name}" if name == phase else name for name in PHASES)
+            self._change_world()
             try:
                 self._phases[phase].enter()
             except (ValueError, OSError) as error:
@@ -189,12 +193,22 @@ class Page:
         if window is None:
             return
         pose = camera.world_from_camera[0].double().numpy()
-        focal, height = float(camera.intrinsics[0, 1, 1]), camera.height
+        # all of the photograph is in view, however narrow the window
+        aspect = camera.width / camera.height
+        half = camera.height / (2 * float(camera.intrinsics[0, 1, 1]))
+        if window.camera.aspect > 0:
+            half *= max(1.0, aspect / window.camera.aspect)
         with window.atomic():
             window.camera.up_direction = -pose[:3, 1]
             window.camera.position = pose[:3, 3]
             window.camera.look_at = pose[:3, 3] + pose[:3, 2] * self.reach()
-            window.camera.fov = 2 * _atan(height / (2 * focal))
+            window.camera.fov = 2 * math.atan(half)
+
+    def light_found(self) -> None:
+        """The preview has the light of what is placed now."""
+        with self._lock:
+            if self.phase == "Light":
+                self._phases["Light"].refresh()
 
     def reach(self) -> float:
         """How far things are from the cameras, roughly: half the median distance of the cameras from their middle."""
@@ -213,10 +227,11 @@ class Page:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(224, 122, 46))
         gui.set_panel_label("splatgraft")
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(380)
+        gui.main_panel.set_width(384)
         self.server.scene.world_axes.visible = False
         self._header = gui.add_html("")
-        self._phase_buttons = self._add_phase_buttons()
+        self._turn = gui.add_button_group("Step", PHASES)
+        self._turn.on_click(self.act(lambda event: self.go(event.target.value.removeprefix(_HERE))))
         self._folders: dict[str, Any] = {}
         self._phases: dict[str, Phase] = {}
         kinds: dict[str, Callable[[Page], Phase]] = {
@@ -231,10 +246,10 @@ class Page:
             with self._folders[name]:
                 self._phases[name] = kinds[name](self)
         self._status = gui.add_html("")
-        self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, hint="Ctrl+Z", color="gray")
-        self._redo = gui.add_button("Redo", icon=viser.Icon.ARROW_FORWARD_UP, hint="Ctrl+Shift+Z", color="gray")
-        self._undo.on_click(self.act(lambda _: self._step_back()))
-        self._redo.on_click(self.act(lambda _: self._step_forward()))
+        self._back = gui.add_button_group("History", _HISTORY)
+        self._back.on_click(
+            self.act(lambda e: self._step_back() if e.target.value == _HISTORY[0] else self._step_forward())
+        )
         undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
         redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
         undo.on_trigger(self.act(lambda _: self._step_back()))
@@ -244,11 +259,6 @@ class Page:
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="red", visible=False)
         self._cancel.on_click(self.act(lambda _: self._cancel_job()))
         self.preview = PreviewPanel(self)
-
-    def _add_phase_buttons(self) -> dict[str, Any]:
-        group = self.gui.add_button_group("Step", options=PHASES)
-        group.on_click(self.act(lambda event: self.go(event.target.value)))
-        return {}
 
     def _step_back(self) -> None:
         self.say("undone" if self.need().undo() else "nothing to undo")
@@ -270,19 +280,35 @@ class Page:
 
     def _header_html(self) -> str:
         where = "no project yet" if self.session is None else str(self.session.files.file.parent.name)
-        steps = "".join(
-            f'<span style="padding:2px 9px;border-radius:10px;margin-right:4px;'
-            f'{"background:#e07a2e;color:#fff" if name == self.phase else "opacity:.55"}">{index + 1} {name}</span>'
-            for index, name in enumerate(PHASES)
-        )
         saved = "all changes are saved" if self.session else ""
         return (
             f'<div class="sg-header" style="{_TEXT}"><b style="font-size:1.1em">{html.escape(where)}</b>'
-            f'<span style="opacity:.6;float:right">{saved}</span>'
-            f'<div style="margin-top:8px;white-space:nowrap">{steps}</div></div>'
+            f'<span style="opacity:.6;float:right">{saved}</span></div>'
         )
 
     # windows
+
+    def _world(self) -> str:
+        return "source" if self.phase == "Select" else "target"
+
+    def _remember_view(self) -> None:
+        window = self.window()
+        if window is not None:
+            camera = window.camera
+            self._views[self._world()] = (camera.position, camera.look_at, camera.up_direction, camera.fov)
+
+    def _change_world(self) -> None:
+        """Source and target have nothing in common: each keeps the view it was left with."""
+        window, kept = self.window(), self._views.get(self._world())
+        self.preview.world_changed()
+        if window is None:
+            return
+        if kept is None:
+            self._frame(window)
+            return
+        with window.atomic():
+            window.camera.up_direction = kept[2]
+            window.camera.position, window.camera.look_at, window.camera.fov = kept[0], kept[1], kept[3]
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self.preview.camera_moved(client.client_id))
@@ -383,9 +409,3 @@ _TEXT = "font-size:.85em;line-height:1.45;padding:2px 12px"
 
 def _minutes(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
-
-
-def _atan(value: float) -> float:
-    import math
-
-    return math.atan(value)

@@ -1,9 +1,10 @@
-"""Place: objects in the target, by a gizmo, by numbers, by name of the move. Knows nothing about how moves are found."""
+"""Place: objects in the target, by a gizmo, by numbers, by the move's name. Knows nothing about how moves are found."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,7 +42,7 @@ class PlacePhase:
         self._suggest = gui.add_button("Find a place for it", icon=viser.Icon.WAND)
         self._which = gui.add_dropdown("Object", ("1",), initial_value="1")
         self._position = gui.add_vector3("Position", (0.0, 0.0, 0.0), step=0.001)
-        self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=1.0, hint="Degrees about x, y, z")
+        self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=0.01, hint="Degrees about x, y, z")
         self._scale = gui.add_number("Scale", 1.0, min=1e-4, step=0.001)
         self._names = gui.add_button_group("Move", ("Drop", "Upright", "Fit size"))
         self._edit = gui.add_button_group("Object ", ("Duplicate", "Delete"))
@@ -160,7 +161,9 @@ class PlacePhase:
         session = self._page.need()
         item = session.scenes.placeable(ObjectPlacement(Similarity.identity()))
         cameras = session.scenes.cameras(session.files.target_cameras)
-        move = placing.suggested(session.scenes.gaussians(session.files.target_scene), item, cameras)
+        move = placing.suggested(
+            session.scenes.gaussians(session.files.target_scene), item, cameras, session.files.placing
+        )
         session.change(replace(session.state, objects=(ObjectPlacement(move),)))
         self._page.say("placed where it is level and in view; drag it, or type numbers")
 
@@ -189,11 +192,8 @@ class PlacePhase:
         file, root = event.target.value, self._page.need().files.file.parent
         self._add_file(keep_upload(root, file.name, file.content, suffixes=SCENES))
 
-    def _add_file(self, path: object) -> None:
+    def _add_file(self, path: Path) -> None:
         session = self._page.need()
-        from pathlib import Path
-
-        assert isinstance(path, Path)
         read_gaussians(path)
         item = session.scenes.placeable(ObjectPlacement(Similarity.identity(), path))
         cameras = session.scenes.cameras(session.files.target_cameras)
@@ -237,7 +237,9 @@ class PlacePhase:
 
     def _show_numbers(self, gizmo: Gizmo) -> None:
         self._position.value = gizmo.position
-        self._degrees.value = degrees_of(gizmo.wxyz)
+        # no -0 and no trailing digits of rounding; what is typed counts exactly
+        x, y, z = (round(angle, 2) + 0.0 for angle in degrees_of(gizmo.wxyz))
+        self._degrees.value = (x, y, z)
         self._scale.value = gizmo.scale
 
     def _show_gizmo(self, session: Session, gizmo: Gizmo) -> None:
@@ -248,7 +250,7 @@ class PlacePhase:
             self._remove_gizmo()
             self._gizmo_size = size
             self._gizmo = self._page.server.scene.add_transform_controls(
-                "/gizmo", scale=size, line_width=4.0, depth_test=False, position=gizmo.position, wxyz=gizmo.wxyz
+                "/gizmo", scale=size, line_width=4.0, position=gizmo.position, wxyz=gizmo.wxyz
             )
             self._gizmo.on_update(self._dragged)
             return

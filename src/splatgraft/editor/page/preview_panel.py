@@ -7,21 +7,27 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 import viser
+from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.editor.latest import Latest
 from splatgraft.editor.page.stage_view import view_of
-from splatgraft.editor.preview import KINDS, NEEDS_LIGHT, Kind, Size, wiped
+from splatgraft.editor.preview import KINDS, NEEDS_LIGHT, Kind, Size, same_inputs, wiped
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState
 from splatgraft.images import write_image
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
+
+
+_SELECTING: tuple[Kind, Kind] = ("Source", "Object alone")
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class PreviewPanel:
             self._number = gui.add_slider("Camera", 0, 1, 1, 0, hint="Step through the target's cameras")
             self._follow = gui.add_checkbox("Follow my view", True, hint="Else the picture stays at the camera")
         self._panel.dock_left()
-        self._panel.set_width(430)
+        self._panel.set_width(400)
         for control in (self._left, self._right, self._share, self._follow):
             control.on_update(lambda event: self.ask() if event.client is not None else None)
         self._number.on_update(page.act(lambda _: self._to_camera()))
@@ -65,6 +71,12 @@ class PreviewPanel:
 
     def reset(self) -> None:
         """Another project: nothing drawn yet."""
+        self._drawn = {}
+
+    def world_changed(self) -> None:
+        """Another scene is shown: its cameras count, and in the source there is one thing to compare."""
+        self._left.visible = self._right.visible = self._page.phase != "Select"
+        self._number.value = 0
         self._drawn = {}
 
     def close(self) -> None:
@@ -97,7 +109,7 @@ class PreviewPanel:
         if wish is not None:
             self._latest.ask(wish)
 
-    def save_picture(self, path: object) -> None:
+    def save_picture(self, path: Path) -> None:
         """Write the right picture at its camera's full size.
 
         Raises: ValueError where there is nothing to draw.
@@ -105,14 +117,12 @@ class PreviewPanel:
         wish = self._wish(width=1280)
         if wish is None:
             raise ValueError("picture: expected a target scene and an open window, found none")
-        import torch
-
         pixels = wish.session.preview.picture(wish.right, wish.state, wish.camera)
-        write_image(path, torch.from_numpy(pixels.astype(np.float32) / 255))  # pyright: ignore[reportArgumentType]
+        write_image(path, torch.from_numpy(pixels.astype(np.float32) / 255))
 
     def _wish(self, *, width: int | None = None) -> _Wish | None:
         session, window = self._page.session, self._page.window()
-        if session is None or not session.files.target_scene.is_file() or self._page.phase == "Select":
+        if session is None or not self._scene(session).is_file():
             return None
         cameras = self._cameras()
         if cameras is None:
@@ -124,8 +134,12 @@ class PreviewPanel:
         else:
             camera = cameras[int(self._number.value)]
             camera = camera.resized((width or self._size.width) / camera.width)
+        left, right = _SELECTING if self._page.phase == "Select" else (self._left.value, self._right.value)
         state = self._moving or session.placed_state()
-        return _Wish(session, state, camera, self._left.value, self._right.value, float(self._share.value))
+        return _Wish(session, state, camera, left, right, float(self._share.value))
+
+    def _scene(self, session: Session) -> Path:
+        return session.files.source_scene if self._page.phase == "Select" else session.files.target_scene
 
     def _cameras(self) -> Cameras | None:
         session = self._page.session
@@ -159,6 +173,7 @@ class PreviewPanel:
             start = time.monotonic()
             preview.relit(wish.state)
             self._draw(wish, note=f"light in {time.monotonic() - start:.1f} s")
+            self._page.light_found()
         else:
             self._draw(wish, note="")
 
@@ -176,25 +191,26 @@ class PreviewPanel:
 
     def _picture(self, kind: Kind, wish: _Wish, problems: list[str]) -> np.ndarray:
         camera = wish.camera
-        key = (camera.world_from_camera.numpy().tobytes(), camera.intrinsics.numpy().tobytes(), wish.state.objects)
-        key = (
-            *key,
-            wish.state.erased,
-            wish.state.light,
-            wish.state.weights,
-            wish.session.files.result.stat().st_mtime_ns if wish.session.files.result.is_file() else 0,
-        )
+        pose = (camera.world_from_camera.numpy().tobytes(), camera.intrinsics.numpy().tobytes())
+        state, result = wish.state, wish.session.files.result
+        stamp = result.stat().st_mtime_ns if result.is_file() else 0
+        objects, selection = state.objects, wish.session.selection() if self._page.phase == "Select" else None
+        key = (*pose, stamp, objects, state.erased, state.light, state.weights, selection)
         drawn = self._drawn.get(kind)
-        if drawn is None or any(
-            a is not b and not (isinstance(a, bytes | int) and a == b) for a, b in zip(drawn[0], key, strict=True)
-        ):
+        if drawn is None or not same_inputs(drawn[0], key):
             try:
-                drawn = (key, wish.session.preview.picture(kind, wish.state, camera))
+                drawn = (key, self._pixels(kind, wish, selection))
             except ValueError as error:
                 problems.append(str(error))
                 return np.full((camera.height, camera.width, 3), 48, np.uint8)
             self._drawn[kind] = drawn
         return drawn[1]
+
+    def _pixels(self, kind: Kind, wish: _Wish, selection: Tensor | None) -> np.ndarray:
+        preview = wish.session.preview
+        if kind in _SELECTING:
+            return preview.source_picture(selection if kind == "Object alone" else None, wish.camera)
+        return preview.picture(kind, wish.state, wish.camera)
 
     def _say(self, text: str) -> None:
         self._caption.content = (

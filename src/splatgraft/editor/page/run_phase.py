@@ -69,9 +69,8 @@ class RunPhase:
         rows = []
         for name, reason in session.reasons().items():
             mark = "&#10003;" if reason is None else "&middot;"
-            rows.append(
-                f'<tr><td style="width:1.4em">{mark}</td><td>{name}</td><td style="opacity:.6">{html.escape(reason or "")}</td></tr>'
-            )
+            why = f'<td style="opacity:.6">{html.escape(reason or "")}</td>'
+            rows.append(f'<tr><td style="width:1.4em">{mark}</td><td>{name}</td>{why}</tr>')
         shown = shlex.join(session.project.run_command("consolidate", "")[1])
         self._steps.content = (
             f'<div style="font-size:.8em;line-height:1.5;padding:2px 12px"><table>{"".join(rows)}</table>'
@@ -79,7 +78,7 @@ class RunPhase:
         )
         there = (session.files.report / "index.html").is_file()
         self._turntable.disabled = not there
-        self._scene.disabled = not session.files.result.is_file()
+        self._scene.visible = session.files.result.is_file()
         link = f'<a href="{FILES_PREFIX}index.html" target="_blank">Open the report</a>' if there else ""
         self._link.content = f'<div style="padding:2px 12px">{link}</div>'
 
