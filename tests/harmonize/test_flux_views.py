@@ -114,3 +114,10 @@ def test_the_machine_does_not_make_a_result_stale(views, weights):
     perform(done, Terminal())
     assert why_stale(job_of(replace(done, batch=4, processes=2, ray="local"))) is None
     assert why_stale(job_of(replace(done, seed=1))) == "seed is now 1, was 0"
+
+
+def test_workers_of_ray_make_the_same_files(views, weights):
+    pytest.importorskip("ray")
+    alone = perform(step(views, weights), Terminal())
+    spread = perform(step(views, weights, "spread", processes=2, ray="local"), Terminal())
+    assert images(spread) == images(alone)

@@ -188,7 +188,7 @@ def test_bad_options_are_one_line(tmp_path, change, line):
 
 def test_object_removal_is_trained_by_the_same_loop(tmp_path):
     base = removal_folder(tmp_path / "base")
-    loop = replace(QUICK, steps=40, batch=4, rate=5e-3, save_every=38, validate_every=99, validation_pairs=1)
+    loop = replace(QUICK, steps=20, batch=4, rate=8e-3, save_every=18, validate_every=99, validation_pairs=1)
     source = RenderedPairs(rendered_folder(tmp_path / "pairs", 1))
 
     def run(name, folder, loop, progress=silent):
@@ -206,7 +206,7 @@ def test_object_removal_is_trained_by_the_same_loop(tmp_path):
     model = train(run("out", base, loop))
     assert error(model) < 0.7 * error(base)
     with pytest.raises(KeyboardInterrupt):
-        train(run("killed", base, loop, killed_at(39)))
+        train(run("killed", base, loop, killed_at(19)))
     train(run("killed", base, loop))
     assert read_losses(tmp_path / "killed" / LOG_FILE) == read_losses(tmp_path / "out" / LOG_FILE)
     trained, again = RemovalObjective(str(model), silent), run("out", base, loop)

@@ -79,17 +79,20 @@ def _train(objective: Any, asked: "TrainFlux | TrainRemoval", base: str, termina
     if not sources:
         raise ValueError("training data: expected --pairs, --generated or --orida, found none")
     mixture, held_out = split_mixture(sources, weights=data.weights, held_out=data.held_out, seed=asked.loop.seed)
+    first = is_first_process(cpu=asked.loop.cpu)
+    say = terminal.say if first else lambda sentence: None
     for source, indices in zip(mixture.sources, mixture.indices, strict=True):
-        terminal.say(f"data: {len(indices)} pairs to train on, {len(source) - len(indices)} held out, {source.name}")
+        say(f"data: {len(indices)} pairs to train on, {len(source) - len(indices)} held out, {source.name}")
     vae = Path(base) / "vae" / "diffusion_pytorch_model.safetensors"
     name = f"{vae.resolve()}|{vae.stat().st_size if vae.is_file() else 0}"
     cache = LatentCache(asked.out / "latents", objective.encode, width=width, height=height, autoencoder=name)
     with terminal.bar("train") as progress:
-        run = Training(objective, mixture, held_out, cache, asked.loop, asked.out, terminal.say, progress)
+        run = Training(objective, mixture, held_out, cache, asked.loop, asked.out, say, progress)
         # of several processes the first holds the folder; the others write nothing but latents, whole files each
-        with locked(asked.out) if is_first_process() else nullcontext():
+        with locked(asked.out) if first else nullcontext():
             model = train(run)
-    terminal.result(model)
+    if first:
+        terminal.result(model)
     return 0
 
 
@@ -102,7 +105,7 @@ def _pixels(data: DataOptions) -> tuple[int, int]:
 
 def _say_memory(size: Size, asked: "TrainFlux", terminal: Terminal) -> None:
     loop: Loop = asked.loop
-    processes, shards = launched()
+    processes, shards = launched(cpu=loop.cpu)
     choice = Choice(
         pairs=max(1, loop.batch // (processes * loop.accumulate)),
         lora=asked.lora,

@@ -1,6 +1,7 @@
 """Latents of training pictures, encoded once and kept on disk. Knows nothing about what is trained on them."""
 
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,11 +57,18 @@ class LatentCache:
                 if latents is None:
                     # one at a time: a batch would be rounded otherwise, and a run could not go on to the bit
                     latents = self._encode(item.pictures[role][None])[0].to("cpu", torch.bfloat16)
-                    item.paths[role].parent.mkdir(parents=True, exist_ok=True)
-                    write_tensors(item.paths[role], {"latents": latents})
+                    _keep(item.paths[role], latents)
                 batch[role].append(latents.float())
         return {role: torch.stack(latents) for role, latents in batch.items()}
 
     def _path(self, key: str) -> Path:
         name = hashlib.sha256(f"{self._job}|{key}".encode()).hexdigest()
         return self._folder / name[:2] / f"{name}.safetensors"
+
+
+def _keep(path: Path, latents: Float[Tensor, "c h w"]) -> None:
+    """Write under a name of this process first: several may encode the same picture at once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    own = path.with_name(f"{path.stem}-{os.getpid()}.safetensors")
+    write_tensors(own, {"latents": latents})
+    os.replace(own, path)

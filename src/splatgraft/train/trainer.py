@@ -244,7 +244,7 @@ class _Loop:
         return folder
 
     def _weights(self) -> dict[str, Tensor]:
-        state = self._accelerator.get_state_dict(self._network)
+        state: Any = self._accelerator.get_state_dict(self._network)
         return {name: tensor.detach().cpu().clone() for name, tensor in state.items()}
 
     def _keep_what_learns(self, models: list[Any], weights: list[Any], output: str) -> None:
@@ -264,17 +264,17 @@ def _states(folder: Path) -> list[Path]:
     return sorted(path for path in (folder / _STATES).glob("[0-9]*") if (path / _JOB_FILE).is_file())
 
 
-def launched() -> tuple[int, int]:
+def launched(*, cpu: bool) -> tuple[int, int]:
     """Processes that accelerate runs, and how many of them share one copy of the weights."""
     from accelerate import PartialState
 
-    state = PartialState()
+    state = PartialState(cpu=cpu)
     sharded = str(state.distributed_type).endswith(("FSDP", "DEEPSPEED"))
     return state.num_processes, state.num_processes if sharded else 1
 
 
-def is_first_process() -> bool:
+def is_first_process(*, cpu: bool) -> bool:
     """Whether this is the process that writes."""
     from accelerate import PartialState
 
-    return PartialState().is_main_process
+    return PartialState(cpu=cpu).is_main_process

@@ -1,5 +1,6 @@
 """The only importer of diffusers and safetensors in harmonize, when one of its classes is wanted. Knows no model."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -96,10 +97,12 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, str] | None = None) -> None:
-    """Write a .safetensors file, whole or not at all."""
+    """Write a .safetensors file, whole or not at all; `about` goes into its metadata, as JSON."""
     from safetensors.torch import save
 
-    content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, dict(about or {}))
+    # one key: safetensors writes several in an order that differs from run to run
+    told = {"splatgraft": json.dumps(dict(about), sort_keys=True)} if about else None
+    content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, told)
     with whole_file(path) as stream:
         stream.write(content)
 

@@ -89,7 +89,8 @@ def _by_index(path: Path) -> list[Photograph]:
             files = [path.parent / (row[name] or "?") for name in COLUMNS[:3]]
             if absent := next((file for file in files if not file.is_file()), None):
                 raise ValueError(f"{path}, line {number}: expected files that are there, found no {absent}")
-            found.append(Photograph(*files, row["object"], row["scene"]))
+            image, mask, background = files
+            found.append(Photograph(image, mask, background, row["object"], row["scene"]))
     return found
 
 

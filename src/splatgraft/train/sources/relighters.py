@@ -88,6 +88,7 @@ class DiffusionRenderer:
     """
 
     licence = "pictures by NVIDIA's DiffusionRenderer, see its licence"
+
     def __init__(self, checkout: Path, python: Path, variant: Literal["svd", "cosmos"] = "svd") -> None:
         """The installation, found complete.
 
