@@ -106,6 +106,7 @@ class PreviewPanel:
     def ask(self) -> None:
         """Draw what counts now, as soon as there is time."""
         wish = self._wish()
+        self._panel.visible = wish is not None
         if wish is not None:
             self._latest.ask(wish)
 

@@ -3,8 +3,10 @@
 Knows nothing about what the page shows.
 """
 
+import contextlib
 import http
 import http.client
+import io
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -54,7 +56,9 @@ class GuardedServer:
             original = websockets.asyncio.server.serve
             websockets.asyncio.server.serve = partial(self._serve, original)  # pyright: ignore
             try:
-                self.viser = viser.ViserServer(host=host, port=port, verbose=False)
+                # its banner names an address without the token, on a stream that is for results
+                with contextlib.redirect_stdout(io.StringIO()):
+                    self.viser = viser.ViserServer(host=host, port=port, verbose=False)
             finally:
                 websockets.asyncio.server.serve = original
         inner = self.viser._websock_server
@@ -74,7 +78,8 @@ class GuardedServer:
 
     def close(self) -> None:
         """Stop to listen."""
-        self.viser.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.viser.stop()
 
     def _seated(self, seat: Seat) -> None:
         self.seat = seat

@@ -1,0 +1,121 @@
+"""A real browser on a real `splatgraft edit`: what the stories of the editor are told with."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ARGUMENTS = (
+    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
+    # Mesa's software GL: a third of the time that the browser's own takes
+    *("--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"),
+)
+
+
+def browser_path() -> str:
+    """Chromium of the system; a machine without one must say so on purpose."""
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is not None:
+        return found
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+    if Path(own).is_file():
+        return own
+    reason = os.environ.get("SPLATGRAFT_NO_BROWSER")
+    if reason:
+        pytest.skip(f"no browser: {reason}")
+    pytest.fail("no Chromium found: `make browser`, or set SPLATGRAFT_NO_BROWSER to the reason why there is none")
+
+
+class Editor:
+    """One server on one project."""
+
+    def __init__(self, project: Path, *options: str) -> None:
+        """Start it and wait for its address."""
+        words = [sys.executable, "-m", "splatgraft", "edit", str(project), "--port", "18080", *options]
+        self.log = project.parent / "server.log"
+        with self.log.open("ab") as errors:
+            self.process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=errors, text=True)
+        assert self.process.stdout is not None
+        self.url = self.process.stdout.readline().strip()
+        assert self.url.startswith("http://"), self.log.read_text()[-2000:]
+
+    def kill(self) -> None:
+        """As a power cut would."""
+        self.process.kill()
+        self.process.wait(20)
+        self._close()
+
+    def end(self) -> int:
+        """As Ctrl-C would; the exit status."""
+        self.process.send_signal(signal.SIGINT)
+        status = self.process.wait(30)
+        self._close()
+        return status
+
+    def _close(self) -> None:
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+class Window:
+    """One page of the editor, with the words of a person."""
+
+    def __init__(self, page: Any) -> None:
+        """A browser's page, opened on the editor already."""
+        self.page = page
+        page.wait_for_selector(".sg-header", timeout=60_000)
+
+    def turn(self, phase: str) -> None:
+        """To another step."""
+        self.page.get_by_role("button", name=phase, exact=True).click()
+        self.page.get_by_role("button", name=f"● {phase}", exact=True).wait_for(timeout=20_000)
+
+    def click(self, name: str) -> None:
+        """A button by its label."""
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def field(self, label: str) -> Any:
+        """The last input in the row of a label: of a slider that is its number."""
+        row = f'//label[normalize-space()="{label}"]/ancestor::div[contains(@class, "mantine-Flex-root")][1]'
+        return self.page.locator(f"xpath={row}//input[not(@type='hidden')]").last
+
+    def write(self, label: str, text: str) -> None:
+        """Type into a field."""
+        self.field(label).fill(text)
+        self.field(label).press("Enter")
+
+    def check(self, label: str) -> None:
+        """A checkbox by its label."""
+        self.field(label).click()
+
+    def choose(self, label: str, option: str) -> None:
+        """An entry of a dropdown."""
+        self.field(label).click()
+        self.page.get_by_role("option", name=option, exact=True).click()
+
+    def says(self, text: str, *, timeout: float = 60) -> None:
+        """Wait until the page says so."""
+        self.page.get_by_text(text).first.wait_for(timeout=timeout * 1000)
+
+    def quiet(self, *, timeout: float = 120) -> None:
+        """Wait until no job is shown."""
+        self.page.wait_for_selector(".sg-job", state="detached", timeout=timeout * 1000)
+
+
+def wait_until(true: Callable[[], bool], *, timeout: float, what: str) -> None:
+    """Poll; fail with `what` where it never becomes true."""
+    end = time.monotonic() + timeout
+    while not true():
+        assert time.monotonic() < end, f"waited {timeout} s for {what}"
+        time.sleep(0.1)

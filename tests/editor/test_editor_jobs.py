@@ -1,0 +1,77 @@
+"""Long work in a child: it outlives who started it, tells how far it is, and is known to be dead when it is."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from editor_driver import wait_until
+
+from splatgraft.editor.jobs import Jobs, JobState, seconds_left
+
+WORK = """
+import sys, os, time
+from pathlib import Path
+from splatgraft.editor.jobs import JobState, hold, write_state
+folder, seconds = Path(sys.argv[1]), float(sys.argv[2])
+lock = hold(folder)
+state = JobState("work", ("run",), os.getpid(), "running", time.time(), step="render", done=3, total=4)
+write_state(folder, state)
+try:
+    time.sleep(seconds)
+    write_state(folder, JobState("work", ("run",), os.getpid(), "done", time.time()))
+except KeyboardInterrupt:
+    write_state(folder, JobState("work", ("run",), os.getpid(), "cancelled", time.time()))
+"""
+
+
+def start(folder: Path, seconds: float) -> Jobs:
+    jobs = Jobs(folder)
+    jobs.start([sys.executable, "-c", WORK, str(folder), str(seconds)], title="work", shown=["run"])
+    return jobs
+
+
+def outcome(jobs: Jobs) -> str:
+    state = jobs.state()
+    return "" if state is None else state.outcome
+
+
+def test_a_job_is_seen_at_work_by_another_and_ends(tmp_path: Path) -> None:
+    assert Jobs(tmp_path).state() is None
+    jobs = start(tmp_path, 1.0)
+    other = Jobs(tmp_path)
+    wait_until(lambda: outcome(other) == "running", timeout=30, what="work")
+    state = other.state()
+    assert state is not None
+    assert state.share == 0.75
+    with pytest.raises(ValueError, match="at work"):
+        other.start(["true"], title="another", shown=[])
+    wait_until(lambda: outcome(other) == "done", timeout=30, what="the end")
+    assert outcome(jobs) == "done"
+
+
+def test_a_cancelled_job_says_so(tmp_path: Path) -> None:
+    jobs = start(tmp_path, 60)
+    wait_until(lambda: outcome(jobs) == "running", timeout=30, what="work")
+    jobs.cancel()
+    wait_until(lambda: outcome(jobs) == "cancelled", timeout=30, what="the cancel")
+    jobs.cancel()
+
+
+def test_a_killed_job_is_not_taken_for_one_at_work(tmp_path: Path) -> None:
+    jobs = start(tmp_path, 60)
+    wait_until(lambda: outcome(jobs) == "running", timeout=30, what="work")
+    state = jobs.state()
+    assert state is not None
+    os.kill(state.pid, signal.SIGKILL)
+    wait_until(lambda: outcome(Jobs(tmp_path)) == "killed", timeout=30, what="the kill to be seen")
+    start(tmp_path, 0)
+
+
+def test_the_time_left_goes_on_as_it_has() -> None:
+    state = JobState("work", (), 1, "running", 0.0, done=3, total=9, step_started=100.0)
+    assert seconds_left(state, 106.0) == 12.0
+    assert seconds_left(state, 100.5) is None
+    assert seconds_left(JobState("work", (), 1, "running", 0.0), time.time()) is None

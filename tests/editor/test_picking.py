@@ -1,0 +1,58 @@
+"""What a person means by a rectangle, a brush and a click."""
+
+import torch
+
+from splatgraft.cameras import Cameras, look_at, pinhole
+from splatgraft.editor.picking import Rectangle, first_hit, in_brush, in_rectangle
+from splatgraft.editor.thinning import shown_indices
+from splatgraft.gaussians import Gaussians
+from splatgraft.segment import corrected, with_correction
+
+
+def scene(means: list[list[float]], *, size: float = 0.1, logit: float = 3.0) -> Gaussians:
+    n = len(means)
+    return Gaussians(
+        means=torch.tensor(means),
+        log_scales=torch.full((n, 3), size).log(),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        opacity_logits=torch.full((n,), logit),
+        sh=torch.zeros(n, 1, 3),
+    )
+
+
+def camera() -> Cameras:
+    pose = look_at(torch.tensor([[0.0, -4.0, 0.0]]), torch.zeros(3), torch.tensor([0.0, 0, 1]))
+    return pinhole(pose, 100.0, width=200, height=100)
+
+
+def test_a_rectangle_takes_what_the_camera_shows_there_and_nothing_behind_it() -> None:
+    # at distance 4 one unit is 25 px: x = 1 is at 125 of 200 px, z = 1 at 25 of 100 px
+    means = torch.tensor([[1.0, 0, 1], [-1.0, 0, 1], [1.0, 0, -1], [0, -8.0, 0]])
+    found = in_rectangle(means, camera(), Rectangle((0.6, 0.2), (0.65, 0.3)))
+    assert found.tolist() == [True, False, False, False]
+    assert not in_rectangle(means, camera(), Rectangle((0.0, 0.0), (1.0, 1.0)))[3]
+
+
+def test_a_click_stops_at_the_first_solid_thing() -> None:
+    ray = torch.tensor([0.0, -4, 0]), torch.tensor([0.0, 1, 0])
+    hit = first_hit(scene([[0.0, 2, 0], [0.05, 0, 0], [1.0, -2, 0]]), *ray)
+    assert hit is not None
+    assert torch.allclose(hit, torch.zeros(3), atol=1e-6)  # float32 of numbers about 4
+    assert first_hit(scene([[0.0, 0, 0]], logit=-3.0), *ray) is None
+    assert first_hit(scene([[0.0, -8, 0]]), *ray) is None
+    assert in_brush(torch.tensor([[0.0, 0.5, 0], [0, 2, 0]]), hit, 1.0).tolist() == [True, False]
+
+
+def test_the_last_stroke_counts() -> None:
+    lifted = torch.tensor([True, True, False, False])
+    strokes = with_correction(None, torch.tensor([False, True, True, False]), add=True)
+    strokes = with_correction(strokes, torch.tensor([False, True, False, False]), add=False)
+    assert corrected(lifted, strokes).tolist() == [True, False, True, False]
+    assert corrected(lifted, None) is lifted
+
+
+def test_thinning_keeps_what_covers_most_in_order() -> None:
+    large, small = scene([[0.0, 0, 0]] * 2, size=1.0), scene([[1.0, 0, 0]] * 3)
+    both = Gaussians(**{k: torch.cat([getattr(small, k), getattr(large, k)]) for k in large.__dict__})
+    assert shown_indices(both, 2).tolist() == [3, 4]
+    assert shown_indices(both, 5).tolist() == [0, 1, 2, 3, 4]

@@ -1,0 +1,59 @@
+"""Keys of a TOML text change, everything else stays."""
+
+import tomllib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from splatgraft.editor.toml_edit import with_keys
+from splatgraft.steps.project_file import TEMPLATE
+
+TEXT = """\
+# a comment
+[source]
+capture = "a"  # beside
+
+[segment]
+box = [
+  1, 2, 3,  # three
+  4, 5, 6,
+]
+threshold = 0.5
+
+# about the next table
+[compose]
+scale = 1.0
+"""
+VALUES = st.one_of(
+    st.floats(allow_nan=False, allow_infinity=False),
+    st.text(st.characters(codec="utf-8", exclude_characters="\x7f")),
+    st.booleans(),
+    st.lists(st.integers()),
+)
+
+
+def test_a_value_over_several_lines_is_replaced_and_comments_stay() -> None:
+    found = with_keys(TEXT, "segment", {"box": (0.0, 1.5), "keep": "all", "threshold": None})
+    assert tomllib.loads(found)["segment"] == {"box": [0.0, 1.5], "keep": "all"}
+    for comment in ("# a comment", "# beside", "# about the next table\n[compose]"):
+        assert comment in found
+
+
+@given(st.dictionaries(st.sampled_from(["box", "keep", "threshold", "new"]), VALUES), st.sampled_from(["segment", "light"]))
+def test_whatever_is_set_is_read_back_and_nothing_else_changes(values: dict, table: str) -> None:
+    before, after = tomllib.loads(TEXT), tomllib.loads(with_keys(TEXT, table, values))
+    assert after.get(table, {}) == before.get(table, {}) | values
+    assert {k: v for k, v in after.items() if k != table} == {k: v for k, v in before.items() if k != table}
+
+
+def test_what_is_set_and_removed_again_leaves_the_values_as_they_were() -> None:
+    text = TEMPLATE.replace("{source}", '"a"').replace("{target}", '"b"')
+    changed = with_keys(with_keys(text, "relight", {"shade": 0.5}), "relight", {"shade": None})
+    assert tomllib.loads(changed) == tomllib.loads(text) | {"relight": {}}
+    assert with_keys(text, "relight", {"shade": None}) == text
+
+
+def test_another_layout_is_refused_rather_than_broken() -> None:
+    with pytest.raises(ValueError, match="by hand"):
+        with_keys('segment = {box = [1]}\n', "segment", {"keep": "all"})
