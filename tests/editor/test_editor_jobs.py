@@ -33,6 +33,12 @@ def start(folder: Path, seconds: float) -> Jobs:
     return jobs
 
 
+def reap(jobs: Jobs) -> None:
+    """Wait for the process, which ends a moment after its last word."""
+    assert jobs._child is not None
+    jobs._child.wait(30)
+
+
 def outcome(jobs: Jobs) -> str:
     state = jobs.state()
     return "" if state is None else state.outcome
@@ -50,6 +56,7 @@ def test_a_job_is_seen_at_work_by_another_and_ends(tmp_path: Path) -> None:
         other.start(["true"], title="another", shown=[])
     wait_until(lambda: outcome(other) == "done", timeout=30, what="the end")
     assert outcome(jobs) == "done"
+    reap(jobs)
 
 
 def test_a_cancelled_job_says_so(tmp_path: Path) -> None:
@@ -58,6 +65,7 @@ def test_a_cancelled_job_says_so(tmp_path: Path) -> None:
     jobs.cancel()
     wait_until(lambda: outcome(jobs) == "cancelled", timeout=30, what="the cancel")
     jobs.cancel()
+    reap(jobs)
 
 
 def test_a_killed_job_is_not_taken_for_one_at_work(tmp_path: Path) -> None:
@@ -67,7 +75,12 @@ def test_a_killed_job_is_not_taken_for_one_at_work(tmp_path: Path) -> None:
     assert state is not None
     os.kill(state.pid, signal.SIGKILL)
     wait_until(lambda: outcome(Jobs(tmp_path)) == "killed", timeout=30, what="the kill to be seen")
-    start(tmp_path, 0)
+    wait_until(lambda: outcome(jobs) == "killed", timeout=30, what="the kill to be seen by the parent")
+    reap(jobs)
+    # and does not stand in the way of the next
+    again = start(tmp_path, 0)
+    wait_until(lambda: outcome(again) == "done", timeout=30, what="the next")
+    reap(again)
 
 
 def test_the_time_left_goes_on_as_it_has() -> None:

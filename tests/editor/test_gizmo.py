@@ -42,4 +42,4 @@ def test_straight_up_and_down_is_the_same_turn(pitch: float) -> None:
 
 def test_one_axis_turns_as_one_expects() -> None:
     half = math.sqrt(0.5)
-    assert wxyz_of((0, 0, 90)) == pytest.approx((half, 0, 0, half))
+    assert wxyz_of((0.0, 0.0, 90.0)) == pytest.approx((half, 0, 0, half))

@@ -5,6 +5,7 @@ A page on another site can reach a server on loopback: its Origin gives it away.
 """
 
 import hmac
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
@@ -66,10 +67,9 @@ class Gate:
 
 
 def _name(host: str) -> str:
-    try:
-        return (urlsplit(f"//{host}").hostname or "").lower()
-    except ValueError:
-        return ""
+    """The name in a Host header; nothing where it is no honest one."""
+    found = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(:[0-9]+)?", host)
+    return found[1].strip("[]").lower() if found else ""
 
 
 def _cookie(headers: Mapping[str, str]) -> str:

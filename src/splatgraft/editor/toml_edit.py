@@ -22,7 +22,11 @@ def with_keys(text: str, table: str, values: Mapping[str, Any]) -> str:
         wanted[table] = inside
     for key, value in values.items():
         text = _with_key(text, table, key, value)
-    if _plain(tomllib.loads(text)) != _plain(wanted):
+    try:
+        found = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        found = None
+    if _plain(found) != _plain(wanted):
         raise ValueError(f"[{table}]: expected one plain `key = value` per line, found another layout; edit it by hand")
     return text
 
@@ -59,7 +63,7 @@ def _value_lines(lines: list[str], at: int) -> int:
 
 def _written(value: Any) -> str:
     # JSON's strings, numbers, booleans and lists are TOML's too
-    return json.dumps(list(value) if isinstance(value, tuple) else value)
+    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
 
 
 def _plain(content: Any) -> Any:

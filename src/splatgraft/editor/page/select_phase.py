@@ -50,22 +50,25 @@ class SelectPhase:
         self._isolate = gui.add_checkbox("Show the object alone", False)
         self._handles = BoxHandles(page.server, page.view, "/source/box", color=(255, 150, 40))
         self._handles.on_moved = self._box_dragged
-        self._inside = False
+        self._inside, self._listens = False, False
         self._connect()
 
     def enter(self) -> None:
-        """Show the source."""
+        """Show the source; asked again, show it as it is now."""
+        if not self._inside:
+            self._page.server.scene.on_rect_select(modifier="shift")(self._rectangle)
+            self._listen(self._brush.value)
         self._inside = True
         self._draw()
-        self._page.server.scene.on_rect_select(modifier="shift")(self._rectangle)
 
     def leave(self) -> None:
         """Take it away."""
+        if self._inside:
+            self._page.server.scene.remove_rect_select_callback(self._rectangle)
+            self._listen(False)
         self._inside = False
         self._page.view.hide("/source")
         self._handles.hide()
-        self._page.server.scene.remove_rect_select_callback(self._rectangle)
-        self._listen(False)
 
     def refresh(self) -> None:
         """Selection, counts and box as they are now."""
@@ -153,9 +156,11 @@ class SelectPhase:
 
     def _listen(self, listen: bool) -> None:
         scene = self._page.server.scene
-        scene.remove_click_callback(self._clicked)
-        if listen:
+        if listen and not self._listens:
             scene.on_click()(self._clicked)
+        if not listen and self._listens:
+            scene.remove_click_callback(self._clicked)
+        self._listens = listen
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         self._page.act(self._stroke_brush)(event)

@@ -1,0 +1,207 @@
+"""A project while it is edited, without a browser: what is decided is in its files at once, and nowhere else."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_project import OPTIONS, write_project
+
+from splatgraft.cli import main
+from splatgraft.editor import placing
+from splatgraft.editor.exports import export_scene
+from splatgraft.editor.preview import KINDS, Size, wiped
+from splatgraft.editor.session import Session
+from splatgraft.editor.state import EditState, read_state, state_files, write_state
+from splatgraft.editor.uploads import SCENES, keep_upload
+from splatgraft.formats import read_gaussians
+from splatgraft.formats.placement import ObjectPlacement
+from splatgraft.images import read_rgb
+from splatgraft.relight import LayerWeights, light_from_json, light_to_json
+from splatgraft.relight.light import Light, LightSource, ambient_of
+from splatgraft.similarity import Similarity
+from splatgraft.steps.edit import StepsProject
+from splatgraft.steps.flow import read_flow
+
+LIGHT = Light(
+    sources=(LightSource(direction=(0.0, 0.6, 0.8), irradiance=(2.0, 2.0, 2.0), name="sun"),),
+    ambient=ambient_of(torch.tensor([0.3, 0.3, 0.4])),
+)
+
+
+@pytest.fixture(scope="module")
+def composed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("session")
+    project = write_project(root, OPTIONS.replace('light = "gain"', 'light = "transfer"'))
+    assert main(["run", str(project), "--to", "compose"]) == 0
+    return project
+
+
+@pytest.fixture
+def session(composed: Path, tmp_path: Path) -> Session:
+    shutil.copytree(composed.parents[1], tmp_path / "copy")
+    return Session(StepsProject(tmp_path / "copy" / "project" / "project.toml"))
+
+
+def contents(session: Session) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in state_files(session.files.file) if path.is_file()}
+
+
+def moved(state: EditState) -> EditState:
+    assert state.objects is not None
+    move = replace(state.objects[0].target_from_object, translation=torch.tensor([0.1, 0.2, 0.3]))
+    return state.with_object(0, ObjectPlacement(move))
+
+
+def test_every_decision_is_on_disk_and_undo_takes_it_off_again(session: Session) -> None:
+    assert [item.object_path for item in session.objects()] == [None]
+    before = contents(session)
+    count = session.scenes.gaussians(session.files.target_scene).count
+    source = session.scenes.gaussians(session.files.source_scene).count
+    steps = [
+        lambda s: moved(session.placed_state()),
+        lambda s: replace(s, erased=torch.arange(count) % 7 == 0),
+        lambda s: replace(s, corrections=(torch.arange(source) % 3 - 1).to(torch.int8)),
+        lambda s: replace(s, light=LIGHT),
+        lambda s: replace(s, weights=LayerWeights(shadow=0.5, gloss=0.0)),
+        lambda s: replace(s, box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), mask_source="grabcut", keep="largest"),
+        lambda s: replace(s, harmonizer="reinhard"),
+    ]
+    for step in steps:
+        session.change(step(session.state))
+    again = read_state(session.files.file)
+    assert again.objects is not None
+    assert again.erased is not None
+    assert again.corrections is not None
+    assert again.light is not None
+    assert torch.equal(again.objects[0].target_from_object.translation, torch.tensor([0.1, 0.2, 0.3]))
+    assert torch.equal(again.erased, torch.arange(count) % 7 == 0)
+    assert torch.equal(again.corrections, (torch.arange(source) % 3 - 1).to(torch.int8))
+    assert light_to_json(again.light) == light_to_json(LIGHT)
+    assert again.weights == LayerWeights(shadow=0.5, gloss=0.0)
+    assert (again.box, again.mask_source, again.keep) == ((0, 0, 0, 1, 1, 1), "grabcut", "largest")
+    after = contents(session)
+    while session.undo():
+        pass
+    for name in ("project.toml", "placement.json", "erased.npy"):
+        # a table that was made for a key may stay, empty
+        assert contents(session).get(name, b"").replace(b"\n[harmonize]\n", b"") == before.get(name, b""), name
+    while session.redo():
+        pass
+    assert contents(session) == after
+    # all of it is what the steps understand
+    read_flow(session.files.file)
+
+
+def test_what_someone_else_wrote_counts_and_is_a_step_that_can_be_undone(session: Session) -> None:
+    assert not session.reload()
+    outside = read_state(session.files.file)
+    write_state(session.files.file, outside, replace(outside, keep="all"))
+    with pytest.raises(ValueError, match="outside"):
+        session.change(replace(session.state, keep="largest"))
+    assert session.state.keep == "all"
+    session.change(replace(session.state, keep="largest"))
+    assert read_state(session.files.file).keep == "largest"
+    session.undo()
+    session.undo()
+    assert read_state(session.files.file).keep is None
+
+
+def test_the_moves_by_name_keep_what_they_promise(session: Session) -> None:
+    item, up = session.placeable(0), torch.tensor([0.0, 0.0, 1.0])
+    target = session.scenes.gaussians(session.files.target_scene)
+    start = session.objects()[0].target_from_object
+    turned = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.7, 0.4], [0.7, 0, 0], [-0.4, 0, 0]]))
+    tilted = Similarity(scale=start.scale, rotation=turned @ start.rotation, translation=start.translation + 0.3 * up)
+    straight = placing.upright(item, tilted, up=up)
+    # float32 rotations, two deep
+    assert torch.allclose(straight.rotation @ item.base.up, up, atol=1e-5)
+    assert torch.allclose(straight.points(item.base.point), tilted.points(item.base.point), atol=1e-5)
+    fallen = placing.dropped(target, item, straight, up=up)
+    assert fallen.scale == straight.scale
+    # the plane's Gaussians are a hundredth thick and were trained for sixty steps
+    assert abs(float(fallen.points(item.base.point)[2])) < 0.1
+    assert float(fallen.points(item.base.point)[2]) < float(straight.points(item.base.point)[2])
+    # the turn about the vertical stayed: heads of a vector at right angles to up agree, but for the slope of the plane
+    side = torch.linalg.cross(item.base.up, torch.tensor([1.0, 0, 0]))
+    heads = [m.rotation @ side / side.norm() for m in (straight, fallen)]
+    assert float(heads[0] @ heads[1]) > 0.98
+    again = placing.dropped(target, item, fallen, up=up)
+    assert torch.allclose(again.translation, fallen.translation, atol=0.02)
+    half = placing.resized(item, fallen, 0.5 * fallen.scale)
+    assert torch.allclose(half.points(item.base.point), fallen.points(item.base.point), atol=1e-5)
+
+
+def test_every_kind_of_picture_is_drawn_or_says_why_not(session: Session) -> None:
+    state = session.placed_state()
+    camera = session.scenes.cameras(session.files.target_cameras)[0]
+    for kind in KINDS:
+        if kind == "Result":
+            with pytest.raises(ValueError, match="finished run"):
+                session.preview.picture(kind, state, camera)
+            continue
+        picture = session.preview.picture(kind, state, camera)
+        assert picture.shape == (camera.height, camera.width, 3)
+        assert picture.std() > 1, kind
+    assert session.preview.is_lit(state)
+    assert not session.preview.is_lit(moved(state))
+    picture, other = (session.preview.picture(kind, state, camera) for kind in ("Copy-paste", "Mask"))
+    both = wiped(picture, other, 0.25)
+    assert (both[:, :10] == picture[:, :10]).all()
+    assert (both[:, 20:] == other[:, 20:]).all()
+
+
+def test_the_preview_of_the_light_is_the_step_s_result(session: Session, tmp_path: Path) -> None:
+    session.change(replace(moved(session.placed_state()), weights=LayerWeights(shadow=0.5)))
+    relit = session.preview.relit(session.state).bake(session.state.weights)
+    assert main(["run", str(session.files.file), "--to", "relight"]) == 0
+    written = read_gaussians(session.files.relit)
+    assert torch.equal(written.sh, relit.sh)
+    assert torch.equal(written.means, relit.means)
+
+
+@pytest.mark.parametrize(("seconds", "wanted"), [(0.3, 480), (0.28, 480), (1.2, 240), (0.02, 800), (60.0, 192)])
+def test_slow_pictures_get_smaller_and_quick_ones_larger(seconds: float, wanted: int) -> None:
+    assert Size().after(seconds) == wanted
+
+
+def test_uploads_are_read_before_they_are_kept(session: Session, tmp_path: Path) -> None:
+    content = session.files.object.read_bytes()
+    kept = keep_upload(tmp_path, "../../my ball.ply", content, suffixes=SCENES)
+    assert kept == tmp_path / "uploads" / "my_ball.ply"
+    assert kept.read_bytes() == content
+    with pytest.raises(ValueError, match=r"my_ball\.ply"):
+        keep_upload(tmp_path, "my ball.ply", b"ply\nnonsense", suffixes=SCENES)
+    assert kept.read_bytes() == content
+    with pytest.raises(ValueError, match="ends in"):
+        keep_upload(tmp_path, "page.html", b"<html>", suffixes=SCENES)
+    assert sorted(p.name for p in kept.parent.iterdir()) == ["my_ball.ply"]
+
+
+def test_nothing_is_exported_before_it_is_made(session: Session) -> None:
+    with pytest.raises(ValueError, match="finished scene"):
+        export_scene(session.files, ".ply")
+
+
+def test_a_project_with_trained_scenes_reads_those(session: Session, tmp_path: Path) -> None:
+    made = StepsProject(tmp_path / "new" / "project.toml")
+    captures = (session.files.source_cameras.parent, session.files.target_cameras.parent)
+    with pytest.raises(ValueError, match="trained scene"):
+        made.create(captures, scenes=(tmp_path / "none.ply", None))
+    made.create(captures, scenes=(session.files.source_scene, None))
+    files = made.files()
+    assert files is not None
+    assert files.source_scene.resolve() == session.files.source_scene.resolve()
+    assert files.target_scene == made.file.parent / "target" / "scene" / "scene.ply"
+
+
+def test_a_light_survives_its_file() -> None:
+    assert light_to_json(light_from_json(light_to_json(LIGHT))) == light_to_json(LIGHT)
+
+
+def test_pictures_are_written_as_they_are(session: Session, tmp_path: Path) -> None:
+    camera = session.scenes.cameras(session.files.target_cameras)[0]
+    photo = session.preview.picture("Photograph", session.placed_state(), camera)
+    stored = read_rgb(session.files.target_capture.parents[2] / "photos" / "target" / "images" / camera.names[0])
+    assert torch.equal(torch.from_numpy(photo), (stored * 255).round().to(torch.uint8))
