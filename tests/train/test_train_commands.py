@@ -98,7 +98,7 @@ def test_painted_pictures_become_pairs(tmp_path, monkeypatch, capsys):
         def mask(self, image):
             return torch.nn.functional.pad(torch.ones(16, 16), (8, 8, 8, 8))
 
-    monkeypatch.setattr("splatgraft.harmonize.flux.library.text_to_image_pipeline", lambda base: Pipeline())
+    monkeypatch.setattr("splatgraft.harmonize.flux.library.text_to_image_pipeline", lambda base, **settings: Pipeline())
     monkeypatch.setattr("splatgraft.segment.birefnet.load_birefnet", lambda weights: Masks())
     base = removal_folder(tmp_path / "base")
     trained = ["train", "removal", str(tmp_path / "removal"), "--base", str(base), "--pairs"]

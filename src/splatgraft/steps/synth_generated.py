@@ -7,6 +7,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from splatgraft.project import locked
 from splatgraft.steps.relighting import Relighting
 from splatgraft.steps.step import Device, Positional, choose_device
@@ -49,7 +51,9 @@ class Generated:
         remover = Remover(self.removal, device, terminal.say, seed=self.seed)
         path = Path(self.masks or "")
         masks = load_birefnet(path if self.masks and path.is_file() else self.masks or DEFAULT_REPOSITORY)
-        painter = Painter(text_to_image_pipeline(self.base), device, (width, height), terminal.say)
+        painter = Painter(
+            text_to_image_pipeline(self.base, torch_dtype=torch.bfloat16), device, (width, height), terminal.say
+        )
 
         def make(text: str, number: int) -> Unlit:
             target = painter.paint(text, seed=self.seed * 1_000_003 + number)

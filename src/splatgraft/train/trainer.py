@@ -80,7 +80,7 @@ class _Loop:
     def __init__(self, run: Training, readers: ThreadPoolExecutor) -> None:
         from accelerate import Accelerator
 
-        self._run_, self._readers, loop = run, readers, run.loop
+        self._training, self._readers, loop = run, readers, run.loop
         self._accelerator = Accelerator(
             mixed_precision=loop.precision, gradient_accumulation_steps=loop.accumulate, cpu=loop.cpu
         )
@@ -105,7 +105,7 @@ class _Loop:
 
     def run(self) -> Path:
         """All steps that are left."""
-        run, loop = self._run_, self._run_.loop
+        run, loop = self._training, self._training.loop
         self._resume()
         curve = Curve(run.folder, loop.tensorboard) if self._accelerator.is_main_process else None
         ahead = self._begin_reading(self.step)
@@ -128,7 +128,7 @@ class _Loop:
         return self._finish()
 
     def _one_step(self, step: int, parts: list[list[Loaded]]) -> float:
-        run, loop, accelerator = self._run_, self._run_.loop, self._accelerator
+        run, loop, accelerator = self._training, self._training.loop, self._accelerator
         total = torch.zeros((), device=accelerator.device)
         for group in self._optimizer.param_groups:
             group["lr"] = loop.rate_at(step)
@@ -155,12 +155,12 @@ class _Loop:
 
     def _positions(self, step: int, part: int) -> range:
         """Places in the order that this process takes in a pass."""
-        begin = step * self._run_.loop.batch
+        begin = step * self._training.loop.batch
         begin += (part * self._accelerator.num_processes + self._accelerator.process_index) * self.each
         return range(begin, begin + self.each)
 
     def _begin_reading(self, step: int) -> list[list[Any]]:
-        run = self._run_
+        run = self._training
 
         def read(position: int) -> Loaded:
             return run.cache.load(run.mixture.draw(position), run.objective.roles)
@@ -169,7 +169,7 @@ class _Loop:
         return [[self._readers.submit(read, at) for at in self._positions(step, part)] for part in parts]
 
     def _save(self) -> None:
-        folder = self._run_.folder / _STATES / f"{self.step:08d}"
+        folder = self._training.folder / _STATES / f"{self.step:08d}"
         partial = folder.with_name(f".{folder.name}.partial")
         if self._accelerator.is_main_process:
             shutil.rmtree(partial, ignore_errors=True)
@@ -179,15 +179,17 @@ class _Loop:
         self._accelerator.wait_for_everyone()
         if self._accelerator.is_main_process:
             with whole_file(partial / _JOB_FILE) as stream:
-                stream.write(json.dumps(self._run_.fingerprint()).encode())
+                stream.write(json.dumps(self._training.fingerprint()).encode())
             shutil.rmtree(folder, ignore_errors=True)
             partial.rename(folder)
-            for old in _states(self._run_.folder)[:-_KEPT_STATES]:
+            for old in _states(self._training.folder)[:-_KEPT_STATES]:
                 shutil.rmtree(old)
         self._accelerator.wait_for_everyone()
 
     def _resume(self) -> None:
-        run, states = self._run_, _states(self._run_.folder)
+        run, states = self._training, _states(self._training.folder)
+        if self._accelerator.is_main_process:
+            cut_log(run.folder / LOG_FILE, int(states[-1].name) if states else 0)
         if not states:
             return
         path = states[-1] / _JOB_FILE
@@ -204,11 +206,9 @@ class _Loop:
         self._accelerator.load_state(str(states[-1]))
         self.step = int(states[-1].name)
         run.say(f"goes on from step {self.step}")
-        if self._accelerator.is_main_process:
-            cut_log(run.folder / LOG_FILE, self.step)
 
     def _validate(self, curve: Curve | None) -> None:
-        run = self._run_
+        run = self._training
         mixture = run.held_out or run.mixture
         asked = Validation(
             run.objective,
@@ -232,7 +232,7 @@ class _Loop:
             curve.add_validation(self.step, found.numbers, sheet)
 
     def _finish(self) -> Path:
-        run, folder = self._run_, self._run_.folder / MODEL_FOLDER
+        run, folder = self._training, self._training.folder / MODEL_FOLDER
         if self._average:
             with self._average.applied():
                 state = self._weights()

@@ -25,7 +25,16 @@ CONDITIONS = 2
 ABOUT_FILE = "harmonizer.json"
 AUTHORS = "nviolante/dot3d"
 WEIGHTS = "diffusion_pytorch_model"
-_HUB_PATTERNS = ["transformer/*", "vae/*", "*.json", "*.safetensors", "unet/*"]
+_PARTS = ("", "transformer/", "vae/", "unet/")
+_HUB_PATTERNS = [
+    # neither single files of the whole nor half-precision copies nor text encoders, which would double a download
+    *(
+        f"{part}{name}"
+        for part in _PARTS
+        for name in ("config.json", f"{WEIGHTS}.safetensors*", f"{WEIGHTS}-*.safetensors")
+    ),
+    *("model_index.json", ABOUT_FILE, PROMPT_FILE),
+]
 
 Say = Callable[[str], None]
 

@@ -17,7 +17,7 @@ class Painter:
 
     def __init__(self, pipeline: Any, device: torch.device, size: tuple[int, int], say: Callable[[str], None]) -> None:
         """`size`: width and height, px."""
-        self._pipeline, self._size = pipeline.to(torch.bfloat16), size
+        self._pipeline, self._size = pipeline, size
         if device.type == "cuda" and torch.cuda.mem_get_info(device)[0] < _WHOLE_BYTES:
             say("painter: parts are fetched from the CPU in turn, since all together do not fit")
             pipeline.enable_model_cpu_offload()
