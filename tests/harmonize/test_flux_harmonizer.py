@@ -11,6 +11,7 @@ pytest.importorskip("diffusers")
 from tiny_models import CHANNELS, flux_folder, quiet, tiny_transformer
 
 from splatgraft.harmonize import HarmonizerInputs, HarmonizerOptions, make_harmonizer
+from splatgraft.harmonize.flux.detail import with_detail, with_material_held
 from splatgraft.harmonize.flux.folder import FluxFolder
 from splatgraft.harmonize.flux.loading import FluxWeights, load_flux, widen_transformer
 from splatgraft.harmonize.flux.lora import add_lora, write_lora
@@ -209,6 +210,17 @@ def test_numbers_that_are_none_and_memory_that_does_not_do_are_said(tmp_path, mo
     monkeypatch.setattr("splatgraft.harmonize.flux.harmonizer.velocity", full)
     with pytest.raises(ValueError, match="expected memory for 1 views at once, found too little; views that are done"):
         harmonizer.harmonize(view())
+
+
+def test_detail_and_strength_are_laid_on_what_the_network_makes(tmp_path):
+    folder, shown = flux_folder(tmp_path / "image-mask", WIDE), view()
+    plain = make_harmonizer("flux", options(folder)).harmonize(shown).image
+    held = with_material_held(plain, shown.composite, shown.mask, strength=0.3)
+    image = make_harmonizer("flux", options(folder, detail=0.7, strength=0.3)).harmonize(shown).image
+    assert torch.equal(image, with_detail(held, shown.composite, amount=0.7))
+    for name in ("detail", "strength"):
+        with pytest.raises(ValueError, match=f"--{name}: expected a number from 0 to 1, found 2.0"):
+            make_harmonizer("flux", options(folder, **{name: 2.0}))
 
 
 def test_the_authors_weights_are_fetched_by_id_and_their_licence_said(tmp_path, monkeypatch):

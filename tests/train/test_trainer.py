@@ -103,6 +103,24 @@ def test_a_trained_adaptation_changes_what_the_base_makes(tmp_path):
     assert json.loads((model / "harmonizer.json").read_text())["variant"] == "image-mask"
 
 
+def test_the_other_condition_is_trained_and_told(tmp_path):
+    run = training(tmp_path, "out", condition="image-background", times="logit-normal", first_layer="zero")
+    assert run.objective.roles == ("target", "composite", "background")
+    harmonizer = make_harmonizer("flux", HarmonizerOptions(weights=str(train(run))))
+    assert harmonizer.network.variant == "image-background"
+    with pytest.raises(ValueError, match=r"model: expected image-mask .--variant., found image-background"):
+        FluxObjective(FluxTraining(str(tmp_path / "out" / "model")), silent)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_on_cuda_in_bf16_losses_are_about_those_of_the_cpu(tmp_path):
+    train(training(tmp_path, "cpu"))
+    train(training(tmp_path, "cuda", replace(QUICK, cpu=False, precision="bf16")))
+    cpu, cuda = (torch.tensor(read_losses(tmp_path / name / LOG_FILE)) for name in ("cpu", "cuda"))
+    # 8 bits of mantissa: percents
+    assert torch.allclose(cpu, cuda, rtol=0.05)
+
+
 def test_the_order_does_not_depend_on_the_number_of_passes(tmp_path):
     losses = []
     for passes in (1, 2):
