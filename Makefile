@@ -1,5 +1,6 @@
 # make install: the environment in .venv; make demo: the whole job on shipped data; make test: all checks;
-# make blender: Blender as a Python module in .venv-blender, for `splatgraft synth --blender-python`.
+# make blender: Blender as a Python module in .venv-blender, for `splatgraft synth --blender-python`;
+# make browser: Chromium, for the editor's tests.
 SHELL := /bin/bash
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
@@ -7,7 +8,7 @@ STAMP := .venv/.installed
 # threads of torch and numba that spin while they wait take the cores from each other
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: install demo test blender clean
+.PHONY: install demo test blender browser clean
 .DEFAULT_GOAL := install
 
 install: $(STAMP)
@@ -30,6 +31,11 @@ blender: .venv-blender/.installed
 	$(BLENDER_PYTHON) -m venv .venv-blender
 	.venv-blender/bin/python -m pip install --quiet --disable-pip-version-check 'bpy==4.2.23' numpy==2.4.6
 	@touch $@
+
+# Debian's Chromium with software OpenGL, for the stories of the editor
+browser:
+	@command -v chromium >/dev/null || { apt-get update -qq && \
+	  apt-get install -y -qq --no-install-recommends chromium libgl1-mesa-dri libegl1 >/dev/null; }
 
 test:
 	.ci/run

@@ -66,11 +66,11 @@ def test_a_missing_extra_is_named_with_the_command_that_brings_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(words: list[str]) -> int:
-        raise ModuleNotFoundError("No module named 'viser.theme'", name="viser.theme")
+        raise ModuleNotFoundError("No module named 'pycolmap.x'", name="pycolmap.x")
 
     monkeypatch.setattr("splatgraft.cli._dispatch", fail)
     assert main(["status"]) == 2
-    assert "pip install 'splatgraft[editor]'" in capsys.readouterr().err
+    assert "pip install 'splatgraft[sfm]'" in capsys.readouterr().err
 
 
 def test_an_interruption_is_no_crash(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

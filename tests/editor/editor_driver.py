@@ -1,6 +1,7 @@
 """A real browser on a real `splatgraft edit`: what the stories of the editor are told with."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -78,7 +79,7 @@ class Window:
 
     def turn(self, phase: str) -> None:
         """To another step."""
-        self.page.get_by_role("button", name=phase, exact=True).click()
+        self.page.get_by_role("button", name=re.compile(f"^(● )?{phase}$")).click()
         self.page.get_by_role("button", name=f"● {phase}", exact=True).wait_for(timeout=20_000)
 
     def click(self, name: str) -> None:

@@ -1,4 +1,4 @@
-"""The whole story in a browser, from two folders of photographs to the exported scene; and kills in the middle of it."""
+"""The whole story in a browser, from two folders of photographs to the exported scene, with kills in between."""
 
 import shutil
 import tempfile
@@ -134,7 +134,7 @@ def select(window: Window, project: Path) -> None:
 def place(window: Window, project: Path) -> None:
     window.turn("Place")
     window.click("Find a place for it")
-    wait_until(lambda: (project.parent / "placement.json").is_file(), timeout=30, what="a placement")
+    wait_until((project.parent / "placement.json").is_file, timeout=30, what="a placement")
     found = object_at(project)
     window.write("Scale", "0.5")
     wait_until(

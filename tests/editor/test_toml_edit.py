@@ -40,7 +40,9 @@ def test_a_value_over_several_lines_is_replaced_and_comments_stay() -> None:
         assert comment in found
 
 
-@given(st.dictionaries(st.sampled_from(["box", "keep", "threshold", "new"]), VALUES), st.sampled_from(["segment", "light"]))
+@given(
+    st.dictionaries(st.sampled_from(["box", "keep", "threshold", "new"]), VALUES), st.sampled_from(["segment", "light"])
+)
 def test_whatever_is_set_is_read_back_and_nothing_else_changes(values: dict, table: str) -> None:
     before, after = tomllib.loads(TEXT), tomllib.loads(with_keys(TEXT, table, values))
     assert after.get(table, {}) == before.get(table, {}) | values
@@ -56,4 +58,4 @@ def test_what_is_set_and_removed_again_leaves_the_values_as_they_were() -> None:
 
 def test_another_layout_is_refused_rather_than_broken() -> None:
     with pytest.raises(ValueError, match="by hand"):
-        with_keys('segment = {box = [1]}\n', "segment", {"keep": "all"})
+        with_keys("segment = {box = [1]}\n", "segment", {"keep": "all"})

@@ -22,7 +22,6 @@ EXTRAS = {
         {"diffusers": "diffusers", "safetensors": "safetensors", "accelerate": "accelerate"},
     ),
     "text": Extra("text encoders, to embed the empty prompt once", {"transformers": "transformers"}),
-    "editor": Extra("the placement editor in a browser", {"viser": "viser"}),
     "blender": Extra("made-up scenes with ground truth", {"bpy": "bpy"}),
     "ray": Extra("rendering and evaluating on many machines", {"ray": "ray"}),
     "birefnet": Extra(

@@ -53,7 +53,7 @@ class Segment:
     keep: Keep = "substantial"
     """Which separate pieces stay: those with at least a twentieth of the largest one's opacity, the largest, or all."""
     corrections: Path | None = None
-    """A .npy with one int8 per Gaussian of the scene, as the editor writes it: 1 adds it to the object, -1 removes it."""
+    """A .npy with one int8 per Gaussian of the scene, as the editor writes it: 1 adds it to the object, -1 removes."""
     solidify: int = SolidifyOptions.iterations
     """Steps that make the object look whole when it stands alone; 0 leaves its Gaussians as they are in the scene."""
     device: Device = "auto"

@@ -11,7 +11,7 @@ import torch
 import viser
 
 from splatgraft.editor.lighting import aimed, arrow_points, ring_points
-from splatgraft.editor.page.place_phase import hide_target, show_target
+from splatgraft.editor.page.place_phase import NO_NAMES, hide_target, show_target
 from splatgraft.editor.state import EditState
 from splatgraft.relight import LayerWeights, Light
 
@@ -31,7 +31,7 @@ class LightPhase:
         self._inside = False
         self._text = gui.add_html("")
         self._find = gui.add_button("Find the light", icon=viser.Icon.SUN)
-        self._which = gui.add_dropdown("Aim", ("1",), initial_value="1", visible=False)
+        self._which = gui.add_dropdown("Aim", NO_NAMES, initial_value=NO_NAMES[0], visible=False)
         self._strength = gui.add_slider("Its strength", 0.0, 3.0, 0.05, 1.0, visible=False)
         self._sliders = {key: gui.add_slider(label, 0.0, 2.0, 0.05, 1.0) for key, label in _LAYERS}
         self._estimate = gui.add_button("Back to the estimate", color="gray")

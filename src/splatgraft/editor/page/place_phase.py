@@ -24,6 +24,8 @@ from splatgraft.similarity import Similarity
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
 
+NO_NAMES: tuple[str, ...] = ("1",)
+"""Of a dropdown before there is anything to choose."""
 _SAVE_EVERY = 0.25
 """Seconds between saves while something is dragged."""
 
@@ -40,7 +42,7 @@ class PlacePhase:
         self._inside = False
         self._note = gui.add_html("", visible=False)
         self._suggest = gui.add_button("Find a place for it", icon=viser.Icon.WAND)
-        self._which = gui.add_dropdown("Object", ("1",), initial_value="1")
+        self._which = gui.add_dropdown("Object", NO_NAMES, initial_value=NO_NAMES[0])
         self._position = gui.add_vector3("Position", (0.0, 0.0, 0.0), step=0.001)
         self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=0.01, hint="Degrees about x, y, z")
         self._scale = gui.add_number("Scale", 1.0, min=1e-4, step=0.001)
@@ -119,13 +121,13 @@ class PlacePhase:
         self._show_box.on_update(act(lambda _: self._toggle_box()))
         self._erase.on_click(act(lambda _: self._erase_box()))
         self._restore.on_click(act(lambda _: self._bring_back()))
-        for name, key, work in (
-            ("Drop to the surface", "G", lambda: self._named("Drop")),
-            ("Duplicate the object", "D", self._duplicate),
-            ("Delete the object", "DELETE", self._delete),
-        ):
-            command = self._page.gui.add_command(name, hotkey=key)
-            command.on_trigger(act(lambda _, work=work: work() if self._inside else None))
+        gui = self._page.gui
+        drop = gui.add_command("Drop to the surface", hotkey="G")
+        duplicate = gui.add_command("Duplicate the object", hotkey="D")
+        delete = gui.add_command("Delete the object", hotkey="delete")
+        drop.on_trigger(act(lambda _: self._named("Drop") if self._inside else None))
+        duplicate.on_trigger(act(lambda _: self._duplicate() if self._inside else None))
+        delete.on_trigger(act(lambda _: self._delete() if self._inside else None))
 
     # moves
 
@@ -139,7 +141,7 @@ class PlacePhase:
 
     def _typed(self) -> None:
         session = self._page.need()
-        gizmo = Gizmo(tuple(self._position.value), wxyz_of(tuple(self._degrees.value)), float(self._scale.value))
+        gizmo = Gizmo(self._position.value, wxyz_of(self._degrees.value), float(self._scale.value))
         self._move(similarity_of(gizmo, session.placeable(self._chosen).base.point))
 
     def _named(self, name: str) -> None:

@@ -64,8 +64,8 @@ class PreviewPanel:
         for control in (self._left, self._right, self._share, self._follow):
             control.on_update(lambda event: self.ask() if event.client is not None else None)
         self._number.on_update(page.act(lambda _: self._to_camera()))
-        self._previous = gui.add_command("Previous camera", hotkey="ARROWLEFT")
-        self._next = gui.add_command("Next camera", hotkey="ARROWRIGHT")
+        self._previous = gui.add_command("Previous camera", hotkey="arrowleft")
+        self._next = gui.add_command("Next camera", hotkey="arrowright")
         self._previous.on_trigger(page.act(lambda _: self._step(-1)))
         self._next.on_trigger(page.act(lambda _: self._step(1)))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from splatgraft.editor.page.box_handles import BoxHandles
 from splatgraft.editor.page.stage_view import view_of
 from splatgraft.editor.picking import Rectangle, first_hit, in_brush, in_rectangle
 from splatgraft.formats import read_capture
-from splatgraft.segment import Box, default_box
+from splatgraft.segment import Box, Keep, default_box
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
@@ -23,6 +23,9 @@ _SOURCES = {
     "a box around the object": "grabcut",
     "a network (BiRefNet)": "birefnet",
 }
+
+
+_KEEP: tuple[str, ...] = get_args(Keep)
 
 
 class SelectPhase:
@@ -36,7 +39,7 @@ class SelectPhase:
         self._show_box = gui.add_checkbox("Box around the object", False)
         self._lower = gui.add_vector3("Box from", (0.0, 0.0, 0.0), step=0.001, visible=False)
         self._upper = gui.add_vector3("Box to", (0.0, 0.0, 0.0), step=0.001, visible=False)
-        self._keep = gui.add_dropdown("Keep pieces", ("substantial", "largest", "all"), initial_value="substantial")
+        self._keep = gui.add_dropdown("Keep pieces", _KEEP, initial_value=_KEEP[0])
         self._cut = gui.add_button("Cut out the object", icon=viser.Icon.WAND)
         with gui.add_folder("Mend by hand"):
             self._mode = gui.add_dropdown("A stroke", ("adds", "removes"), initial_value="removes")
@@ -79,7 +82,7 @@ class SelectPhase:
         name = next((n for n, value in _SOURCES.items() if value == (state.mask_source or "files")), None)
         if name is not None:
             self._source.value = name
-        self._keep.value = state.keep or "substantial"
+        self._keep.value = state.keep or _KEEP[0]
         box = session.box()
         self._lower.visible = self._upper.visible = self._show_box.value
         if box is not None:

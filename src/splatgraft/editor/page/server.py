@@ -62,7 +62,8 @@ class GuardedServer:
             finally:
                 websockets.asyncio.server.serve = original
         inner = self.viser._websock_server
-        inner._handle_incoming_message = partial(self._filtered, inner._handle_incoming_message)
+        # pyright would have viser's parameter names
+        setattr(inner, "_handle_incoming_message", partial(self._filtered, inner._handle_incoming_message))  # noqa: B010
         inner.on_client_connect(lambda connection: self._seated(self.seat.joined(connection.client_id)))
         inner.on_client_disconnect(lambda connection: self._seated(self.seat.left(connection.client_id)))
         self._check(host)
