@@ -113,6 +113,7 @@ def _say_memory(size: Size, asked: "TrainFlux", terminal: Terminal) -> None:
         ema=loop.ema > 0,
         checkpointing=not asked.no_checkpointing,
         shards=shards,
+        half=loop.precision != "no",
     )
     for line in table(size, choice):
         terminal.say(f"memory: {line}")

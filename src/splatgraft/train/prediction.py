@@ -1,6 +1,9 @@
 """Memory that a training takes, per option, before it begins. Pure arithmetic; knows no network but its numbers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+_PER_BLOCK = 54
+"""Bytes a token and channel that a block keeps; tests/harmonize/test_flux_memory.py measures them."""
 
 
 @dataclass(frozen=True)
@@ -29,21 +32,29 @@ class Choice:
     checkpointing: bool = True
     shards: int = 1
     """Processes that share weights, gradients and optimiser (FSDP, DeepSpeed stage 3)."""
+    half: bool = True
+    """Arithmetic in 16 bits."""
 
 
 def training_bytes(size: Size, choice: Choice) -> int:
     """Bytes on each device: weights, gradients, optimiser, average, activations.
 
-    Learning weights are float32 (4), their gradients too (4), Adam's two moments (8, or 2 in 8 bits), an average (4);
-    what does not learn is bfloat16 (2). A block keeps some 34 bytes a token and channel for its backward pass
-    (Korthikanti et al. 2022, without attention maps, which are not stored), or 2 where it is computed again.
+    Learning weights are float32 (4), their gradients too (4), Adam's two moments (8, or 2 in 8 bits), an average (4),
+    and a copy in 16 bits (2) that autocast keeps through a pass; what does not learn is bfloat16 (2). Measured on
+    FLUX's blocks under autocast: a block keeps 54 bytes a token and channel for its backward pass, or 2 where it is
+    computed again; twice that in 32 bits.
     """
     learning = choice.lora * size.adapted if choice.lora else size.parameters
     frozen = size.parameters if choice.lora else 0
-    each = 8 + (2 if choice.adam8bit else 8) + (4 if choice.ema else 0)
-    per_token = 2 * size.blocks + 34 if choice.checkpointing else 34 * size.blocks
-    activations = choice.pairs * size.tokens * size.width * per_token
+    each = 8 + (2 if choice.adam8bit else 8) + (4 if choice.ema else 0) + (2 if choice.half else 0)
+    activations = activation_bytes(size, choice)
     return (learning * each + frozen * 2) // choice.shards + activations + (1 << 30)
+
+
+def activation_bytes(size: Size, choice: Choice) -> int:
+    """What of it the backward pass needs."""
+    per_token = 2 * size.blocks + _PER_BLOCK if choice.checkpointing else _PER_BLOCK * size.blocks
+    return choice.pairs * size.tokens * size.width * per_token * (1 if choice.half else 2)
 
 
 def table(size: Size, choice: Choice) -> list[str]:
@@ -55,8 +66,8 @@ def table(size: Size, choice: Choice) -> list[str]:
     }
     lines = []
     for name, (lora, small) in ways.items():
-        way = Choice(choice.pairs, lora, small, choice.ema, choice.checkpointing, choice.shards)
-        again = Choice(choice.pairs, lora, small, choice.ema, not choice.checkpointing, choice.shards)
+        way = replace(choice, lora=lora, adam8bit=small)
+        again = replace(way, checkpointing=not choice.checkpointing)
         chosen = lora == choice.lora and small == choice.adam8bit
         words = ("with", "without") if choice.checkpointing else ("without", "with")
         lines.append(
