@@ -22,14 +22,23 @@ def irradiance(beams: Beams, normals: Float[Tensor, "n 3"], *, arrives: Float[Te
 
 
 def shade_ratio(
-    target: Float[Tensor, "n 3"], source: Float[Tensor, "n 3"], normals: Normals, opacities: Float[Tensor, "n"]
+    target: Float[Tensor, "n 3"],
+    source: Float[Tensor, "n 3"],
+    normals: Normals,
+    opacities: Float[Tensor, "n"],
+    *,
+    seen: float = 1.0,
 ) -> Float[Tensor, "n 3"]:
     """Irradiance at the new place over irradiance at the old one, made safe.
 
-    Floored, clamped around the object's mean, and drawn towards that mean where the normal is unsure.
+    Floored, clamped around the object's mean, and drawn towards that mean where the normal is unsure. The mean is drawn
+    towards 1 the less of both lights was `seen`, in [0, 1], and its tint more so: both captures were exposed and white
+    balanced for their own light. The powers, 1 and 3, are near least squares over rendered scenes with known light.
     """
     log_ratio = (_floored(target, opacities) / _floored(source, opacities)).log()
-    return _safe(log_ratio, normals, opacities)
+    middle = _mean(log_ratio, opacities)
+    gray = middle.mean()
+    return _safe(log_ratio - middle + seen * gray + seen**3 * (middle - gray), normals, opacities)
 
 
 def unknown_origin_ratio(

@@ -25,6 +25,8 @@ _FACES = torch.tensor(
 )
 # under this much opacity the colour of a pixel is noise
 _FAINTEST = 0.02
+# standard deviation over distance: what is wider is smeared over half a face by the affine approximation of splatting
+_WIDEST = 0.2
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ def cube_directions(size: int) -> tuple[Float[Tensor, "6 s s 3"], Float[Tensor, 
 
 def render_panorama(scene: Gaussians, center: Float[Tensor, "3"], *, size: int = 64, nearest: float = 0.0) -> Panorama:
     """What `scene` looks like from `center`; Gaussians centred nearer than `nearest` (world units) are left out."""
-    far_enough = (scene.means - center.to(scene.means)).norm(dim=-1) >= nearest
+    distance = (scene.means - center.to(scene.means)).norm(dim=-1)
+    far_enough = (distance >= nearest) & (scene.scales.max(1).values < _WIDEST * distance)
     # the plane of each face only has to keep out what is behind it: distance was taken care of above
     near = max(nearest / math.sqrt(3), 1e-6)
     seen = render(scene.select(far_enough), cube_cameras(center, size), options=RenderOptions(near=near))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from splatgraft.cameras import Cameras, look_at, pinhole
 from splatgraft.gaussians import Gaussians, concatenate
+from splatgraft.images import linear_from_srgb
 from splatgraft.relight.estimate_light import light_of
 from splatgraft.relight.light import Light, LightSource
 from splatgraft.relight.normals import estimate_normals
@@ -19,11 +20,18 @@ from splatgraft.relight.panorama import Panorama, cube_cameras, render_panorama
 from splatgraft.relight.scene_shading import Ball
 from splatgraft.relight.vote import Vote, vote
 from splatgraft.rendering import render
+from splatgraft.spherical_harmonics import rgb_from_dc
 
 _LOWEST = math.radians(4)  # bright patches below are reflections
 _SUN = 0.03  # steradians; the glare of a sun in a photograph is smaller, a window larger
 _ENCLOSED = 0.6
 _SIZE = 64  # pixels along each face of the panorama
+_CLEAR = 0.35  # confidence of a vote beyond which no wider one is asked
+_AROUND = 3.0  # object radii within which surfaces tell how bright the light is
+_ALBEDO = 0.4  # of a mean surface, linear
+_UNSEEN = 0.25
+_LEVEL = math.log(9)
+_GLARE_DEG = 12.0
 
 
 def up_of(cameras: Cameras) -> Float[Tensor, "3"]:
@@ -45,11 +53,53 @@ def light_at(
     whole = scene if also is None else concatenate([scene, also])
     orbit = float((cameras.centers - ball.center).norm(dim=1).median())
     radius = max(3 * ball.radius, min(orbit, 8 * ball.radius))
-    near = (whole.means - ball.center).norm(dim=1) < 1.4 * radius
-    whole = whole.select(near)
-    voted = vote(whole, estimate_normals(whole, cameras), center=ball.center, radius=radius, up=up)
+    voted, radius = _asked(whole, cameras, ball.center, radius, up)
     light = combine(panorama, voted, up, asked_within=radius)
-    return _through_windows(light, scene, ball), None
+    light = _through_windows(light, scene, ball)
+    return levelled(light, scene, ball, cameras), None
+
+
+def _asked(
+    whole: Gaussians, cameras: Cameras, center: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"]
+) -> tuple[Vote | None, float]:
+    """The vote of the shadows near the place, or of those half as far again where the near ones say little; its radius.
+
+    Near ones know best what reaches the place, but a bare table has none.
+    """
+    found: tuple[Vote | None, float] = (None, radius)
+    for wide in (radius, 1.5 * radius):
+        part = whole.select((whole.means - center).norm(dim=1) < 1.4 * wide)
+        voted = vote(part, estimate_normals(part, cameras), center=center, radius=wide, up=up)
+        if voted is not None and (found[0] is None or voted.confidence > found[0].confidence):
+            found = (voted, wide)
+        if voted is not None and voted.confidence > _CLEAR:
+            break
+    return found
+
+
+def levelled(light: Light, scene: Gaussians, ball: Ball, cameras: Cameras) -> Light:
+    """`light` as bright as two witnesses say in the mean (geometric): what is seen around, and what is lit by it.
+
+    Much of what shines on a place was never photographed, so the panorama alone is off by a factor of two or more.
+    The surfaces around the place reflect that light; under the albedo of a mean surface they tell it as well. They
+    count as much as the panorama where `_UNSEEN` of it is missing, and nothing where it is whole.
+    """
+    up = up_of(cameras)
+    near = (scene.means - ball.center).norm(dim=1) < _AROUND * ball.radius
+    part = scene.select(near & (scene.opacities > 0.3))
+    if part.count < 50:
+        return light
+    upward = estimate_normals(part, cameras).vectors @ up > 0.7
+    area = part.opacities * part.scales.sort(1).values[:, 1:].prod(1) * upward
+    if int(upward.sum()) < 30:
+        return light
+    reflected = linear_from_srgb(rgb_from_dc(part.sh[:, 0]).clamp(0.002, 1)).mean(1)
+    told = math.pi * float((area * reflected).sum() / area.sum()) / _ALBEDO
+    seen = float(light.irradiance(up[None]).mean())
+    share = 0.5 * min(1.0, (1 - light.coverage) / _UNSEEN)
+    factor = math.exp(share * max(-_LEVEL, min(_LEVEL, math.log(told / max(seen, 1e-9)))))
+    sources = [replace(s, irradiance=tuple(factor * v for v in s.irradiance)) for s in light.sources]
+    return replace(light, sources=tuple(sources), ambient=factor * light.ambient)
 
 
 def _through_windows(light: Light, scene: Gaussians, ball: Ball) -> Light:
@@ -136,11 +186,12 @@ def _from_vote(voted: Vote, ambient: float) -> LightSource:
 
 def _fused(voted: LightSource, patch: LightSource, apart: float) -> LightSource:
     """Two sightings of one light: directions by inverse variance, the larger strength, more confidence."""
-    own = math.hypot(patch.uncertainty_deg, 0.5 * patch.angular_radius_deg)
+    # what shines is somewhere in a patch that a camera clipped: glare is wider than the sun, and not around it
+    own = math.hypot(_GLARE_DEG, patch.angular_radius_deg)
     weight_voted, weight_patch = voted.uncertainty_deg**-2, own**-2
     mixed = weight_voted * torch.tensor(voted.direction) + weight_patch * torch.tensor(patch.direction)
     error = (weight_voted + weight_patch) ** -0.5
-    disagreement = 0.3 * math.degrees(apart)
+    disagreement = 0.6 * weight_patch / (weight_voted + weight_patch) * math.degrees(apart)
     return replace(
         voted,
         direction=tuple(torch.nn.functional.normalize(mixed, dim=0).tolist()),

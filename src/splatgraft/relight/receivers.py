@@ -11,7 +11,7 @@ from torch import Tensor
 
 from splatgraft.gaussians import Gaussians, concatenate
 from splatgraft.relight.scene_shading import ObjectMaps, SceneRatio, scene_ratio
-from splatgraft.relight.split import NARROWER, split_along
+from splatgraft.splitting import NARROWER, split_along
 
 _ROUNDS = 3
 _VARIATION = 0.05  # share of light over one standard deviation: about the contrast at which an edge is seen as one

@@ -95,16 +95,17 @@ def relight(
         facing = body.normals.vectors
         actor = _Actor(body, scene_visibility(stage.maps, raised(body.gaussians, facing), facing))
         actors.append(actor)
-        shades.append(_shade(actor, beams))
+        shades.append(_shade(actor, beams, stage.light))
     return _assembled(stage, actors, shades, beams, options=options, baked=baked, report=report)
 
 
-def _shade(actor: _Actor, beams: Beams) -> Float[Tensor, "n 3"]:
+def _shade(actor: _Actor, beams: Beams, light: Light) -> Float[Tensor, "n 3"]:
     body = actor.body
     now = irradiance(beams, body.normals.vectors, arrives=body.own * actor.arrives)
-    if body.then is None:
+    if body.then is None or body.before is None:
         return unknown_origin_ratio(now, body.normals, body.gaussians.opacities)
-    return shade_ratio(now, body.then, body.normals, body.gaussians.opacities)
+    seen = 0.5 * (light.coverage + body.before.coverage)
+    return shade_ratio(now, body.then, body.normals, body.gaussians.opacities, seen=seen)
 
 
 def _assembled(  # noqa: PLR0913

@@ -24,8 +24,8 @@ _LOWEST = math.radians(5)
 _RECEIVERS = 4000
 _OCCLUDERS = 16000
 _MAP_SIZE = 128
-# errors in visibility make a least-squares slope too small; on synthetic scenes by a median factor of 1.6
-_ATTENUATION = 1.4
+# errors in visibility make a least-squares slope too small, the more, the less of the brightness it explains
+_ATTENUATION, _ATTENUATED = 1.2, 0.2
 _HIDDEN = 0.6  # openness below which a point is inside something
 _STRENGTHS = (0.3, 0.8, 2.0, 4.0, 8.0)
 
@@ -88,12 +88,12 @@ def vote(
     typical = float(scores.median())
     contrast = (top - typical) / max(top, 1e-9)
     # measured on synthetic scenes: the less the best direction explains, the farther it is from the truth
-    uncertainty = math.hypot(uncertainty, math.radians(3 + 22 * math.exp(-top / 0.15)))
+    uncertainty = math.hypot(uncertainty, math.radians(3 + 16 * math.exp(-top / 0.15)))
     confidence = top / (top + 0.08) * min(1.0, 1.6 * contrast)
     return Vote(
         direction=direction,
         uncertainty=uncertainty,
-        strength=_ATTENUATION * fit.strength(lit[:, nearest]),
+        strength=(1 + _ATTENUATION * math.exp(-top / _ATTENUATED)) * fit.strength(lit[:, nearest]),
         confidence=confidence,
         explained=top,
         directions=directions,

@@ -18,6 +18,7 @@ from splatgraft.harmonize import make_harmonizer
 from splatgraft.image_losses import lpips_vgg, windowed_fourier
 from splatgraft.project import PLACEMENT_FILE, SCENE_FILE
 from splatgraft.relight import SourceScene, relight
+from splatgraft.splitting import split_around
 from splatgraft.steps.benchmark_scene import ReadyScene, fresh
 from splatgraft.steps.composite_folder import placement_files, read_composite
 from splatgraft.steps.consolidate import Consolidate
@@ -110,13 +111,15 @@ class RelightTruly:
     def write(self, folder: Path, context: Context) -> None:
         """Make the relit composite."""
         source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
+        composite = read_composite(self.target, self.placement)
         relit = relight(
-            read_composite(self.target, self.placement),
+            composite,
             read_cameras(self.cameras),
             sources=[source],
             light=read_true_light(self.light),
         )
-        write_gaussians(folder / SCENE_FILE, relit.bake())
+        placed = [one.in_target() for one in composite.objects]
+        write_gaussians(folder / SCENE_FILE, split_around(relit.bake(), relit.is_object, placed)[0])
         for sentence in relit.report:
             context.terminal.say(sentence)
 

@@ -7,6 +7,7 @@ from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.formats.placement import Placement, read_placement, write_placement
 from splatgraft.gaussians import Gaussians
 from splatgraft.project import IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
+from splatgraft.splitting import split_around
 from splatgraft.steps.selection_file import write_selection
 
 
@@ -42,7 +43,7 @@ def assemble(target: Gaussians, objects: list[Gaussians], placement: Placement) 
 
 def write_composite(folder: Path, composite: Composite, placement: Placement) -> None:
     """Write the three files; `placement` names every object."""
-    gaussians, is_object = composite.bake()
+    gaussians, is_object = split_around(*composite.bake(), [placed.in_target() for placed in composite.objects])
     write_gaussians(folder / SCENE_FILE, gaussians)
     write_selection(folder / IS_OBJECT_FILE, is_object)
     write_placement(folder / PLACEMENT_FILE, placement)

@@ -11,6 +11,7 @@ from splatgraft.relight.exposure import relight_by_gain
 from splatgraft.relight.layers import LayerWeights
 from splatgraft.relight.light import Light, light_from_json, light_to_json
 from splatgraft.relight.transfer import RelightOptions, SourceScene, relight
+from splatgraft.splitting import split_around
 from splatgraft.steps.composite_folder import placement_files, read_composite
 from splatgraft.steps.selection_file import write_selection
 from splatgraft.steps.step import Context, Inputs
@@ -65,6 +66,8 @@ class Relight:
             relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
             found = relit.light
             gaussians, is_object, sentences = relit.bake(self.weights), relit.is_object, relit.report
+        placed = [one.in_target() for one in composite.objects]
+        gaussians, is_object = split_around(gaussians, is_object, placed)
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_selection(folder / IS_OBJECT_FILE, is_object)
         (folder / LIGHT_TEXT_FILE).write_text("\n".join(sentences) + "\n")
