@@ -6,8 +6,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,20 @@ def browser_path() -> str:
     if reason:
         pytest.skip(f"no browser: {reason}")
     pytest.fail("no Chromium found: `make browser`, or set SPLATGRAFT_NO_BROWSER to the reason why there is none")
+
+
+@contextmanager
+def with_browser() -> Iterator[Any]:
+    """A browser with nothing open."""
+    path = browser_path()
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
+        context = driver.chromium.launch_persistent_context(
+            folder, executable_path=path, headless=True, args=list(ARGUMENTS), viewport={"width": 1280, "height": 900}
+        )
+        yield context
+        context.close()
 
 
 class Editor:
@@ -76,6 +92,13 @@ class Window:
         """A browser's page, opened on the editor already."""
         self.page = page
         page.wait_for_selector(".sg-header", timeout=60_000)
+
+    @staticmethod
+    def opened(browser: Any, editor: Editor) -> "Window":
+        """A new window on an editor."""
+        page = browser.new_page()
+        page.goto(editor.url)
+        return Window(page)
 
     def turn(self, phase: str) -> None:
         """To another step."""

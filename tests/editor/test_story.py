@@ -1,7 +1,6 @@
 """The whole story in a browser, from two folders of photographs to the exported scene, with kills in between."""
 
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from editor_driver import ARGUMENTS, Editor, Window, browser_path, wait_until
+from editor_driver import Editor, Window, wait_until, with_browser
 from tiny_project import OPTIONS, ball, photograph, plane
 
 from splatgraft.cli import main
@@ -19,7 +18,7 @@ from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import read_placement
 
 pytest.importorskip("viser")
-playwright = pytest.importorskip("playwright.sync_api")
+pytest.importorskip("playwright.sync_api")
 
 # a ball and a plane have no photographed surroundings worth an estimate, but the transfer must run on them
 LIT = OPTIONS.replace('light = "gain"', 'light = "transfer"')
@@ -27,19 +26,8 @@ LIT = OPTIONS.replace('light = "gain"', 'light = "transfer"')
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    path = browser_path()
-    with playwright.sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
-        context = driver.chromium.launch_persistent_context(
-            folder, executable_path=path, headless=True, args=list(ARGUMENTS), viewport={"width": 1280, "height": 900}
-        )
-        yield context
-        context.close()
-
-
-def opened(browser: Any, editor: Editor) -> Window:
-    page = browser.new_page()
-    page.goto(editor.url)
-    return Window(page)
+    with with_browser() as found:
+        yield found
 
 
 def object_at(project: Path) -> torch.Tensor:
@@ -65,7 +53,7 @@ def test_the_whole_story(browser: Any, tmp_path: Path) -> None:
     project.parent.mkdir()
     editor = Editor(project)
     try:
-        window = opened(browser, editor)
+        window = Window.opened(browser, editor)
         start_project(window, tmp_path)
         window = leave_and_come_back(window, browser, editor)
         select(window, project)
@@ -98,7 +86,7 @@ def leave_and_come_back(window: Window, browser: Any, editor: Editor) -> Window:
     window.click("Reconstruct both scenes")
     window.page.wait_for_selector(".sg-job", timeout=30_000)
     window.page.close()
-    window = opened(browser, editor)
+    window = Window.opened(browser, editor)
     window.quiet()
     window.says("400 Gaussians")
     return window
@@ -185,7 +173,7 @@ def killed_while_dragging(window: Window, browser: Any, editor: Editor, project:
     assert float(moved[2] - before[2]) > 0.01
     assert float((moved - before)[:2].norm()) < 0.035 * float(moved[2] - before[2])
     editor = Editor(project)
-    window = opened(browser, editor)
+    window = Window.opened(browser, editor)
     window.turn("Place")
     window.click("Drop")
     wait_until(lambda: float(object_at(project)[2]) < float(moved[2]), timeout=20, what="the drop")
@@ -206,7 +194,7 @@ def killed_while_running(window: Window, browser: Any, editor: Editor, project: 
     editor.kill()
     window.page.close()
     editor = Editor(project)
-    window = opened(browser, editor)
+    window = Window.opened(browser, editor)
     wait_until(lambda: (state := jobs.state()) is not None and state.outcome == "done", timeout=120, what="the end")
     assert (project.parent / "result" / "scene.ply").is_file()
     window.turn("Run")

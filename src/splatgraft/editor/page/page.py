@@ -136,12 +136,12 @@ class Page:
         with self._lock:
             try:
                 self._phases[self.phase].refresh()
+                self.preview.ask()
             except (ValueError, OSError) as error:
                 self.say(" ".join(str(error).split()), bad=True)
             self._header.content = self._header_html()
             history = None if self.session is None else self.session.history
             self._back.visible = history is not None and bool(history.past or history.future)
-            self.preview.ask()
 
     def open_project(self) -> None:
         """Take up the project that is there now."""

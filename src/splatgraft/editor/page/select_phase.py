@@ -84,6 +84,7 @@ class SelectPhase:
             self._source.value = name
         self._keep.value = state.keep or _KEEP[0]
         box = session.box()
+        self._show_box.value = box is not None
         self._lower.visible = self._upper.visible = self._show_box.value
         if box is not None:
             self._lower.value, self._upper.value = tuple(box.lower.tolist()), tuple(box.upper.tolist())
@@ -131,7 +132,9 @@ class SelectPhase:
 
     def _toggle_box(self) -> None:
         session = self._page.need()
-        if self._show_box.value and session.box() is None:
+        if not self._show_box.value:
+            self._set(box=None)
+        elif session.box() is None:
             self._set_box(self._guess())
             self._page.say("drag the two corners until the object is inside; the table stays outside")
 
