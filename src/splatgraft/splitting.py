@@ -67,7 +67,7 @@ def _interpolated(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 6"]:
 
 _WIDE = 0.25  # object radii
 _REACH = 1.5
-_ROUNDS = 4
+_ROUNDS = 6
 _MOST = 4000  # pieces' wholes per round and object: a scene of a million small Gaussians has none
 
 

@@ -12,10 +12,10 @@ from splatgraft.relight.light import ambient_of
 from splatgraft.relight.normals import estimate_normals
 from splatgraft.relight.place_light import light_at
 from splatgraft.relight.scene_shading import Ball
-from splatgraft.splitting import split_along
 from splatgraft.relight.vote import vote
 from splatgraft.rendering import render
 from splatgraft.spherical_harmonics import dc_from_rgb
+from splatgraft.splitting import split_along
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 

@@ -78,3 +78,21 @@ def test_near_things_are_left_out():
     seen = render_panorama(concatenate([near, far]), torch.zeros(3), size=16, nearest=0.5)
     alone = render_panorama(far, torch.zeros(3), size=16, nearest=0.5)
     assert torch.equal(seen.radiance, alone.radiance)
+
+
+def test_wide_gaussians_close_by_are_not_smeared_over_the_horizon():
+    # a sky, and under the point a table of discs as wide as they are far
+    sky = shell(torch.full((3000, 3), 0.7), even(), radius=6.0, spread=0.36)
+    x = torch.linspace(-0.6, 0.6, 5)
+    grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    table = Gaussians(
+        means=torch.cat([grid, torch.full((25, 1), -0.25)], 1),
+        log_scales=torch.tensor([0.2, 0.2, 0.01]).log().repeat(25, 1),
+        quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(25, 1),
+        opacity_logits=torch.full((25,), 4.0),
+        sh=dc_from_rgb(torch.tensor([0.9, 0.1, 0.1])).repeat(25, 1)[:, None],
+    )
+    seen = render_panorama(concatenate([sky, table]), torch.zeros(3), size=32, nearest=0.1)
+    level = seen.directions[..., 2].abs() < 0.1
+    found = seen.radiance[level]
+    assert (found[:, 0] - found[:, 1]).abs().max() < 0.02
