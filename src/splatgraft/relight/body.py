@@ -12,13 +12,14 @@ from torch import Tensor
 from splatgraft.cameras import Cameras
 from splatgraft.composite import PlacedObject
 from splatgraft.gaussians import Gaussians
+from splatgraft.orbit import estimate_up
 from splatgraft.relight.beams import ambient_pairs, beams_of, source_pairs
 from splatgraft.relight.cache import RelightCache
 from splatgraft.relight.cast import Beams
 from splatgraft.relight.light import Light
 from splatgraft.relight.normals import Normals, estimate_normals
 from splatgraft.relight.object_shading import irradiance
-from splatgraft.relight.place_light import light_at, up_of
+from splatgraft.relight.place_light import light_at
 from splatgraft.relight.scene_shading import Ball, ObjectMaps, ball_of, map_object, self_visibility
 from splatgraft.similarity import Similarity
 
@@ -70,7 +71,7 @@ def set_body(
         before, problem = cache.get(
             f"origin {index}", (placed.gaussians, source), lambda: _origin_light(placed.gaussians, source)
         )
-        story = problem if before is None else before.describe(up_of(source.cameras)) + "."
+        story = problem if before is None else before.describe(estimate_up(source.cameras)) + "."
         if before is not None:
             before = before.rotated(placed.target_from_object.rotation)
             bundles = beams_of(before)

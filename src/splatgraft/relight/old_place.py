@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 from splatgraft.gaussians import Gaussians
+from splatgraft.orbit import estimate_up
 from splatgraft.relight.beams import beams_of
 from splatgraft.relight.body import SourceScene
 from splatgraft.relight.local_gain import apply_gain
 from splatgraft.relight.normals import estimate_normals, raised
-from splatgraft.relight.place_light import light_at, up_of
+from splatgraft.relight.place_light import light_at
 from splatgraft.relight.scene_shading import (
     Ball,
     ball_of,
@@ -43,4 +44,4 @@ def without_shadow(source: SourceScene, own: Gaussians) -> tuple[Gaussians, tupl
     gain = 1 / (ratio.shadow + ratio.bounce).clamp(1 / _BRIGHTEST, _BRIGHTEST)
     sh = scene.sh.clone()
     sh[index] = apply_gain(receivers, gain).sh
-    return replace(scene, sh=sh), (light.describe(up_of(source.cameras)) + ".",)
+    return replace(scene, sh=sh), (light.describe(estimate_up(source.cameras)) + ".",)

@@ -13,6 +13,7 @@ from torch import Tensor
 from splatgraft.cameras import Cameras, look_at, pinhole
 from splatgraft.gaussians import Gaussians, concatenate
 from splatgraft.images import linear_from_srgb
+from splatgraft.orbit import estimate_up
 from splatgraft.relight.estimate_light import light_of
 from splatgraft.relight.light import Light, LightSource
 from splatgraft.relight.normals import estimate_normals
@@ -34,29 +35,31 @@ _LEVEL = math.log(9)
 _GLARE_DEG = 12.0
 
 
-def up_of(cameras: Cameras) -> Float[Tensor, "3"]:
-    """The mean upward direction of cameras held by people: the least that images' columns agree on."""
-    return torch.nn.functional.normalize(-cameras.world_from_camera[:, :3, 1].mean(0), dim=0)
-
-
 def light_at(
     scene: Gaussians, ball: Ball, cameras: Cameras, *, also: Gaussians | None = None
 ) -> tuple[Light | None, str | None]:
-    """The light in the middle of `ball`, or a sentence that says why there is none.
+    """The light in the middle of `ball`, `levelled`, or a sentence that says why there is none.
 
     `also` stands in the scene too and casts shadows, but is not seen from the middle: the object itself.
     """
+    light, problem = unlevelled_light_at(scene, ball, cameras, also=also)
+    return (None if light is None else levelled(light, scene, ball, cameras)), problem
+
+
+def unlevelled_light_at(
+    scene: Gaussians, ball: Ball, cameras: Cameras, *, also: Gaussians | None = None
+) -> tuple[Light | None, str | None]:
+    """As `light_at`, as bright as the panorama alone says."""
     panorama, problem = panorama_at(scene, ball)
     if panorama is None:
         return None, problem
-    up = up_of(cameras)
+    up = estimate_up(cameras)
     whole = scene if also is None else concatenate([scene, also])
     orbit = float((cameras.centers - ball.center).norm(dim=1).median())
     radius = max(3 * ball.radius, min(orbit, 8 * ball.radius))
     voted, radius = _asked(whole, cameras, ball.center, radius, up)
     light = combine(panorama, voted, up, asked_within=radius)
-    light = _through_windows(light, scene, ball)
-    return levelled(light, scene, ball, cameras), None
+    return _through_windows(light, scene, ball), None
 
 
 def _asked(
@@ -84,7 +87,7 @@ def levelled(light: Light, scene: Gaussians, ball: Ball, cameras: Cameras) -> Li
     The surfaces around the place reflect that light; under the albedo of a mean surface they tell it as well. They
     count as much as the panorama where `_UNSEEN` of it is missing, and nothing where it is whole.
     """
-    up = up_of(cameras)
+    up = estimate_up(cameras)
     near = (scene.means - ball.center).norm(dim=1) < _AROUND * ball.radius
     part = scene.select(near & (scene.opacities > 0.3))
     if part.count < 50:

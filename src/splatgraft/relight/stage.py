@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.gaussians import Gaussians
+from splatgraft.orbit import estimate_up
 from splatgraft.relight.beams import beams_of, main_count
 from splatgraft.relight.cache import RelightCache
 from splatgraft.relight.estimate_light import light_of
@@ -18,7 +19,7 @@ from splatgraft.relight.light import Light
 from splatgraft.relight.litness import lit_share
 from splatgraft.relight.normals import Normals, estimate_normals, raised
 from splatgraft.relight.object_shading import irradiance
-from splatgraft.relight.place_light import light_at, panorama_at, up_of
+from splatgraft.relight.place_light import levelled, panorama_at, unlevelled_light_at
 from splatgraft.relight.scene_shading import Ball, SceneMaps, map_scene, scene_visibility
 
 
@@ -87,14 +88,20 @@ def _estimated(
     """The light at `place`; after a move within the region its sources are kept and the rest is looked at again."""
     kept = cache.peek("light", (scene, region))
     if kept is None:
-        light, problem = light_at(scene, place, cameras)
-        if light is not None:
-            cache.put("light", (scene, region), light)
-        return light, problem
+        light, problem = unlevelled_light_at(scene, place, cameras)
+        if light is None:
+            return None, problem
+        level = levelled(light, scene, place, cameras)
+        cache.put("light", (scene, region), (light, level))
+        return level, None
     panorama, problem = panorama_at(scene, place)
     if panorama is None:
         return None, problem
-    return replace(light_of(panorama, up_of(cameras)), sources=kept.sources), None
+    # sources keep their brightness too: depth maps and the object's own light are kept with them
+    before, level = kept
+    factor = float(level.ambient[0].sum() / before.ambient[0].sum().clamp_min(1e-9))
+    here = light_of(panorama, estimate_up(cameras))
+    return replace(here, sources=level.sources, ambient=factor * here.ambient), None
 
 
 def _as_it_looks(

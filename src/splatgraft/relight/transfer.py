@@ -14,6 +14,7 @@ from torch import Tensor
 from splatgraft.cameras import Cameras
 from splatgraft.composite import Composite
 from splatgraft.gaussians import Gaussians, concatenate
+from splatgraft.orbit import estimate_up
 from splatgraft.relight.beams import beams_of
 from splatgraft.relight.body import Body, SourceScene, set_body
 from splatgraft.relight.cache import RelightCache
@@ -23,7 +24,6 @@ from splatgraft.relight.layers import Relit, unchanged
 from splatgraft.relight.light import Light
 from splatgraft.relight.normals import raised
 from splatgraft.relight.object_shading import irradiance, shade_ratio, unknown_origin_ratio
-from splatgraft.relight.place_light import up_of
 from splatgraft.relight.receivers import Receivers, shade_receivers
 from splatgraft.relight.scene_shading import (
     Ball,
@@ -86,7 +86,7 @@ def relight(
     if stage is None:
         return unchanged(baked, is_object, report=(f"{problem} The object is pasted as it is.",))
     beams = beams_of(stage.light)
-    report = [stage.light.describe(up_of(cameras)) + (", as given." if light is not None else ".")]
+    report = [stage.light.describe(estimate_up(cameras)) + (", as given." if light is not None else ".")]
     actors, shades = [], []
     for i, (one, source) in enumerate(placed):
         body = set_body(one, source, cameras, light=stage.light, index=i, cache=cache)
