@@ -37,7 +37,7 @@ class BoxHandles:
             handle = self._server.scene.get_handle_by_name(f"{self._name}/{corner}")
             if new or handle is None:
                 handle = self._server.scene.add_transform_controls(
-                    f"{self._name}/{corner}", scale=size, disable_rotations=True, position=at.numpy(), depth_test=False
+                    f"{self._name}/{corner}", scale=size, disable_rotations=True, position=at.numpy()
                 )
                 handle.on_update(self._dragged)
             else:

@@ -175,7 +175,7 @@ class LightPhase:
         position = arrow_points(light.sources[index], self._centre(), self._reach())[0].numpy()
         if self._handle is None:
             self._handle = self._page.server.scene.add_transform_controls(
-                "/light/handle", scale=0.45 * self._reach(), disable_rotations=True, depth_test=False, position=position
+                "/light/handle", scale=0.45 * self._reach(), disable_rotations=True, position=position
             )
             self._handle.on_update(self._dragged)
         else:

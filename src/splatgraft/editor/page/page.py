@@ -153,12 +153,15 @@ class Page:
         """Turn to another phase."""
         with self._lock:
             self._remember_view()
+            world = self._world()
             self._phases[self.phase].leave()
             self._folders[self.phase].visible = False
             self.phase = phase
             self._folders[phase].visible = True
             self._turn.options = tuple(f"{_HERE}{name}" if name == phase else name for name in PHASES)
-            self._change_world()
+            if self._world() != world:
+                self._change_world()
+            self._status.content = ""
             try:
                 self._phases[phase].enter()
             except (ValueError, OSError) as error:
@@ -232,6 +235,10 @@ class Page:
         self._header = gui.add_html("")
         self._turn = gui.add_button_group("Step", PHASES)
         self._turn.on_click(self.act(lambda event: self.go(event.target.value.removeprefix(_HERE))))
+        self._job = gui.add_html("", visible=False)
+        self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
+        self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="red", visible=False)
+        self._cancel.on_click(self.act(lambda _: self._cancel_job()))
         self._folders: dict[str, Any] = {}
         self._phases: dict[str, Phase] = {}
         kinds: dict[str, Callable[[Page], Phase]] = {
@@ -254,10 +261,6 @@ class Page:
         redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
         undo.on_trigger(self.act(lambda _: self._step_back()))
         redo.on_trigger(self.act(lambda _: self._step_forward()))
-        self._job = gui.add_html("", visible=False)
-        self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
-        self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="red", visible=False)
-        self._cancel.on_click(self.act(lambda _: self._cancel_job()))
         self.preview = PreviewPanel(self)
 
     def _step_back(self) -> None:
