@@ -112,6 +112,13 @@ def select(window: Window, project: Path) -> None:
     wait_until(lambda: read_state(project).corrections is None, timeout=20, what="the stroke undone")
     window.click("Redo")
     wait_until(lambda: read_state(project).corrections is not None, timeout=20, what="the stroke again")
+    # the ball is in the middle between the two panels
+    window.check("Brush: click on the picture")
+    window.page.mouse.click(648, 450)
+    window.says("Gaussians under the stroke")
+    window.check("Brush: click on the picture")
+    window.click("Undo")
+    window.says("undone")
     window.click("Cut out the object")
     window.page.wait_for_selector(".sg-job", timeout=30_000)
     window.quiet()

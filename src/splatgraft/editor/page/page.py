@@ -16,7 +16,7 @@ from typing import Any, Protocol, runtime_checkable
 import viser
 
 from splatgraft.cameras import Cameras
-from splatgraft.editor.jobs import seconds_left
+from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.light_phase import LightPhase
 from splatgraft.editor.page.open_phase import OpenPhase
 from splatgraft.editor.page.place_phase import PlacePhase
@@ -74,7 +74,6 @@ class Page:
         self._lock = threading.RLock()
         self._notices: dict[int, Any] = {}
         self._open = True
-        self._last_job = ""
         self._views: dict[str, tuple[Any, ...]] = {}
         self._build()
         guarded.on_seat = self._seats_changed
@@ -175,7 +174,7 @@ class Page:
         """
         self.need().run(to, title)
         self.say(f"{title}: started; you may close this page, it goes on")
-        self._show_job()
+        self.job.refresh()
 
     def allowed(self, text: str) -> Path:
         """The path that a person typed.
@@ -207,6 +206,11 @@ class Page:
             window.camera.look_at = pose[:3, 3] + pose[:3, 2] * self.reach()
             window.camera.fov = 2 * math.atan(half)
 
+    def redraw(self) -> None:
+        """Files have changed: show the phase anew."""
+        self._phases[self.phase].enter()
+        self.refresh()
+
     def light_found(self) -> None:
         """The preview has the light of what is placed now."""
         with self._lock:
@@ -235,10 +239,7 @@ class Page:
         self._header = gui.add_html("")
         self._turn = gui.add_button_group("Step", PHASES)
         self._turn.on_click(self.act(lambda event: self.go(event.target.value.removeprefix(_HERE))))
-        self._job = gui.add_html("", visible=False)
-        self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
-        self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="red", visible=False)
-        self._cancel.on_click(self.act(lambda _: self._cancel_job()))
+        self.job = JobPanel(self)
         self._folders: dict[str, Any] = {}
         self._phases: dict[str, Phase] = {}
         kinds: dict[str, Callable[[Page], Phase]] = {
@@ -268,10 +269,6 @@ class Page:
 
     def _step_forward(self) -> None:
         self.say("done again" if self.need().redo() else "nothing to do again")
-
-    def _cancel_job(self) -> None:
-        self.need().jobs.cancel()
-        self.say("cancelled; earlier results are whole, and the same run goes on from here")
 
     def _first_phase(self) -> str:
         if self.session is None:
@@ -373,42 +370,7 @@ class Page:
         if session.reload():
             self.say("the project's files were changed outside the editor; that counts now")
             self.refresh()
-        self._show_job()
-
-    def _show_job(self) -> None:
-        session = self.session
-        state = None if session is None else session.job()
-        seen = f"{state.pid} {state.outcome} {state.step}" if state else ""
-        live = state is not None and state.live
-        self._job.visible = self._bar.visible = self._cancel.visible = live
-        if state is not None and live:
-            left = seconds_left(state, time.time())
-            rest = f"{_minutes(left)} left in this step" if left is not None else "time left not known yet"
-            self._job.content = (
-                f'<div class="sg-job" style="{_TEXT}"><b>{html.escape(state.title)}</b><br>'
-                f"{html.escape(state.step or 'starting')}: {html.escape(state.message or '...')}<br>{rest}</div>"
-            )
-            self._bar.value = 100 * state.share
-        if seen != self._last_job:
-            ended, self._last_job = bool(self._last_job) and not live, seen
-            if session is not None and state is not None and (ended or state.outcome == "killed"):
-                self._job_ended(state.title, state.outcome, state.error)
-            if session is not None:
-                self._phases[self.phase].enter()
-                self.refresh()
-
-    def _job_ended(self, title: str, outcome: str, error: str) -> None:
-        sentences = {
-            "done": f"{title}: done",
-            "failed": f"{title}: {error}",
-            "cancelled": f"{title}: cancelled; earlier results are whole",
-            "killed": f"{title}: ended without a word; start it again, it goes on from where it was",
-        }
-        self.say(sentences.get(outcome, outcome), bad=outcome in ("failed", "killed"))
+        self.job.refresh()
 
 
 _TEXT = "font-size:.85em;line-height:1.45;padding:2px 12px"
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"

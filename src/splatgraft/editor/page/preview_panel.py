@@ -59,10 +59,12 @@ class PreviewPanel:
             self._share = gui.add_slider("Compare", 0.0, 1.0, 0.01, 0.5)
             self._number = gui.add_slider("Camera", 0, 1, 1, 0, hint="Step through the target's cameras")
             self._follow = gui.add_checkbox("Follow my view", True, hint="Else the picture stays at the camera")
+            self._frusta = gui.add_checkbox("Show the cameras", False)
         self._panel.dock_left()
         self._panel.set_width(400)
         for control in (self._left, self._right, self._share, self._follow):
             control.on_update(lambda event: self.ask() if event.client is not None else None)
+        self._frusta.on_update(page.act(lambda _: self._show_cameras()))
         self._number.on_update(page.act(lambda _: self._to_camera()))
         self._previous = gui.add_command("Previous camera", hotkey="arrowleft")
         self._next = gui.add_command("Next camera", hotkey="arrowright")
@@ -78,6 +80,7 @@ class PreviewPanel:
         self._left.visible = self._right.visible = self._page.phase != "Select"
         self._number.value = 0
         self._drawn = {}
+        self._show_cameras()
 
     def close(self) -> None:
         """End the thread."""
@@ -149,6 +152,9 @@ class PreviewPanel:
         files = session.files
         path = files.source_cameras if self._page.phase == "Select" else files.target_cameras
         return session.scenes.cameras(path) if path.is_file() else None
+
+    def _show_cameras(self) -> None:
+        self._page.view.cameras(self._cameras() if self._frusta.value else None, size=0.08 * self._page.reach())
 
     def _to_camera(self) -> None:
         cameras = self._cameras()

@@ -11,7 +11,7 @@ from torch import Tensor
 from splatgraft.cameras import Cameras
 from splatgraft.editor.gizmo import gizmo_of
 from splatgraft.editor.thinning import shown_indices
-from splatgraft.gaussians import Gaussians, quaternion_from_rotation
+from splatgraft.gaussians import Gaussians, quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.segment import Box
 from splatgraft.similarity import Similarity
 from splatgraft.spherical_harmonics import C0
@@ -94,8 +94,11 @@ class StageView:
         if self._scene.get_handle_by_name(name) is not None:
             self._scene.remove_by_name(name)
 
-    def cameras(self, cameras: Cameras, *, size: float, visible: bool) -> None:
-        """Where the photographs were taken."""
+    def cameras(self, cameras: Cameras | None, *, size: float) -> None:
+        """Where the photographs were taken; None takes them away."""
+        self.remove("/cameras")
+        if cameras is None:
+            return
         quaternions = quaternion_from_rotation(cameras.world_from_camera[:, :3, :3])
         for index, (camera, wxyz) in enumerate(zip(cameras, quaternions.numpy(), strict=True)):
             fov = 2 * float(torch.atan(camera.height / (2 * camera.intrinsics[0, 1, 1])))
@@ -107,7 +110,6 @@ class StageView:
                 color=(90, 140, 200),
                 wxyz=wxyz,
                 position=camera.centers[0].numpy(),
-                visible=visible,
                 cast_shadow=False,
                 receive_shadow=False,
             )
@@ -155,6 +157,4 @@ def view_of(camera: viser.CameraHandle, *, width: int) -> Cameras:
 
 def viser_rotation(wxyz: np.ndarray) -> Float[Tensor, "3 3"]:
     """The rotation of a quaternion as viser holds it."""
-    from splatgraft.gaussians import rotation_from_quaternion
-
     return rotation_from_quaternion(torch.tensor(np.asarray(wxyz), dtype=torch.float32)[None])[0]
