@@ -154,7 +154,7 @@ def test_every_kind_of_picture_is_drawn_or_says_why_not(session: Session) -> Non
 
 def test_the_preview_of_the_light_is_the_step_s_result(session: Session, tmp_path: Path) -> None:
     session.change(replace(moved(session.placed_state()), weights=LayerWeights(shadow=0.5)))
-    relit = session.preview.relit(session.state).bake(session.state.weights)
+    relit = session.preview.lit_scene(session.state)
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     written = read_gaussians(session.files.relit)
     assert torch.equal(written.sh, relit.sh)

@@ -11,8 +11,6 @@ import pytest
 from editor_driver import Editor, Window, with_browser
 from tiny_project import write_project
 
-pytest.importorskip("viser")
-
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:

@@ -17,9 +17,6 @@ from splatgraft.editor.state import read_state
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import read_placement
 
-pytest.importorskip("viser")
-pytest.importorskip("playwright.sync_api")
-
 # a ball and a plane have no photographed surroundings worth an estimate, but the transfer must run on them
 LIT = OPTIONS.replace('light = "gain"', 'light = "transfer"')
 

@@ -20,6 +20,7 @@ from splatgraft.formats import read_capture
 from splatgraft.gaussians import Gaussians
 from splatgraft.relight import RelightCache, Relit, relight
 from splatgraft.rendering import render
+from splatgraft.splitting import split_around
 
 Kind = Literal[
     "Copy-paste",
@@ -116,24 +117,40 @@ class Preview:
                 raise ValueError("Result: expected a finished run, found none yet")
             return self._scenes.gaussians(self._scenes.files.result)
         if kind == "Light transfer":
-            relit = self.relit(state)
-            return self._keep("lit scene", (relit, state.weights), lambda: relit.bake(state.weights))
+            return self.lit_scene(state)
         composite = self._composite(state)
         if kind == "Target alone":
             inputs = (composite.target, composite.erased)
             return self._keep("bare", inputs, lambda: composite.target.select(~composite.erased))
-        return self._keep("pasted", (composite,), composite.bake)[0]
+        return self._pasted(composite)[0]
+
+    def lit_scene(self, state: EditState) -> Gaussians:
+        """What the step `relight` would write.
+
+        Raises: ValueError where a file is missing.
+        """
+        relit, placed = self.relit(state), [one.in_target() for one in self._composite(state).objects]
+
+        def make() -> Gaussians:
+            return split_around(relit.bake(state.weights), relit.is_object, placed)[0]
+
+        return self._keep("lit scene", (relit, state.weights), make)
+
+    def _pasted(self, composite: Composite) -> tuple[Gaussians, Bool[Tensor, "n"]]:
+        """What the step `compose` would write."""
+        placed = [one.in_target() for one in composite.objects]
+        return self._keep("pasted", (composite,), lambda: split_around(*composite.bake(), placed))
 
     def _mask(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         composite = self._composite(state)
-        gaussians, is_object = self._keep("pasted", (composite,), composite.bake)
+        gaussians, is_object = self._pasted(composite)
         features = render(gaussians, camera, outputs=frozenset(), features=is_object[:, None].float()).features
         assert features is not None
         return _bytes(features[0].expand(-1, -1, 3))
 
     def _depth(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         composite = self._composite(state)
-        gaussians, _ = self._keep("pasted", (composite,), composite.bake)
+        gaussians, _ = self._pasted(composite)
         depth = render(gaussians, camera, outputs=frozenset({"depth"})).depth
         assert depth is not None
         near = depth[0][depth[0] > 0]
