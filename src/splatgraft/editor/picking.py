@@ -9,8 +9,8 @@ from torch import Tensor
 from splatgraft.cameras import Cameras
 from splatgraft.gaussians import Gaussians
 
-_SOLID = 0.3
-"""Least opacity of what a ray stops at."""
+_REACH = 3.0
+"""Standard deviations beyond which a Gaussian stops nothing."""
 
 
 @dataclass(frozen=True)
@@ -36,20 +36,26 @@ def in_rectangle(means: Float[Tensor, "n 3"], camera: Cameras, rectangle: Rectan
 def first_hit(
     gaussians: Gaussians, origin: Float[Tensor, "3"], direction: Float[Tensor, "3"]
 ) -> Float[Tensor, "3"] | None:
-    """Where a ray first meets something solid: the point on it beside the first Gaussian that it passes within one
-    standard deviation; None where it meets nothing."""
-    direction = torch.nn.functional.normalize(direction, dim=0)
-    offset = gaussians.means - origin
-    along = offset @ direction
-    beside = offset - along[:, None] * direction
-    near = (beside.norm(dim=1) < gaussians.scales.amax(1)) & (along > 0) & (gaussians.opacities > _SOLID)
+    """Where a ray meets what the picture shows: where half of the light is stopped; None where it never is.
+
+    Each Gaussian stops its share at the point of the ray where it is densest (3DGS, Eq. 3, along a ray).
+    """
+    direction = torch.nn.functional.normalize(direction, dim=0).double()
+    offset = gaussians.means.double() - origin.double()
+    beside = (offset - (offset @ direction)[:, None] * direction).norm(dim=1)
+    near = beside < _REACH * gaussians.scales.amax(1)
     covariances = gaussians.select(near).covariances.double()
     # a thousandth of the largest axis keeps needles and discs invertible
     floor = 1e-6 * covariances.diagonal(dim1=1, dim2=2).sum(1)
     inverse = torch.linalg.inv(covariances + floor[:, None, None] * torch.eye(3, dtype=torch.float64))
-    spread = torch.einsum("ni,nij,nj->n", beside[near].double(), inverse, beside[near].double())
-    met = along[near][spread < 1]
-    return origin + met.min() * direction if len(met) else None
+    forward = torch.einsum("i,nij->nj", direction, inverse)
+    depth = (forward * offset[near]).sum(1) / (forward @ direction)
+    rest = offset[near] - depth[:, None] * direction
+    alpha = gaussians.opacities[near] * torch.exp(-0.5 * torch.einsum("ni,nij,nj->n", rest, inverse, rest))
+    depth, alpha = depth[depth > 0], alpha[depth > 0]
+    order = depth.argsort()
+    stopped = 1 - (1 - alpha[order]).cumprod(0) > 0.5
+    return origin + float(depth[order][stopped][0]) * direction.to(origin) if bool(stopped.any()) else None
 
 
 def in_brush(means: Float[Tensor, "n 3"], centre: Float[Tensor, "3"], radius: float) -> Bool[Tensor, "n"]:

@@ -70,7 +70,7 @@ class Scenes:
         own = path == self.files.object
         cameras = self.cameras(self.files.source_cameras if own else self.files.target_cameras)
         surroundings = self.gaussians(self.files.surroundings) if own and self.files.surroundings.is_file() else None
-        return self._derive(
+        return self.derive(
             f"placeable {path}", (gaussians, cameras, surroundings), lambda: placeable(gaussians, cameras, surroundings)
         )
 
@@ -84,12 +84,12 @@ class Scenes:
         moves = [item.target_from_object for item in items]
         erased = state.erased
         if erased is None:
-            erased = self._derive("nothing", (target,), lambda: torch.zeros(target.count, dtype=torch.bool))
+            erased = self.derive("nothing", (target,), lambda: torch.zeros(target.count, dtype=torch.bool))
         return compose(target, objects, target_from_objects=moves, erased=erased)
 
-    def kept(self, erased: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
-        """What is not erased; the same tensor for the same one."""
-        return self._derive("kept", (erased,), lambda: ~erased)
+    def others(self, name: str, flags: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """All but those; the same tensor for the same flags of that name."""
+        return self.derive(f"others {name}", (flags,), lambda: ~flags)
 
     def source_scenes(self, state: EditState) -> list[SourceScene | None]:
         """What each object was taken from, as the step `relight` knows it: of the first alone."""
@@ -97,7 +97,7 @@ class Scenes:
         if not count or not self.files.surroundings.is_file():
             return [None] * count
         parts = (self.gaussians(self.files.surroundings), self.cameras(self.files.source_cameras))
-        source = self._derive("source", parts, lambda: SourceScene(*parts))
+        source = self.derive("source", parts, lambda: SourceScene(*parts))
         return [source, *[None] * (count - 1)]
 
     def _read(self, kind: str, path: Path, read: Callable[[Path], Any]) -> Any:
@@ -109,7 +109,8 @@ class Scenes:
                 self._kept[kind, path] = kept
             return kept[1]
 
-    def _derive(self, name: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    def derive(self, name: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+        """What `make` gives; the same object until one of `inputs` is another one."""
         with self._lock:
             kept = self._derived.get(name)
             if kept is None or any(a is not b for a, b in zip(kept[0], inputs, strict=True)):

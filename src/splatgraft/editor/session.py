@@ -20,6 +20,7 @@ from splatgraft.editor.project_access import Project, ProjectFiles
 from splatgraft.editor.scenes import Scenes
 from splatgraft.editor.state import EditState, read_state, state_files, write_state
 from splatgraft.formats.placement import ObjectPlacement, read_placement
+from splatgraft.gaussians import Gaussians
 from splatgraft.orbit import estimate_up
 from splatgraft.segment import Box, corrected, with_correction
 from splatgraft.similarity import Similarity
@@ -131,12 +132,17 @@ class Session:
             return None
         scene = self.scenes.gaussians(self.files.source_scene)
         lifted, state = self.scenes.lifted(), self.state
+        inputs = (scene, lifted, state.box, state.corrections)
+        return self.scenes.derive("selected", inputs, lambda: self._selected(scene, lifted))
+
+    def _selected(self, scene: Gaussians, lifted: Bool[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
+        corrections = self.state.corrections
         if lifted is None:
             box = self.box()
             lifted = torch.zeros(scene.count, dtype=torch.bool) if box is None else box.contains(scene.means)
-        if state.corrections is not None and len(state.corrections) != scene.count:
-            return lifted
-        return corrected(lifted, state.corrections)
+        # strokes over a scene that is no more say nothing about this one
+        fits = corrections is None or len(corrections) == scene.count
+        return corrected(lifted, corrections) if fits else lifted
 
     def box(self) -> Box | None:
         """The box around the object, in the source's world."""

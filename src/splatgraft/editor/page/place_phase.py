@@ -294,7 +294,7 @@ def show_target(page: Page) -> None:
     session = page.need()
     state, view = session.placed_state(), page.view
     target = session.scenes.gaussians(session.files.target_scene)
-    kept = None if state.erased is None else session.scenes.kept(state.erased)
+    kept = None if state.erased is None else session.scenes.others("erased", state.erased)
     view.splats("/target/scene", target, which=kept)
     objects = state.objects or ()
     for index, item in enumerate(objects):

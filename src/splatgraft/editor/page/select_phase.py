@@ -120,7 +120,7 @@ class SelectPhase:
         if self._isolate.value:
             self._page.view.hide("/source/rest")
         else:
-            self._page.view.splats("/source/rest", scene, which=~selection)
+            self._page.view.splats("/source/rest", scene, which=session.scenes.others("selected", selection))
         kind = "the object" if session.scenes.lifted() is not None else "inside the box"
         shown = [s for n, s in self._page.view.shown.items() if n.startswith("/source") and s.count < s.total]
         thin = f"<br>{sum(s.count for s in shown):,} are shown; files keep all" if shown else ""
