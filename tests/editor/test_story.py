@@ -111,6 +111,9 @@ def select(window: Window, project: Path) -> None:
     wait_until(lambda: read_state(project).corrections is not None, timeout=20, what="the stroke again")
     # the ball is in the middle between the two panels
     window.check("Brush: click on the picture")
+    window.says("the brush is on")
+    # the page hears of it a moment after its text
+    window.page.wait_for_timeout(500)
     window.page.mouse.click(648, 450)
     window.says("Gaussians under the stroke")
     window.check("Brush: click on the picture")

@@ -105,7 +105,7 @@ class SelectPhase:
             field.on_update(act(lambda _: self._box_typed()))
         self._cut.on_click(act(lambda _: self._page.run("segment", "Cut out the object")))
         self._isolate.on_update(act(lambda _: None))
-        self._brush.on_update(act(lambda _: self._listen(self._brush.value)))
+        self._brush.on_update(act(lambda _: self._toggle_brush()))
         self._apply_box.on_click(act(lambda _: self._stroke_box()))
         self._forget.on_click(act(lambda _: self._set(corrections=None)))
 
@@ -159,6 +159,10 @@ class SelectPhase:
     def _box_dragged(self, box: Box, ended: bool) -> None:
         if ended:
             self._page.act(lambda _: self._set_box(box))(None)
+
+    def _toggle_brush(self) -> None:
+        self._listen(self._brush.value)
+        self._page.say("the brush is on: a click is a stroke, a drag still turns the view" if self._brush.value else "")
 
     def _listen(self, listen: bool) -> None:
         scene = self._page.server.scene
