@@ -101,7 +101,9 @@ def relight(
 
 def _shade(actor: _Actor, beams: Beams, light: Light) -> Float[Tensor, "n 3"]:
     body = actor.body
-    now = irradiance(beams, body.normals.vectors, arrives=body.own * actor.arrives)
+    # ambient light was looked at from the place itself: what blocks it is in the panorama already, as at the old place
+    arrives = torch.where(torch.as_tensor(beams.is_source), actor.arrives, torch.ones(()))
+    now = irradiance(beams, body.normals.vectors, arrives=body.own * arrives)
     if body.then is None or body.before is None:
         return unknown_origin_ratio(now, body.normals, body.gaussians.opacities)
     seen = 0.5 * (light.coverage + body.before.coverage)

@@ -14,7 +14,7 @@ from splatgraft.consolidate import (
 from splatgraft.fitting import l1_dssim
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.gaussians import Gaussians
-from splatgraft.harmonize import make_harmonizer
+from splatgraft.harmonize import HARMONIZERS, HarmonizerOptions, make_harmonizer
 from splatgraft.image_losses import lpips_vgg, windowed_fourier
 from splatgraft.project import PLACEMENT_FILE, SCENE_FILE
 from splatgraft.relight import SourceScene, relight
@@ -145,6 +145,8 @@ class UpdateIteratively:
     schedule: Schedule = "linear"
     weights: Path | None = None
     """Folder of LPIPS's weights."""
+    model: str | None = None
+    """The harmoniser's own weights: folder, file or hub id."""
     device: Device = "auto"
 
     def inputs(self) -> Inputs:
@@ -158,7 +160,9 @@ class UpdateIteratively:
         is_object = read_selection(self.composite / "is_object.npy", composite.count, self.composite / SCENE_FILE).to(
             device
         )
-        cameras, harmonizer = read_cameras(self.cameras).to(device), make_harmonizer(self.harmonizer)
+        cameras = read_cameras(self.cameras).to(device)
+        options = HarmonizerOptions(weights=self.model, device=device, say=context.terminal.say)
+        harmonizer = make_harmonizer(self.harmonizer, options)
 
         def harmonize_at(scene: Gaussians, strength: float) -> LazyImages:
             views = [view_of(composite, is_object, prior=scene, camera=camera) for camera in cameras]
@@ -167,13 +171,19 @@ class UpdateIteratively:
 
         loss = {"fourier": windowed_fourier, "l1-dssim": l1_dssim}.get(self.loss)
         strengths = linear_schedule() if self.schedule == "linear" else geometric_schedule()
-        options = ConsolidateOptions(loss=loss or lpips_vgg(self.weights))
-        scene = iterative_update(prior, cameras, harmonize_at, strengths, options, progress=context.progress)
+        consolidation = ConsolidateOptions(loss=loss or lpips_vgg(self.weights))
+        scene = iterative_update(prior, cameras, harmonize_at, strengths, consolidation, progress=context.progress)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
 
 
 def result_of(
-    method: Method, ready: ReadyScene, *, weights: Path | None, device: Device, terminal: Terminal
+    method: Method,
+    ready: ReadyScene,
+    *,
+    weights: Path | None,
+    model: str | None,
+    device: Device,
+    terminal: Terminal,
 ) -> tuple[Path, dict[str, float]]:
     """The method's scene and the seconds that its own steps took; what is fresh is kept, what methods share as well.
 
@@ -185,12 +195,14 @@ def result_of(
         prior, seconds["relight"] = _prior_of(method.prior, ready, terminal)
     if method.harmonizer is None:
         return prior, seconds
-    make_harmonizer(method.harmonizer)
+    if method.harmonizer not in HARMONIZERS:
+        expected = ", ".join(sorted(HARMONIZERS))
+        raise ValueError(f"harmonizer: expected one of {expected}, found {method.harmonizer!r}")
     out = ready.work / "methods" / method.folder_name
     if method.schedule != "once":
         step = UpdateIteratively(ready.composite, prior, ready.cameras, out / "result", device=device)
         chosen = {"harmonizer": method.harmonizer, "loss": method.loss, "schedule": method.schedule}
-        update = type(step)(**{**vars(step), **chosen, "weights": weights})
+        update = type(step)(**{**vars(step), **chosen, "weights": weights, "model": model})
         seconds["update"] = fresh(update, terminal)
         return out / "result" / SCENE_FILE, seconds
     views = ready.work / "views" / method.prior
@@ -198,7 +210,9 @@ def result_of(
     draw = Render(composite, ready.cameras, views, is_object=ready.is_object, prior=prior, device=device)
     seconds["render"] = fresh(draw, terminal)
     harmonized = ready.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
-    seconds["harmonize"] = fresh(Harmonize(views, harmonized, method.harmonizer), terminal)
+    seconds["harmonize"] = fresh(
+        Harmonize(views, harmonized, method.harmonizer, weights=model, device=device), terminal
+    )
     fit = Consolidate(prior, views, harmonized, out / "result", loss=method.loss, lpips_weights=weights, device=device)
     seconds["consolidate"] = fresh(fit, terminal)
     return out / "result" / SCENE_FILE, seconds

@@ -56,6 +56,8 @@ class EvaluateBenchmark:
     """Fetch the published data set into the folder first."""
     weights: Path | None = None
     """Folder with the weights of LPIPS and Inception; torch hub's cache where not given."""
+    harmonizer_weights: str | None = None
+    """Weights of the image model that the methods name: folder, file or hub id, as `harmonize --weights` takes them."""
     at_once: int = 1
     """Scenes at a time on this machine."""
     ray: str | None = None
@@ -122,7 +124,12 @@ def _measure_scene(command: EvaluateBenchmark, scene: GivenScene, methods: list[
             result, seconds = None, {}
             if method.pictures is None:
                 result, seconds = result_of(
-                    method, ready, weights=command.weights, device=command.device, terminal=terminal
+                    method,
+                    ready,
+                    weights=command.weights,
+                    model=command.harmonizer_weights,
+                    device=command.device,
+                    terminal=terminal,
                 )
             shown = None if method.pictures is None else method.pictures / scene.name
             step = MeasureMethod(
