@@ -87,9 +87,7 @@ class Cameras:
 
     def to(self, device: torch.device | str) -> "Cameras":
         """The same cameras on `device`; sizes stay on the CPU."""
-        return replace(
-            self, world_from_camera=self.world_from_camera.to(device), intrinsics=self.intrinsics.to(device)
-        )
+        return replace(self, world_from_camera=self.world_from_camera.to(device), intrinsics=self.intrinsics.to(device))
 
 
 def pinhole(

@@ -30,6 +30,15 @@ class RenderSize:
 
 
 @dataclass(frozen=True)
+class Sampling:
+    """Points on surfaces, evenly by area, within a ball."""
+
+    count: int
+    center: Vector
+    radius: float
+
+
+@dataclass(frozen=True)
 class Take:
     """One set of pictures of a job, from all its cameras or some."""
 
@@ -52,6 +61,14 @@ class Take:
 
     The panorama is linear light, scaled as the pictures are: row 0 is straight up, the middle column +x, and columns
     run to the right seen from inside; small suns are left out of it and listed by themselves."""
+    surface: Sampling | None = None
+    """Instead of pictures: points on the object, or on the scene where none is named, `0000.npy` (n, 6): position and
+    outward normal, world axes."""
+
+    @property
+    def is_pictures(self) -> bool:
+        """Whether it is rendered from cameras."""
+        return self.probe is None and self.surface is None
 
 
 @dataclass(frozen=True)
@@ -70,7 +87,7 @@ class Job:
     def files(self, out: Path) -> Iterator[Path]:
         """The marks that say which pictures are done, one for each take and camera."""
         for take in self.takes:
-            every = (0,) if take.probe is not None else range(len(self.cameras))
+            every = range(len(self.cameras)) if take.is_pictures else (0,)
             for i in every if take.cameras is None else take.cameras:
                 yield out / take.name / f"{i:04d}.done"
 

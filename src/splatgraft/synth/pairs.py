@@ -6,6 +6,9 @@ One folder a scene and camera arc, `<out>/<scene>_<arc>/`:
     background/0000.png ...                  the scene without any object, 8-bit sRGB, one file a camera
     object0/0000.png, _mask, _depth, _normal, _albedo    with object 0: the consistent target and its passes
     object0_light0/0000.png                  object 0 alone under another environment map, RGBA, straight alpha
+    object0_light0_probe/0000.npy, suns.json    that light around the object, linear (64, 128, 3), and its small suns
+    place_probe/0000.npy, suns.json          the scene's light where the objects stand, in the units of its pictures
+    scene_surface/0000.npy, object0_surface/    points on what is there, (n, 6): position and outward normal
 
 `mask` is soft coverage (cryptomatte); `depth` is a float16 .npy along the optical axis in metres, 0 for the sky;
 `normal` is 0.5 + 0.5 n in world axes; `albedo` is the diffuse colour, sRGB.
@@ -24,11 +27,12 @@ from torch import Tensor
 
 from splatgraft.images import read_rgb
 from splatgraft.synth import objects, views
-from splatgraft.synth.jobs import Job, RenderSize, Take
+from splatgraft.synth.jobs import Job, RenderSize, Sampling, Take
 from splatgraft.synth.outdoors import OUTDOORS, SUPPLIED_MAPS, outdoor
 from splatgraft.synth.rooms import INTERIORS, interior
 from splatgraft.synth.scene import Scene, World
 
+_OBJECT_POINTS, _SCENE_POINTS, _NEAR = 12_000, 100_000, 8.0
 KINDS: tuple[str, ...] = (*INTERIORS, *OUTDOORS)
 
 
@@ -79,6 +83,7 @@ def plan(options: PairPlan, number: int) -> Job:
             made = objects.make(rng.randrange(2**31), place)
         heights.append(max(part.location[2] + part.size[2] / 2 for part in made))
         things[f"object{i}"] = objects.standing_at(made, place.location, rng.uniform(0, 6.283))
+    middle = (place.location[0], place.location[1], place.location[2] + 0.5 * max(heights))
     takes = [Take("background", scene=True)]
     for name in things:
         takes.append(Take(name, scene=True, object=name, passes=("color", "mask", "depth", "normal", "albedo")))
@@ -86,6 +91,10 @@ def plan(options: PairPlan, number: int) -> Job:
             world = World("environment", path=rng.choice(options.maps), rotation=rng.uniform(0, 6.283))
             alone = f"{name}_light{light}"
             takes.append(Take(alone, scene=False, object=name, world=world, exposure_group=alone))
+            takes.append(Take(f"{alone}_probe", scene=False, world=world, exposure_group=alone, probe=middle))
+        takes.append(Take(f"{name}_surface", scene=False, object=name, surface=Sampling(_OBJECT_POINTS, middle, _NEAR)))
+    takes.append(Take("place_probe", scene=True, probe=middle))
+    takes.append(Take("scene_surface", scene=True, surface=Sampling(_SCENE_POINTS, middle, _NEAR)))
     cameras = views.arc(scene, place, max(heights), number)
     provenance = {"kind": kind, "seed": str(options.seed), "number": str(number), "licence": "own render"}
     return Job(scene, things, cameras, tuple(takes), options.size, number, provenance)
@@ -185,7 +194,7 @@ def samples_in(folder: Path) -> list[PairSample]:
         takes, cameras = [take["name"] for take in job["takes"]], len(job["cameras"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected the description of a render job, found {error}") from error
-    alone = [take.split("_") for take in takes if "_light" in take]
+    alone = [take.split("_") for take in takes if "_light" in take and not take.endswith("_probe")]
     return [PairSample(folder, i, name, light) for i in range(cameras) for name, light in alone]
 
 

@@ -18,6 +18,7 @@ import contents
 import numpy as np
 import passes
 import probe
+import surface
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 
@@ -124,7 +125,8 @@ def main(path):
     for take in job["takes"]:
         folder = os.path.join(job["out"], take["name"])
         os.makedirs(folder, exist_ok=True)
-        chosen = take.get("cameras", [0] if take.get("probe") else range(len(cameras)))
+        pictures = not (take.get("probe") or take.get("surface"))
+        chosen = take.get("cameras", range(len(cameras)) if pictures else [0])
         todo = [i for i in chosen if not os.path.exists(os.path.join(folder, f"{i:04d}.done"))]
         if not todo:
             continue
@@ -132,7 +134,8 @@ def main(path):
         if take.get("probe"):
             exposure = _exposure(job, take, cameras)
             world = take.get("world") or job["scene"]["world"]
-            panorama, suns = probe.measure(job["scene"], world, take["probe"], scene_things)
+            shown = job["scene"] if take["scene"] else {**job["scene"], "lamps": []}
+            panorama, suns = probe.measure(shown, world, take["probe"], scene_things)
             passes.write_npy(os.path.join(folder, "0000.npy"), (panorama * exposure).astype(np.float32))
             for sun in suns:
                 sun["irradiance"] = [value * exposure for value in sun["irradiance"]]
@@ -140,6 +143,13 @@ def main(path):
                 json.dump(suns, out, indent=1)
             _done(folder, 0, 0.0)
             passes.configure(job["width"], job["height"], job["samples"], job.get("seed", 0))
+            continue
+        if take.get("surface"):
+            things = objects[take["object"]] if take["object"] else scene_things
+            passes.write_npy(
+                os.path.join(folder, "0000.npy"), surface.points(things, take["surface"], job.get("seed", 0))
+            )
+            _done(folder, 0, 0.0)
             continue
         matte = [thing.name for thing in objects.get(take["object"], [])]
         exposure = _exposure(job, take, cameras) * 2.0 ** take.get("stops", 0.0)
