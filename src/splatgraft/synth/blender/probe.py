@@ -24,6 +24,7 @@ def measure(scene, world, point, things):
         thing.visible_camera = True
     layer.world = contents.make_world({**world, "sun_disc": False})
     layer.render.resolution_x, layer.render.resolution_y = WIDTH, HEIGHT
+    layer.render.film_transparent = False  # or the world would be left out
     cycles.samples = _SAMPLES
     panorama = passes.render(_panoramic(point), ["color"])["color"][..., :3].astype(np.float64)
     for thing in shown:
