@@ -21,7 +21,7 @@ import torch
 
 from splatgraft.formats import read_capture
 from splatgraft.images import linear_from_srgb, read_rgb
-from splatgraft.steps.true_light import light_from_probe
+from splatgraft.relight.probe import light_from_probe
 from splatgraft.synth import benchmark, objects, pairs
 from splatgraft.synth.jobs import Job, RenderSize, Take, check_blender, render_job
 from splatgraft.synth.scene import Camera, Lamp, Material, Part, Place, Scene, World

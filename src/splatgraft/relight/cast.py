@@ -52,18 +52,14 @@ class Occlusion:
 
 
 def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tensor, "k"]) -> Occlusion:
-    """Pyramids of the maps `front`, completed by the opposite maps `back` (mirrored in u, depth negated)."""
+    """Pyramids of the maps `front` (with colour), completed by the opposite maps `back` (mirrored in u, depth negated)."""
     alpha = maps.alpha[front]
     first = torch.where(maps.first < float(FAR) / 2, maps.first, maps.mean)
     lit_side = first[front]
     far_side = torch.maximum(-first[back].flip(2), lit_side)
     planes = [alpha, alpha * lit_side, alpha * 0.5 * (lit_side + far_side)]
-    if len(maps.color):
-        back_alpha = maps.alpha[back].flip(2)[..., None].clamp_min(1e-3)
-        unlit = (maps.color[back].flip(2) / back_alpha).movedim(-1, 0)
-        planes += [alpha * unlit[0], alpha * unlit[1], alpha * unlit[2]]
-    else:
-        planes += [torch.zeros_like(alpha)] * 3
+    unlit = (maps.color[back] / maps.alpha[back][:, None].clamp_min(1e-3)).flip(3)
+    planes += [alpha * unlit[:, channel] for channel in range(3)]
     level = torch.stack(planes, 1)
     levels = []
     while True:

@@ -4,15 +4,14 @@ Sun that falls through a window lights a patch of the table; no depth map knows 
 Brightness is compared within groups of one material, then smoothed. Knows nothing about objects or files.
 """
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.gaussians import Gaussians
 from splatgraft.images import linear_from_srgb
 from splatgraft.relight.materials import group_materials
+from splatgraft.relight.neighbours import nearest_neighbours
 from splatgraft.relight.normals import Normals
 from splatgraft.spherical_harmonics import rgb_from_dc
 
@@ -44,10 +43,8 @@ def lit_share(
         if bool(inside.any()):
             lit_albedo[group] = albedo[inside].quantile(0.75)
     shown = ((value / lit_albedo[groups].clamp_min(1e-6) - without) / (full - without)).clamp(0, 1)
-    points = gaussians.means[index].double().numpy()
-    k = min(_NEIGHBOURS, len(index))
-    _, neighbours = KDTree(points, balanced_tree=False, compact_nodes=False).query(points, k=k, workers=2)
-    smooth = shown[torch.from_numpy(np.asarray(neighbours))].median(1).values
+    neighbours = nearest_neighbours(gaussians.means[index], count=_NEIGHBOURS)
+    smooth = shown[neighbours.long()].median(1).values
     certain = ((smooth - 0.2) / 0.4).clamp(0, 1)
     share[index] = certain
     return share

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numba import njit, prange
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.gaussians import Gaussians
+from splatgraft.relight.neighbours import nearest_neighbours
 from splatgraft.rendering import render
 
 NEIGHBOURS = 16
@@ -39,14 +39,11 @@ def estimate_normals(gaussians: Gaussians, cameras: Cameras) -> Normals:
     n = gaussians.count
     if n == 0:
         return Normals(vectors=torch.zeros(0, 3), confidence=torch.zeros(0), seen=torch.zeros(0, dtype=torch.bool))
-    means = gaussians.means.double().numpy()
-    k = min(NEIGHBOURS, n)
-    _, neighbours = KDTree(means, balanced_tree=False, compact_nodes=False).query(means, k=k, workers=2)
-    neighbours = neighbours.reshape(n, k).astype(np.int32)
-    cloud = (means, gaussians.covariances.double().numpy(), gaussians.opacities.double().numpy())
+    neighbours = nearest_neighbours(gaussians.means, count=NEIGHBOURS).numpy()
+    cloud = (gaussians.means.numpy(), gaussians.covariances.numpy(), gaussians.opacities.numpy())
     towards, seen = _towards_viewers(gaussians, cameras)
     out = np.zeros((n, 4), np.float32)
-    _estimate(cloud, neighbours, towards.double().numpy(), out)
+    _estimate(cloud, neighbours, towards.numpy(), out)
     result = torch.from_numpy(_agree(out, neighbours))
     confidence = result[:, 3] * torch.where(seen, 1.0, 0.5)
     return Normals(vectors=result[:, :3].contiguous(), confidence=confidence, seen=seen)
@@ -100,32 +97,36 @@ def _look(means, widths, camera, surface, total):
             total[0, i, 2] += z / length
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 @no_type_check
-def _shortest_axis(m):
+def _shortest_axis(xx, xy, xz, yy, yz, zz):
     """Unit eigenvector of the smallest eigenvalue of a symmetric matrix, and how much shorter it is than the next."""
-    mean = (m[0, 0] + m[1, 1] + m[2, 2]) / 3
-    a, b, c = m[0, 0] - mean, m[1, 1] - mean, m[2, 2] - mean
-    off = m[0, 1] ** 2 + m[0, 2] ** 2 + m[1, 2] ** 2
-    p = np.sqrt((a * a + b * b + c * c + 2 * off) / 6)
-    best = np.array([0.0, 0.0, 1.0])
+    mean = (xx + yy + zz) / 3
+    a, b, c = xx - mean, yy - mean, zz - mean
+    p = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
     if p < 1e-12:
-        return best, 0.0
-    determinant = a * (b * c - m[1, 2] ** 2) - m[0, 1] * (m[0, 1] * c - m[1, 2] * m[0, 2])
-    determinant += m[0, 2] * (m[0, 1] * m[1, 2] - b * m[0, 2])
+        return 0.0, 0.0, 1.0, 0.0
+    determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
     angle = np.arccos(min(1.0, max(-1.0, determinant / (2 * p**3)))) / 3
     smallest = mean + 2 * p * np.cos(angle + 2 * np.pi / 3)
     middle = 3 * mean - smallest - (mean + 2 * p * np.cos(angle))
-    rows = m - smallest * np.eye(3)
-    longest = 0.0
+    a, b, c = xx - smallest, yy - smallest, zz - smallest
+    # the eigenvector is across any two rows; of the three products the longest is the surest
+    best_x, best_y, best_z, longest = 0.0, 0.0, 1.0, 0.0
     for r in range(3):
-        x, y = rows[r], rows[(r + 1) % 3]
-        axis = np.array([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
-        length = np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+        if r == 0:
+            x, y, z = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
+        elif r == 1:
+            x, y, z = b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz
+        else:
+            x, y, z = yz * xz - c * xy, c * a - xz * xz, xz * xy - yz * a
+        length = x * x + y * y + z * z
         if length > longest:
             longest = length
-            best = axis / length
-    return best, 1.0 - np.sqrt(max(smallest, 0.0) / max(middle, 1e-12))
+            best_x, best_y, best_z = x, y, z
+    length = np.sqrt(best_x * best_x + best_y * best_y + best_z * best_z)
+    flatness = 1.0 - np.sqrt(max(smallest, 0.0) / max(middle, 1e-12))
+    return best_x / length, best_y / length, best_z / length, flatness
 
 
 @njit(cache=True, parallel=True)
@@ -133,26 +134,34 @@ def _shortest_axis(m):
 def _estimate(cloud, neighbours, towards, out):
     means, covariances, opacities = cloud
     for i in prange(len(means)):
-        total = 0.0
-        center = np.zeros(3)
+        # places from the point itself: squares of world coordinates would lose digits
+        total, cx, cy, cz = 1e-12, 0.0, 0.0, 0.0
+        xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in neighbours[i]:
-            total += opacities[j]
-            center += opacities[j] * means[j]
-        center /= max(total, 1e-12)
-        mixture = np.zeros((3, 3))
-        for j in neighbours[i]:
-            weight = opacities[j] / max(total, 1e-12)
-            away = means[j] - center
-            for r in range(3):
-                for c in range(3):
-                    mixture[r, c] += weight * (covariances[j, r, c] + away[r] * away[c])
+            w = float(opacities[j])
+            x, y, z = means[j, 0] - means[i, 0], means[j, 1] - means[i, 1], means[j, 2] - means[i, 2]
+            total += w
+            cx, cy, cz = cx + w * x, cy + w * y, cz + w * z
+            c = covariances[j]
+            xx, xy, xz = xx + w * (c[0, 0] + x * x), xy + w * (c[0, 1] + x * y), xz + w * (c[0, 2] + x * z)
+            yy, yz, zz = yy + w * (c[1, 1] + y * y), yz + w * (c[1, 2] + y * z), zz + w * (c[2, 2] + z * z)
+        cx, cy, cz = cx / total, cy / total, cz / total
+        xx, xy, xz = xx / total - cx * cx, xy / total - cx * cy, xz / total - cx * cz
+        yy, yz, zz = yy / total - cy * cy, yz / total - cy * cz, zz / total - cz * cz
         own = covariances[i]
-        scale = mixture[0, 0] + mixture[1, 1] + mixture[2, 2] + 1e-30
-        own_scale = own[0, 0] + own[1, 1] + own[2, 2] + 1e-30
-        normal, flatness = _shortest_axis(mixture / scale + 0.5 * own / own_scale)
-        if normal[0] * towards[i, 0] + normal[1] * towards[i, 1] + normal[2] * towards[i, 2] < 0:
-            normal = -normal
-        out[i, 0], out[i, 1], out[i, 2] = normal[0], normal[1], normal[2]
+        scale = 1 / (xx + yy + zz + 1e-30)
+        own_scale = 0.5 / (float(own[0, 0]) + own[1, 1] + own[2, 2] + 1e-30)
+        x, y, z, flatness = _shortest_axis(
+            scale * xx + own_scale * own[0, 0],
+            scale * xy + own_scale * own[0, 1],
+            scale * xz + own_scale * own[0, 2],
+            scale * yy + own_scale * own[1, 1],
+            scale * yz + own_scale * own[1, 2],
+            scale * zz + own_scale * own[2, 2],
+        )
+        if x * towards[i, 0] + y * towards[i, 1] + z * towards[i, 2] < 0:
+            x, y, z = -x, -y, -z
+        out[i, 0], out[i, 1], out[i, 2] = x, y, z
         # twice as wide as thick is a surface
         out[i, 3] = min(1.0, max(0.0, 2 * flatness))
 

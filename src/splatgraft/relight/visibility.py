@@ -9,16 +9,20 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit, prange
+from numba import get_num_threads, njit, prange
 from torch import Tensor
 
 from splatgraft.gaussians import Gaussians
 from splatgraft.images import linear_from_srgb
+from splatgraft.rendering.cpu_rows import LANES, lanes, largest, load, smaller, store, where_at_least, where_below
 from splatgraft.spherical_harmonics import rgb_from_dc
 
 FAR = np.float32(1e30)
 _BINS = 4096
-_CUTOFF = 3.0  # standard deviations; at this distance a splat of opacity 1 has alpha 0.011
+_CUTOFF = np.float32(3.04)  # standard deviations, where a splat of opacity 1 falls to `_FAINTEST`
+_FAINTEST = np.float32(0.01)  # alpha
+_SPENT = np.float32(0.02)  # share of light that is not followed further
+_HALF = np.float32(0.5)
 
 
 @dataclass(frozen=True)
@@ -68,10 +72,10 @@ class DepthMaps:
     """Depth at which light is half blocked; 1e30 where less than half is blocked."""
     alpha: Float[Tensor, "k s s"]
     """Share of the light blocked, in [0, 1]."""
-    mean: Float[Tensor, "k s s"]
-    """Blended depth of what blocks; 0 where nothing does."""
-    color: Float[Tensor, "c s s 3"]
-    """Blended linear colour of the side towards the light, over black; c is k, or 0 where none was asked for."""
+    mean: Float[Tensor, "c s s"]
+    """Blended depth of what blocks; 0 where nothing does; c is k, or 0 where no colour was asked for."""
+    color: Float[Tensor, "c 3 s s"]
+    """Blended linear colour of the side towards the light, over black."""
 
     @property
     def texel(self) -> float:
@@ -82,20 +86,23 @@ class DepthMaps:
 def splat_depth_maps(
     occluders: Occluders, window: Window, *, size: int, with_color: bool, nearest: Float[Tensor, "k"] | None = None
 ) -> DepthMaps:
-    """Depth maps of `occluders`, `size` pixels square; blended front to back as the renderer does.
+    """Depth maps of `occluders`, `size` (a multiple of 16) pixels square; blended front to back as the renderer does.
 
-    Colour is kept where `with_color` asks for it. Occluders at a depth below `nearest` (that is, farther than
+    Colour and mean depth are kept where `with_color` asks for it. Occluders at a depth below `nearest` (that is, farther than
     -`nearest` from the window's centre towards that light) are left out.
     """
     k = len(window.frames)
-    first = np.full((k, size, size), FAR, np.float32)
-    alpha = np.zeros((k, size, size), np.float32)
-    mean = np.zeros((k, size, size), np.float32)
-    color = np.zeros((k if with_color else 0, size, size, 3), np.float32)
+    c = k if with_color else 0
+    assert size % LANES == 0
+    first, left = np.zeros((k, size, size), np.float32), np.ones((k, size, size), np.float32)
+    mean, color = np.zeros((c, size, size), np.float32), np.zeros((c, 3, size, size), np.float32)
     geometry = (_array(occluders.means), _array(occluders.covariances), _array(occluders.opacities))
     view = (_array(window.frames), _array(window.center), np.float32(window.radius))
     limits = _array(nearest) if nearest is not None else np.full(k, -FAR, np.float32)
-    _splat(geometry, _array(occluders.linear_rgb), view, limits, (first, alpha, mean, color))
+    _splat(geometry, _array(occluders.linear_rgb), view, limits, (first, left, mean, color), get_num_threads())
+    first[left >= _HALF] = FAR
+    alpha = np.subtract(np.float32(1), left, out=left)
+    mean /= np.maximum(alpha[:c], np.float32(1e-6))
     return DepthMaps(
         window=window,
         first=torch.from_numpy(first),
@@ -122,98 +129,125 @@ def _array(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32)
 
 
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _project(frame, geometry, view, nearest, splats):
+    """Gaussians that touch a map, in the order of their depth: rows of `splats`, and how many."""
+    means, covariances, opacities = geometry
+    center, radius, size = view
+    f = frame
+    per_unit = np.float32(size / (2 * radius))
+    square = per_unit * per_unit
+    depths, kept = np.empty(len(means), np.float32), np.empty(len(means), np.int32)
+    count = 0
+    low, high = np.float32(1e30), np.float32(-1e30)
+    for i in range(len(means)):
+        x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
+        depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
+        if opacities[i] < _FAINTEST or depth < nearest:
+            continue
+        c = covariances[i]
+        reach = _CUTOFF * np.sqrt(c[0, 0] + c[1, 1] + c[2, 2]) + np.float32(1) / per_unit
+        u = f[0, 0] * x + f[0, 1] * y + f[0, 2] * z
+        v = f[1, 0] * x + f[1, 1] * y + f[1, 2] * z
+        if abs(u) > radius + reach or abs(v) > radius + reach:
+            continue
+        depths[count], kept[count] = depth, i
+        count += 1
+        low, high = min(low, depth), max(high, depth)
+    # counting sort
+    start = np.zeros(_BINS + 1, np.int32)
+    per_depth = np.float32(_BINS - 1) / max(high - low, np.float32(1e-12))
+    for j in range(count):
+        start[int((depths[j] - low) * per_depth) + 1] += 1
+    for b in range(_BINS):
+        start[b + 1] += start[b]
+    for j in range(count):
+        i = kept[j]
+        b = int((depths[j] - low) * per_depth)
+        s = splats[start[b]]
+        start[b] += 1
+        x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
+        c = covariances[i]
+        # rows of F C, then F C F^T for (u, v) and the depth column
+        a0 = f[0, 0] * c[0, 0] + f[0, 1] * c[1, 0] + f[0, 2] * c[2, 0]
+        a1 = f[0, 0] * c[0, 1] + f[0, 1] * c[1, 1] + f[0, 2] * c[2, 1]
+        a2 = f[0, 0] * c[0, 2] + f[0, 1] * c[1, 2] + f[0, 2] * c[2, 2]
+        b0 = f[1, 0] * c[0, 0] + f[1, 1] * c[1, 0] + f[1, 2] * c[2, 0]
+        b1 = f[1, 0] * c[0, 1] + f[1, 1] * c[1, 1] + f[1, 2] * c[2, 1]
+        b2 = f[1, 0] * c[0, 2] + f[1, 1] * c[1, 2] + f[1, 2] * c[2, 2]
+        uu = (a0 * f[0, 0] + a1 * f[0, 1] + a2 * f[0, 2]) * square + np.float32(0.15)
+        uv = (a0 * f[1, 0] + a1 * f[1, 1] + a2 * f[1, 2]) * square
+        vv = (b0 * f[1, 0] + b1 * f[1, 1] + b2 * f[1, 2]) * square + np.float32(0.15)
+        uz = (a0 * f[2, 0] + a1 * f[2, 1] + a2 * f[2, 2]) * per_unit
+        vz = (b0 * f[2, 0] + b1 * f[2, 1] + b2 * f[2, 2]) * per_unit
+        inverse = np.float32(1) / (uu * vv - uv * uv)
+        s[0] = (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z + radius) * per_unit
+        s[1] = (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z + radius) * per_unit
+        s[2] = depths[j]
+        s[3], s[4], s[5] = vv * inverse, -uv * inverse, uu * inverse
+        s[6], s[7] = s[3] * uz + s[4] * vz, s[4] * uz + s[5] * vz
+        s[8], s[9] = opacities[i], vv
+        s[10] = np.float32(2) * np.log(opacities[i] / _FAINTEST)
+        s[11] = np.float32(i)
+    return count
+
+
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
-def _splat(geometry, rgb, view, limits, maps):  # noqa: PLR0912, PLR0915  (one kernel: projection, sort and blending)
-    means, covariances, opacities = geometry
+def _splat(geometry, rgb, view, limits, maps, threads):  # noqa: PLR0912  (one kernel: splats, rows, pixels)
     frames, center, radius = view
-    first, alpha, mean, color = maps
-    n, size, with_color = len(means), first.shape[1], len(color) > 0
-    per_unit = np.float32(size / (2 * radius))
-    for k in prange(len(frames)):
-        f = frames[k]
-        kept = np.empty(n, np.int32)
-        splats = np.empty((n, 9), np.float32)  # u, v, depth, conic abc, depth slope uv, opacity
-        count = 0
-        nearest, farthest = np.float32(1e30), np.float32(-1e30)
-        for i in range(n):
-            x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
-            opacity = opacities[i]
-            depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
-            if opacity < 0.02 or depth < limits[k]:
-                continue
-            u = (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z + radius) * per_unit
-            v = (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z + radius) * per_unit
-            c = covariances[i]
-            reach = _CUTOFF * np.sqrt(max(c[0, 0], c[1, 1], c[2, 2]) * 3) * per_unit + 1
-            if u < -reach or v < -reach or u > size + reach or v > size + reach:
-                continue
-            # rows of F C, then F C F^T for (u, v) and the depth column
-            a0 = f[0, 0] * c[0, 0] + f[0, 1] * c[1, 0] + f[0, 2] * c[2, 0]
-            a1 = f[0, 0] * c[0, 1] + f[0, 1] * c[1, 1] + f[0, 2] * c[2, 1]
-            a2 = f[0, 0] * c[0, 2] + f[0, 1] * c[1, 2] + f[0, 2] * c[2, 2]
-            b0 = f[1, 0] * c[0, 0] + f[1, 1] * c[1, 0] + f[1, 2] * c[2, 0]
-            b1 = f[1, 0] * c[0, 1] + f[1, 1] * c[1, 1] + f[1, 2] * c[2, 1]
-            b2 = f[1, 0] * c[0, 2] + f[1, 1] * c[1, 2] + f[1, 2] * c[2, 2]
-            square = per_unit * per_unit
-            uu = (a0 * f[0, 0] + a1 * f[0, 1] + a2 * f[0, 2]) * square + np.float32(0.15)
-            uv = (a0 * f[1, 0] + a1 * f[1, 1] + a2 * f[1, 2]) * square
-            vv = (b0 * f[1, 0] + b1 * f[1, 1] + b2 * f[1, 2]) * square + np.float32(0.15)
-            uz = (a0 * f[2, 0] + a1 * f[2, 1] + a2 * f[2, 2]) * per_unit
-            vz = (b0 * f[2, 0] + b1 * f[2, 1] + b2 * f[2, 2]) * per_unit
-            inverse = np.float32(1) / (uu * vv - uv * uv)
-            s = splats[count]
-            s[0], s[1], s[2] = u, v, depth
-            s[3], s[4], s[5] = vv * inverse, -uv * inverse, uu * inverse
-            s[6], s[7] = s[3] * uz + s[4] * vz, s[4] * uz + s[5] * vz
-            s[8] = opacity
-            kept[count] = i
-            count += 1
-            nearest, farthest = min(nearest, depth), max(farthest, depth)
-        # counting sort by depth
-        start = np.zeros(_BINS + 1, np.int32)
-        per_depth = np.float32(_BINS - 1) / max(farthest - nearest, np.float32(1e-12))
-        for j in range(count):
-            start[int((splats[j, 2] - nearest) * per_depth) + 1] += 1
-        for b in range(_BINS):
-            start[b + 1] += start[b]
-        order = np.empty(count, np.int32)
-        for j in range(count):
-            b = int((splats[j, 2] - nearest) * per_depth)
-            order[start[b]] = j
-            start[b] += 1
-        for o in range(count):
-            j = order[o]
-            u, v, depth, ca, cb, cc, su, sv, opacity = splats[j]
-            determinant = ca * cc - cb * cb
-            limit = 2 * np.log(opacity * np.float32(100))
-            if limit <= 0:
-                continue
-            reach_u, reach_v = np.sqrt(limit * cc / determinant), np.sqrt(limit * ca / determinant)
-            for row in range(max(0, int(np.ceil(v - reach_v - 0.5))), min(size, int(np.floor(v + reach_v + 0.5)))):
-                dv = np.float32(row) + np.float32(0.5) - v
-                left = max(0, int(np.ceil(u - reach_u - 0.5)))
-                for column in range(left, min(size, int(np.floor(u + reach_u + 0.5)))):
-                    transmitted = 1 - alpha[k, row, column]
-                    if transmitted < 0.02:
+    first, left, mean, color = maps
+    size = first.shape[1]
+    for thread in prange(threads):
+        splats = np.empty((len(geometry[0]), 12), np.float32)
+        for k in range(thread, len(frames), threads):
+            count = _project(frames[k], geometry, (center, radius, size), limits[k], splats)
+            closed = np.zeros((size, size // LANES), np.bool_)  # where light no longer reaches
+            near, through = first[k], left[k]
+            for j in range(count):
+                u, v, depth, ca, cb, cc, su, sv, opacity, var_v, cut, who = splats[j]
+                reach = np.sqrt(cut * var_v)
+                for row in range(max(0, int(np.ceil(v - reach - 0.5))), min(size, int(np.floor(v + reach + 0.5)))):
+                    dv = np.float32(row) + np.float32(0.5) - v
+                    # where the ellipse q = cut meets the row
+                    across = cb * dv
+                    rest = cc * dv * dv
+                    root = across * across - ca * (rest - cut)
+                    if root <= 0:
                         continue
-                    du = np.float32(column) + np.float32(0.5) - u
-                    q = ca * du * du + 2 * cb * du * dv + cc * dv * dv
-                    if q > limit:
+                    half = np.sqrt(root) / ca
+                    middle = u - across / ca - np.float32(0.5)
+                    low, high = max(0, int(np.ceil(middle - half))), min(size - 1, int(np.floor(middle + half)))
+                    if low > high:
                         continue
-                    weight = min(np.float32(0.99), opacity * np.exp(np.float32(-0.5) * q)) * transmitted
-                    at = depth + su * du + sv * dv
-                    if transmitted > 0.5 and transmitted - weight <= 0.5:
-                        first[k, row, column] = at
-                    alpha[k, row, column] += weight
-                    mean[k, row, column] += weight * at
-                    if with_color:
-                        for channel in range(3):
-                            color[k, row, column, channel] += weight * rgb[kept[j], channel]
-        for row in range(size):
-            for column in range(size):
-                if alpha[k, row, column] > 1e-6:
-                    mean[k, row, column] /= alpha[k, row, column]
+                    for tile in range(low // LANES, high // LANES + 1):
+                        if closed[row, tile]:
+                            continue
+                        at = row * size + tile * LANES
+                        du = lanes() + (np.float32(tile * LANES) + np.float32(0.5) - u)
+                        q = du * (du * ca + np.float32(2) * across) + rest
+                        # exp(-q / 2) to 0.004, by squaring (1 - q / 128) six times
+                        bell = np.float32(1) - q * np.float32(1 / 128)
+                        bell *= bell
+                        bell *= bell
+                        bell *= bell
+                        bell *= bell
+                        bell *= bell
+                        bell *= bell
+                        share = where_below(q, cut, smaller(bell * opacity, np.float32(0.99)))
+                        before = load(through, at)
+                        weight = before * share
+                        after = before - weight
+                        place = du * su + (depth + sv * dv)
+                        store(near, at, load(near, at) + where_at_least(before, _HALF, where_below(after, _HALF, place)))
+                        store(through, at, after)
+                        closed[row, tile] = largest(after) < _SPENT
+                        if len(color):
+                            store(mean[k], at, load(mean[k], at) + weight * place)
+                            for channel in range(3):
+                                plane = color[k, channel]
+                                store(plane, at, load(plane, at) + weight * rgb[int(who), channel])
 
 
 @njit(cache=True, parallel=True, fastmath=True)

@@ -1,0 +1,208 @@
+"""Cameras around a scene that came without any: where its dense part is, which way is up, from where it can be seen.
+
+Knows nothing about files, and nothing of how the scene was made.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.cameras import Cameras, look_at, pinhole
+from splatgraft.gaussians import Gaussians
+from splatgraft.progress import Progress, silent
+from splatgraft.rendering import render
+
+WIDTH, HEIGHT = 640, 480
+"""Of the pictures, pixels."""
+_HALF_FOV = math.radians(30)
+"""Of the width."""
+_ELEVATIONS_DEG = (20.0, 42.0)
+_DISTANCES = (2.4, 1.7, 3.4, 1.2)
+"""Over the radius of the dense part, the best first: at 2.4 it fills the picture."""
+_LEAST_VIEWS = 8
+_POINTS = 20_000
+_TRIALS = 1000
+_ALIGNED = math.cos(math.radians(25))
+
+
+@dataclass(frozen=True)
+class LookOptions:
+    """How a scene without photographs is looked at."""
+
+    views: int = 36
+    """Of a trained scene: how many pictures are made of it, from all around; fewer where things stand in the way."""
+    up: tuple[float, float, float] | None = None
+    """Of a trained scene: its up; found from its largest level surface where not given."""
+
+    def __post_init__(self) -> None:
+        """Raises: ValueError where there would be too few views, or up has no length."""
+        if self.views < _LEAST_VIEWS:
+            raise ValueError(f"--views: expected at least {_LEAST_VIEWS}, found {self.views}")
+        if self.up is not None and not math.hypot(*self.up) > 0:
+            raise ValueError(f"--up: expected a direction, found {self.up}")
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """Places from which a scene can be looked at."""
+
+    cameras: Cameras
+    """Around the dense part, looking at its middle."""
+    points: Float[Tensor, "m 3"]
+    """Centres of solid Gaussians: what structure from motion would have found."""
+    point_colors: Float[Tensor, "m 3"]
+    """sRGB in [0, 1]."""
+    report: tuple[str, ...]
+    """Plain sentences: what was assumed."""
+
+
+def find_viewpoints(scene: Gaussians, options: LookOptions, *, progress: Progress = silent) -> Viewpoints:
+    """Rings of cameras around the scene's dense part, those left out that see only what stands in the way.
+
+    Raises: ValueError where the scene has too few solid Gaussians to tell what it shows.
+    """
+    solid = _solid(scene)
+    centre, radius = dense_part(solid.means)
+    if options.up is None:
+        up, reason = find_up(solid.means, centre, radius)
+    else:
+        up, reason = torch.nn.functional.normalize(torch.tensor(options.up), dim=0), "as given"
+    cameras, dropped = _seeing(scene, centre, radius, up=up, views=options.views, progress=progress)
+    report = [
+        f"a scene without photographs: {len(cameras)} pictures are made of it, from around {_shown(centre)}",
+        f"up is taken to be {_shown(up)}: {reason}",
+    ]
+    if dropped:
+        report.append(f"{dropped} of {options.views} views were left out: something stands in their way")
+    return Viewpoints(cameras, solid.means, (0.5 + 0.28209479 * solid.sh[:, 0]).clamp(0, 1), tuple(report))
+
+
+def photographed(
+    scene: Gaussians, found: Viewpoints, *, write: Callable[[str, Tensor], None], progress: Progress = silent
+) -> None:
+    """Hand a picture of `scene` from every viewpoint to `write`, by the camera's name."""
+    for index, camera in enumerate(found.cameras):
+        color = render(scene, camera).color
+        assert color is not None
+        write(camera.names[0], color[0].clamp(0, 1))
+        progress(index + 1, len(found.cameras), "pictures of the scene")
+
+
+def dense_part(points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "3"], float]:
+    """Centre of the densest half of the points, and the radius that holds half of them."""
+    centre = points.median(0).values
+    for _ in range(10):
+        distance = (points - centre).norm(dim=1)
+        centre = points[distance <= distance.median()].mean(0)
+    return centre, float((points - centre).norm(dim=1).median())
+
+
+def find_up(
+    points: Float[Tensor, "m 3"], centre: Float[Tensor, "3"], radius: float
+) -> tuple[Float[Tensor, "3"], str]:
+    """Unit up, and why: the normal of the largest plane about the dense part, to the side on which things stand.
+
+    The custom of the files decides where z is vertical (+z), since below a table there stands as much as on it, and
+    where both sides are alike (-y as structure from motion leaves it, or +z).
+    """
+    near = points[(points - centre).norm(dim=1) < 2 * radius]
+    near = near[:: max(1, len(near) // 4000)]
+    generator = torch.Generator().manual_seed(0)
+    corners = near[torch.randint(len(near), (_TRIALS, 3), generator=generator)]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # three points in a row span no plane
+    spans = normals.norm(dim=1) > 1e-4 * radius**2
+    normals, corners = torch.nn.functional.normalize(normals[spans], dim=1), corners[spans]
+    heights = normals @ near.T - (normals * corners[:, 0]).sum(1)[:, None]
+    thickness = 0.02 * radius
+    counts = (heights.abs() < thickness).sum(1).float()
+    # walls are as large as floors: those at right angles to the customary ups count less
+    customary = normals[:, 1:].abs().amax(1) > _ALIGNED
+    best = int((counts * torch.where(customary, 1.0, 0.6)).argmax())
+    if counts[best] < 0.1 * len(near):
+        return torch.tensor([0.0, -1.0, 0.0]), "no level surface was found, and most files have it so"
+    inliers = near[heights[best].abs() < thickness]
+    middle = inliers.mean(0)
+    normal = torch.linalg.eigh((inliers - middle).double().T @ (inliers - middle).double()).eigenvectors[:, 0].float()
+    height = (near - middle) @ normal
+    beside = ((near - centre) - ((near - centre) @ normal)[:, None] * normal).norm(dim=1) < radius
+    above = float(((height > 3 * thickness) & (height < radius) & beside).sum())
+    below = float(((height < -3 * thickness) & (height > -radius) & beside).sum())
+    share = f"the normal of a surface that holds {float(counts[best]) / len(near):.0%} of the dense part"
+    if abs(float(normal[2])) < _ALIGNED and max(above, below) > 3 * min(above, below) + 1:
+        return normal if above > below else -normal, f"{share}, on whose one side most things stand"
+    customary_side = float(normal @ torch.tensor([0.0, -1.0, 1.0])) >= 0
+    return normal if customary_side else -normal, f"{share}; which of its sides is a guess by custom"
+
+
+def _solid(scene: Gaussians) -> Gaussians:
+    """At most so many Gaussians that stop light and are no backdrop."""
+    largest = scene.scales.amax(1)
+    which = ((scene.opacities > 0.3) & (largest < 20 * largest.median())).nonzero()[:, 0]
+    if len(which) < 20:
+        raise ValueError(f"scene: expected at least 20 solid Gaussians, found {len(which)} of {scene.count}")
+    return scene.select(which[:: math.ceil(len(which) / _POINTS)])
+
+
+def _seeing(
+    scene: Gaussians,
+    centre: Float[Tensor, "3"],
+    radius: float,
+    *,
+    up: Float[Tensor, "3"],
+    views: int,
+    progress: Progress,
+) -> tuple[Cameras, int]:
+    """Along every direction the best distance from which the middle is in view; and how many directions have none."""
+    directions = _directions(views, up)
+    chosen: list[Tensor] = []
+    poor: list[tuple[float, Tensor]] = []
+    for index, direction in enumerate(directions):
+        offsets = [k * radius * direction for k in _DISTANCES]
+        tried = [_tried(scene, centre, offset=offset, radius=radius, up=up) for offset in offsets]
+        good = [pose for pose, blocked in tried if blocked < 0.1]
+        if good:
+            chosen.append(good[0])
+        else:
+            poor.append(min(((blocked, pose) for pose, blocked in tried), key=lambda pair: pair[0]))
+        progress(index + 1, views, "places to look from")
+    missing = max(0, _LEAST_VIEWS - len(chosen))
+    chosen += [pose for _, pose in sorted(poor, key=lambda pair: pair[0])[:missing]]
+    poses = torch.stack(chosen)
+    return pinhole(poses, 0.5 * WIDTH / math.tan(_HALF_FOV), width=WIDTH, height=HEIGHT, prefix="look"), len(poor)
+
+
+def _tried(
+    scene: Gaussians, centre: Float[Tensor, "3"], *, offset: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "4 4"], float]:
+    """A pose, and the share of its picture in which something stands in the way of the dense part."""
+    pose, distance = look_at((centre + offset)[None], centre, up), float(offset.norm())
+    small = pinhole(pose, 24 / math.tan(_HALF_FOV), width=48, height=36)
+    seen = render(scene, small, outputs=frozenset({"depth"}))
+    assert seen.depth is not None
+    depth, alpha = seen.depth[0], seen.alpha[0]
+    close = float((alpha * (depth < 0.35 * distance)).mean())
+    # a wall before the dense part: in the middle of the picture nothing of that part is nearer
+    hidden = float((alpha * (depth < distance - 1.1 * radius))[12:24, 16:32].mean())
+    return pose[0], max(close, 0.3 * hidden)
+
+
+def _directions(views: int, up: Float[Tensor, "3"]) -> Float[Tensor, "v 3"]:
+    """Unit directions from the centre to the cameras: rings at several elevations, turned against one another."""
+    side = torch.eye(3)[int(up.abs().argmin())]
+    x = torch.nn.functional.normalize(torch.linalg.cross(side, up), dim=0)
+    y = torch.linalg.cross(up, x)
+    index = torch.arange(views)
+    azimuth = 2 * math.pi * index / views
+    elevation = torch.deg2rad(torch.tensor(_ELEVATIONS_DEG))[index % len(_ELEVATIONS_DEG)]
+    flat = azimuth.cos()[:, None] * x + azimuth.sin()[:, None] * y
+    return elevation.cos()[:, None] * flat + elevation.sin()[:, None] * up
+
+
+def _shown(vector: Float[Tensor, "3"]) -> str:
+    return "(" + ", ".join(f"{x + 0.0:.2f}" for x in vector.tolist()) + ")"
+
