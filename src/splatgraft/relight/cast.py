@@ -52,7 +52,10 @@ class Occlusion:
 
 
 def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tensor, "k"]) -> Occlusion:
-    """Pyramids of the maps `front` (with colour), completed by the opposite maps `back` (mirrored in u, depth negated)."""
+    """Pyramids of the maps `front`, completed by the opposite maps `back` (mirrored in u, depth negated).
+
+    Both were made with colour.
+    """
     alpha = maps.alpha[front]
     first = torch.where(maps.first < float(FAR) / 2, maps.first, maps.mean)
     lit_side = first[front]

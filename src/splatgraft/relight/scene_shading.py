@@ -14,7 +14,7 @@ from splatgraft.relight.beams import ambient_pairs, source_pairs
 from splatgraft.relight.cast import Beams, Occlusion, cast, occlusion_from_maps
 from splatgraft.relight.directions import frames_along
 from splatgraft.relight.normals import raised
-from splatgraft.relight.visibility import DepthMaps, Window, occluders_of, splat_depth_maps, visibility
+from splatgraft.relight.visibility import DepthMaps, Window, occluders_of, splat_depth_maps, thinned, visibility
 
 SOURCE_SIZE, AMBIENT_SIZE = 512, 256
 _DEAD_ZONE = 0.004  # changes of linear light below half an 8-bit step of a mid grey are left out
@@ -103,10 +103,12 @@ def map_scene(scene: Gaussians, region: Ball, beams: Beams) -> SceneMaps:
     """Depth maps of `scene` for every bundle. Only what is in the region blocks: the light is from beyond it."""
     maps: list[DepthMaps | None] = []
     near = (scene.means - region.center).norm(dim=1) < 1.5 * region.radius + 3 * scene.scales.max(1).values
-    occluders = occluders_of(scene.select(near))
+    blockers = scene.select(near)
     for part, size in ((source_pairs(beams)[0], SOURCE_SIZE), (ambient_pairs(beams)[0], AMBIENT_SIZE)):
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
         nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
+        # what is finer than a pixel of the map tells no more than a sample of it
+        occluders = occluders_of(thinned(blockers, width=2 * region.radius / size))
         seen = splat_depth_maps(occluders, window, size=size, with_color=False, nearest=nearest)
         maps.append(seen if len(part) else None)
     of_sources, of_ambient = maps

@@ -50,18 +50,19 @@ def set_stage(
     """
     region = _region(scene, place, reach, cache)
     members = cache.get("members", (scene, region), lambda: _members(scene, region))
-    normals = cache.get("normals", (members, cameras), lambda: estimate_normals(scene.select(members), cameras))
+    around = cache.get("around", (members,), lambda: scene.select(members))
+    normals = cache.get("normals", (around, cameras), lambda: estimate_normals(around, cameras))
     if light is None:
         light, problem = _estimated(scene, cameras, place, region, cache)
         if light is None:
             return None, problem
     lit = light
     maps = cache.get("maps", (scene, region, lit.sources), lambda: map_scene(scene, region, beams_of(lit)))
-    points = raised(scene.select(members), normals.vectors)
+    points = cache.get("points", (normals,), lambda: raised(around, normals.vectors))
     arrives = cache.get(
         "arrives",
         (maps, normals),
-        lambda: _as_it_looks(scene.select(members), normals, lit, scene_visibility(maps, points, normals.vectors)),
+        lambda: _as_it_looks(around, normals, lit, scene_visibility(maps, points, normals.vectors)),
     )
     return Stage(scene=scene, members=members, normals=normals, light=lit, maps=maps, arrives=arrives), None
 
@@ -116,6 +117,4 @@ def _as_it_looks(
     by_main = irradiance(ours, normals.vectors, arrives=arrives).mean(1)
     by_all = irradiance(everything, normals.vectors, arrives=arrives).mean(1)
     share = lit_share(gaussians, normals, rest=by_all - by_main, light=by_main)
-    out = arrives.clone()
-    out[:, :count] *= share[:, None]
-    return out
+    return torch.cat([arrives[:, :count] * share[:, None], arrives[:, count:]], 1)

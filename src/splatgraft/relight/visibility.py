@@ -3,7 +3,8 @@
 Knows nothing about light, colour spaces or objects: occluders in, maps out; points in, visibility out.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import no_type_check
 
 import numpy as np
@@ -63,6 +64,18 @@ def occluders_of(gaussians: Gaussians) -> Occluders:
     )
 
 
+def thinned(gaussians: Gaussians, *, width: float) -> Gaussians:
+    """Fewer, wider Gaussians that cover the same area: those narrower than `width` survive by chance, and grow to it.
+
+    Stochastic simplification (Cook et al. 2007): one survives with probability (its width / `width`)^2.
+    """
+    share = (gaussians.log_scales.sort(1).values[:, 1:].sum(1) - 2 * math.log(width)).exp().clamp(1e-6, 1)
+    lots = torch.rand(gaussians.count, generator=torch.Generator().manual_seed(0))
+    chosen = (lots < share).nonzero()[:, 0]
+    kept = gaussians.select(chosen)
+    return replace(kept, log_scales=kept.log_scales - 0.5 * share[chosen, None].log())
+
+
 @dataclass(frozen=True)
 class DepthMaps:
     """What k far lights see of some occluders."""
@@ -88,8 +101,8 @@ def splat_depth_maps(
 ) -> DepthMaps:
     """Depth maps of `occluders`, `size` (a multiple of 16) pixels square; blended front to back as the renderer does.
 
-    Colour and mean depth are kept where `with_color` asks for it. Occluders at a depth below `nearest` (that is, farther than
-    -`nearest` from the window's centre towards that light) are left out.
+    Colour and mean depth are kept where `with_color` asks for it. Occluders at a depth below `nearest` (that is,
+    farther than -`nearest` from the window's centre towards that light) are left out.
     """
     k = len(window.frames)
     c = k if with_color else 0
@@ -131,7 +144,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _project(frame, geometry, view, nearest, splats):
+def _project(frame, geometry, view, nearest, splats):  # noqa: PLR0915  (one kernel: what touches, order, shapes)
     """Gaussians that touch a map, in the order of their depth: rows of `splats`, and how many."""
     means, covariances, opacities = geometry
     center, radius, size = view
@@ -193,9 +206,33 @@ def _project(frame, geometry, view, nearest, splats):
     return count
 
 
+@njit(cache=True, fastmath=True, inline="always")
+@no_type_check
+def _blend(splat, at, dv, du, maps):
+    """One splat over a row of pixels; whether no light is left behind all of them."""
+    _, _, depth, ca, cb, cc, su, sv, opacity, _, cut, _ = splat
+    near, through = maps
+    q = du * (du * ca + np.float32(2) * cb * dv) + cc * dv * dv
+    # exp(-q / 2) to 0.004, by squaring (1 - q / 128) six times
+    bell = np.float32(1) - q * np.float32(1 / 128)
+    bell = bell * bell
+    bell = bell * bell
+    bell = bell * bell
+    bell = bell * bell
+    bell = bell * bell
+    bell = bell * bell
+    before = load(through, at)
+    weight = before * where_below(q, cut, smaller(bell * opacity, np.float32(0.99)))
+    after = before - weight
+    place = du * su + (depth + sv * dv)
+    store(near, at, load(near, at) + where_at_least(before, _HALF, where_below(after, _HALF, place)))
+    store(through, at, after)
+    return weight, weight * place, largest(after) < _SPENT
+
+
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
-def _splat(geometry, rgb, view, limits, maps, threads):  # noqa: PLR0912  (one kernel: splats, rows, pixels)
+def _splat(geometry, rgb, view, limits, maps, threads):
     frames, center, radius = view
     first, left, mean, color = maps
     size = first.shape[1]
@@ -206,14 +243,13 @@ def _splat(geometry, rgb, view, limits, maps, threads):  # noqa: PLR0912  (one k
             closed = np.zeros((size, size // LANES), np.bool_)  # where light no longer reaches
             near, through = first[k], left[k]
             for j in range(count):
-                u, v, depth, ca, cb, cc, su, sv, opacity, var_v, cut, who = splats[j]
+                u, v, _, ca, cb, cc, _, _, _, var_v, cut, who = splats[j]
                 reach = np.sqrt(cut * var_v)
                 for row in range(max(0, int(np.ceil(v - reach - 0.5))), min(size, int(np.floor(v + reach + 0.5)))):
                     dv = np.float32(row) + np.float32(0.5) - v
                     # where the ellipse q = cut meets the row
                     across = cb * dv
-                    rest = cc * dv * dv
-                    root = across * across - ca * (rest - cut)
+                    root = across * across - ca * (cc * dv * dv - cut)
                     if root <= 0:
                         continue
                     half = np.sqrt(root) / ca
@@ -226,25 +262,9 @@ def _splat(geometry, rgb, view, limits, maps, threads):  # noqa: PLR0912  (one k
                             continue
                         at = row * size + tile * LANES
                         du = lanes() + (np.float32(tile * LANES) + np.float32(0.5) - u)
-                        q = du * (du * ca + np.float32(2) * across) + rest
-                        # exp(-q / 2) to 0.004, by squaring (1 - q / 128) six times
-                        bell = np.float32(1) - q * np.float32(1 / 128)
-                        bell *= bell
-                        bell *= bell
-                        bell *= bell
-                        bell *= bell
-                        bell *= bell
-                        bell *= bell
-                        share = where_below(q, cut, smaller(bell * opacity, np.float32(0.99)))
-                        before = load(through, at)
-                        weight = before * share
-                        after = before - weight
-                        place = du * su + (depth + sv * dv)
-                        store(near, at, load(near, at) + where_at_least(before, _HALF, where_below(after, _HALF, place)))
-                        store(through, at, after)
-                        closed[row, tile] = largest(after) < _SPENT
+                        weight, placed, closed[row, tile] = _blend(splats[j], at, dv, du, (near, through))
                         if len(color):
-                            store(mean[k], at, load(mean[k], at) + weight * place)
+                            store(mean[k], at, load(mean[k], at) + placed)
                             for channel in range(3):
                                 plane = color[k, channel]
                                 store(plane, at, load(plane, at) + weight * rgb[int(who), channel])
