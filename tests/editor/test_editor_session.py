@@ -14,6 +14,7 @@ from splatgraft.editor.exports import export_scene
 from splatgraft.editor.preview import KINDS, Size, wiped
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState, read_state, state_files, write_state
+from splatgraft.editor.toml_edit import with_keys
 from splatgraft.editor.uploads import SCENES, keep_upload
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
@@ -179,12 +180,30 @@ def test_uploads_are_read_before_they_are_kept(session: Session, tmp_path: Path)
     assert sorted(p.name for p in kept.parent.iterdir()) == ["my_ball.ply"]
 
 
+@pytest.mark.parametrize("light_by", ["gain", "off"])
+def test_the_light_that_is_shown_is_what_the_step_writes(session: Session, light_by: str) -> None:
+    file = session.files.file
+    text = with_keys(file.read_text(), "relight", {"light": light_by})
+    file.write_text(text)
+    assert session.reload()
+    assert main(["run", str(file), "--to", "relight"]) == 0
+    state = session.placed_state()
+    assert session.preview.is_lit(state)
+    shown, written = session.preview.lit_scene(state), read_gaussians(session.files.relit)
+    assert torch.equal(shown.sh, written.sh)
+    assert torch.equal(shown.means, written.means)
+    assert light_by in session.preview.light_note()
+    camera = session.scenes.cameras(session.files.target_cameras)[0]
+    with pytest.raises(ValueError, match="physical transfer"):
+        session.preview.picture("Shadow layer", state, camera)
+
+
 def test_nothing_is_exported_before_it_is_made(session: Session) -> None:
     with pytest.raises(ValueError, match="finished scene"):
         export_scene(session.files, ".ply")
 
 
-def test_a_project_with_trained_scenes_reads_those(session: Session, tmp_path: Path) -> None:
+def test_a_project_with_trained_scenes_takes_those_over(session: Session, tmp_path: Path) -> None:
     made = StepsProject(tmp_path / "new" / "project.toml")
     captures = (session.files.source_cameras.parent, session.files.target_cameras.parent)
     with pytest.raises(ValueError, match="trained scene"):
@@ -192,8 +211,9 @@ def test_a_project_with_trained_scenes_reads_those(session: Session, tmp_path: P
     made.create(captures, scenes=(session.files.source_scene, None))
     files = made.files()
     assert files is not None
-    assert files.source_scene.resolve() == session.files.source_scene.resolve()
-    assert files.target_scene == made.file.parent / "target" / "scene" / "scene.ply"
+    assert files.pictured == (False, False)
+    assert main(["run", str(made.file), "--to", "source/reconstruct"]) == 0
+    assert files.source_scene.read_bytes() == session.files.source_scene.read_bytes()
 
 
 def test_a_light_survives_its_file() -> None:

@@ -73,7 +73,7 @@ def start_project(window: Window, root: Path) -> None:
     window.write("Object from", str(root / "photos" / "nowhere"))
     window.write("Place into", str(root / "photos" / "target"))
     window.click("Start the project")
-    window.says("expected photos, a video or a posed capture, found nothing")
+    window.says("expected photos, a video, a posed capture or a scene, found nothing")
     window.write("Object from", str(root / "photos" / "source"))
     window.click("Start the project")
     window.says("the project is there")

@@ -50,7 +50,7 @@ def test_whatever_is_set_is_read_back_and_nothing_else_changes(values: dict, tab
 
 
 def test_what_is_set_and_removed_again_leaves_the_values_as_they_were() -> None:
-    text = TEMPLATE.replace("{source}", '"a"').replace("{target}", '"b"')
+    text = TEMPLATE.replace("{source}", 'capture = "a"').replace("{target}", 'capture = "b"')
     changed = with_keys(with_keys(text, "relight", {"shade": 0.5}), "relight", {"shade": None})
     assert tomllib.loads(changed) == tomllib.loads(text) | {"relight": {}}
     assert with_keys(text, "relight", {"shade": None}) == text

@@ -1,7 +1,18 @@
-"""Capture: photos or a video become posed images. Knows nothing about Gaussians."""
+"""Capture: photos, a video or a scene without either become posed images. Trains nothing."""
 
 from splatgraft.capture.orientation import upright
 from splatgraft.capture.structure_from_motion import PoseOptions, PoseReport, pose_photos
 from splatgraft.capture.video import extract_frames
+from splatgraft.capture.viewpoints import LookOptions, Viewpoints, find_viewpoints, photographed
 
-__all__ = ["PoseOptions", "PoseReport", "extract_frames", "pose_photos", "upright"]
+__all__ = [
+    "LookOptions",
+    "PoseOptions",
+    "PoseReport",
+    "Viewpoints",
+    "extract_frames",
+    "find_viewpoints",
+    "photographed",
+    "pose_photos",
+    "upright",
+]

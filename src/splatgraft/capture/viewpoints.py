@@ -101,9 +101,7 @@ def dense_part(points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "3"], float]
     return centre, float((points - centre).norm(dim=1).median())
 
 
-def find_up(
-    points: Float[Tensor, "m 3"], centre: Float[Tensor, "3"], radius: float
-) -> tuple[Float[Tensor, "3"], str]:
+def find_up(points: Float[Tensor, "m 3"], centre: Float[Tensor, "3"], radius: float) -> tuple[Float[Tensor, "3"], str]:
     """Unit up, and why: the normal of the largest plane about the dense part, to the side on which things stand.
 
     The custom of the files decides where z is vertical (+z), since below a table there stands as much as on it, and
@@ -205,4 +203,3 @@ def _directions(views: int, up: Float[Tensor, "3"]) -> Float[Tensor, "v 3"]:
 
 def _shown(vector: Float[Tensor, "3"]) -> str:
     return "(" + ", ".join(f"{x + 0.0:.2f}" for x in vector.tolist()) + ")"
-

@@ -19,6 +19,7 @@ from splatgraft.editor.state import EditState
 from splatgraft.formats import read_capture
 from splatgraft.gaussians import Gaussians
 from splatgraft.relight import RelightCache, Relit, relight
+from splatgraft.relight.exposure import relight_by_gain
 from splatgraft.rendering import render
 from splatgraft.splitting import split_around
 
@@ -78,8 +79,10 @@ class Preview:
         self._made: dict[str, tuple[tuple[Any, ...], Any]] = {}
 
     def is_lit(self, state: EditState) -> bool:
-        """Whether the light transfer of this state is there already."""
+        """Whether the light transfer of this state is there already, or takes no time."""
         made = self._made.get("relit")
+        if not self._scenes.files.transfers_light:
+            return True
         return made is not None and same_inputs(made[0], self._light_inputs(state))
 
     def relit(self, state: EditState) -> Relit:
@@ -103,6 +106,14 @@ class Preview:
         color = render(self._scene(kind, state), camera).color
         assert color is not None
         return _bytes(color[0])
+
+    def light_note(self) -> str:
+        """What `Light transfer` shows where project.toml asks for less than the physical one."""
+        light_by = self._scenes.files.light_by
+        what = {"gain": "exposure and white balance of the object alone", "off": "nothing: the object as captured"}
+        return (
+            "" if light_by == "transfer" else f"{what[light_by]}, as project.toml asks ([relight] light = {light_by})"
+        )
 
     def source_picture(self, which: Bool[Tensor, "n"] | None, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         """The source scene, or those of its Gaussians that `which` names."""
@@ -129,12 +140,22 @@ class Preview:
 
         Raises: ValueError where a file is missing.
         """
+        if self._scenes.files.light_by == "off":
+            return self._pasted(self._composite(state))[0]
+        if self._scenes.files.light_by == "gain":
+            composite = self._composite(state)
+            return self._keep("gained", (composite,), lambda: self._gained(composite, state))
         relit, placed = self.relit(state), [one.in_target() for one in self._composite(state).objects]
 
         def make() -> Gaussians:
             return split_around(relit.bake(state.weights), relit.is_object, placed)[0]
 
         return self._keep("lit scene", (relit, state.weights), make)
+
+    def _gained(self, composite: Composite, state: EditState) -> Gaussians:
+        cameras, sources = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.source_scenes(state)
+        adjusted, _ = relight_by_gain(composite, cameras, sources=sources)
+        return split_around(*adjusted.bake(), [one.in_target() for one in composite.objects])[0]
 
     def _pasted(self, composite: Composite) -> tuple[Gaussians, Bool[Tensor, "n"]]:
         """What the step `compose` would write."""
@@ -164,6 +185,8 @@ class Preview:
         return np.ascontiguousarray(colored[..., ::-1])
 
     def _shadow(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        if not self._scenes.files.transfers_light:
+            raise ValueError(f"Shadow layer: expected the physical transfer, found {self.light_note()}")
         relit = self.relit(state)
         layers = self._keep("layers", (relit, state.weights), lambda: relit.ratio(state.weights))
         # half grey is unchanged, so that both what is darkened and what is brightened can be seen
@@ -187,6 +210,7 @@ class Preview:
             cameras,
             sources=self._scenes.source_scenes(state),
             light=state.light,
+            options=self._scenes.files.relighting,
             cache=self._cache,
         )
 
@@ -195,7 +219,7 @@ class Preview:
         return self._keep("composite", inputs, lambda: self._scenes.composite(state))
 
     def _light_inputs(self, state: EditState) -> tuple[Any, ...]:
-        return (self._composite(state), state.light)
+        return (self._composite(state), state.light, repr(self._scenes.files.relighting))
 
     def _keep(self, name: str, inputs: tuple[Any, ...], make: Any) -> Any:
         made = self._made.get(name)
@@ -218,9 +242,9 @@ def wiped(
 
 
 def same_inputs(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
-    """Whether two lists of inputs are the very same objects; numbers and bytes count by value."""
+    """Whether two lists of inputs are the very same objects; numbers, texts and bytes count by value."""
     return len(a) == len(b) and all(
-        x is y or (isinstance(x, int | float | bytes) and x == y) for x, y in zip(a, b, strict=True)
+        x is y or (isinstance(x, int | float | str | bytes) and x == y) for x, y in zip(a, b, strict=True)
     )
 
 

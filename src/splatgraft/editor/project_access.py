@@ -3,9 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 from splatgraft.compose import PlaceOptions
+from splatgraft.project import Side
+from splatgraft.relight import RelightOptions
+
+LightBy = Literal["transfer", "gain", "off"]
+Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -44,10 +49,19 @@ class ProjectFiles:
     """The consolidated scene."""
     report: Path
     """The folder of index.html."""
-    transfers_light: bool
-    """Whether [relight] asks for the physical transfer."""
+    pictured: tuple[bool, bool]
+    """Whether the source and the target are scenes without photographs: their pictures were made of them."""
+    light_by: LightBy
+    """What [relight] asks for: the physical transfer, a gain of the object alone, or nothing."""
+    relighting: RelightOptions
+    """What it says of the physical transfer."""
     placing: PlaceOptions
     """What [compose] says of the place, where none is decided yet."""
+
+    @property
+    def transfers_light(self) -> bool:
+        """Whether there is a light to find and to aim."""
+        return self.light_by == "transfer"
 
 
 @runtime_checkable
@@ -71,10 +85,14 @@ class Project(Protocol):
         ...
 
     def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
-        """Write project.toml for two captures, source first, and the scenes that were trained on them already.
+        """Write project.toml for two captures or scenes, source first, and scenes that were trained on these captures.
 
-        Raises: ValueError where a capture is not there, or a project is.
+        Raises: ValueError where one of them is not there, or a project is.
         """
+        ...
+
+    def set_up(self, side: Side, up: Triple | None) -> None:
+        """Say what is up in a scene without photographs; None: it is found."""
         ...
 
     def run_command(self, to: str, title: str) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -22,6 +22,7 @@ from splatgraft.editor.state import EditState, read_state, state_files, write_st
 from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.gaussians import Gaussians
 from splatgraft.orbit import estimate_up
+from splatgraft.project import Side
 from splatgraft.segment import Box, corrected, with_correction
 from splatgraft.similarity import Similarity
 
@@ -123,6 +124,18 @@ class Session:
     def _read_stamps(self) -> dict[Path, tuple[int, int]]:
         paths = [path for path in state_files(self.files.file) if path.is_file()]
         return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in paths}
+
+    def set_up(self, side: Side, up: tuple[float, float, float] | None) -> None:
+        """Say what is up in a scene without photographs: it shapes the pictures, and is no step to be undone.
+
+        Raises: ValueError as `change`.
+        """
+        with self._lock:
+            if self.reload():
+                raise ValueError(f"{self.files.file.name}: changed outside the editor; please do it again")
+            self.project.set_up(side, up)
+            self._stamps = self._read_stamps()
+            self._refresh_files()
 
     # what is selected in the source
 

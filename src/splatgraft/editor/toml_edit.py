@@ -32,7 +32,8 @@ def with_keys(text: str, table: str, values: Mapping[str, Any]) -> str:
 
 
 def _with_key(text: str, table: str, key: str, value: Any) -> str:
-    lines = text.splitlines()
+    # not splitlines, for which a string may hold ends of lines that TOML does not know
+    lines = text.removesuffix("\n").split("\n")
     start = next((i for i, line in enumerate(lines) if re.match(rf"\s*\[{re.escape(table)}\]\s*(#.*)?$", line)), None)
     if start is None:
         if value is None:

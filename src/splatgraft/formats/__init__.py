@@ -14,6 +14,7 @@ from splatgraft.gaussians import Gaussians
 from splatgraft.posed_images import PosedImages
 
 __all__ = [
+    "is_scene",
     "read_cameras",
     "read_capture",
     "read_gaussians",
@@ -28,6 +29,11 @@ __all__ = [
 
 _READERS = {".ply": read_gaussian_ply, ".splat": read_splat, ".spz": read_spz}
 _WRITERS = {".ply": write_gaussian_ply, ".splat": write_splat, ".spz": write_spz}
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a file of that name would be a trained scene, as its suffix says."""
+    return path.suffix.lower() in _READERS
 
 
 def read_gaussians(path: Path) -> Gaussians:

@@ -1,11 +1,11 @@
-"""The command `capture`: photos, a video or a posed capture become a folder with transforms.json and points.ply."""
+"""The command `capture`: photos, a video, a posed capture or a trained scene become a folder with transforms.json."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatgraft.capture import PoseOptions, extract_frames, pose_photos
-from splatgraft.formats import read_capture, write_capture
-from splatgraft.images import list_images
+from splatgraft.capture import LookOptions, PoseOptions, extract_frames, find_viewpoints, photographed, pose_photos
+from splatgraft.formats import is_scene, read_capture, read_gaussians, write_capture
+from splatgraft.images import list_images, write_image
 from splatgraft.posed_images import PosedImages
 from splatgraft.steps.capture_files import capture_inputs, has_poses
 from splatgraft.steps.step import Context, Inputs, Positional
@@ -13,25 +13,29 @@ from splatgraft.steps.step import Context, Inputs, Positional
 
 @dataclass(frozen=True)
 class Capture:
-    """Pose photos or a video; poses that are there already are taken over, and images are then referred to."""
+    """Pose photos or a video; poses that are there already are taken over, and images are then referred to. Of a
+    trained scene without photographs, pictures are made from all around."""
 
     capture: Positional
-    """A folder of photos, a video, a COLMAP folder or a folder with transforms.json."""
+    """A folder of photos, a video, a COLMAP folder, a folder with transforms.json, or a .ply, .spz or .splat."""
     out: Path = Path("capture")
     """Folder for transforms.json and points.ply."""
     max_side: int = 1600
     """Longest side at which images are served from here on, pixels; 0 keeps all."""
     options: PoseOptions = field(default_factory=PoseOptions)
+    look: LookOptions = field(default_factory=LookOptions)
 
     def inputs(self) -> Inputs:
-        """The photos, or the video, or the files of the posed capture."""
+        """The photos, or the video, or the scene, or the files of the posed capture."""
         if has_poses(self.capture):
             return capture_inputs(self.capture, read_capture(self.capture), masks=True)
         return {"photos": tuple(list_images(self.capture)) if self.capture.is_dir() else (self.capture,)}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the posed capture."""
-        if has_poses(self.capture):
+        if is_scene(self.capture):
+            posed = self._pictures(folder, context)
+        elif has_poses(self.capture):
             posed = read_capture(self.capture)
             context.terminal.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points")
         else:
@@ -40,6 +44,24 @@ class Capture:
             )
             context.terminal.say(f"{self.capture}: {report}")
         write_capture(folder, _limited(posed, self.max_side))
+
+    def _pictures(self, folder: Path, context: Context) -> PosedImages:
+        """Pictures of a scene that came without photographs."""
+        scene = read_gaussians(self.capture)
+        found = find_viewpoints(scene, self.look, progress=context.progress)
+        for sentence in found.report:
+            context.terminal.say(f"{self.capture}: {sentence}")
+        (folder / "images").mkdir()
+        paths = {name: folder / "images" / f"{name}.png" for name in found.cameras.names}
+        photographed(
+            scene, found, write=lambda name, picture: write_image(paths[name], picture), progress=context.progress
+        )
+        return PosedImages(
+            image_paths=tuple(paths.values()),
+            cameras=found.cameras,
+            points=found.points,
+            point_colors=found.point_colors,
+        )
 
     def _photos(self, folder: Path, context: Context) -> list[Path]:
         if self.capture.is_dir():

@@ -14,6 +14,7 @@ from splatgraft.editor.project_access import ProjectFiles
 from splatgraft.editor.session import EDITOR_FOLDER
 from splatgraft.editor.toml_edit import with_keys
 from splatgraft.editor.uploads import LIMIT_BYTES
+from splatgraft.formats import is_scene
 from splatgraft.project import (
     CAMERAS_FILE,
     LIGHT_FILE,
@@ -22,10 +23,12 @@ from splatgraft.project import (
     SCENE_FILE,
     SELECTION_FILE,
     SURROUNDINGS_FILE,
+    Side,
     locked,
 )
+from splatgraft.steps.capture import Capture
 from splatgraft.steps.compose import Compose
-from splatgraft.steps.flow import read_flow
+from splatgraft.steps.flow import Flow, read_flow
 from splatgraft.steps.init import Init
 from splatgraft.steps.relight import Relight
 from splatgraft.steps.segment import Segment
@@ -76,7 +79,9 @@ class StepsProject:
             light=layout.relit / LIGHT_FILE,
             result=layout.result / SCENE_FILE,
             report=layout.report,
-            transfers_light=relight.light == "transfer",
+            pictured=(_is_pictured(flow, "source"), _is_pictured(flow, "target")),
+            light_by=relight.light,
+            relighting=relight.options,
             placing=compose.options,
         )
 
@@ -97,11 +102,15 @@ class StepsProject:
                 raise ValueError(f"{scene}: expected a trained scene, found no such file")
         Init(folder=self.file.parent, source=captures[0], target=captures[1]).execute(self.terminal)
         text = self.file.read_text(encoding="utf-8")
-        source, target = (None if s is None else os.path.relpath(s, self.file.parent) for s in scenes)
-        # where the layout's own scenes would be read
-        named = (("segment", "scene", source), ("compose", "target", target), ("relight", "target", target))
-        for table, key, path in named:
-            text = with_keys(text, table, {key: path}) if path is not None else text
+        for side, scene in zip(("source", "target"), scenes, strict=True):
+            if scene is not None:
+                text = with_keys(text, side, {"scene": os.path.relpath(scene, self.file.parent)})
+        with whole_file(self.file) as stream:
+            stream.write(text.encode())
+
+    def set_up(self, side: Side, up: tuple[float, float, float] | None) -> None:
+        """Say what is up in a scene without photographs."""
+        text = with_keys(self.file.read_text(encoding="utf-8"), side, {"up": up})
         with whole_file(self.file) as stream:
             stream.write(text.encode())
 
@@ -113,6 +122,11 @@ class StepsProject:
         out = () if self.out is None else ("--out", str(self.out))
         command = (sys.executable, "-m", "splatgraft.steps.edit_job", *words)
         return command, ("splatgraft", "run", str(self.file), "--to", to, *out)
+
+
+def _is_pictured(flow: Flow, side: Side) -> bool:
+    step = flow.steps[f"{side}/capture"]
+    return isinstance(step, Capture) and is_scene(step.capture)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from splatgraft.project import (
     Layout,
     Side,
 )
+from splatgraft.steps.adopt import Adopt
 from splatgraft.steps.capture import Capture
 from splatgraft.steps.compose import Compose
 from splatgraft.steps.consolidate import Consolidate
@@ -91,7 +92,10 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
     for side in sides:
         steps[f"{side}/capture"] = file.step(Capture, out=layout.capture(side), side=side)
         given = {"capture": layout.capture(side)}
-        steps[f"{side}/reconstruct"] = file.step(Reconstruct, given, out=layout.scene(side), side=side)
+        # a scene that was trained already stands where a reconstruction would
+        trained = file.scene(side)
+        kind, given = (Reconstruct, given) if trained is None else (Adopt, {"scene": trained})
+        steps[f"{side}/reconstruct"] = file.step(kind, given, out=layout.scene(side), side=side)
     return Flow(layout, steps | _joint_steps(file, layout))
 
 

@@ -5,6 +5,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatgraft.editor.toml_edit import with_keys
+from splatgraft.formats import is_scene
 from splatgraft.project import PROJECT_FILE
 from splatgraft.steps.project_file import TEMPLATE
 from splatgraft.steps.step import Positional
@@ -19,9 +21,10 @@ class Init:
     folder: Positional
     """The project's folder; made where it does not exist."""
     source: Path
-    """The capture with the object: photos, a video, a COLMAP folder or a folder with transforms.json."""
+    """The capture with the object: photos, a video, a COLMAP folder or a folder with transforms.json; or a trained
+    scene (.ply, .spz, .splat) without photographs."""
     target: Path
-    """The capture that receives it."""
+    """The capture or the scene that receives it."""
 
     def execute(self, terminal: Terminal) -> int:
         """Write the file; one that is there is never replaced."""
@@ -30,14 +33,20 @@ class Init:
             raise ValueError(f"{path}: expected no project here yet, found one")
         for capture in (self.source, self.target):
             if not capture.exists():
-                raise ValueError(f"{capture}: expected photos, a video or a posed capture, found nothing")
+                raise ValueError(f"{capture}: expected photos, a video, a posed capture or a scene, found nothing")
         self.folder.mkdir(parents=True, exist_ok=True)
-        # a JSON string is a TOML string
-        source, target = (json.dumps(os.path.relpath(capture, self.folder)) for capture in (self.source, self.target))
+        text = TEMPLATE.replace("{source}", self._key(self.source)).replace("{target}", self._key(self.target))
+        if is_scene(self.source):
+            # nothing but a box can say where the object is
+            text = with_keys(text, "segment", {"mask_source": "grabcut"})
         with whole_file(path) as stream:
-            stream.write(TEMPLATE.replace("{source}", source).replace("{target}", target).encode())
+            stream.write(text.encode())
         terminal.result(path)
         return 0
+
+    def _key(self, capture: Path) -> str:
+        # a JSON string is a TOML string
+        return f"{'scene' if is_scene(capture) else 'capture'} = {json.dumps(os.path.relpath(capture, self.folder))}"
 
 
 COMMAND = Init

@@ -17,7 +17,7 @@ from splatgraft.segment import Box, default_box, grabcut_masks, load_birefnet, r
 from splatgraft.steps.lazy_sequence import LazySequence
 from splatgraft.steps.view_images import file_stems
 
-MaskSource = Literal["files", "grabcut", "birefnet"]
+MaskSource = Literal["files", "grabcut", "birefnet", "box"]
 
 
 def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> PosedImages:
@@ -36,7 +36,7 @@ def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> P
     if not with_mask.any():
         raise ValueError(
             f"{folder or path}: expected masks named like the images ({capture.cameras.names[0]}), found none; "
-            "give --masks FOLDER, or --mask-source grabcut (with --box), or --mask-source birefnet"
+            "give --masks FOLDER, or --mask-source grabcut (with --box), or --mask-source birefnet, or box"
         )
     return _with_masks(capture, paths, with_mask)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from splatgraft.formats import is_scene
 from splatgraft.project import Side
 from splatgraft.settings import Table, from_table, read_toml
 
@@ -17,10 +18,11 @@ TEMPLATE = """\
 
 [source]
 # photos, a video, a COLMAP folder or a folder with transforms.json; masks/ beside images/ is found
-capture = {source}
+# or, beside it or instead of it: scene = "trained.ply" (.spz, .splat); without a capture, pictures are made of it
+{source}
 
 [target]
-capture = {target}
+{target}
 
 # [source.reconstruct]       # for one capture alone; [reconstruct] is for both
 # iterations = 7000
@@ -32,7 +34,7 @@ capture = {target}
 
 # [segment]
 # masks = "masks"            # where they are not beside the images
-# method = "grabcut"         # no masks: from a box around the object, in the source's world
+# mask_source = "grabcut"    # no masks: from a box around the object, in the source's world
 # box = [-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]
 
 # [compose]                  # placement.json beside this file, where there is one, comes first
@@ -68,11 +70,22 @@ class ProjectFile:
         if side is not None:
             own = self.content[side]
             is_capture = name == "capture"
-            values |= {k: v for k, v in own.items() if not isinstance(v, dict)} if is_capture else own.get(name, {})
+            values |= self._of_capture(side) if is_capture else own.get(name, {})
             where = f"{self.path} [{side}]" if is_capture else where
         # a path that the table names wins over the layout's, so that a step can take other files; results stay put
         layout = {key: path for key, path in (given or {}).items() if key not in values} | {"out": out}
         return from_table(kind, Table(values, where, self.path.parent), layout)
+
+    def scene(self, side: Side) -> Path | None:
+        """The scene that was trained already, where one is named."""
+        found = self.content[side].get("scene")
+        return None if found is None else self.path.parent / Path(found).expanduser()
+
+    def _of_capture(self, side: Side) -> dict[str, Any]:
+        """The keys of [source] or [target] that are options of `capture`; a scene alone is looked at."""
+        own = {key: value for key, value in self.content[side].items() if not isinstance(value, dict)}
+        scene = own.pop("scene", None)
+        return own if scene is None else {"capture": scene} | own
 
 
 def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
@@ -87,9 +100,23 @@ def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
             raise ValueError(f"{path}: expected tables among {', '.join(known)}; found {name}")
         if not isinstance(table, dict):
             raise ValueError(f"{path}: expected [{name}] to be a table, found {table!r}")
-    for side in ("source", "target"):
-        if not isinstance(content.get(side, {}).get("capture"), str):
-            raise ValueError(f"{path} [{side}]: expected the key capture with a path, found none")
+    sides: tuple[Side, ...] = ("source", "target")
+    for side in sides:
+        _check_side(path, side, content.get(side, {}))
         if inner := [k for k, v in content[side].items() if isinstance(v, dict) and k != "reconstruct"]:
             raise ValueError(f"{path}: expected no table in [{side}] but [{side}.reconstruct], found {inner[0]}")
     return ProjectFile(path, content)
+
+
+def _check_side(path: Path, side: Side, table: Mapping[str, Any]) -> None:
+    for key in ("capture", "scene"):
+        if key in table and not isinstance(table[key], str):
+            raise ValueError(f"{path} [{side}] {key}: expected a path, found {table[key]!r}")
+    if "capture" not in table and "scene" not in table:
+        raise ValueError(f"{path} [{side}]: expected the key capture (or scene) with a path, found none")
+    if is_scene(Path(table.get("capture", ""))):
+        raise ValueError(f"{path} [{side}] capture: expected photographs, found a scene; write scene = instead")
+    if "scene" in table and "reconstruct" in table:
+        raise ValueError(
+            f"{path} [{side}.reconstruct]: expected none beside a trained scene, found one"
+        )

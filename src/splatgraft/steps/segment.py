@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.formats.corrections import read_corrections
@@ -41,7 +43,8 @@ class Segment:
     out: Path = Path("object")
     """Folder for object.ply, surroundings.ply (the scene without it), selection.npy, feature.npy; masks/ where made."""
     mask_source: MaskSource = "files"
-    """files: masks/ beside the images, or --masks. grabcut: from a box around the object. birefnet: from a network."""
+    """files: masks/ beside the images, or --masks. grabcut: from a box around the object. birefnet: from a network.
+    box: no masks, all Gaussians whose centre is in the box (of a scene that is the object alone: a box around all)."""
     masks: Path | None = None
     """Folder of masks named like the images, white where the object is; views without one are left out."""
     box: tuple[float, float, float, float, float, float] | None = None
@@ -75,15 +78,18 @@ class Segment:
         device = choose_device(self.device, context.terminal)
         scene = read_gaussians(self.scene).to(device)
         box = None if self.box is None else Box(torch.tensor(self.box[:3]), torch.tensor(self.box[3:]))
-        views = self._masked_views(scene, folder, box, context)
-        masks = read_masks(views)
-        feature = lift_masks(scene, views.cameras.to(device), masks, self.options, progress=context.progress)
+        views, feature = None, _in_box(scene, box) if self.mask_source == "box" else None
+        if feature is None:
+            views = self._masked_views(scene, folder, box, context)
+            cameras = views.cameras.to(device)
+            feature = lift_masks(scene, cameras, read_masks(views), self.options, progress=context.progress)
         selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=self.keep))
         if self.corrections is not None:
             selection = corrected(selection, read_corrections(self.corrections))
         context.terminal.say(f"object: {int(selection.sum()):,} of {scene.count:,} Gaussians")
         chosen = scene.select(selection)
-        if self.solidify:
+        if self.solidify and views is not None:
+            masks = read_masks(views)
             photographs = LazySequence(len(views), lambda index: (views.image(index), masks[index]))
             options, cameras = SolidifyOptions(iterations=self.solidify), views.cameras.to(device)
             chosen = solidify_object(scene, selection, cameras, photographs, options=options, progress=context.progress)
@@ -101,6 +107,12 @@ class Segment:
         if self.mask_source == "grabcut":
             return cut_masks(capture, scene, box=box, folder=made, progress=context.progress)
         return network_masks(capture, weights=self.birefnet, folder=made, progress=context.progress)
+
+
+def _in_box(scene: Gaussians, box: Box | None) -> Float[Tensor, "n"]:
+    if box is None:
+        raise ValueError("--mask-source box: expected --box beside it, found none")
+    return box.contains(scene.means).float()
 
 
 COMMAND = Segment

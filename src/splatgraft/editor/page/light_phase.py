@@ -96,7 +96,7 @@ class LightPhase:
     def _why_none(self) -> str:
         session = self._page.need()
         if not session.files.transfers_light:
-            return "project.toml asks for no physical transfer ([relight] light): there is nothing to aim."
+            return f"The light is no physical transfer: {session.preview.light_note()}. There is nothing to aim."
         if not session.objects():
             return "No object is placed yet: see step 3."
         state = session.placed_state()

@@ -1,19 +1,36 @@
-"""Open: two captures become a project; scenes are reconstructed. Knows nothing about how."""
+"""Open: two captures or scenes become a project; what is missing is reconstructed. Knows nothing about how."""
 
 from __future__ import annotations
 
-import html
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import viser
 
+from splatgraft.editor.project_access import Triple
+from splatgraft.editor.session import Session
 from splatgraft.editor.uploads import SCENES, SUFFIXES, keep_upload
+from splatgraft.orbit import estimate_up
+from splatgraft.project import Side
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
 
-_HELP = "A capture is a folder of photos, a video, a COLMAP folder, or a folder with a `transforms.json`."
+_HELP = (
+    "A capture is a folder of photos, a video, a COLMAP folder, or a folder with a `transforms.json`. "
+    "A trained scene (`.ply`, `.spz`, `.splat`) will do as well: it is looked at from all around."
+)
+_SIDES: tuple[tuple[Side, str], ...] = (("source", "Object from"), ("target", "Place into"))
+_UPS: dict[str, Triple | None] = {
+    "as found": None,
+    "+z": (0.0, 0.0, 1.0),
+    "-y": (0.0, -1.0, 0.0),
+    "+y": (0.0, 1.0, 0.0),
+    "-z": (0.0, 0.0, -1.0),
+    "+x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+}
 
 
 class OpenPhase:
@@ -23,9 +40,9 @@ class OpenPhase:
         """Build them."""
         self._page, gui = page, page.gui
         self._help = gui.add_markdown(_HELP)
-        self._source = gui.add_text("Object from", "", hint="The capture with the object: a path")
-        self._target = gui.add_text("Place into", "", hint="The capture that receives it: a path")
-        self._trained = gui.add_folder("Scenes that are trained already", expand_by_default=False)
+        self._source = gui.add_text("Object from", "", hint="The capture or scene with the object: a path")
+        self._target = gui.add_text("Place into", "", hint="The capture or scene that receives it: a path")
+        self._trained = gui.add_folder("Scenes trained on these captures", expand_by_default=False)
         with self._trained:
             self._scenes = (
                 gui.add_text("Of the first", "", hint="A .ply, .spz or .splat in the same frame as its capture"),
@@ -34,9 +51,12 @@ class OpenPhase:
         self._upload = gui.add_upload_button("Upload a video or a scene", icon=viser.Icon.UPLOAD, color="gray")
         self._start = gui.add_button("Start the project", icon=viser.Icon.PLUS)
         self._facts = gui.add_html("")
+        self._ups = {side: gui.add_dropdown(f"Up: {name.lower()}", tuple(_UPS), visible=False) for side, name in _SIDES}
         self._build = gui.add_button("Reconstruct both scenes", icon=viser.Icon.PLAYER_PLAY)
         self._start.on_click(page.act(lambda _: self._create()))
         self._upload.on_upload(page.act(self._uploaded))
+        for side, _ in _SIDES:
+            self._ups[side].on_update(page.act(partial(self._set_up, side)))
         self._build.on_click(page.act(lambda _: page.run("reconstruct", "Reconstruct both scenes")))
 
     def enter(self) -> None:
@@ -55,14 +75,11 @@ class OpenPhase:
         for control in (self._help, self._source, self._target, self._trained, self._upload, self._start):
             control.visible = session is None
         self._facts.visible = self._build.visible = session is not None
+        for index, (side, _) in enumerate(_SIDES):
+            self._ups[side].visible = session is not None and session.files.pictured[index]
         if session is None:
             return
-        lines = []
-        for side, scene in (("Object from", session.files.source_scene), ("Place into", session.files.target_scene)):
-            state = (
-                f"{session.scenes.gaussians(scene).count:,} Gaussians" if scene.is_file() else "not reconstructed yet"
-            )
-            lines.append(f"<b>{side}</b>: {html.escape(state)}")
+        lines = [self._line(session, index) for index in range(len(_SIDES))]
         for name, shown in self._page.view.shown.items():
             if shown.count < shown.total:
                 lines.append(f"{name}: {shown.count:,} of {shown.total:,} shown; files keep all")
@@ -70,19 +87,45 @@ class OpenPhase:
             f'<div style="font-size:.85em;line-height:1.6;padding:2px 12px">{"<br>".join(lines)}</div>'
         )
         both = session.files.source_scene.is_file() and session.files.target_scene.is_file()
-        self._build.label = "Reconstruct again what is stale" if both else "Reconstruct both scenes"
+        self._build.label = "Reconstruct again what is stale" if both else self._title(session)
         self._build.color = "gray" if both else None
+
+    def _line(self, session: Session, index: int) -> str:
+        files, name = session.files, _SIDES[index][1]
+        scene = (files.source_scene, files.target_scene)[index]
+        cameras = (files.source_cameras, files.target_cameras)[index]
+        if not scene.is_file():
+            return f"<b>{name}</b>: not reconstructed yet"
+        text = f"<b>{name}</b>: {session.scenes.gaussians(scene).count:,} Gaussians"
+        if files.pictured[index] and cameras.is_file():
+            made = session.scenes.cameras(cameras)
+            up = ", ".join(f"{x + 0.0:.2f}" for x in estimate_up(made).tolist())
+            text += f"; it came without photographs: {len(made)} pictures were made of it, with ({up}) as up"
+        return text
+
+    def _title(self, session: Session) -> str:
+        return "Take over both scenes" if all(session.files.pictured) else "Reconstruct both scenes"
+
+    def _set_up(self, side: Side, _: viser.GuiEvent) -> None:
+        session = self._page.need()
+        session.set_up(side, _UPS[self._ups[side].value])
+        self._page.run("reconstruct", "Look at the scene again")
 
     def _create(self) -> None:
         source, target = (self._page.allowed(field.value) for field in (self._source, self._target))
         scenes = [self._page.allowed(field.value) if field.value.strip() else None for field in self._scenes]
         self._page.project.create((source, target), scenes=(scenes[0], scenes[1]))
         self._page.open_project()
+        session = self._page.need()
+        if all(session.files.pictured):
+            # nothing is trained, so there is nothing to wait for
+            self._page.run("reconstruct", self._title(session))
+            return
         self._page.say("the project is there; reconstruct both scenes next")
 
     def _uploaded(self, event: viser.GuiEvent) -> None:
         file = event.target.value
         path = keep_upload(self._page.project.file.parent, file.name, file.content, suffixes=SUFFIXES)
-        fields = self._scenes if path.suffix.lower() in SCENES else (self._source, self._target)
+        fields = (self._source, self._target, *(self._scenes if path.suffix.lower() in SCENES else ()))
         next((field for field in fields if not field.value), fields[-1]).value = str(path)
         self._page.say(f"{Path(file.name).name}: kept as {path}")

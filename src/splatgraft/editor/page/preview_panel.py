@@ -192,8 +192,12 @@ class PreviewPanel:
         self._image.image = wiped(left, right, wish.share)
         self._size = replace(self._size, width=self._size.after(spent))
         height, width = left.shape[:2]
+        files, shown = wish.session.files, (wish.left, wish.right)
+        notes = [note, wish.session.preview.light_note() if "Light transfer" in shown else ""]
+        if "Photograph" in shown and files.pictured[1]:
+            notes.append("no photograph: a picture made of the scene, which came without any")
         self._say(
-            " &middot; ".join([f"{wish.left} | {wish.right}", f"{width} x {height}", *filter(None, [note]), *problems])
+            " &middot; ".join([f"{wish.left} | {wish.right}", f"{width} x {height}", *filter(None, notes), *problems])
         )
 
     def _picture(self, kind: Kind, wish: _Wish, problems: list[str]) -> np.ndarray:

@@ -22,6 +22,7 @@ _SOURCES = {
     "masks beside the photos": "files",
     "a box around the object": "grabcut",
     "a network (BiRefNet)": "birefnet",
+    "no masks: all that is in the box": "box",
 }
 
 

@@ -1,0 +1,87 @@
+"""Where a scene without cameras is looked at from."""
+
+import math
+
+import pytest
+import torch
+
+from splatgraft.capture import LookOptions, find_viewpoints, photographed
+from splatgraft.capture.viewpoints import dense_part, find_up
+from splatgraft.gaussians import Gaussians, concatenate
+from splatgraft.orbit import estimate_up, focus_point
+
+
+def blobs(means: torch.Tensor, size: float = 0.05) -> Gaussians:
+    n = len(means)
+    return Gaussians(
+        means=means,
+        log_scales=torch.full((n, 3), size).log(),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        opacity_logits=torch.full((n,), 4.0),
+        sh=torch.zeros(n, 1, 3),
+    )
+
+
+def table(seed: int = 0) -> torch.Tensor:
+    """A level surface with things on it, z up, and a far cloud that is not looked at."""
+    generator = torch.Generator().manual_seed(seed)
+    flat = torch.cat([2 * torch.rand(2000, 2, generator=generator) - 1, torch.zeros(2000, 1)], 1)
+    things = 0.5 * torch.rand(800, 3, generator=generator) - torch.tensor([0.25, 0.25, 0.0])
+    far = 8 * torch.randn(400, 3, generator=generator)
+    return torch.cat([flat, things, far])
+
+
+def turned_up(rotation: torch.Tensor) -> tuple[torch.Tensor, str]:
+    points = table() @ rotation.T
+    return find_up(points, *dense_part(points))
+
+
+def test_the_dense_part_is_the_table_not_the_cloud() -> None:
+    centre, radius = dense_part(table())
+    assert float(centre.norm()) < 0.25  # a quarter of the table: the things pull the middle up
+    assert 0.4 < radius < 1.2
+
+
+@pytest.mark.parametrize("angle", [0.0, 20.0])
+def test_up_is_the_side_on_which_things_stand(angle: float) -> None:
+    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    tilt = torch.tensor([[1.0, 0, 0], [0, c, -s], [0, s, c]])
+    y_down = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    for rotation in (tilt, tilt @ y_down, tilt @ y_down.T):
+        up, why = turned_up(rotation)
+        # a fiftieth of the radius is the plane's thickness
+        assert float(up @ rotation[:, 2]) > math.cos(0.05), why
+    assert turned_up(tilt)[1].endswith("a guess by custom")
+    assert turned_up(tilt @ y_down.T)[1].endswith("most things stand")
+
+
+def test_cameras_go_round_the_dense_part_upright_and_see_it() -> None:
+    scene = blobs(table())
+    found = find_viewpoints(scene, LookOptions(views=12))
+    centre, radius = dense_part(scene.means)
+    assert torch.allclose(focus_point(found.cameras), centre, atol=1e-3 * radius)  # float32 lines through one point
+    assert torch.allclose(estimate_up(found.cameras), torch.tensor([0.0, 0.0, 1.0]), atol=0.05)
+    assert bool((found.cameras.centers[:, 2] > centre[2]).all())
+    seen: list[float] = []
+    photographed(scene, found, write=lambda name, picture: seen.append(float(picture.mean())))
+    assert len(seen) == len(found.cameras)
+    assert min(seen) > 0.1
+
+
+def test_a_wall_is_not_looked_at_from_behind() -> None:
+    y, z = torch.meshgrid(torch.linspace(-4, 4, 60), torch.linspace(-1, 6, 50), indexing="ij")
+    wall = blobs(torch.stack([torch.full_like(y, 1.0), y, z], -1).reshape(-1, 3), 0.1)
+    scene = concatenate([blobs(torch.cat([table()[:2800]] * 3)), wall])
+    options = LookOptions(views=16, up=(0.0, 0.0, 1.0))
+    found = find_viewpoints(scene, options)
+    open_side = find_viewpoints(blobs(torch.cat([table()[:2800]] * 3)), options)
+    assert bool((open_side.cameras.centers[:, 0] > 1.0).any())
+    assert not bool((found.cameras.centers[:, 0] > 1.0).any())
+    assert any("as given" in sentence for sentence in found.report)
+
+
+def test_a_scene_that_shows_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least 20 solid"):
+        find_viewpoints(blobs(table()[:10]), LookOptions())
+    with pytest.raises(ValueError, match="expected a direction"):
+        LookOptions(up=(0.0, 0.0, 0.0))

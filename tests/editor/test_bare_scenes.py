@@ -1,0 +1,87 @@
+"""Scenes without photographs and cameras, as source and as target: the whole transfer through the steps."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_project import ball, plane
+
+from splatgraft.cli import main
+from splatgraft.editor.session import Session
+from splatgraft.editor.toml_edit import with_keys
+from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
+from splatgraft.formats.placement import read_placement
+from splatgraft.gaussians import concatenate
+from splatgraft.orbit import estimate_up
+from splatgraft.steps.edit import StepsProject
+
+AROUND_THE_BALL = [-0.35, -0.35, 0.03, 0.35, 0.35, 0.65]
+
+
+def bare_project(root: Path, *, suffix: str, **segment: object) -> Path:
+    """Two scene files and a project of them."""
+    scenes = [concatenate([plane((0.3, 0.5, 0.3)), ball()]), plane((0.5, 0.45, 0.6))]
+    paths = [root / f"{name}{suffix}" for name in ("source", "target")]
+    for path, scene in zip(paths, scenes, strict=True):
+        write_gaussians(path, scene)
+    project = root / "project" / "project.toml"
+    assert main(["init", str(project.parent), "--source", str(paths[0]), "--target", str(paths[1])]) == 0
+    text = with_keys(project.read_text(), "segment", {"keep": "all", "solidify": 4, **segment})
+    for side in ("source", "target"):
+        text = with_keys(text, side, {"views": 8})
+    text = with_keys(text, "compose", {"point": [0.0, 0.0, 0.5], "scale": 0.8})
+    project.write_text(with_keys(text, "consolidate", {"passes": 1}))
+    return project
+
+
+def test_a_transfer_between_two_bare_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = bare_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, threshold=0.5)
+    assert main(["run", str(project), "--to", "consolidate"]) == 0
+    said = capsys.readouterr().err
+    assert "a scene without photographs: 8 pictures" in said
+    assert "up is taken to be (0.00, 0.00, 1.00)" in said
+    root = project.parent
+    assert (root / "source/scene/scene.ply").read_bytes() == (tmp_path / "source.ply").read_bytes()
+    # pictures alone tell the ball, which is red, from the plane, which is not
+    object_ = read_gaussians(root / "object" / "object.ply")
+    assert 40 < object_.count <= ball().count
+    assert bool((object_.sh[:, 0, 0] > object_.sh[:, 0, 1]).all())
+    placed = read_placement(root / "composite" / "placement.json").objects[0].target_from_object
+    # of 0.65, where a ball that is cut 0.03 above its foot is half a blob lower or higher
+    assert abs(float(placed.points(object_.means)[:, 2].median()) - 0.8 * 0.3) < 0.1
+    assert (root / "result" / "scene.ply").is_file()
+
+
+def test_a_box_alone_cuts_and_the_whole_file_may_be_the_object(tmp_path: Path) -> None:
+    project = bare_project(tmp_path, suffix=".spz", box=AROUND_THE_BALL, mask_source="box")
+    assert main(["run", str(project), "--to", "segment"]) == 0
+    assert read_gaussians(project.parent / "object" / "object.ply").count == ball().count
+    everything = [-9.0, -9.0, -9.0, 9.0, 9.0, 9.0]
+    project.write_text(with_keys(project.read_text(), "segment", {"box": everything}))
+    # nothing is left to tell the light or the surface that it came from: the transfer must do without
+    assert main(["run", str(project), "--to", "relight"]) == 0
+    scene = read_gaussians(tmp_path / "source.spz")
+    assert read_gaussians(project.parent / "object" / "object.ply").count == scene.count
+    assert read_gaussians(project.parent / "object" / "surroundings.ply").count == 0
+    session = Session(StepsProject(project))
+    assert session.files.pictured == (True, True)
+    assert session.placeable(0).base.stands_on == "extent"
+    # the .spz turned the plane's axes, and the cameras were turned with it
+    up = estimate_up(read_cameras(project.parent / "target" / "capture"))
+    assert torch.allclose(
+        up, torch.tensor([0.0, 0.0, 1.0]), atol=0.02
+    )  # of a plane whose centres are rounded to 1/4096
+
+
+def test_what_is_named_wrongly_is_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = bare_project(tmp_path, suffix=".ply")
+    text = project.read_text()
+    for wrong, message in (
+        (text.replace('scene = "../source.ply"', 'capture = "../source.ply"'), "write scene = instead"),
+        (text.replace('scene = "../source.ply"', ""), "expected the key capture (or scene)"),
+        (text + "[source.reconstruct]\niterations = 3\n", "beside a trained scene"),
+        (text.replace("../source.ply", "../nowhere.ply"), "nowhere.ply"),
+    ):
+        project.write_text(wrong)
+        assert main(["run", str(project), "--to", "reconstruct"]) == 2
+        assert message in capsys.readouterr().err
