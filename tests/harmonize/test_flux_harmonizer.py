@@ -18,6 +18,7 @@ from splatgraft.harmonize.flux.lora import add_lora, write_lora
 
 pytestmark = list(quiet)
 WIDE = CHANNELS * 12
+PICTURES = ("composite", "background", "mask", "depth", "normal", "prior")
 
 
 def view(h=32, w=48, seed=0):
@@ -57,7 +58,7 @@ def test_a_padded_view_is_cropped_from_the_whole_and_a_legal_size_is_not_padded(
         image = torch.cat([image, image[-2:-1]], 0)
         return torch.cat([image, image[:, -2:-1]], 1)
 
-    whole = HarmonizerInputs(**{name: grown(picture) for name, picture in small.__dict__.items()})
+    whole = replace(small, **{name: grown(getattr(small, name)) for name in PICTURES})
     assert torch.equal(harmonizer.harmonize(small).image, harmonizer.harmonize(whole).image[:31, :47])
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from splatgraft.harmonize.compact.registered import make_compact
 from splatgraft.harmonize.flux.registered import make_flux
 from splatgraft.harmonize.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
 from splatgraft.harmonize.keep import KeepPrior
@@ -22,6 +23,7 @@ __all__ = [
 HARMONIZERS: dict[str, Callable[[HarmonizerOptions], Harmonizer]] = {
     "none": lambda options: KeepPrior(),
     "reinhard": lambda options: Reinhard(),
+    "compact": make_compact,
     "flux": make_flux,
     "lbm": make_lbm,
     "ic-light": make_ic_light,

@@ -24,6 +24,10 @@ class HarmonizerInputs:
     """Unit normal of the composite towards the camera, in the target's world; 0 where nothing is hit."""
     prior: Float[Tensor, "h w 3"]
     """The composite after light transfer, sRGB in [0, 1]; equal to `composite` where none was done."""
+    trust: float = 0.0
+    """How far the light behind `prior` may be believed, in [0, 1]; 0 where there was no transfer."""
+    camera_from_world: Float[Tensor, "3 3"] | None = None
+    """The camera's rotation (right, down, away); None where the normals are in the camera's frame already."""
 
 
 @dataclass(frozen=True)

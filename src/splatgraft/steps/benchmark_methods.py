@@ -16,8 +16,9 @@ from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.gaussians import Gaussians
 from splatgraft.harmonize import HARMONIZERS, HarmonizerOptions, make_harmonizer
 from splatgraft.image_losses import lpips_vgg, windowed_fourier
-from splatgraft.project import PLACEMENT_FILE, SCENE_FILE
+from splatgraft.project import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
 from splatgraft.relight import SourceScene, relight
+from splatgraft.relight.light import light_to_json
 from splatgraft.splitting import split_around
 from splatgraft.steps.benchmark_scene import ReadyScene, fresh
 from splatgraft.steps.composite_folder import placement_files, read_composite
@@ -120,6 +121,8 @@ class RelightTruly:
         )
         placed = [one.in_target() for one in composite.objects]
         write_gaussians(folder / SCENE_FILE, split_around(relit.bake(), relit.is_object, placed)[0])
+        if relit.light is not None:
+            (folder / LIGHT_FILE).write_text(light_to_json(relit.light))
         for sentence in relit.report:
             context.terminal.say(sentence)
 

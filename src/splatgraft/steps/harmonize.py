@@ -23,7 +23,8 @@ class Harmonize:
     out: Path = Path("harmonized")
     """Folder for images/, and confidence/ where the method says how far it trusts itself."""
     method: str = "none"
-    """none (keeps the prior), reinhard (a baseline), flux (the paper's); lbm, ic-light, mv-colight, image-editing."""
+    """none (keeps the prior), compact (a small network of ours), reinhard (a baseline), flux (the paper's); lbm,
+    ic-light, mv-colight, image-editing."""
     weights: str | None = None
     """Folder, file or hub id of the method's weights, such as nviolante/dot3d/image-mask for flux."""
     base: str | None = None
@@ -39,7 +40,7 @@ class Harmonize:
     sampling_steps: int = 4
     """flux: of the sampling."""
     strength: float = 1.0
-    """flux: how far the object's material may change; 0 lets only its light change."""
+    """flux: how far the object's material may change; 0 lets only its light change. compact: how much is corrected."""
     detail: float = 0.0
     """flux: 1 lays the network's light onto the composite's own pixels, 0 keeps the network's pixels."""
     precision: Literal["auto", "bf16", "fp8", "nf4", "offload", "float32"] = "auto"

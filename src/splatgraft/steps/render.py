@@ -14,6 +14,9 @@ from splatgraft.gaussians import Gaussians
 from splatgraft.harmonize import HarmonizerInputs
 from splatgraft.images import write_image
 from splatgraft.posed_images import PosedImages, held_out
+from splatgraft.project import LIGHT_FILE
+from splatgraft.relight.light import light_from_json
+from splatgraft.relight.trust import trust_in
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.rendering.interface import Output
 from splatgraft.steps.selection_file import read_selection
@@ -47,7 +50,18 @@ class Render:
         cameras = self.cameras / "transforms.json" if self.cameras.is_dir() else self.cameras
         optional = {"is_object": self.is_object, "prior": self.prior}
         given = {role: (path,) for role, path in optional.items() if path is not None}
+        if (light := self._light()) is not None:
+            given["light"] = (light,)
         return {"scene": (self.scene,), "cameras": (cameras,), **given}
+
+    def _light(self) -> Path | None:
+        """The light that `relight` wrote beside the prior."""
+        path = None if self.prior is None else self.prior.parent / LIGHT_FILE
+        return path if path is not None and path.is_file() else None
+
+    def _trust(self) -> float:
+        path = self._light()
+        return 0.0 if path is None else trust_in(light_from_json(path.read_text(), name=str(path)))
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the pictures, one camera at a time."""
@@ -60,7 +74,7 @@ class Render:
             return _render_plain(scene, cameras, folder=folder, options=options, context=context)
         is_object = read_selection(self.is_object, scene.count, self.scene).to(device)
         prior = scene if self.prior is None else read_gaussians(self.prior).to(device)
-        views = ViewFolder.create(folder, cameras.to("cpu"))
+        views = ViewFolder.create(folder, cameras.to("cpu"), trust=self._trust())
         for index, camera in enumerate(cameras):
             views.write(index, view_of(scene, is_object, prior=prior, camera=camera, options=options))
             context.progress(index + 1, len(cameras), views.stems[index])
@@ -73,6 +87,7 @@ def view_of(
     prior: Gaussians,
     camera: Cameras,
     options: RenderOptions = RenderOptions(),
+    trust: float = 0.0,
 ) -> HarmonizerInputs:
     """What a harmoniser sees of one view of a composite, on the CPU."""
     outputs: frozenset[Output] = frozenset({"color", "depth", "normal"})
@@ -89,6 +104,8 @@ def view_of(
         depth=full.depth[0].cpu(),
         normal=full.normal[0].cpu(),
         prior=color if prior is composite else _color(render(prior, camera, options=options).color),
+        trust=trust,
+        camera_from_world=camera.camera_from_world[0, :3, :3].cpu(),
     )
 
 

@@ -1,10 +1,12 @@
 """A folder of rendered views: one file per picture and camera, as `render` writes and later steps read them.
 
     transforms.json  composite/NAME.png  background/  prior/  mask/  normal/NAME.png  depth/NAME.npy
+    prior.json       how far the light behind prior/ may be believed
 
 Knows nothing about how pictures are made or used.
 """
 
+import json
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -20,6 +22,7 @@ from splatgraft.images import read_mask, read_rgb, write_image
 from splatgraft.project import CAMERAS_FILE
 from splatgraft.whole_file import whole_file
 
+_PRIOR_FILE = "prior.json"
 PICTURES = ("composite", "background", "prior", "mask", "normal", "depth")
 
 
@@ -48,11 +51,12 @@ class ViewFolder:
     """File names of the views, without suffix."""
 
     @staticmethod
-    def create(folder: Path, cameras: Cameras) -> "ViewFolder":
-        """An empty one with its cameras and sub-folders."""
+    def create(folder: Path, cameras: Cameras, *, trust: float = 0.0) -> "ViewFolder":
+        """An empty one with its cameras, sub-folders, and the trust in [0, 1] in the light behind its priors."""
         for name in PICTURES:
             (folder / name).mkdir(parents=True, exist_ok=True)
         write_cameras(folder / CAMERAS_FILE, cameras)
+        (folder / _PRIOR_FILE).write_text(json.dumps({"trust": round(trust, 4)}) + "\n")
         return ViewFolder(folder, cameras, file_stems(cameras))
 
     @staticmethod
@@ -74,7 +78,8 @@ class ViewFolder:
     def files(self) -> tuple[Path, ...]:
         """All of them, for telling whether one changed."""
         pictures = [self.path(name, i) for name in PICTURES for i in range(len(self))]
-        return (self.folder / CAMERAS_FILE, *pictures)
+        prior = self.folder / _PRIOR_FILE
+        return (self.folder / CAMERAS_FILE, *pictures, *((prior,) if prior.is_file() else ()))
 
     def write(self, index: int, view: HarmonizerInputs) -> None:
         """Write all pictures of one view."""
@@ -99,8 +104,25 @@ class ViewFolder:
                 wanted = f"{composite.shape[1]}x{composite.shape[0]}"
                 raise ValueError(f"{self.path(name, index)}: expected {wanted} pixels, found {found}")
         return HarmonizerInputs(
-            composite=composite, background=background, mask=mask, depth=depth, normal=normal, prior=prior
+            composite=composite,
+            background=background,
+            mask=mask,
+            depth=depth,
+            normal=normal,
+            prior=prior,
+            trust=self._trust(),
+            camera_from_world=self.cameras.camera_from_world[index, :3, :3],
         )
+
+    def _trust(self) -> float:
+        """In the light behind the priors; 0 in folders of versions that did not say."""
+        path = self.folder / _PRIOR_FILE
+        if not path.is_file():
+            return 0.0
+        try:
+            return float(json.loads(path.read_text())["trust"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: expected {{\"trust\": 0 to 1}}, found {path.read_text()[:80]!r}") from error
 
 
 def _normal_from_rgb(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:

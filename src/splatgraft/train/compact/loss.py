@@ -1,0 +1,84 @@
+"""What the compact network is asked to make small: log ratios by region, gradients, and doing worse than the prior."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.harmonize.compact.features import Answer, View, composed
+from splatgraft.images import srgb_from_linear
+
+_LIFT = 0.01
+_SHADOW = 0.95
+"""Truth over background below which a pixel is in the shadow."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Mean errors of a batch, per region."""
+
+    object: Tensor
+    shadow: Tensor
+    rest: Tensor
+
+
+def regions(view: View, truth: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights (b 1 h w) of the object, of the shadow band and of the rest."""
+    ratio = (truth.mean(1, keepdim=True) + _LIFT) / (view.background.mean(1, keepdim=True) + _LIFT)
+    off = (view.mask < 0.02).to(truth)
+    shadow = off * (ratio < _SHADOW)
+    return view.mask, shadow, off - shadow
+
+
+def errors_of(image: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"], view: View) -> Errors:
+    """sRGB and log error of `image`, linear, averaged over each region."""
+    apart = _apart(image, truth)
+    object_, shadow, rest = regions(view, truth)
+    return Errors(_mean(apart, object_), _mean(apart, shadow), _mean(apart, rest))
+
+
+def loss_of(view: View, answer: Answer, truth: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Errors, Errors]:
+    """The loss, the errors of the answer, and those of the prior."""
+    image = composed(view, answer)
+    found, before = errors_of(image, truth, view), errors_of(view.prior(), truth, view)
+    loss = found.object + found.shadow + 2 * found.rest
+    loss = loss + 0.5 * _gradients(image, truth, view)
+    hinge = [(getattr(found, k) - getattr(before, k)).clamp_min(0) for k in ("object", "shadow", "rest")]
+    loss = loss + 0.5 * hinge[0] + 0.5 * hinge[1] + hinge[2]
+    return loss + 0.02 * _doubt(image.detach(), truth, answer), found, before
+
+
+def _apart(image: Tensor, truth: Tensor) -> Float[Tensor, "b 1 h w"]:
+    # where the truth is burnt out, how far the image is beyond white does not matter
+    srgb = (srgb_from_linear(image.clamp(1e-6, 1)) - srgb_from_linear(truth.clamp(1e-6, 1))).abs()
+    log = ((image.clamp_max(1) + _LIFT) / (truth + _LIFT)).log().abs()
+    return (2 * srgb + 0.3 * log).mean(1, keepdim=True)
+
+
+def _mean(values: Tensor, weight: Tensor) -> Tensor:
+    """Mean over a region of each picture, then over pictures; small regions count less than their share."""
+    area = weight.sum((1, 2, 3))
+    whole = values.shape[-1] * values.shape[-2]
+    each = (values * weight).sum((1, 2, 3)) / (area + 0.003 * whole)
+    return each.mean()
+
+
+def _gradients(image: Tensor, truth: Tensor, view: View) -> Tensor:
+    """Edges of light: differences of the log ratio between neighbours, near the object."""
+    ratio = ((image.clamp_max(1) + _LIFT) / (truth + _LIFT)).log().clamp(-2, 2)
+    object_, shadow, _ = regions(view, truth)
+    weight = (object_ + shadow).clamp_max(1)
+    across = _mean((ratio[..., 1:] - ratio[..., :-1]).abs().mean(1, keepdim=True), weight[..., 1:])
+    down = _mean((ratio[..., 1:, :] - ratio[..., :-1, :]).abs().mean(1, keepdim=True), weight[..., 1:, :])
+    return across + down
+
+
+def _doubt(image: Tensor, truth: Tensor, answer: Answer) -> Tensor:
+    """Laplace likelihood of the error; teaches only how large it is."""
+    error = (
+        (srgb_from_linear(image.clamp(1e-6, 1)) - srgb_from_linear(truth.clamp(1e-6, 1))).abs().mean(1, keepdim=True)
+    )
+    size = answer.log_error.shape[-2:]
+    error = torch.nn.functional.interpolate(error, size=size, mode="area")
+    return (error * (-answer.log_error).exp() + answer.log_error).mean()
