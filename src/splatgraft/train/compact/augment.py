@@ -17,7 +17,7 @@ _NO_PRIOR = 0.08
 
 def augmented(
     view: View, target: Float[Tensor, "1 3 h w"], size: tuple[int, int], seed: str
-) -> tuple[View, Float[Tensor, "1 3 h w"]]:
+) -> tuple[View, Float[Tensor, "1 3 i j"]]:
     """A cut around the object at `size` (height, width), mirrored half of the time, with another exposure and doubt."""
     rng = random.Random(seed)
     top, left, height, width = _cut(view.mask[0, 0], size, rng)

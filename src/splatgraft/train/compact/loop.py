@@ -6,6 +6,7 @@ What a step is given follows from the seed and the step alone. A state holds wei
 import json
 import math
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -80,33 +81,32 @@ def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]
     average = Average(network, loop.ema)
     first = _resumed(run, network, optimizer, average)
     cut_log(run.folder / LOG_FILE, first)
-    curve = Curve(run.folder, tensorboard=False)
-    for step in range(first, loop.steps):
-        for group in optimizer.param_groups:
-            group["lr"] = loop.rate * _schedule(step, loop.steps)
-        loss = _one_step(run, network, step)
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-        average.update()
-        value = float(loss.detach())
-        if not math.isfinite(value):
-            raise ValueError(
-                f"training: expected a finite loss at step {step + 1}, found {value}; the last state is kept"
-            )
-        curve.add(step + 1, value, optimizer.param_groups[0]["lr"])
-        run.progress(step + 1, loop.steps, f"loss {curve.smooth:.4f}")
-        last = step + 1 == loop.steps
-        if last or (step + 1) % loop.validate_every == 0:
-            with average.applied():
-                numbers, sheet = validated(run, network)
-            words = ", ".join(f"{name} {value:.4f}" for name, value in numbers.items())
-            run.say(f"step {step + 1}, held out: {words}")
-            curve.add_validation(step + 1, numbers, sheet)
-        if last or (step + 1) % loop.save_every == 0:
-            _save(run, network, optimizer, average, step + 1)
-    curve.close()
+    with closing(Curve(run.folder, tensorboard=False)) as curve:
+        for step in range(first, loop.steps):
+            for group in optimizer.param_groups:
+                group["lr"] = loop.rate * _schedule(step, loop.steps)
+            loss = _one_step(run, network, step)
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimizer.step()
+            average.update()
+            value = float(loss.detach())
+            if not math.isfinite(value):
+                raise ValueError(
+                    f"training: expected a finite loss at step {step + 1}, found {value}; the last state is kept"
+                )
+            curve.add(step + 1, value, optimizer.param_groups[0]["lr"])
+            run.progress(step + 1, loop.steps, f"loss {curve.smooth:.4f}")
+            last = step + 1 == loop.steps
+            if last or (step + 1) % loop.validate_every == 0:
+                with average.applied():
+                    numbers, sheet = validated(run, network)
+                words = ", ".join(f"{name} {value:.4f}" for name, value in numbers.items())
+                run.say(f"step {step + 1}, held out: {words}")
+                curve.add_validation(step + 1, numbers, sheet)
+            if last or (step + 1) % loop.save_every == 0:
+                _save(run, network, optimizer, average, step + 1)
     with average.applied():
         return loop.network, {name: tensor.detach().cpu().clone() for name, tensor in network.state_dict().items()}
 
