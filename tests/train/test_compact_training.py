@@ -149,7 +149,7 @@ def test_the_command_makes_weights_that_the_harmoniser_loads(rendered, tmp_path,
     words += ["--batch", "2", "--size", "32", "48", "--validation-pairs", "1", "--widths", "8", "8", "16", "16"]
     assert main([*words, "--blocks", "1", "1", "1", "1", "--heads", "2"]) == 0
     assert (tmp_path / "compact.safetensors").is_file()
-    assert "4 pairs to learn from, 4 held out" in capsys.readouterr().out
+    assert "4 pairs to learn from, 4 held out" in capsys.readouterr().err
 
 
 def test_a_missing_probe_is_named(tmp_path):
