@@ -95,6 +95,51 @@ def test_every_decision_is_on_disk_and_undo_takes_it_off_again(session: Session)
     read_flow(session.files.file)
 
 
+def test_undo_goes_on_after_the_editor_ended(session: Session) -> None:
+    count = session.scenes.gaussians(session.files.target_scene).count
+    source = session.scenes.gaussians(session.files.source_scene).count
+    states = [contents(session)]
+    for step in (
+        lambda s: moved(session.placed_state()),
+        lambda s: replace(s, erased=torch.arange(count) % 7 == 0),
+        lambda s: replace(s, corrections=(torch.arange(source) % 3 - 1).to(torch.int8)),
+        lambda s: replace(s, light=LIGHT, box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.5)),
+        lambda s: replace(s, weights=LayerWeights(shadow=0.5), light=None, mask_source="grabcut", keep="largest"),
+        # no step: it changes nothing
+        lambda s: replace(s, keep="largest"),
+    ):
+        session.change(step(session.state))
+        states.append(contents(session))
+    session.undo()
+    again = Session(session.project)
+    assert again.notice is None
+    assert contents(again) == states[-3]
+    assert again.redo()
+    assert not again.redo()
+    for wanted in reversed(states[1:-2]):
+        assert again.undo()
+        found, kept = contents(again), ("project.toml", "placement.json", "erased.npy", "corrections.npy")
+        for name in kept:
+            # a file that project.toml no longer names may stay, and a table that was made for a key, empty
+            if name in wanted or name == "placement.json":
+                assert found[name].replace(b"\n[relight]\n", b"") == wanted[name].replace(b"\n[relight]\n", b""), name
+    # what was changed while no editor was open is one step more, and what no step leads to is gone
+    file = session.files.file
+    write_state(file, again.state, replace(again.state, harmonizer="reinhard"))
+    third = Session(session.project)
+    assert third.state.harmonizer == "reinhard"
+    names = {path.stem for path in (session.files.root / ".editor" / "states").iterdir()}
+    assert third.undo()
+    assert third.state.harmonizer is None
+    assert {*third.history.past, *third.history.future, third.history.present} <= names
+    # a broken list is said, and hinders nobody
+    (session.files.root / ".editor" / "history.json").write_text("{")
+    fourth = Session(session.project)
+    assert fourth.notice is not None
+    assert "undo begins anew" in fourth.notice
+    assert not fourth.undo()
+
+
 def test_what_someone_else_wrote_counts_and_is_a_step_that_can_be_undone(session: Session) -> None:
     assert not session.reload()
     outside = read_state(session.files.file)
@@ -153,9 +198,15 @@ def test_every_kind_of_picture_is_drawn_or_says_why_not(session: Session) -> Non
     assert (both[:, 20:] == other[:, 20:]).all()
 
 
-def test_the_preview_of_the_light_is_the_step_s_result(session: Session, tmp_path: Path) -> None:
-    session.change(replace(moved(session.placed_state()), weights=LayerWeights(shadow=0.5)))
+@pytest.mark.parametrize("light", [None, LIGHT])
+def test_the_preview_of_the_light_is_the_step_s_result(session: Session, light: Light | None) -> None:
+    session.change(replace(moved(session.placed_state()), weights=LayerWeights(shadow=0.5), light=light))
+    # what comes first must not show in what comes last
+    draft = session.preview.lit_scene(session.state, draft=True)
+    assert not session.preview.is_lit(session.state)
     relit = session.preview.lit_scene(session.state)
+    assert session.preview.lit_scene(session.state, draft=True) is relit
+    assert draft.count <= relit.count
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     written = read_gaussians(session.files.relit)
     assert torch.equal(written.sh, relit.sh)

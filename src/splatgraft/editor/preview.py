@@ -3,7 +3,7 @@
 Knows nothing about browsers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import cv2
@@ -18,7 +18,7 @@ from splatgraft.editor.scenes import Scenes
 from splatgraft.editor.state import EditState
 from splatgraft.formats import read_capture
 from splatgraft.gaussians import Gaussians
-from splatgraft.relight import RelightCache, Relit, relight
+from splatgraft.relight import Light, RelightCache, RelightOptions, Relit, SourceScene, relight
 from splatgraft.relight.exposure import relight_by_gain
 from splatgraft.rendering import render
 from splatgraft.splitting import split_around
@@ -92,8 +92,17 @@ class Preview:
         """
         return self._keep("relit", self._light_inputs(state), lambda: self._relight(state))
 
-    def picture(self, kind: Kind, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-        """One picture from one camera.
+    def drafted(self, state: EditState) -> Relit:
+        """The same in a fraction of the time: shadows have coarse edges, and at first the object keeps its brightness.
+
+        Raises: ValueError where a file is missing.
+        """
+        return self._keep("draft", self._light_inputs(state), lambda: self._draft(state))
+
+    def picture(
+        self, kind: Kind, state: EditState, camera: Cameras, *, draft: bool = False
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """One picture from one camera; with `draft` its light is the one that is there soonest.
 
         Raises: ValueError where what it shows is not there yet.
         """
@@ -102,8 +111,8 @@ class Preview:
         if kind in ("Mask", "Depth"):
             return self._mask(state, camera) if kind == "Mask" else self._depth(state, camera)
         if kind == "Shadow layer":
-            return self._shadow(state, camera)
-        color = render(self._scene(kind, state), camera).color
+            return self._shadow(state, camera, draft=draft)
+        color = render(self._scene(kind, state, draft=draft), camera).color
         assert color is not None
         return _bytes(color[0])
 
@@ -122,21 +131,21 @@ class Preview:
         assert color is not None
         return _bytes(color[0])
 
-    def _scene(self, kind: Kind, state: EditState) -> Gaussians:
+    def _scene(self, kind: Kind, state: EditState, *, draft: bool) -> Gaussians:
         if kind == "Result":
             if not self._scenes.files.result.is_file():
                 raise ValueError("Result: expected a finished run, found none yet")
             return self._scenes.gaussians(self._scenes.files.result)
         if kind == "Light transfer":
-            return self.lit_scene(state)
+            return self.lit_scene(state, draft=draft)
         composite = self._composite(state)
         if kind == "Target alone":
             inputs = (composite.target, composite.erased)
             return self._keep("bare", inputs, lambda: composite.target.select(~composite.erased))
         return self._pasted(composite)[0]
 
-    def lit_scene(self, state: EditState) -> Gaussians:
-        """What the step `relight` would write.
+    def lit_scene(self, state: EditState, *, draft: bool = False) -> Gaussians:
+        """What the step `relight` would write, or a draft of it.
 
         Raises: ValueError where a file is missing.
         """
@@ -145,7 +154,8 @@ class Preview:
         if self._scenes.files.light_by == "gain":
             composite = self._composite(state)
             return self._keep("gained", (composite,), lambda: self._gained(composite, state))
-        relit, placed = self.relit(state), [one.in_target() for one in self._composite(state).objects]
+        relit = self._soonest(state) if draft else self.relit(state)
+        placed = [one.in_target() for one in self._composite(state).objects]
 
         def make() -> Gaussians:
             return split_around(relit.bake(state.weights), relit.is_object, placed)[0]
@@ -184,10 +194,10 @@ class Preview:
         colored = cv2.applyColorMap((level * 255).byte().numpy(), cv2.COLORMAP_TURBO)
         return np.ascontiguousarray(colored[..., ::-1])
 
-    def _shadow(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+    def _shadow(self, state: EditState, camera: Cameras, *, draft: bool) -> UInt8[np.ndarray, "h w 3"]:
         if not self._scenes.files.transfers_light:
             raise ValueError(f"Shadow layer: expected the physical transfer, found {self.light_note()}")
-        relit = self.relit(state)
+        relit = self._soonest(state) if draft else self.relit(state)
         layers = self._keep("layers", (relit, state.weights), lambda: relit.ratio(state.weights))
         # half grey is unchanged, so that both what is darkened and what is brightened can be seen
         seen = render(relit.gaussians, camera, outputs=frozenset(), features=(0.5 * layers).clamp(0, 1))
@@ -203,15 +213,32 @@ class Preview:
         image = capture.image(capture.cameras.names.index(camera.names[0]))
         return cv2.resize(_bytes(image), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
+    def _soonest(self, state: EditState) -> Relit:
+        return self.relit(state) if self.is_lit(state) else self.drafted(state)
+
     def _relight(self, state: EditState) -> Relit:
+        options, sources = self._scenes.files.relighting, self._scenes.source_scenes(state)
+        made = self._made.get("draft")
+        found = None if made is None or not same_inputs(made[0], self._light_inputs(state)) else made[1]
+        if found is None or found.light is None or state.light is not None:
+            return self._transferred(state, sources, state.light, options)
+        # the draft looked for the light already, at this very place
+        relit = self._transferred(state, sources, found.light, options)
+        return replace(relit, report=(*found.report[:1], *relit.report[1:]))
+
+    def _draft(self, state: EditState) -> Relit:
+        sources = self._scenes.source_scenes(state)
+        if "relit" not in self._made:
+            # where the object comes from takes half of the first time
+            sources = [None] * len(sources)
+        return self._transferred(state, sources, state.light, replace(self._scenes.files.relighting, most_added=0.0))
+
+    def _transferred(
+        self, state: EditState, sources: list[SourceScene | None], light: Light | None, options: RelightOptions
+    ) -> Relit:
         cameras = self._scenes.cameras(self._scenes.files.target_cameras)
         return relight(
-            self._composite(state),
-            cameras,
-            sources=self._scenes.source_scenes(state),
-            light=state.light,
-            options=self._scenes.files.relighting,
-            cache=self._cache,
+            self._composite(state), cameras, sources=sources, light=light, options=options, cache=self._cache
         )
 
     def _composite(self, state: EditState) -> Composite:

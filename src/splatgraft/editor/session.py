@@ -18,7 +18,8 @@ from splatgraft.editor.placing import Placeable
 from splatgraft.editor.preview import Preview
 from splatgraft.editor.project_access import Project, ProjectFiles
 from splatgraft.editor.scenes import Scenes
-from splatgraft.editor.state import EditState, read_state, state_files, write_state
+from splatgraft.editor.state import EditState, as_written, read_state, state_files, write_state
+from splatgraft.editor.state_store import StateStore
 from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.gaussians import Gaussians
 from splatgraft.orbit import estimate_up
@@ -33,7 +34,7 @@ class Session:
     """What the editor knows of a project that is open."""
 
     def __init__(self, project: Project) -> None:
-        """Open it where it was left.
+        """Open it where it was left, with all steps that led there.
 
         Raises: ValueError where there is no project.toml, or it is broken.
         """
@@ -45,7 +46,10 @@ class Session:
         self.scenes = Scenes(files)
         self.preview = Preview(self.scenes)
         self.jobs = Jobs(files.root / EDITOR_FOLDER)
-        self.history: History[EditState] = History(read_state(files.file))
+        self.notice: str | None = None
+        self._store = StateStore(files.root / EDITOR_FOLDER, home=files.file.parent)
+        self._state = read_state(files.file)
+        self.history: History[str] = self._left_history()
         self._stamps = self._read_stamps()
         self._found: tuple[int, tuple[ObjectPlacement, ...]] = (0, ())
         self._lock = threading.RLock()
@@ -53,7 +57,7 @@ class Session:
     @property
     def state(self) -> EditState:
         """What counts now."""
-        return self.history.present
+        return self._state
 
     def change(self, state: EditState) -> None:
         """One step that can be undone, saved at once.
@@ -61,7 +65,10 @@ class Session:
         Raises: ValueError where the files were changed by someone else (they count then), or cannot be written.
         """
         with self._lock:
-            self._go(self.history.then(state))
+            state = as_written(state, self._state)
+            name = self._store.keep(state)
+            # what changes nothing is no step
+            self._go(self.history if name == self.history.present else self.history.then(name), state)
 
     def amend(self, state: EditState) -> None:
         """A change that is no step of its own: it goes with the one before.
@@ -69,7 +76,8 @@ class Session:
         Raises: ValueError as `change`.
         """
         with self._lock:
-            self._go(self.history.amended(state))
+            state = as_written(state, self._state)
+            self._go(self.history.amended(self._store.keep(state)), state)
 
     def undo(self) -> bool:
         """Back by one step; False where there is none.
@@ -77,9 +85,11 @@ class Session:
         Raises: ValueError as `change`.
         """
         with self._lock:
-            possible = bool(self.history.past)
-            self._go(self.history.undone())
-            return possible
+            if not self.history.past:
+                return False
+            history = self.history.undone()
+            self._go(history, self._store.read(history.present))
+            return True
 
     def redo(self) -> bool:
         """Forward by one step; False where there is none.
@@ -87,9 +97,11 @@ class Session:
         Raises: ValueError as `change`.
         """
         with self._lock:
-            possible = bool(self.history.future)
-            self._go(self.history.redone())
-            return possible
+            if not self.history.future:
+                return False
+            history = self.history.redone()
+            self._go(history, self._store.read(history.present))
+            return True
 
     def reload(self) -> bool:
         """Take over what someone else wrote into the files, as one step; whether there was anything.
@@ -101,20 +113,37 @@ class Session:
             if stamps == self._stamps:
                 return False
             found = read_state(self.files.file)
-            self.history, self._stamps = self.history.then(found), stamps
+            self._stamps, self._state = stamps, found
+            name = self._store.keep(found)
+            if name != self.history.present:
+                self._remember(self.history.then(name))
             self._refresh_files()
             return True
 
-    def _go(self, history: History[EditState]) -> None:
-        before = self.history.present
-        if history.present is before:
-            self.history = history
+    def _go(self, history: History[str], state: EditState) -> None:
+        if history.present == self.history.present:
+            self._remember(history)
             return
         if self.reload():
             raise ValueError(f"{self.files.file.name}: changed outside the editor; that counts now, please do it again")
-        write_state(self.files.file, before, history.present)
+        write_state(self.files.file, self._state, state)
+        self._state, self._stamps = state, self._read_stamps()
+        self._remember(history)
+
+    def _left_history(self) -> History[str]:
+        """The steps up to what the files say now; what was changed while no editor was open is one more."""
+        try:
+            left = self._store.history()
+        except ValueError as error:
+            self.notice, left = f"{error}; undo begins anew", None
+        now = self._store.keep(self._state)
+        history = History(now) if left is None else left if left.present == now else left.then(now)
+        self._store.keep_history(history)
+        return history
+
+    def _remember(self, history: History[str]) -> None:
         self.history = history
-        self._stamps = self._read_stamps()
+        self._store.keep_history(history)
 
     def _refresh_files(self) -> None:
         files = self.project.files()

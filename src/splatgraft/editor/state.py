@@ -102,6 +102,13 @@ def write_state(project: Path, before: EditState, after: EditState) -> None:
             stream.write(text.encode())
 
 
+def as_written(state: EditState, before: EditState) -> EditState:
+    """The state as it will be read again: a light.json has six digits. What `before` has stays the same object."""
+    if state.light is None or state.light is before.light:
+        return state
+    return replace(state, light=light_from_json(light_to_json(state.light)))
+
+
 def state_files(project: Path) -> tuple[Path, ...]:
     """All files that hold the state."""
     names = (PLACEMENT_FILE, ERASED_FILE, CORRECTIONS_FILE, LIGHT_FILE)

@@ -16,6 +16,8 @@ class Adopt:
     """A .ply, .spz or .splat, in the frame of its capture where there is one."""
     out: Path = Path("scene")
     """Folder for scene.ply."""
+    capture: Path | None = None
+    """Where its cameras are; a project makes them first. Nothing is read of them."""
 
     def inputs(self) -> Inputs:
         """The scene."""

@@ -94,7 +94,7 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
         given = {"capture": layout.capture(side)}
         # a scene that was trained already stands where a reconstruction would
         trained = file.scene(side)
-        kind, given = (Reconstruct, given) if trained is None else (Adopt, {"scene": trained})
+        kind, given = (Reconstruct, given) if trained is None else (Adopt, given | {"scene": trained})
         steps[f"{side}/reconstruct"] = file.step(kind, given, out=layout.scene(side), side=side)
     return Flow(layout, steps | _joint_steps(file, layout))
 

@@ -48,7 +48,10 @@ class OpenPhase:
                 gui.add_text("Of the first", "", hint="A .ply, .spz or .splat in the same frame as its capture"),
                 gui.add_text("Of the second", "", hint="A .ply, .spz or .splat in the same frame as its capture"),
             )
-        self._upload = gui.add_upload_button("Upload a video or a scene", icon=viser.Icon.UPLOAD, color="gray")
+        # viser shows an upload button also where it is told not to; what hides is the folder
+        self._uploads = gui.add_folder("From this computer")
+        with self._uploads:
+            self._upload = gui.add_upload_button("Upload a video or a scene", icon=viser.Icon.UPLOAD, color="gray")
         self._start = gui.add_button("Start the project", icon=viser.Icon.PLUS)
         self._facts = gui.add_html("")
         self._ups = {side: gui.add_dropdown(f"Up: {name.lower()}", tuple(_UPS), visible=False) for side, name in _SIDES}
@@ -72,7 +75,7 @@ class OpenPhase:
     def refresh(self) -> None:
         """Fields before there is a project, facts after."""
         session = self._page.session
-        for control in (self._help, self._source, self._target, self._trained, self._upload, self._start):
+        for control in (self._help, self._source, self._target, self._trained, self._uploads, self._start):
             control.visible = session is None
         self._facts.visible = self._build.visible = session is not None
         for index, (side, _) in enumerate(_SIDES):

@@ -84,6 +84,7 @@ class Page:
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(lambda client: self._notices.pop(client.client_id, None))
         self.go(self._first_phase())
+        self._say_notice()
         threading.Thread(target=self._ticks, daemon=True).start()
 
     # for the phases
@@ -147,6 +148,7 @@ class Page:
         self.session = Session(self.project)
         self.preview.reset()
         self.go(self._first_phase())
+        self._say_notice()
 
     def go(self, phase: str) -> None:
         """Turn to another phase."""
@@ -277,6 +279,10 @@ class Page:
         if not files.source_scene.is_file() or not files.target_scene.is_file():
             return "Open"
         return "Place" if self.session.can_place() else "Select"
+
+    def _say_notice(self) -> None:
+        if self.session is not None and self.session.notice is not None:
+            self.say(self.session.notice, bad=True)
 
     def _header_html(self) -> str:
         where = "no project yet" if self.session is None else str(self.session.files.file.parent.name)

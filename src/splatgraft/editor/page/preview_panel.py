@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 
 
 _SELECTING: tuple[Kind, Kind] = ("Source", "Object alone")
+_AT_ONCE = 0.8
+"""Seconds that a draft of the light may take without anything else being shown first."""
+_LEAST_ASPECT = 1.2
+"""Width over height: between two panels a window is narrow, and its picture would be taller than the screen."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,9 @@ class _Wish:
     left: Kind
     right: Kind
     share: float
+    moving: bool
+    """Something is being dragged: a draft will do."""
+    draft: bool = False
 
 
 class PreviewPanel:
@@ -49,6 +56,7 @@ class PreviewPanel:
         self._size = Size()
         self._drawn: dict[Kind, tuple[tuple[object, ...], np.ndarray]] = {}
         self._moving: EditState | None = None
+        self._draft_took = float("inf")
         self._latest = Latest(self._work, lambda error: self._say(" ".join(str(error).split())))
         self._panel = gui.add_panel()
         with self._panel.add_tab("True picture", viser.Icon.PHOTO):
@@ -73,7 +81,7 @@ class PreviewPanel:
 
     def reset(self) -> None:
         """Another project: nothing drawn yet."""
-        self._drawn = {}
+        self._drawn, self._draft_took = {}, float("inf")
 
     def world_changed(self) -> None:
         """Another scene is shown: its cameras count, and in the source there is one thing to compare."""
@@ -134,13 +142,13 @@ class PreviewPanel:
         if self._number.max != max(1, len(cameras) - 1):
             self._number.max = max(1, len(cameras) - 1)
         if self._follow.value and window is not None:
-            camera = view_of(window.camera, width=width or self._size.width)
+            camera = view_of(window.camera, width=width or self._size.width, least_aspect=_LEAST_ASPECT)
         else:
             camera = cameras[int(self._number.value)]
             camera = camera.resized((width or self._size.width) / camera.width)
         left, right = _SELECTING if self._page.phase == "Select" else (self._left.value, self._right.value)
         state = self._moving or session.placed_state()
-        return _Wish(session, state, camera, left, right, float(self._share.value))
+        return _Wish(session, state, camera, left, right, float(self._share.value), self._moving is not None)
 
     def _scene(self, session: Session) -> Path:
         return session.files.source_scene if self._page.phase == "Select" else session.files.target_scene
@@ -170,19 +178,25 @@ class PreviewPanel:
 
     def _work(self, wish: _Wish) -> None:
         preview = wish.session.preview
-        waits = {wish.left, wish.right} & set(NEEDS_LIGHT) and not preview.is_lit(wish.state)
-        if waits:
+        if not {wish.left, wish.right} & set(NEEDS_LIGHT) or preview.is_lit(wish.state):
+            self._draw(wish, note="")
+            return
+        if self._draft_took > _AT_ONCE:
             # what is quick comes at once, the light when it is there
             quick = replace(wish, **{side: _quick(getattr(wish, side)) for side in ("left", "right")})
             self._draw(quick, note="light: at work ...")
             if self._latest.overtaken:
                 return
-            start = time.monotonic()
-            preview.relit(wish.state)
-            self._draw(wish, note=f"light in {time.monotonic() - start:.1f} s")
-            self._page.light_found()
-        else:
-            self._draw(wish, note="")
+        start = time.monotonic()
+        preview.drafted(wish.state)
+        self._draft_took = time.monotonic() - start
+        self._draw(replace(wish, draft=True), note=f"a draft of the light in {self._draft_took:.1f} s")
+        if wish.moving or self._latest.overtaken:
+            return
+        start = time.monotonic()
+        preview.relit(wish.state)
+        self._draw(wish, note=f"light in {time.monotonic() - start:.1f} s")
+        self._page.light_found()
 
     def _draw(self, wish: _Wish, *, note: str) -> None:
         start = time.monotonic()
@@ -206,7 +220,7 @@ class PreviewPanel:
         state, result = wish.state, wish.session.files.result
         stamp = result.stat().st_mtime_ns if result.is_file() else 0
         objects, selection = state.objects, wish.session.selection() if self._page.phase == "Select" else None
-        key = (*pose, stamp, objects, state.erased, state.light, state.weights, selection)
+        key = (*pose, wish.draft, stamp, objects, state.erased, state.light, state.weights, selection)
         drawn = self._drawn.get(kind)
         if drawn is None or not same_inputs(drawn[0], key):
             try:
@@ -221,7 +235,7 @@ class PreviewPanel:
         preview = wish.session.preview
         if kind in _SELECTING:
             return preview.source_picture(selection if kind == "Object alone" else None, wish.camera)
-        return preview.picture(kind, wish.state, wish.camera)
+        return preview.picture(kind, wish.state, wish.camera, draft=wish.draft)
 
     def _say(self, text: str) -> None:
         self._caption.content = (

@@ -143,9 +143,9 @@ class StageView:
         handle.scale = gizmo.scale * unit
 
 
-def view_of(camera: viser.CameraHandle, *, width: int) -> Cameras:
-    """A window's camera as one of ours, `width` pixels wide."""
-    aspect = camera.aspect if camera.aspect > 0 else 1.5
+def view_of(camera: viser.CameraHandle, *, width: int, least_aspect: float = 0.0) -> Cameras:
+    """A window's camera as one of ours, `width` pixels wide; a narrower one than `least_aspect` sees more aside."""
+    aspect = max(least_aspect, camera.aspect if camera.aspect > 0 else 1.5)
     height = max(16, round(width / aspect))
     pose = torch.eye(4)
     pose[:3, :3] = viser_rotation(camera.wxyz)
