@@ -4,12 +4,13 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from editor_driver import wait_until
 
-from splatgraft.editor.jobs import Jobs, JobState, seconds_left
+from splatgraft.editor.jobs import Jobs, JobState, PlannedStep, seconds_left, seconds_left_in_all, write_state
 
 WORK = """
 import sys, os, time
@@ -88,3 +89,31 @@ def test_the_time_left_goes_on_as_it_has() -> None:
     assert seconds_left(state, 106.0) == 12.0
     assert seconds_left(state, 100.5) is None
     assert seconds_left(JobState("work", (), 1, "running", 0.0), time.time()) is None
+
+
+def test_what_an_earlier_run_did_took_no_time_now() -> None:
+    state = JobState("work", (), 1, "running", 0.0, done=60, total=100, begun=50, step_started=100.0)
+    assert seconds_left(state, 120.0) == 80.0
+
+
+def test_the_time_left_in_all_counts_on_what_was_measured_and_mends_what_was_guessed() -> None:
+    plan = (PlannedStep("a", 10.0, True), PlannedStep("b", 4.0, False), PlannedStep("c", 6.0, False))
+    state = JobState("work", (), 1, "running", 0.0, step="a", step_started=100.0, plan=plan)
+    assert seconds_left_in_all(state, 103.0) == 7.0 + 4.0 + 6.0
+    # its own progress is the better witness, and a measured step says nothing about the guesses
+    assert seconds_left_in_all(replace(state, done=1, total=4), 105.0) == 15.0 + 4.0 + 6.0
+    # b takes twice what was guessed: so will c
+    later = replace(state, step="b", step_started=110.0, done=1, total=2, took=(("a", 10.0),))
+    assert seconds_left_in_all(later, 114.0) == 4.0 + 12.0
+    assert seconds_left_in_all(replace(later, step="c", took=(("a", 10.0), ("b", 8.0)), done=0), 111.0) == 11.0
+    # nothing is known of the first step, or of the job
+    assert seconds_left_in_all(replace(state, plan=plan[1:], step="b"), 103.0) is None
+    assert seconds_left_in_all(replace(state, plan=()), 103.0) is None
+    assert seconds_left_in_all(replace(state, outcome="done"), 103.0) is None
+
+
+def test_the_plan_survives_its_file(tmp_path: Path) -> None:
+    plan, took = (PlannedStep("a", 1.5, True),), (("b", 2.5),)
+    state = JobState("work", ("run",), os.getpid(), "done", 0.0, plan=plan, took=took)
+    write_state(tmp_path, state)
+    assert Jobs(tmp_path).state() == state

@@ -19,10 +19,12 @@ from splatgraft.editor.uploads import SCENES, keep_upload
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.images import read_rgb
+from splatgraft.project import read_record
 from splatgraft.relight import LayerWeights, light_from_json, light_to_json
 from splatgraft.relight.light import Light, LightSource, ambient_of
 from splatgraft.similarity import Similarity
 from splatgraft.steps.edit import StepsProject
+from splatgraft.steps.expected_time import expected_steps
 from splatgraft.steps.flow import read_flow
 
 LIGHT = Light(
@@ -265,6 +267,18 @@ def test_a_project_with_trained_scenes_takes_those_over(session: Session, tmp_pa
     assert files.pictured == (False, False)
     assert main(["run", str(made.file), "--to", "source/reconstruct"]) == 0
     assert files.source_scene.read_bytes() == session.files.source_scene.read_bytes()
+
+
+def test_the_plan_of_a_run_is_what_is_stale_as_long_as_it_took_before(session: Session) -> None:
+    flow = read_flow(session.files.file)
+    planned = expected_steps(flow, ["segment", "relight", "render"])
+    assert [step.name for step in planned] == ["segment", "relight", "render"]
+    assert [step.is_measured for step in planned] == [True, False, False]
+    record = read_record(flow.steps["segment"].out)
+    assert record is not None
+    assert planned[0].seconds == record.seconds
+    # what was not measured keeps its usual share
+    assert planned[1].seconds / planned[2].seconds == pytest.approx(2.7 / 3.7)
 
 
 def test_a_light_survives_its_file() -> None:

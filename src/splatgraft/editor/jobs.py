@@ -23,6 +23,18 @@ _LIVE = ("starting", "running")
 
 
 @dataclass(frozen=True)
+class PlannedStep:
+    """A step that a job will do or has done."""
+
+    name: str
+    """As the state names it."""
+    seconds: float
+    """What it will roughly take."""
+    is_measured: bool
+    """Whether that is how long it took here before, rather than what is usual."""
+
+
+@dataclass(frozen=True)
 class JobState:
     """How far a job is, as its process wrote it last."""
 
@@ -46,8 +58,14 @@ class JobState:
     """What the step says about itself."""
     step_started: float = 0.0
     """Seconds since 1970."""
+    begun: int = 0
+    """Units of the step that an earlier run had done."""
     error: str = ""
     """One line where it failed."""
+    plan: tuple[PlannedStep, ...] = ()
+    """All steps of the job in their order; empty where that is not known."""
+    took: tuple[tuple[str, float], ...] = ()
+    """Steps of this run that have ended, with their seconds."""
 
     @property
     def live(self) -> bool:
@@ -62,10 +80,38 @@ class JobState:
 
 def seconds_left(state: JobState, now: float) -> float | None:
     """Until the step at work ends, if it goes on as it has; None where it is too early to tell."""
-    spent = now - state.step_started
-    if not state.live or not 0 < state.done <= state.total or spent < 1:
+    spent, done = now - state.step_started, state.done - state.begun
+    if not state.live or not 0 < done <= state.total - state.begun or spent < 1:
         return None
-    return spent * (state.total - state.done) / state.done
+    return spent * (state.total - state.done) / done
+
+
+def seconds_left_in_all(state: JobState, now: float) -> float | None:
+    """Until the whole job ends; None where it is too early to tell.
+
+    The steps to come take what they took before; guesses among them are corrected by how far off the steps of this
+    run were, the one at work as far as its progress tells.
+    """
+    names = [step.name for step in state.plan]
+    if not state.live or state.step not in names:
+        return None
+    at = names.index(state.step)
+    current, later = state.plan[at], state.plan[at + 1 :]
+    left, spent = seconds_left(state, now), now - state.step_started
+    if left is None and not current.is_measured and at == 0:
+        return None
+    factor = _slowness(state, None if left is None else spent + left)
+    if left is None:
+        left = max(0.0, current.seconds * (1.0 if current.is_measured else factor) - spent)
+    return left + sum(step.seconds * (1.0 if step.is_measured else factor) for step in later)
+
+
+def _slowness(state: JobState, current: float | None) -> float:
+    """How many times what was guessed the steps of this run take; 1 where nothing is known."""
+    took = dict(state.took) | ({} if current is None else {state.step: current})
+    guessed = {step.name: step.seconds for step in state.plan if not step.is_measured and step.name in took}
+    whole = sum(guessed.values())
+    return sum(took[name] for name in guessed) / whole if whole > 0 else 1.0
 
 
 def write_state(folder: Path, state: JobState) -> None:
@@ -131,7 +177,9 @@ class Jobs:
     def _read(self) -> JobState | None:
         try:
             fields = json.loads((self.folder / STATE_FILE).read_text())
-            return JobState(**(fields | {"command": tuple(fields["command"])}))
+            plan = tuple(PlannedStep(**step) for step in fields.pop("plan", ()))
+            took = tuple((str(name), float(seconds)) for name, seconds in fields.pop("took", ()))
+            return JobState(**(fields | {"command": tuple(fields["command"]), "plan": plan, "took": took}))
         except FileNotFoundError:
             return None
         except (ValueError, KeyError, TypeError) as error:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from splatgraft.editor.jobs import JobState, hold, write_state
+from splatgraft.editor.jobs import JobState, PlannedStep, hold, write_state
 from splatgraft.progress import Progress
 from splatgraft.steps.terminal import Terminal
 
@@ -33,16 +33,22 @@ class StateTerminal(Terminal):
     def bar(self, name: str) -> Generator[Progress]:
         """The bar of `Terminal`, told to the state file as well."""
         now = time.time()
-        self.write(replace(self.state, step=name, done=0, total=0, message="", step_started=now))
+        self.write(replace(self.state, step=name, done=0, total=0, begun=0, message="", step_started=now))
+        first = True
         with super().bar(name) as progress:
 
             def move(done: int, total: int, message: str) -> None:
+                nonlocal first
                 progress(done, total, message)
+                if first:
+                    # a step that was killed goes on where it was: that part took no time now
+                    first, self.state = False, replace(self.state, begun=done if done > 1 else 0)
                 self.state = replace(self.state, done=done, total=total, message=f"{done}/{total} {message}")
                 if time.time() - self._written > _WRITE_EVERY:
                     self.write(self.state)
 
             yield move
+        self.state = replace(self.state, took=(*self.state.took, (name, time.time() - now)))
 
     def write(self, state: JobState) -> None:
         """Replace the state file."""
@@ -63,6 +69,7 @@ def main(arguments: Sequence[str]) -> int:
     terminal = StateTerminal(folder, JobState(title, shown, os.getpid(), "running", time.time()))
     try:
         terminal.write(terminal.state)
+        terminal.write(replace(terminal.state, plan=_plan(project, out, to)))
         Run(project=project, out=out, to=to).execute(terminal)
         terminal.write(replace(terminal.state, outcome="done"))
         return 0
@@ -74,6 +81,20 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     finally:
         lock.release()
+
+
+def _plan(project: Path, out: Path | None, to: str) -> tuple[PlannedStep, ...]:
+    """What the run will do; nothing where that cannot be told yet."""
+    from splatgraft.steps.expected_time import expected_steps
+    from splatgraft.steps.flow import read_flow
+    from splatgraft.steps.status import reasons
+
+    try:
+        flow = read_flow(project, out)
+        why = reasons(flow)
+        return expected_steps(flow, [name for name in flow.up_to(to) if why[name] is not None])
+    except ValueError:
+        return ()  # the run itself says it, and better
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import viser
 
-from splatgraft.editor.jobs import JobState, seconds_left
+from splatgraft.editor.jobs import JobState, seconds_left, seconds_left_in_all
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
@@ -47,8 +47,14 @@ class JobPanel:
         self._page.redraw()
 
     def _show(self, state: JobState) -> None:
-        left = seconds_left(state, time.time())
-        rest = f"{_minutes(left)} left in this step" if left is not None else "time left not known yet"
+        now = time.time()
+        whole, left = seconds_left_in_all(state, now), seconds_left(state, now)
+        parts = [f"about {_minutes(whole)} left in all"] if whole is not None else []
+        parts += [f"{_minutes(left)} in this step"] if left is not None else []
+        rest = ", ".join(parts) or "time left not known yet"
+        names = [step.name for step in state.plan]
+        if state.step in names:
+            rest += f" &middot; step {names.index(state.step) + 1} of {len(names)}"
         self._text.content = (
             f'<div class="sg-job" style="font-size:.85em;line-height:1.45;padding:2px 12px">'
             f"<b>{html.escape(state.title)}</b><br>"
