@@ -4,18 +4,20 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 from tiny_project import OPTIONS, write_project
 
 from splatgraft.cli import main
 from splatgraft.editor import placing
-from splatgraft.editor.exports import export_scene
+from splatgraft.editor.exports import export_scene, export_turntable
 from splatgraft.editor.preview import KINDS, Size, wiped
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState, read_state, state_files, write_state
 from splatgraft.editor.toml_edit import with_keys
 from splatgraft.editor.uploads import SCENES, keep_upload
+from splatgraft.evaluate.pictures import write_animation
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.images import read_rgb
@@ -254,6 +256,28 @@ def test_the_light_that_is_shown_is_what_the_step_writes(session: Session, light
 def test_nothing_is_exported_before_it_is_made(session: Session) -> None:
     with pytest.raises(ValueError, match="finished scene"):
         export_scene(session.files, ".ply")
+    with pytest.raises(ValueError, match="a turntable"):
+        export_turntable(session.files, ".mp4")
+
+
+def test_the_turntable_is_a_film_of_the_same_frames(session: Session) -> None:
+    session.files.report.mkdir()
+    frames = [torch.full((25, 41, 3), level) for level in (0.1, 0.5, 0.9)]
+    write_animation(session.files.report / "turntable.webp", frames, fps=10.0)
+    path, remark = export_turntable(session.files, ".mp4")
+    # this build may know either codec, or none: then it is said
+    assert path.suffix == ".mp4" or "instead" in remark
+    if path.suffix == ".mp4":
+        film = cv2.VideoCapture(str(path))
+        shown = [film.read()[1] for _ in frames]
+        assert not film.read()[0]
+        assert film.get(cv2.CAP_PROP_FPS) == 10.0
+        # a flat picture survives any codec to within its steps of quantisation
+        assert all(abs(float(x.mean()) / 255 - float(y.mean())) < 0.03 for x, y in zip(shown, frames, strict=True))
+        assert shown[0].shape == (24, 40, 3)
+    webp, remark = export_turntable(session.files, ".webp")
+    assert webp.read_bytes() == (session.files.report / "turntable.webp").read_bytes()
+    assert remark == ""
 
 
 def test_a_project_with_trained_scenes_takes_those_over(session: Session, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+from splatgraft.editor.film import write_film
 from splatgraft.editor.project_access import ProjectFiles
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.project import REPORT_FILE
@@ -27,15 +28,22 @@ def export_scene(files: ProjectFiles, suffix: str) -> Path:
     return path
 
 
-def export_turntable(files: ProjectFiles) -> Path:
-    """The turntable of the report as export/turntable.webp.
+def export_turntable(files: ProjectFiles, suffix: str) -> tuple[Path, str]:
+    """The turntable of the report as export/turntable.SUFFIX, and what is to be said of it.
 
     Raises: ValueError where there is none yet.
     """
     found = next((p for p in (files.report / "turntable.webp", files.report / "turntable.gif") if p.is_file()), None)
     if found is None:
         raise ValueError(f"{files.report}: expected a turntable, found none yet; run the report first")
-    return Path(shutil.copy2(found, _folder(files) / found.name))
+    path = _folder(files) / f"turntable{suffix}"
+    if suffix != ".mp4":
+        return Path(shutil.copy2(found, path.with_suffix(found.suffix))), ""
+    try:
+        codec = write_film(path, found)
+    except ValueError as error:
+        return Path(shutil.copy2(found, _folder(files) / found.name)), f"{error}; here is {found.name} instead"
+    return path, "" if codec == "H.264" else f"in {codec}, which players show but browsers do not; .webp is for those"
 
 
 def report_page(files: ProjectFiles) -> Path:

@@ -33,7 +33,7 @@ class RunPhase:
         with gui.add_folder("Take home"):
             self._scene = gui.add_button_group("Scene", (".ply", ".spz", ".splat"))
             self._picture = gui.add_button("Picture of this view", icon=viser.Icon.PHOTO, color="gray")
-            self._turntable = gui.add_button("Turntable", icon=viser.Icon.DOWNLOAD, color="gray")
+            self._turntable = gui.add_button_group("Turntable", (".mp4", ".webp"))
             self._link = gui.add_html("")
         act = page.act
         self._method.on_update(act(lambda _: self._set_method()))
@@ -42,7 +42,7 @@ class RunPhase:
         self._scene.on_click(
             act(lambda event: self._send(event, exports.export_scene(page.need().files, event.target.value)))
         )
-        self._turntable.on_click(act(lambda event: self._send(event, exports.export_turntable(page.need().files))))
+        self._turntable.on_click(act(self._send_turntable))
         self._picture.on_click(act(self._send_picture))
 
     def enter(self) -> None:
@@ -77,7 +77,7 @@ class RunPhase:
             f'<div style="opacity:.6;margin-top:6px">the same by command:</div><code>{html.escape(shown)}</code></div>'
         )
         there = (session.files.report / "index.html").is_file()
-        self._turntable.disabled = not there
+        self._turntable.visible = there
         self._scene.visible = session.files.result.is_file()
         link = f'<a href="{FILES_PREFIX}index.html" target="_blank">Open the report</a>' if there else ""
         self._link.content = f'<div style="padding:2px 12px">{link}</div>'
@@ -90,6 +90,12 @@ class RunPhase:
         path = exports.picture_path(self._page.need().files, "view")
         self._page.preview.save_picture(path)
         self._send(event, path)
+
+    def _send_turntable(self, event: viser.GuiEvent) -> None:
+        path, remark = exports.export_turntable(self._page.need().files, event.target.value)
+        self._send(event, path)
+        if remark:
+            self._page.say(f"written: {path}; {remark}")
 
     def _send(self, event: viser.GuiEvent, path: Path) -> None:
         if event.client is not None:
