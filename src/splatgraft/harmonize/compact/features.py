@@ -88,6 +88,10 @@ class Answer:
     log_error: Float[Tensor, "b 1 i j"]
     """Log of the error that the network expects of itself, sRGB."""
 
+    def whole(self) -> "Answer":
+        """The same in float32."""
+        return Answer(**{name: tensor.float() for name, tensor in vars(self).items()})
+
 
 def log_ratio_of(prior: Float[Tensor, "*n"], composite: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Log of prior over composite, both linear; safe in the dark."""

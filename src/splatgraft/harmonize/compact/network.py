@@ -49,23 +49,22 @@ class CompactNetwork(nn.Module):
         super().__init__()
         self.size = size
         w, n = size.widths, size.blocks
-        self.stem = nn.Conv2d(CHANNELS, w[0], 3, stride=2, padding=1)
-        self.down = nn.ModuleList([nn.Conv2d(w[i], w[i + 1], 2, stride=2) for i in range(3)])
+        self.stem = _Halved(CHANNELS, w[0])
+        self.down = nn.ModuleList([_Halved(w[i], w[i + 1]) for i in range(3)])
         self.falling = nn.ModuleList([_blocks(w[i], n[i]) for i in range(4)])
         self.attention = _Attention(w[3], size.heads)
-        self.up = nn.ModuleList([nn.Conv2d(w[i + 1], w[i], 1) for i in range(3)])
+        self.up = nn.ModuleList([_Mixed(w[i + 1], w[i]) for i in range(3)])
         self.rising = nn.ModuleList([_blocks(w[i], min(n[i], 2)) for i in range(3)])
-        self.maps = nn.Conv2d(w[0], 12, 3, padding=1)
+        self.maps = _Mixed(w[0], 12)
         self.by_normal = nn.Linear(2 * w[3], 3 * SH_COUNT)
-        self.grid = nn.Conv2d(w[3], 12 * GRID_BINS, 1)
+        self.grid = _Mixed(w[3], 12 * GRID_BINS)
         for head in (self.maps, self.by_normal, self.grid):
             nn.init.zeros_(head.weight)
-            assert head.bias is not None
             nn.init.zeros_(head.bias)
 
     def forward(self, channels: Float[Tensor, "b 16 h w"]) -> Answer:
         """See `Answer`; maps at half the size, the grid at a sixteenth."""
-        x = self.falling[0](self.stem(channels.contiguous(memory_format=torch.channels_last)))
+        x = self.falling[0](self.stem(channels))
         kept = [x]
         for down, blocks in zip(self.down, self.falling[1:], strict=True):
             x = blocks(down(x))
@@ -97,6 +96,23 @@ def _bounded(x: Tensor, most: float) -> Tensor:
 
 def _blocks(width: int, count: int) -> nn.Sequential:
     return nn.Sequential(*[_Block(width) for _ in range(count)])
+
+
+class _Mixed(nn.Linear):
+    """A convolution of 1x1 as a product of matrices, which trains three times as fast on a CPU."""
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h w"]:
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class _Halved(_Mixed):
+    """A convolution of 2x2 with stride 2, in the same way."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__(4 * channels, width)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d i j"]:
+        return super().forward(F.pixel_unshuffle(x, 2))
 
 
 class _Block(nn.Module):

@@ -46,6 +46,8 @@ class CompactLoop:
     save_every: int = 200
     validate_every: int = 500
     validation_pairs: int = 96
+    bf16: bool = False
+    """Compute the network in bfloat16; half the time where the processor knows it."""
     threads: int = 0
     """Of torch; 0 leaves it as it is."""
     network: CompactSize = field(default_factory=CompactSize)
@@ -127,7 +129,9 @@ def _one_step(run: CompactTraining, network: CompactNetwork, step: int) -> Tenso
         views.append(view)
         truths.append(truth)
     view, truth = batched(views).to(run.device), torch.cat(truths).to(run.device)
-    return loss_of(view, network(view.channels()), truth)[0]
+    with torch.autocast(run.device.type, torch.bfloat16, enabled=loop.bf16):
+        answer = network(view.channels())
+    return loss_of(view, answer.whole(), truth)[0]
 
 
 @torch.no_grad()

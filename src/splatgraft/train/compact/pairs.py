@@ -17,6 +17,8 @@ from splatgraft.progress import Progress, silent
 from splatgraft.synth.benchmark import rendered_cameras
 from splatgraft.synth.pairs import PairSample, read_manifest
 
+_LINEAR = linear_from_srgb(torch.arange(256) / 255)
+
 
 @dataclass(frozen=True)
 class HeldOut:
@@ -73,8 +75,8 @@ class CompactPairs:
         def array(take: str) -> Tensor:
             return torch.from_numpy(self._arrays[entry.folder, take, entry.camera])
 
-        target = linear_from_srgb(array(entry.object).float() / 255)
-        background = linear_from_srgb(array("background").float() / 255)
+        target = _LINEAR[array(entry.object).int()]
+        background = _LINEAR[array("background").int()]
         mask = array(f"{entry.object} mask").float() / 255
         relit = array(f"{entry.object}_{entry.light}").float() / 255
         covered = torch.minimum(mask, relit[..., 3])[..., None]
