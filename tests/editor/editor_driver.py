@@ -1,5 +1,6 @@
 """A real browser on a real `splatgraft edit`: what the stories of the editor are told with."""
 
+import io
 import os
 import re
 import shutil
@@ -13,7 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 ARGUMENTS = (
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
@@ -131,6 +134,28 @@ class Window:
     def says(self, text: str, *, timeout: float = 60) -> None:
         """Wait until the page says so."""
         self.page.get_by_text(text).first.wait_for(timeout=timeout * 1000)
+
+    def drag(self, start: tuple[float, float], by: tuple[float, float], *, release: bool = True) -> None:
+        """Press at `start`, move and let go."""
+        mouse = self.page.mouse
+        mouse.move(*start)
+        mouse.down()
+        for step in range(1, 9):
+            mouse.move(start[0] + by[0] * step / 8, start[1] + by[1] * step / 8)
+            self.page.wait_for_timeout(60)
+        if release:
+            mouse.up()
+
+    def handle_of_the_gizmo(self) -> tuple[float, float]:
+        """Where the vertical arrow of the gizmo is: the bluest place of the canvas."""
+        self.page.wait_for_timeout(1500)
+        picture = np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")).astype(int)
+        # viser's blue for z; the panels have none of it
+        blue = (abs(picture - np.array([48, 144, 240])).sum(-1) < 90).nonzero()
+        assert len(blue[0]) > 20, "the gizmo's blue arrow is not in view"
+        rows, columns = blue
+        top = rows.argsort()[: max(10, len(rows) // 8)]
+        return float(np.median(columns[top])), float(np.median(rows[top]))
 
     def quiet(self, *, timeout: float = 120) -> None:
         """Wait until no job is shown."""

@@ -3,7 +3,7 @@
 import torch
 
 from splatgraft.cameras import Cameras, look_at, pinhole
-from splatgraft.editor.picking import Rectangle, first_hit, in_brush, in_rectangle
+from splatgraft.editor.picking import Ray, Rectangle, between, first_hit, in_brush, in_rectangle, painted
 from splatgraft.editor.thinning import shown_indices
 from splatgraft.gaussians import Gaussians
 from splatgraft.segment import corrected, with_correction
@@ -40,7 +40,25 @@ def test_a_click_stops_at_the_first_solid_thing() -> None:
     assert torch.allclose(hit, torch.zeros(3), atol=1e-6)  # float32 of numbers about 4
     assert first_hit(scene([[0.0, 0, 0]], logit=-3.0), *ray) is None
     assert first_hit(scene([[0.0, -8, 0]]), *ray) is None
-    assert in_brush(torch.tensor([[0.0, 0.5, 0], [0, 2, 0]]), hit, 1.0).tolist() == [True, False]
+    around = scene([[0.0, 0.5, 0], [0, 1.05, 0], [0, 2, 0]])
+    assert in_brush(around, hit, 1.0).tolist() == [True, True, False]
+    # a wide Gaussian is reached from aside, but not by a brush that is far from its centre
+    assert in_brush(scene([[0.0, 0.15, 0], [0, 0.25, 0]], size=1.0), hit, 0.1).tolist() == [True, False]
+
+
+def test_a_quick_stroke_has_no_gaps_and_passes_over_what_is_not_there() -> None:
+    row = scene([[0.1 * i, 0, 0] for i in range(-10, 11) if abs(i) > 2], size=0.05)
+    eye = torch.tensor([0.0, -4, 0])
+    start, end = (Ray(eye, torch.tensor([x, 4.0, 0])) for x in (-1.0, 1.0))
+    # two moments alone touch the ends; the whole stroke touches all
+    assert int(painted(row, [start, end], size=0.05).sum()) == 4
+    rays = between(start, end, size=0.05)
+    assert bool(painted(row, [start, *rays], size=0.05).all())
+    directions = torch.stack([torch.nn.functional.normalize(ray.direction, dim=0) for ray in [start, *rays]])
+    assert (
+        float((directions[1:] - directions[:-1]).norm(dim=1).max()) <= 0.25 * 0.05 / 0.97
+    )  # the chord between the ends is 0.97 from the eye
+    assert not painted(row, [Ray(eye, torch.tensor([0.0, 4.0, 0]))], size=0.05).any()
 
 
 def test_the_last_stroke_counts() -> None:

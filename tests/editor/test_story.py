@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from editor_driver import Editor, Window, wait_until, with_browser
@@ -33,17 +32,6 @@ def browser() -> Iterator[Any]:
 
 def object_at(project: Path) -> torch.Tensor:
     return read_placement(project.parent / "placement.json").objects[0].target_from_object.translation
-
-
-def canvas_drag(window: Window, start: tuple[float, float], by: tuple[float, float], *, release: bool = True) -> None:
-    mouse = window.page.mouse
-    mouse.move(*start)
-    mouse.down()
-    for step in range(1, 9):
-        mouse.move(start[0] + by[0] * step / 8, start[1] + by[1] * step / 8)
-        window.page.wait_for_timeout(60)
-    if release:
-        mouse.up()
 
 
 @pytest.mark.timeout(600)
@@ -106,7 +94,7 @@ def select(window: Window, project: Path) -> None:
     # a rectangle over the upper left part of the picture, in the middle of the canvas
     window.page.keyboard.down("Shift")
     window.page.wait_for_timeout(150)
-    canvas_drag(window, (640, 300), (60, 400))
+    window.drag((640, 300), (60, 400))
     window.page.keyboard.up("Shift")
     wait_until(lambda: read_state(project).corrections is not None, timeout=20, what="strokes")
     window.click("Undo")
@@ -114,13 +102,13 @@ def select(window: Window, project: Path) -> None:
     window.click("Redo")
     wait_until(lambda: read_state(project).corrections is not None, timeout=20, what="the stroke again")
     # the ball is in the middle between the two panels
-    window.check("Brush: click on the picture")
+    window.check("Brush")
     window.says("the brush is on")
     # the page hears of it a moment after its text
     window.page.wait_for_timeout(500)
     window.page.mouse.click(648, 450)
     window.says("Gaussians under the stroke")
-    window.check("Brush: click on the picture")
+    window.check("Brush")
     window.click("Undo")
     window.says("undone")
     window.click("Cut out the object")
@@ -155,26 +143,10 @@ def place(window: Window, project: Path) -> None:
     )
 
 
-def handle_of_the_gizmo(window: Window) -> tuple[float, float]:
-    """Where the vertical arrow of the gizmo is: the bluest place of the canvas."""
-    import io
-
-    from PIL import Image
-
-    window.page.wait_for_timeout(1500)
-    picture = np.asarray(Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")).astype(int)
-    # viser's blue for z; the panels have none of it
-    blue = (abs(picture - np.array([48, 144, 240])).sum(-1) < 90).nonzero()
-    assert len(blue[0]) > 20, "the gizmo's blue arrow is not in view"
-    rows, columns = blue
-    top = rows.argsort()[: max(10, len(rows) // 8)]
-    return float(np.median(columns[top])), float(np.median(rows[top]))
-
-
 def killed_while_dragging(window: Window, browser: Any, editor: Editor, project: Path) -> tuple[Editor, Window]:
     before = object_at(project)
-    at = handle_of_the_gizmo(window)
-    canvas_drag(window, at, (0, -60), release=False)
+    at = window.handle_of_the_gizmo()
+    window.drag(at, (0, -60), release=False)
     wait_until(lambda: not torch.equal(object_at(project), before), timeout=20, what="the drag in placement.json")
     editor.kill()
     window.page.mouse.up()

@@ -1,5 +1,7 @@
 """Which Gaussians a person means: a box in space, a rectangle of the picture, a brush. Knows nothing about browsers."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -58,6 +60,37 @@ def first_hit(
     return origin + float(depth[order][stopped][0]) * direction.to(origin) if bool(stopped.any()) else None
 
 
-def in_brush(means: Float[Tensor, "n 3"], centre: Float[Tensor, "3"], radius: float) -> Bool[Tensor, "n"]:
-    """Which centres lie in the ball of a brush."""
-    return (means - centre).norm(dim=1) <= radius
+def in_brush(gaussians: Gaussians, centre: Float[Tensor, "3"], radius: float) -> Bool[Tensor, "n"]:
+    """Which Gaussians a brush's ball reaches: by their middle size, but none whose centre is two radii away.
+
+    A narrow brush would else slip between the centres of wide Gaussians, and a wide one take the backdrop.
+    """
+    reach = gaussians.scales.median(1).values.clamp_max(radius)
+    return (gaussians.means - centre).norm(dim=1) <= radius + reach
+
+
+@dataclass(frozen=True)
+class Ray:
+    """Where a person points."""
+
+    origin: Float[Tensor, "3"]
+    """The eye."""
+    direction: Float[Tensor, "3"]
+    """Of any length."""
+
+
+def painted(gaussians: Gaussians, rays: Sequence[Ray], *, size: float) -> Bool[Tensor, "n"]:
+    """Which Gaussians a stroke takes: a ball around each hit, `size` of its distance wide, so of one size in the picture."""
+    touched = torch.zeros(gaussians.count, dtype=torch.bool)
+    for ray in rays:
+        hit = first_hit(gaussians, ray.origin, ray.direction)
+        if hit is not None:
+            touched |= in_brush(gaussians, hit, 0.5 * size * float((hit - ray.origin).norm()))
+    return touched
+
+
+def between(start: Ray, end: Ray, *, size: float) -> list[Ray]:
+    """Rays from after `start` up to `end`, a quarter of the brush apart, so that a quick stroke has no gaps."""
+    a, b = (torch.nn.functional.normalize(ray.direction, dim=0) for ray in (start, end))
+    count = max(1, math.ceil(float((b - a).norm()) / (0.25 * size)))
+    return [Ray(end.origin, a + (b - a) * (step + 1) / count) for step in range(count)]

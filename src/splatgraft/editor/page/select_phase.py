@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, get_args
 
-import numpy as np
 import torch
 import viser
 
 from splatgraft.editor.page.box_handles import BoxHandles
-from splatgraft.editor.page.stage_view import view_of
-from splatgraft.editor.picking import Rectangle, first_hit, in_brush, in_rectangle
+from splatgraft.editor.page.brush import Brush
+from splatgraft.editor.page.stage_view import TINT, Color, view_of
+from splatgraft.editor.picking import Rectangle, in_rectangle
 from splatgraft.formats import read_capture
 from splatgraft.segment import Box, Keep, default_box
 
@@ -27,6 +27,8 @@ _SOURCES = {
 
 
 _KEEP: tuple[str, ...] = get_args(Keep)
+_ADDS: Color = (0.2, 0.9, 0.3)
+_REMOVES: Color = (0.9, 0.1, 0.2)
 
 
 class SelectPhase:
@@ -44,24 +46,26 @@ class SelectPhase:
         self._cut = gui.add_button("Cut out the object", icon=viser.Icon.WAND)
         with gui.add_folder("Mend by hand"):
             self._mode = gui.add_dropdown("A stroke", ("adds", "removes"), initial_value="removes")
-            self._brush = gui.add_checkbox("Brush: click on the picture", False)
-            self._radius = gui.add_slider(
-                "Brush size", 0.01, 1.0, 0.01, 0.1, hint="Share of the distance to the object"
+            self._use_brush = gui.add_checkbox("Brush", False, hint="Drag or click on the picture (key B)")
+            self._size = gui.add_slider(
+                "Brush size", 0.01, 0.5, 0.01, 0.1, hint="Share of the distance to what it hits"
             )
             gui.add_markdown("Shift and drag: a rectangle.")
-            self._apply_box = gui.add_button("Apply the stroke to the box", color="gray")
+            self._stroke_box = gui.add_checkbox("Box for strokes", False, hint="Another box than the object's")
+            self._box_group = gui.add_button_group("All in that box", ("Add", "Remove"), visible=False)
             self._forget = gui.add_button("Forget all strokes", icon=viser.Icon.ERASER, color="gray")
         self._isolate = gui.add_checkbox("Show the object alone", False)
         self._handles = BoxHandles(page.server, page.view, "/source/box", color=(255, 150, 40))
         self._handles.on_moved = self._box_dragged
-        self._inside, self._listens = False, False
+        self._stroke_handles = BoxHandles(page.server, page.view, "/source/stroke_box", color=(60, 160, 255))
+        self._brush = Brush(page, on_stroke=self._stroke, color=lambda: _ADDS if self._adds() else _REMOVES)
+        self._inside = False
         self._connect()
 
     def enter(self) -> None:
         """Show the source; asked again, show it as it is now."""
         if not self._inside:
             self._page.server.scene.on_rect_select(modifier="shift")(self._rectangle)
-            self._listen(self._brush.value)
         self._inside = True
         self._draw()
 
@@ -69,10 +73,11 @@ class SelectPhase:
         """Take it away."""
         if self._inside:
             self._page.server.scene.remove_rect_select_callback(self._rectangle)
-            self._listen(False)
         self._inside = False
+        self._brush.off()
         self._page.view.hide("/source")
         self._handles.hide()
+        self._stroke_handles.hide()
 
     def refresh(self) -> None:
         """Selection, counts and box as they are now."""
@@ -93,7 +98,14 @@ class SelectPhase:
             self._handles.show(box)
         else:
             self._handles.hide()
-        self._apply_box.disabled = not self._show_box.value
+        self._box_group.visible = self._stroke_box.value
+        if not self._stroke_box.value:
+            self._stroke_handles.hide()
+        if self._use_brush.value and session.files.source_scene.is_file():
+            scene = session.scenes.gaussians(session.files.source_scene)
+            self._brush.on(scene, size=float(self._size.value))
+        else:
+            self._brush.off()
         self._forget.disabled = state.corrections is None
         self._draw()
 
@@ -106,8 +118,11 @@ class SelectPhase:
             field.on_update(act(lambda _: self._box_typed()))
         self._cut.on_click(act(lambda _: self._page.run("segment", "Cut out the object")))
         self._isolate.on_update(act(lambda _: None))
-        self._brush.on_update(act(lambda _: self._toggle_brush()))
-        self._apply_box.on_click(act(lambda _: self._stroke_box()))
+        self._use_brush.on_update(act(lambda _: self._say_brush()))
+        self._size.on_update(act(lambda _: None))
+        self._stroke_box.on_update(act(lambda _: self._toggle_stroke_box()))
+        self._box_group.on_click(act(lambda event: self._stroke_in_box(add=event.target.value == "Add")))
+        self._page.gui.add_command("Brush on or off", hotkey="B").on_trigger(act(lambda _: self._toggle_brush()))
         self._forget.on_click(act(lambda _: self._set(corrections=None)))
 
     def _draw(self) -> None:
@@ -117,7 +132,7 @@ class SelectPhase:
             return
         scene, selection = session.scenes.gaussians(session.files.source_scene), session.selection()
         assert selection is not None
-        self._page.view.splats("/source/object", scene, which=selection, tinted=not self._isolate.value)
+        self._page.view.splats("/source/object", scene, which=selection, tint=None if self._isolate.value else TINT)
         if self._isolate.value:
             self._page.view.hide("/source/rest")
         else:
@@ -162,34 +177,21 @@ class SelectPhase:
             self._page.act(lambda _: self._set_box(box))(None)
 
     def _toggle_brush(self) -> None:
-        self._listen(self._brush.value)
-        self._page.say("the brush is on: a click is a stroke, a drag still turns the view" if self._brush.value else "")
+        if self._inside:
+            self._use_brush.value = not self._use_brush.value
+            self._say_brush()
 
-    def _listen(self, listen: bool) -> None:
-        scene = self._page.server.scene
-        if listen and not self._listens:
-            scene.on_click()(self._clicked)
-        if not listen and self._listens:
-            scene.remove_click_callback(self._clicked)
-        self._listens = listen
+    def _say_brush(self) -> None:
+        on = "the brush is on: drag or click on the picture; B puts it away, so that a drag turns the view again"
+        self._page.say(on if self._use_brush.value else "the brush is away")
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        self._page.act(self._stroke_brush)(event)
+    def _toggle_stroke_box(self) -> None:
+        if self._stroke_box.value:
+            whole = self._page.need().box() or self._guess()
+            self._stroke_handles.show(whole.grown(1.1))
 
     def _rectangle(self, event: viser.SceneRectSelectEvent) -> None:
         self._page.act(self._stroke_rectangle)(event)
-
-    def _stroke_brush(self, event: viser.SceneClickEvent) -> None:
-        session = self._page.need()
-        scene = session.scenes.gaussians(session.files.source_scene)
-        origin, direction = (
-            torch.tensor(np.asarray(v), dtype=torch.float32) for v in (event.ray_origin, event.ray_direction)
-        )
-        hit = first_hit(scene, origin, direction)
-        if hit is None:
-            raise ValueError("brush: expected something solid under the click, found nothing")
-        radius = float(self._radius.value) * 0.5 * float((hit - origin).norm())
-        self._stroke(in_brush(scene.means, hit, radius))
 
     def _stroke_rectangle(self, event: viser.SceneRectSelectEvent) -> None:
         session = self._page.need()
@@ -197,15 +199,19 @@ class SelectPhase:
         camera = view_of(event.client.camera, width=1000)
         self._stroke(in_rectangle(scene.means, camera, Rectangle(event.screen_min, event.screen_max)))
 
-    def _stroke_box(self) -> None:
-        session = self._page.need()
-        box = session.box()
+    def _stroke_in_box(self, *, add: bool) -> None:
+        session, box = self._page.need(), self._stroke_handles.box
         if box is None:
-            raise ValueError("box: expected one, found none")
-        self._stroke(box.contains(session.scenes.gaussians(session.files.source_scene).means))
+            raise ValueError("box: expected one in view, found none")
+        self._correct(box.contains(session.scenes.gaussians(session.files.source_scene).means), add=add)
+
+    def _adds(self) -> bool:
+        return self._mode.value == "adds"
 
     def _stroke(self, touched: torch.Tensor) -> None:
-        add = self._mode.value == "adds"
+        self._correct(touched, add=self._adds())
+
+    def _correct(self, touched: torch.Tensor, *, add: bool) -> None:
         self._page.need().correct(touched, add=add)
         self._page.say(
             f"{'added' if add else 'removed'}: {int(touched.sum()):,} Gaussians under the stroke; cut again to use it"

@@ -16,7 +16,8 @@ from splatgraft.segment import Box
 from splatgraft.similarity import Similarity
 from splatgraft.spherical_harmonics import C0
 
-TINT = torch.tensor([1.0, 0.45, 0.1])
+Color = tuple[float, float, float]
+TINT: Color = (1.0, 0.45, 0.1)
 _EDGES = np.array([[i, j] for i in range(8) for j in range(i) if bin(i ^ j).count("1") == 1])
 
 
@@ -37,7 +38,7 @@ class StageView:
         """Nothing shown yet; `budget` is how many Gaussians a browser gets per scene."""
         self._scene = server.scene
         self._budget = budget
-        self._splats: dict[str, tuple[tuple[int, ...], viser.GaussianSplatHandle | None, Shown]] = {}
+        self._splats: dict[str, tuple[tuple[object, ...], viser.GaussianSplatHandle | None, Shown]] = {}
         self._kept: dict[str, object] = {}
         self.shown: dict[str, Shown] = {}
 
@@ -47,17 +48,17 @@ class StageView:
         gaussians: Gaussians,
         *,
         which: Bool[Tensor, "n"] | None = None,
-        tinted: bool = False,
+        tint: Color | None = None,
         move: Similarity | None = None,
     ) -> None:
         """Show the Gaussians (those in `which`), moved as a whole by `move`; a move alone sends no splats again."""
-        key = (id(gaussians), id(which), int(tinted))
+        key = (id(gaussians), id(which), tint)
         kept = self._splats.get(name)
         if kept is None or kept[0] != key:
             # what `key` names must live as long as the key, or its number could be given to another
             self._kept[name] = (gaussians, which)
             chosen = gaussians if which is None else gaussians.select(which)
-            kept = (key, *self._add(name, chosen, tinted))
+            kept = (key, *self._add(name, chosen, tint))
             self._splats[name] = kept
         handle, self.shown[name] = kept[1], kept[2]
         if handle is not None:
@@ -114,7 +115,9 @@ class StageView:
                 receive_shadow=False,
             )
 
-    def _add(self, name: str, gaussians: Gaussians, tinted: bool) -> tuple[viser.GaussianSplatHandle | None, Shown]:
+    def _add(
+        self, name: str, gaussians: Gaussians, tint: Color | None
+    ) -> tuple[viser.GaussianSplatHandle | None, Shown]:
         shown = gaussians.select(shown_indices(gaussians, self._budget))
         if not shown.count:
             self.remove(name)
@@ -122,8 +125,8 @@ class StageView:
         # viser keeps covariances in half precision: sizes are brought to where that is exact, the node takes them back
         unit = float(shown.log_scales.median().exp()) * 10
         colors = (0.5 + C0 * shown.sh[:, 0]).clamp(0, 1)
-        if tinted:
-            colors = 0.45 * colors + 0.55 * TINT
+        if tint is not None:
+            colors = 0.45 * colors + 0.55 * torch.tensor(tint)
         covariances = (shown.covariances / unit**2).clamp(-6e4, 6e4)
         handle = self._scene.add_gaussian_splats(
             name,
