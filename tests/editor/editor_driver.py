@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,14 @@ ARGUMENTS = (
     *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
     # Mesa's software GL: a third of the time that the browser's own takes
     *("--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"),
+)
+
+
+KNOWN_COMPLAINTS = (
+    # viser draws splats on a quad whose corners have no z; three then finds no sphere around it, and never hides it
+    "Computed radius is NaN",
+    # three's controls, on a touch or a wheel
+    "Unable to preventDefault inside passive event listener",
 )
 
 
@@ -94,6 +102,8 @@ class Window:
     def __init__(self, page: Any) -> None:
         """A browser's page, opened on the editor already."""
         self.page = page
+        self.complaints: list[str] = []
+        page.on("console", lambda said: self.complaints.append(said.text) if said.type == "error" else None)
         page.wait_for_selector(".sg-header", timeout=60_000)
 
     @staticmethod
@@ -121,6 +131,26 @@ class Window:
         """Type into a field."""
         self.field(label).fill(text)
         self.field(label).press("Enter")
+
+    def write_all(self, label: str, numbers: Sequence[float]) -> None:
+        """Type into the fields of a vector."""
+        row = f'//label[normalize-space()="{label}"]/ancestor::div[contains(@class, "mantine-Flex-root")][1]'
+        inputs = self.page.locator(f"xpath={row}//input[not(@type='hidden')]")
+        for index, number in enumerate(numbers):
+            inputs.nth(index).fill(str(number))
+            inputs.nth(index).press("Enter")
+            # the page sends back what it took, all numbers of it
+            self.page.wait_for_timeout(400)
+
+    def unfold(self, folder: str) -> None:
+        """Open a folder of controls."""
+        self.page.get_by_text(folder, exact=True).click()
+
+    def upload(self, button: str, path: Path) -> None:
+        """A file by an upload button."""
+        with self.page.expect_file_chooser() as chooser:
+            self.click(button)
+        chooser.value.set_files(str(path))
 
     def check(self, label: str) -> None:
         """A checkbox by its label."""
@@ -156,6 +186,10 @@ class Window:
         rows, columns = blue
         top = rows.argsort()[: max(10, len(rows) // 8)]
         return float(np.median(columns[top])), float(np.median(rows[top]))
+
+    def unknown_complaints(self) -> list[str]:
+        """What the browser's console says but for what viser is known to cause."""
+        return [text for text in self.complaints if not any(known in text for known in KNOWN_COMPLAINTS)]
 
     def quiet(self, *, timeout: float = 120) -> None:
         """Wait until no job is shown."""

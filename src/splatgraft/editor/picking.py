@@ -80,7 +80,7 @@ class Ray:
 
 
 def painted(gaussians: Gaussians, rays: Sequence[Ray], *, size: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians a stroke takes: a ball around each hit, `size` of its distance wide, so of one size in the picture."""
+    """Which Gaussians a stroke takes: a ball around each hit, `size` of its distance wide."""
     touched = torch.zeros(gaussians.count, dtype=torch.bool)
     for ray in rays:
         hit = first_hit(gaussians, ray.origin, ray.direction)

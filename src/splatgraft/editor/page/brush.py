@@ -33,6 +33,7 @@ class Brush:
         self._rays: tuple[Ray, ...] = ()
         self._done, self._touched = 0, torch.zeros(0, dtype=torch.bool)
         self._latest = Latest(self._paint, lambda error: page.say(" ".join(str(error).split()), bad=True))
+        page.at_end.append(self._latest.close)
 
     def on(self, scene: Gaussians, *, size: float) -> None:
         """Paint on this scene from now on; `size` is the width of the brush over the distance of what it touches."""
@@ -61,10 +62,6 @@ class Brush:
             self._page.server.scene.remove_click_callback(self._clicked)
             self._canvas.remove()
             self._canvas = None
-
-    def close(self) -> None:
-        """End the thread."""
-        self._latest.close()
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         self._rays, self._done = (Ray(_vector(event.ray_origin), _vector(event.ray_direction)),), 0

@@ -74,6 +74,7 @@ class Page:
         self._lock = threading.RLock()
         self._notices: dict[int, Any] = {}
         self._open = True
+        self.at_end: list[Callable[[], None]] = []
         self._views: dict[str, tuple[Any, ...]] = {}
         self._build()
         guarded.on_seat = self._seats_changed
@@ -358,7 +359,8 @@ class Page:
     def close(self) -> None:
         """End the threads."""
         self._open = False
-        self.preview.close()
+        for end in (self.preview.close, *self.at_end):
+            end()
 
     def _ticks(self) -> None:
         while self._open:
