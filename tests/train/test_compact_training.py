@@ -3,6 +3,7 @@
 import math
 import random
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -150,6 +151,18 @@ def test_the_command_makes_weights_that_the_harmoniser_loads(rendered, tmp_path,
     assert main([*words, "--blocks", "1", "1", "1", "1", "--heads", "2"]) == 0
     assert (tmp_path / "compact.safetensors").is_file()
     assert "4 pairs to learn from, 4 held out" in capsys.readouterr().err
+
+
+def test_the_shipped_pairs_are_read_with_their_light(tmp_path):
+    shipped = Path(__file__).parents[2] / "data" / "pairs"
+    priors.write_priors([shipped / "kitchen_0001_00001"], tmp_path, seed=0)
+    pairs = CompactPairs(shipped, tmp_path, NOTHING)
+    assert len(pairs.training) == 10
+    view, truth = pairs.read(0)
+    # wherever the object is not and casts nothing, background and truth are one render but for its noise
+    far = (view.mask == 0) & (view.log_ratio.abs().sum(1, keepdim=True) == 0)
+    assert float((view.background - truth).abs().mean(1, keepdim=True)[far].median()) < 0.02
+    assert 0 < pairs.read(0)[0].trust < 1
 
 
 def test_a_missing_probe_is_named(tmp_path):

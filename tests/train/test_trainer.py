@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -20,7 +21,7 @@ from splatgraft.train.removal_objective import RemovalObjective
 from splatgraft.train.settings import Loop
 from splatgraft.train.sources.relit import RelitPairs
 from splatgraft.train.sources.rendered import RenderedPairs
-from splatgraft.train.sources.source import split_mixture
+from splatgraft.train.sources.source import fitted_pair, split_mixture
 from splatgraft.train.trainer import Training, train
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
@@ -57,9 +58,21 @@ def inputs(sample):
     return HarmonizerInputs(composite, sample.background, mask, flat, torch.zeros_like(composite), composite)
 
 
+def one_shipped_pair(tmp_path):
+    """The first of the rendered pairs that ship with the repository."""
+    shipped, folder = Path(__file__).parents[2] / "data" / "pairs", tmp_path / "shipped"
+    folder.mkdir()
+    line = (shipped / "manifest.jsonl").read_text().splitlines()[0]
+    (folder / "manifest.jsonl").write_text(line + "\n")
+    (folder / json.loads(line)["folder"]).symlink_to(shipped / json.loads(line)["folder"])
+    return folder
+
+
 def test_it_overfits_and_is_loaded_as_it_was(tmp_path):
     loop = replace(QUICK, steps=250, batch=8, rate=3e-3, save_every=1000, validate_every=1000)
     run = training(tmp_path, "out", loop, pairs=1, times="schnell", checkpointing=False)
+    mixture, _ = split_mixture([RenderedPairs(one_shipped_pair(tmp_path))], weights=(), held_out=0.0, seed=0)
+    run = replace(run, mixture=mixture, held_out=None)
     model = train(run)
     losses = torch.tensor(read_losses(tmp_path / "out" / LOG_FILE))
     assert losses[-20:].mean() < losses[:5].mean() / 10
@@ -67,7 +80,7 @@ def test_it_overfits_and_is_loaded_as_it_was(tmp_path):
     loaded = run.cache.load(sample, run.objective.roles)
     shown = run.objective.predict(run.objective.network.eval(), run.cache.finish([loaded], run.objective.roles), 3)
     harmonizer = make_harmonizer("flux", HarmonizerOptions(weights=str(model), seed=3))
-    image = harmonizer.harmonize(inputs(sample.source.read(sample.index))).image
+    image = harmonizer.harmonize(inputs(fitted_pair(sample.source.read(sample.index), 32, 32))).image
     # kept latents are rounded to bfloat16 (2^-9 of values of about one), fresh ones are not
     assert (image - shown[0].permute(1, 2, 0)).abs().max() < 0.02
     stored = json.loads((model / "transformer" / "config.json").read_text())
