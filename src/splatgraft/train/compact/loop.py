@@ -75,7 +75,7 @@ def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]
     if loop.threads:
         torch.set_num_threads(loop.threads)
     torch.manual_seed(loop.seed)
-    network = CompactNetwork(loop.network).to(run.device, memory_format=torch.channels_last)
+    network = CompactNetwork(loop.network).to(run.device)
     decayed = [p for p in network.parameters() if p.ndim > 1]
     others = [p for p in network.parameters() if p.ndim <= 1]
     groups = [{"params": decayed, "weight_decay": loop.decay}, {"params": others, "weight_decay": 0.0}]

@@ -70,9 +70,9 @@ def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Pro
                 lights = [light for o, light in takes if o == object_]
                 for light, prior in zip(lights, priors_of(folder, object_, lights, seed=seed), strict=True):
                     arrays[f"{object_}_{light}"] = prior.log_ratio.numpy().astype(np.float16)
-                    arrays[f"{object_}_{light}_trust"] = np.float32(prior.trust)
+                    arrays[f"{object_}_{light}_trust"] = np.array(prior.trust, np.float32)
             with whole_file(path) as stream:
-                np.savez_compressed(stream, **arrays)
+                np.savez_compressed(stream, allow_pickle=False, **arrays)
         progress(number + 1, len(folders), folder.name)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
@@ -71,7 +71,7 @@ def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussian
 
 def surfels(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], color: Float[Tensor, "3"]) -> Gaussians:
     """Flat, opaque Gaussians as wide as the points are apart."""
-    distances, _ = cKDTree(points.numpy()).query(points.numpy()[::7], k=5)
+    distances, _ = KDTree(points.numpy()).query(points.numpy()[::7], k=5)
     width = max(1e-4, 0.6 * float(np.median(distances[:, -1])))
     rotations = frames_along(-normals).transpose(1, 2)
     return Gaussians(
