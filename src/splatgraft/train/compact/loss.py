@@ -42,18 +42,35 @@ def loss_of(view: View, answer: Answer, truth: Float[Tensor, "b 3 h w"]) -> tupl
     """The loss, the errors of the answer, and those of the prior."""
     image = composed(view, answer)
     found, before = errors_of(image, truth, view), errors_of(view.prior(), truth, view)
-    loss = found.object + found.shadow + 2 * found.rest
-    loss = loss + 0.5 * _gradients(image, truth, view)
+    loss = 0.6 * (found.object + found.shadow) + 4 * found.rest
+    loss = loss + _squares(image, truth, view) + 0.5 * _gradients(image, truth, view)
     hinge = [(getattr(found, k) - getattr(before, k)).clamp_min(0) for k in ("object", "shadow", "rest")]
     loss = loss + 0.5 * hinge[0] + 0.5 * hinge[1] + hinge[2]
     return loss + 0.02 * _doubt(image.detach(), truth, answer), found, before
 
 
 def _apart(image: Tensor, truth: Tensor) -> Float[Tensor, "b 1 h w"]:
-    # where the truth is burnt out, how far the image is beyond white does not matter
-    srgb = (srgb_from_linear(image.clamp(1e-6, 1)) - srgb_from_linear(truth.clamp(1e-6, 1))).abs()
-    log = ((image.clamp_max(1) + _LIFT) / (truth + _LIFT)).log().abs()
+    seen = _seen(image, truth)
+    srgb = (srgb_from_linear(seen) - srgb_from_linear(truth.clamp(1e-6, 1))).abs()
+    log = ((seen + _LIFT) / (truth + _LIFT)).log().abs()
     return (2 * srgb + 0.3 * log).mean(1, keepdim=True)
+
+
+def _seen(image: Tensor, truth: Tensor) -> Tensor:
+    """The image as a camera would see it where the truth is burnt out; elsewhere too much light stays too much."""
+    return torch.where(truth < 0.99, image.clamp_max(4), image.clamp_max(1)).clamp_min(1e-6)
+
+
+def _squares(image: Tensor, truth: Tensor, view: View) -> Tensor:
+    """Squared errors, which ask for the mean of what may be: of sRGB on the object, of light over before in shadows.
+
+    Absolute errors ask for the median, and the median of an unsure shadow is none at all.
+    """
+    object_, shadow, _ = regions(view, truth)
+    seen = _seen(image, truth)
+    apart = (srgb_from_linear(seen) - srgb_from_linear(truth.clamp(1e-6, 1))) ** 2
+    ratio = ((seen - truth) / (view.background + 2 * _LIFT)).clamp(-2, 2) ** 2
+    return 4 * _mean(apart.mean(1, keepdim=True), object_) + 2 * _mean(ratio.mean(1, keepdim=True), shadow)
 
 
 def _mean(values: Tensor, weight: Tensor) -> Tensor:
@@ -66,7 +83,7 @@ def _mean(values: Tensor, weight: Tensor) -> Tensor:
 
 def _gradients(image: Tensor, truth: Tensor, view: View) -> Tensor:
     """Edges of light: differences of the log ratio between neighbours, near the object."""
-    ratio = ((image.clamp_max(1) + _LIFT) / (truth + _LIFT)).log().clamp(-2, 2)
+    ratio = ((_seen(image, truth) + _LIFT) / (truth + _LIFT)).log().clamp(-2, 2)
     object_, shadow, _ = regions(view, truth)
     weight = (object_ + shadow).clamp_max(1)
     across = _mean((ratio[..., 1:] - ratio[..., :-1]).abs().mean(1, keepdim=True), weight[..., 1:])
