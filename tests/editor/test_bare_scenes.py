@@ -13,6 +13,7 @@ from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
 from splatgraft.gaussians import concatenate
 from splatgraft.orbit import estimate_up
+from splatgraft.settings import read_toml
 from splatgraft.steps.edit import StepsProject
 
 AROUND_THE_BALL = [-0.35, -0.35, 0.03, 0.35, 0.35, 0.65]
@@ -28,7 +29,7 @@ def bare_project(root: Path, *, suffix: str, **segment: object) -> Path:
     assert main(["init", str(project.parent), "--source", str(paths[0]), "--target", str(paths[1])]) == 0
     text = with_keys(project.read_text(), "segment", {"keep": "all", "solidify": 4, **segment})
     for side in ("source", "target"):
-        text = with_keys(text, side, {"views": 8})
+        text = with_keys(text, side, {"views": 8, "picture_width": 160})
     text = with_keys(text, "compose", {"point": [0.0, 0.0, 0.5], "scale": 0.8})
     project.write_text(with_keys(text, "consolidate", {"passes": 1}))
     return project
@@ -71,6 +72,20 @@ def test_a_box_alone_cuts_and_the_whole_file_may_be_the_object(tmp_path: Path) -
     assert torch.allclose(
         up, torch.tensor([0.0, 0.0, 1.0]), atol=0.02
     )  # of a plane whose centres are rounded to 1/4096
+
+
+def test_up_can_be_put_right_and_that_is_no_step(tmp_path: Path) -> None:
+    project = bare_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, mask_source="box")
+    session = Session(StepsProject(project))
+    session.set_up("target", (0.0, 0.0, -1.0))
+    assert not session.reload()
+    assert not session.undo()
+    assert main(["run", str(project), "--to", "reconstruct"]) == 0
+    cameras = read_cameras(project.parent / "target" / "capture")
+    assert torch.allclose(estimate_up(cameras), torch.tensor([0.0, 0.0, -1.0]), atol=0.02)  # two rings of eight cameras
+    assert bool((cameras.centers[:, 2] < 0).all())
+    session.set_up("target", None)
+    assert "up" not in read_toml(project)["target"]
 
 
 def test_what_is_named_wrongly_is_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,8 +16,6 @@ from splatgraft.gaussians import Gaussians
 from splatgraft.progress import Progress, silent
 from splatgraft.rendering import render
 
-WIDTH, HEIGHT = 640, 480
-"""Of the pictures, pixels."""
 _HALF_FOV = math.radians(30)
 """Of the width."""
 _ELEVATIONS_DEG = (20.0, 42.0)
@@ -35,6 +33,8 @@ class LookOptions:
 
     views: int = 36
     """Of a trained scene: how many pictures are made of it, from all around; fewer where things stand in the way."""
+    picture_width: int = 640
+    """Of these pictures, pixels; their height is three quarters of it."""
     up: tuple[float, float, float] | None = None
     """Of a trained scene: its up; found from its largest level surface where not given."""
 
@@ -42,6 +42,8 @@ class LookOptions:
         """Raises: ValueError where there would be too few views, or up has no length."""
         if self.views < _LEAST_VIEWS:
             raise ValueError(f"--views: expected at least {_LEAST_VIEWS}, found {self.views}")
+        if self.picture_width < 16:
+            raise ValueError(f"--picture-width: expected at least 16, found {self.picture_width}")
         if self.up is not None and not math.hypot(*self.up) > 0:
             raise ValueError(f"--up: expected a direction, found {self.up}")
 
@@ -71,7 +73,10 @@ def find_viewpoints(scene: Gaussians, options: LookOptions, *, progress: Progres
         up, reason = find_up(solid.means, centre, radius)
     else:
         up, reason = torch.nn.functional.normalize(torch.tensor(options.up), dim=0), "as given"
-    cameras, dropped = _seeing(scene, centre, radius, up=up, views=options.views, progress=progress)
+    poses, dropped = _seeing(scene, centre, radius, up=up, views=options.views, progress=progress)
+    width = options.picture_width
+    focal = 0.5 * width / math.tan(_HALF_FOV)
+    cameras = pinhole(poses, focal, width=width, height=width * 3 // 4, prefix="look")
     report = [
         f"a scene without photographs: {len(cameras)} pictures are made of it, from around {_shown(centre)}",
         f"up is taken to be {_shown(up)}: {reason}",
@@ -154,7 +159,7 @@ def _seeing(
     up: Float[Tensor, "3"],
     views: int,
     progress: Progress,
-) -> tuple[Cameras, int]:
+) -> tuple[Float[Tensor, "v 4 4"], int]:
     """Along every direction the best distance from which the middle is in view; and how many directions have none."""
     directions = _directions(views, up)
     chosen: list[Tensor] = []
@@ -170,8 +175,7 @@ def _seeing(
         progress(index + 1, views, "places to look from")
     missing = max(0, _LEAST_VIEWS - len(chosen))
     chosen += [pose for _, pose in sorted(poor, key=lambda pair: pair[0])[:missing]]
-    poses = torch.stack(chosen)
-    return pinhole(poses, 0.5 * WIDTH / math.tan(_HALF_FOV), width=WIDTH, height=HEIGHT, prefix="look"), len(poor)
+    return torch.stack(chosen), len(poor)
 
 
 def _tried(
@@ -202,4 +206,4 @@ def _directions(views: int, up: Float[Tensor, "3"]) -> Float[Tensor, "v 3"]:
 
 
 def _shown(vector: Float[Tensor, "3"]) -> str:
-    return "(" + ", ".join(f"{x + 0.0:.2f}" for x in vector.tolist()) + ")"
+    return "(" + ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in vector.tolist()) + ")"

@@ -54,7 +54,7 @@ class OpenPhase:
             self._upload = gui.add_upload_button("Upload a video or a scene", icon=viser.Icon.UPLOAD, color="gray")
         self._start = gui.add_button("Start the project", icon=viser.Icon.PLUS)
         self._facts = gui.add_html("")
-        self._ups = {side: gui.add_dropdown(f"Up: {name.lower()}", tuple(_UPS), visible=False) for side, name in _SIDES}
+        self._ups = {side: gui.add_dropdown(f"Up: {side}", tuple(_UPS), visible=False) for side, _ in _SIDES}
         self._build = gui.add_button("Reconstruct both scenes", icon=viser.Icon.PLAYER_PLAY)
         self._start.on_click(page.act(lambda _: self._create()))
         self._upload.on_upload(page.act(self._uploaded))
@@ -102,7 +102,7 @@ class OpenPhase:
         text = f"<b>{name}</b>: {session.scenes.gaussians(scene).count:,} Gaussians"
         if files.pictured[index] and cameras.is_file():
             made = session.scenes.cameras(cameras)
-            up = ", ".join(f"{x + 0.0:.2f}" for x in estimate_up(made).tolist())
+            up = ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in estimate_up(made).tolist())
             text += f"; it came without photographs: {len(made)} pictures were made of it, with ({up}) as up"
         return text
 
