@@ -12,9 +12,8 @@ from splatgraft.relight.light import Light, LightSource
 
 AMBIENT_COUNT = 32
 SOURCE_BEAMS = 9
-_SINGLE = math.radians(
-    8.0
-)  # up to this softness one filtered map is within 0.02 of the truth; beyond, several are used
+# up to this softness one filtered map is within 0.02 of the truth; beyond, several are used
+_SINGLE = math.radians(8.0)
 
 
 def beams_of(light: Light) -> Beams:
@@ -84,14 +83,16 @@ def _part(beams: Beams, *, source: bool) -> tuple[Beams, Int[Tensor, "k"], Int[T
 
 
 def _disk(source: LightSource, parts: int) -> list[torch.Tensor]:
-    """Directions spread over the cone of `source` (Vogel spiral)."""
+    """Directions spread over the cone of `source` (Vogel spiral), within it by as much as a part's own cone is wide."""
     direction = torch.tensor(source.direction)
     if parts == 1:
         return [direction]
     right, down, _ = frames_along(direction[None])[0]
     out = []
     for j in range(parts):
-        r, angle = math.sqrt((j + 0.5) / parts) * math.sin(source.softness), j * math.pi * (3 - math.sqrt(5))
+        # variances add: of the spiral, radius R sqrt(1 - 1/parts), and of a part, radius R / sqrt(parts)
+        r = math.sqrt((j + 0.5) / parts * (1 - 1 / parts)) * math.sin(source.softness)
+        angle = j * math.pi * (3 - math.sqrt(5))
         side = r * math.cos(angle) * right + r * math.sin(angle) * down
         out.append(side + math.sqrt(max(0.0, 1 - r * r)) * direction)
     return out

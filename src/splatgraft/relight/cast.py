@@ -144,6 +144,10 @@ def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one ker
             u, v = f[0, 0] * x + f[0, 1] * y + f[0, 2] * z, f[1, 0] * x + f[1, 1] * y + f[1, 2] * z
             depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
             spread = np.tan(min(softness[k], np.float32(1.2)))
+            # how the cosine changes over the cone: what lies behind the surface lights nothing
+            lean_u = spread * (f[0, 0] * normals[i, 0] + f[0, 1] * normals[i, 1] + f[0, 2] * normals[i, 2])
+            lean_v = spread * (f[1, 0] * normals[i, 0] + f[1, 1] * normals[i, 1] + f[1, 2] * normals[i, 2])
+            facing = np.float32(0)
             width = spread * max(np.float32(0), depth + radius)
             blocked, red, green, blue = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
             if depth > -radius and abs(u) < radius + width and abs(v) < radius + width:
@@ -153,6 +157,11 @@ def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one ker
                         if found < 1e-4:
                             break
                         width = spread * max(np.float32(0), distance / found)
+                    tilt = max(np.float32(0), cosine + disk[t, 0] * lean_u + disk[t, 1] * lean_v)
+                    if t >= search:
+                        facing += tilt
+                    if tilt <= 0:
+                        continue
                     # the level whose pixels are about as wide as the gap between taps
                     gap = width / texel * (search_gap if t < search else tap_gap)
                     level_size, level_start, scale = size, 0, np.float32(1)
@@ -177,11 +186,13 @@ def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one ker
                                 found += share * p[0]
                                 distance += share * (depth * p[0] - p[2])
                             else:
-                                share /= taps
+                                share *= tilt
                                 blocked += share * p[0]
                                 red += share * p[3]
                                 green += share * p[4]
                                 blue += share * p[5]
+            if facing > 0:
+                blocked, red, green, blue = blocked / facing, red / facing, green / facing, blue / facing
             blocked = min(blocked, np.float32(1))
             # radiance of the unlit side over the solid angle it fills: of the bundle's pi * sin^2 cone
             cone = np.float32(np.pi) * np.sin(softness[k]) ** 2

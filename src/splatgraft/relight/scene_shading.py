@@ -143,13 +143,31 @@ def scene_ratio(
     maps: ObjectMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], *, arrives: Float[Tensor, "m k"]
 ) -> SceneRatio:
     """Ratio at `points`; `arrives` is the share of each bundle that the scene lets through."""
-    before, after, bounce = torch.zeros(3, len(points), 3).unbind(0)
-    column = 0
+    sums = (light_sums(maps, points, normals, arrives=arrives, sources=flag) for flag in (True, False))
+    return ratio_of(sum(sums, torch.zeros(3, len(points), 3)))
+
+
+def light_sums(
+    maps: ObjectMaps,
+    points: Float[Tensor, "m 3"],
+    normals: Float[Tensor, "m 3"],
+    *,
+    arrives: Float[Tensor, "m k"],
+    sources: bool,
+) -> Float[Tensor, "3 m 3"]:
+    """Irradiance at `points` before, after and by bounce, of the sources' bundles or of the ambient ones."""
+    total, column = torch.zeros(3, len(points), 3), 0
     for part, occlusion, bias in maps.occlusions:
         share = arrives[:, column : column + len(part)].contiguous()
         column += len(part)
-        sums = cast(occlusion, part, points, normals, arrives=share, bias=bias)
-        before, after, bounce = before + sums[0], after + sums[1], bounce + sums[2]
+        if part.is_source[0] == sources:
+            total = total + torch.stack(cast(occlusion, part, points, normals, arrives=share, bias=bias))
+    return total
+
+
+def ratio_of(sums: Float[Tensor, "3 m 3"]) -> SceneRatio:
+    """What such sums come to as a change."""
+    before, after, bounce = sums
     total = before.clamp_min(1e-9)
     # where no light was, none can be taken
     ratio = torch.where(before > 1e-8, after / total, 1).clamp(_DARKEST, 1)
@@ -164,15 +182,22 @@ def _beyond_dead_zone(change: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
     return change * ((strongest - _DEAD_ZONE) / (2 * _DEAD_ZONE)).clamp(0, 1)
 
 
-def reachable(points: Float[Tensor, "m 3"], ball: Ball, beams: Beams, *, farthest: float) -> Bool[Tensor, "m"]:
-    """Points within `farthest` of the object that some bundle's shadow cone may touch."""
+def reachable(
+    points: Float[Tensor, "m 3"],
+    ball: Ball,
+    beams: Beams,
+    *,
+    farthest: float,
+    rims: Float[Tensor, "m"] | float = 0.0,
+) -> Bool[Tensor, "m"]:
+    """Points within `farthest` of the object that some bundle's shadow cone may touch, or come nearer than `rims`."""
     away = points - ball.center
     distance = away.norm(dim=1)
-    near = distance < 3.5 * ball.radius
+    near = distance - rims < 3.5 * ball.radius
     for direction, softness, source in zip(beams.directions, beams.softness, beams.is_source, strict=True):
         if source:
             along = -(away @ direction)
             aside = (distance**2 - along**2).clamp_min(0).sqrt()
             spread = torch.tan(softness.clamp_max(1.2)) * (along + ball.radius).clamp_min(0)
-            near |= (along > -ball.radius) & (aside < ball.radius + spread)
-    return near & (distance < farthest)
+            near |= (along + rims > -ball.radius) & (aside - rims < ball.radius + spread)
+    return near & (distance - rims < farthest)

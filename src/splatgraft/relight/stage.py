@@ -31,6 +31,8 @@ class Stage:
     """All of it, erased Gaussians left out."""
     members: Int[Tensor, "m"]
     """Positions of the scene's Gaussians around the place."""
+    around: Gaussians
+    """The members."""
     normals: Normals
     """Of the members."""
     light: Light
@@ -64,7 +66,8 @@ def set_stage(
         (maps, normals),
         lambda: _as_it_looks(around, normals, lit, scene_visibility(maps, points, normals.vectors)),
     )
-    return Stage(scene=scene, members=members, normals=normals, light=lit, maps=maps, arrives=arrives), None
+    found = Stage(scene=scene, members=members, around=around, normals=normals, light=lit, maps=maps, arrives=arrives)
+    return found, None
 
 
 def _region(scene: Gaussians, place: Ball, reach: float, cache: RelightCache) -> Ball:

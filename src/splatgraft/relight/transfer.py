@@ -24,7 +24,7 @@ from splatgraft.relight.layers import Relit, unchanged
 from splatgraft.relight.light import Light
 from splatgraft.relight.normals import raised
 from splatgraft.relight.object_shading import irradiance, shade_ratio, unknown_origin_ratio
-from splatgraft.relight.receivers import Receivers, shade_receivers
+from splatgraft.relight.receivers import RIM, Receivers, shade_receivers
 from splatgraft.relight.scene_shading import (
     Ball,
     SceneRatio,
@@ -152,12 +152,12 @@ def _on_scene(
     stage: Stage, actors: list[_Actor], beams: Beams, *, budget: int, degree: int
 ) -> tuple[Receivers, SceneRatio]:
     """The members that some object reaches, split where needed, and the product of all objects' ratios on them."""
-    points = stage.scene.means[stage.members]
+    points, rims = stage.around.means, RIM * stage.around.scales.max(1).values
     reached = torch.zeros(len(points), dtype=torch.bool)
     for actor in actors:
-        reached |= reachable(points, actor.body.ball, beams, farthest=stage.maps.region.radius)
+        reached |= reachable(points, actor.body.ball, beams, farthest=stage.maps.region.radius, rims=rims)
     receivers = Receivers(
-        gaussians=stage.scene.select(stage.members[reached]).with_sh_degree(degree),
+        gaussians=stage.around.select(reached).with_sh_degree(degree),
         normals=stage.normals.vectors[reached],
         arrives=stage.arrives[reached],
         trust=torch.ones(int(reached.sum())),
