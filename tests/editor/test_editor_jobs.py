@@ -85,14 +85,14 @@ def test_a_killed_job_is_not_taken_for_one_at_work(tmp_path: Path) -> None:
 
 
 def test_the_time_left_goes_on_as_it_has() -> None:
-    state = JobState("work", (), 1, "running", 0.0, done=3, total=9, step_started=100.0)
+    state = JobState("work", (), 1, "running", 0.0, done=3, total=9, begun_at=100.0)
     assert seconds_left(state, 106.0) == 12.0
     assert seconds_left(state, 100.5) is None
     assert seconds_left(JobState("work", (), 1, "running", 0.0), time.time()) is None
 
 
 def test_what_an_earlier_run_did_took_no_time_now() -> None:
-    state = JobState("work", (), 1, "running", 0.0, done=60, total=100, begun=50, step_started=100.0)
+    state = JobState("work", (), 1, "running", 0.0, done=60, total=100, begun=50, begun_at=100.0)
     assert seconds_left(state, 120.0) == 80.0
 
 
@@ -101,11 +101,15 @@ def test_the_time_left_in_all_counts_on_what_was_measured_and_mends_what_was_gue
     state = JobState("work", (), 1, "running", 0.0, step="a", step_started=100.0, plan=plan)
     assert seconds_left_in_all(state, 103.0) == 7.0 + 4.0 + 6.0
     # its own progress is the better witness, and a measured step says nothing about the guesses
-    assert seconds_left_in_all(replace(state, done=1, total=4), 105.0) == 15.0 + 4.0 + 6.0
+    assert seconds_left_in_all(replace(state, done=1, total=4, begun_at=100.0), 105.0) == 15.0 + 4.0 + 6.0
+    # but what it counts may be one of several things
+    assert seconds_left_in_all(replace(state, done=3, total=4, begun_at=100.0), 103.0) == 7.0 + 4.0 + 6.0
     # b takes twice what was guessed: so will c
-    later = replace(state, step="b", step_started=110.0, done=1, total=2, took=(("a", 10.0),))
+    later = replace(state, step="b", step_started=110.0, begun_at=110.0, done=1, total=2, took=(("a", 10.0),))
     assert seconds_left_in_all(later, 114.0) == 4.0 + 12.0
     assert seconds_left_in_all(replace(later, step="c", took=(("a", 10.0), ("b", 8.0)), done=0), 111.0) == 11.0
+    # at the end of what it counts it is not known what else there is
+    assert seconds_left(replace(later, done=2), 114.0) is None
     # nothing is known of the first step, or of the job
     assert seconds_left_in_all(replace(state, plan=plan[1:], step="b"), 103.0) is None
     assert seconds_left_in_all(replace(state, plan=()), 103.0) is None

@@ -59,7 +59,9 @@ class JobState:
     step_started: float = 0.0
     """Seconds since 1970."""
     begun: int = 0
-    """Units of the step that an earlier run had done."""
+    """Units that were done when it began to count: by an earlier run that was killed."""
+    begun_at: float = 0.0
+    """Seconds since 1970: when it began to count; a step that counts several things begins several times."""
     error: str = ""
     """One line where it failed."""
     plan: tuple[PlannedStep, ...] = ()
@@ -79,9 +81,9 @@ class JobState:
 
 
 def seconds_left(state: JobState, now: float) -> float | None:
-    """Until the step at work ends, if it goes on as it has; None where it is too early to tell."""
-    spent, done = now - state.step_started, state.done - state.begun
-    if not state.live or not 0 < done <= state.total - state.begun or spent < 1:
+    """Until what the step counts is done, if it goes on as it has; None at its end and where it is too early to tell."""
+    spent, done = now - state.begun_at, state.done - state.begun
+    if not state.live or not 0 < done < state.total - state.begun or spent < 1:
         return None
     return spent * (state.total - state.done) / done
 
@@ -101,8 +103,9 @@ def seconds_left_in_all(state: JobState, now: float) -> float | None:
     if left is None and not current.is_measured and at == 0:
         return None
     factor = _slowness(state, None if left is None else spent + left)
-    if left is None:
-        left = max(0.0, current.seconds * (1.0 if current.is_measured else factor) - spent)
+    expected = current.seconds * (1.0 if current.is_measured else factor) - spent
+    # what it counts now may be one of several things
+    left = max(left or 0.0, expected if left is None or current.is_measured else 0.0)
     return left + sum(step.seconds * (1.0 if step.is_measured else factor) for step in later)
 
 

@@ -33,16 +33,18 @@ class StateTerminal(Terminal):
     def bar(self, name: str) -> Generator[Progress]:
         """The bar of `Terminal`, told to the state file as well."""
         now = time.time()
-        self.write(replace(self.state, step=name, done=0, total=0, begun=0, message="", step_started=now))
-        first = True
+        self.write(replace(self.state, step=name, done=0, total=0, message="", step_started=now))
+        last: tuple[int, int] | None = None
         with super().bar(name) as progress:
 
             def move(done: int, total: int, message: str) -> None:
-                nonlocal first
+                nonlocal last
                 progress(done, total, message)
-                if first:
-                    # a step that was killed goes on where it was: that part took no time now
-                    first, self.state = False, replace(self.state, begun=done if done > 1 else 0)
+                if last is None or done < last[0] or total != last[1]:
+                    # another thing is counted; one that was killed goes on where it was: that part took no time now
+                    since = now if last is None else time.time()
+                    self.state = replace(self.state, begun=done if done > 1 else 0, begun_at=since)
+                last = (done, total)
                 self.state = replace(self.state, done=done, total=total, message=f"{done}/{total} {message}")
                 if time.time() - self._written > _WRITE_EVERY:
                     self.write(self.state)
