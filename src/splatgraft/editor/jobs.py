@@ -81,7 +81,7 @@ class JobState:
 
 
 def seconds_left(state: JobState, now: float) -> float | None:
-    """Until what the step counts is done, if it goes on as it has; None at its end and where it is too early to tell."""
+    """Until what the step counts is done, if it goes on as it has; None at its end, and where it is too early."""
     spent, done = now - state.begun_at, state.done - state.begun
     if not state.live or not 0 < done < state.total - state.begun or spent < 1:
         return None
