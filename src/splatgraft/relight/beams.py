@@ -22,11 +22,7 @@ def beams_of(light: Light) -> Beams:
     What a source's confidence leaves is given back as even light, so an unsure source casts a weaker shadow.
     """
     directions, irradiance, softness, within = [], [], [], []
-    budget = SOURCE_BEAMS
-    for i, source in enumerate(light.sources[:SOURCE_BEAMS]):
-        later = min(len(light.sources), SOURCE_BEAMS) - i - 1
-        parts = _parts(source, budget - later)
-        budget -= parts
+    for source, parts in zip(light.sources, _parts(light), strict=False):
         rgb = torch.tensor(source.irradiance) * source.confidence / parts
         for direction in _disk(source, parts):
             directions.append(direction)
@@ -49,13 +45,19 @@ def beams_of(light: Light) -> Beams:
 
 def main_count(light: Light) -> int:
     """How many of the first bundles belong to the first source."""
-    if not light.sources:
-        return 0
-    return _parts(light.sources[0], SOURCE_BEAMS - min(len(light.sources), SOURCE_BEAMS) + 1)
+    return _parts(light)[0] if light.sources else 0
 
 
-def _parts(source: LightSource, room: int) -> int:
-    return 1 if source.softness <= _SINGLE else max(1, min(5, room))
+def _parts(light: Light) -> list[int]:
+    """Bundles per source, brightest first: as many for a wide one as are free; half of those where others are wide."""
+    wide = [source.softness > _SINGLE for source in light.sources[:SOURCE_BEAMS]]
+    free = SOURCE_BEAMS - len(wide)
+    parts = []
+    for i, is_wide in enumerate(wide):
+        taken = (free + 1) // 2 if any(wide[i + 1 :]) else free
+        parts.append(1 + taken if is_wide else 1)
+        free -= parts[-1] - 1
+    return parts
 
 
 def source_pairs(beams: Beams) -> tuple[Beams, Int[Tensor, "k"], Int[Tensor, "k"]]:
@@ -88,11 +90,10 @@ def _disk(source: LightSource, parts: int) -> list[torch.Tensor]:
     if parts == 1:
         return [direction]
     right, down, _ = frames_along(direction[None])[0]
-    out = []
-    for j in range(parts):
-        # variances add: of the spiral, radius R sqrt(1 - 1/parts), and of a part, radius R / sqrt(parts)
-        r = math.sqrt((j + 0.5) / parts * (1 - 1 / parts)) * math.sin(source.softness)
-        angle = j * math.pi * (3 - math.sqrt(5))
-        side = r * math.cos(angle) * right + r * math.sin(angle) * down
-        out.append(side + math.sqrt(max(0.0, 1 - r * r)) * direction)
-    return out
+    j = torch.arange(parts)
+    # variances add: of the spiral, radius R sqrt(1 - 1/parts), and of a part, radius R / sqrt(parts)
+    r = ((j + 0.5) / parts * (1 - 1 / parts)).sqrt() * math.sin(source.softness)
+    angle = j * math.pi * (3 - math.sqrt(5))
+    side = (r * angle.cos())[:, None] * right + (r * angle.sin())[:, None] * down
+    side = side - side.mean(0)
+    return list(side + (1 - (side**2).sum(1, keepdim=True)).sqrt() * direction)
