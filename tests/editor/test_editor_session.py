@@ -194,8 +194,8 @@ def test_every_kind_of_picture_is_drawn_or_says_why_not(session: Session) -> Non
         picture = session.preview.picture(kind, state, camera)
         assert picture.shape == (camera.height, camera.width, 3)
         assert picture.std() > 1, kind
-    assert session.preview.is_lit(state)
-    assert not session.preview.is_lit(moved(state))
+    assert session.transfers.is_lit(state)
+    assert not session.transfers.is_lit(moved(state))
     picture, other = (session.preview.picture(kind, state, camera) for kind in ("Copy-paste", "Mask"))
     both = wiped(picture, other, 0.25)
     assert (both[:, :10] == picture[:, :10]).all()
@@ -206,10 +206,10 @@ def test_every_kind_of_picture_is_drawn_or_says_why_not(session: Session) -> Non
 def test_the_preview_of_the_light_is_the_step_s_result(session: Session, light: Light | None) -> None:
     session.change(replace(moved(session.placed_state()), weights=LayerWeights(shadow=0.5), light=light))
     # what comes first must not show in what comes last
-    draft = session.preview.lit_scene(session.state, draft=True)
-    assert not session.preview.is_lit(session.state)
-    relit = session.preview.lit_scene(session.state)
-    assert session.preview.lit_scene(session.state, draft=True) is relit
+    draft = session.transfers.scene(session.state, draft=True)
+    assert not session.transfers.is_lit(session.state)
+    relit = session.transfers.scene(session.state)
+    assert session.transfers.scene(session.state, draft=True) is relit
     assert draft.count <= relit.count
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     written = read_gaussians(session.files.relit)
@@ -243,11 +243,11 @@ def test_the_light_that_is_shown_is_what_the_step_writes(session: Session, light
     assert session.reload()
     assert main(["run", str(file), "--to", "relight"]) == 0
     state = session.placed_state()
-    assert session.preview.is_lit(state)
-    shown, written = session.preview.lit_scene(state), read_gaussians(session.files.relit)
+    assert session.transfers.is_lit(state)
+    shown, written = session.transfers.scene(state), read_gaussians(session.files.relit)
     assert torch.equal(shown.sh, written.sh)
     assert torch.equal(shown.means, written.means)
-    assert light_by in session.preview.light_note()
+    assert light_by in session.transfers.note()
     camera = session.scenes.cameras(session.files.target_cameras)[0]
     with pytest.raises(ValueError, match="physical transfer"):
         session.preview.picture("Shadow layer", state, camera)

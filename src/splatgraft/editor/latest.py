@@ -30,6 +30,11 @@ class Latest(Generic[T]):
         """Whether a newer request waits: long work may stop here."""
         return bool(self._waiting)
 
+    def idle(self, seconds: float) -> bool:
+        """Whether no newer request came for so long: time for work that cannot be stopped."""
+        with self._wake:
+            return not self._wake.wait_for(lambda: bool(self._waiting) or not self._open, timeout=seconds)
+
     def close(self) -> None:
         """Let the present one end, then stop."""
         with self._wake:

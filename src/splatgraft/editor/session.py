@@ -20,6 +20,7 @@ from splatgraft.editor.project_access import Project, ProjectFiles
 from splatgraft.editor.scenes import Scenes
 from splatgraft.editor.state import EditState, as_written, read_state, state_files, write_state
 from splatgraft.editor.state_store import StateStore
+from splatgraft.editor.transfers import Transfers
 from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.gaussians import Gaussians
 from splatgraft.orbit import estimate_up
@@ -44,7 +45,8 @@ class Session:
         self.project = project
         self.files: ProjectFiles = files
         self.scenes = Scenes(files)
-        self.preview = Preview(self.scenes)
+        self.transfers = Transfers(self.scenes)
+        self.preview = Preview(self.scenes, self.transfers)
         self.jobs = Jobs(files.root / EDITOR_FOLDER)
         self.notice: str | None = None
         self._store = StateStore(files.root / EDITOR_FOLDER, home=files.file.parent)

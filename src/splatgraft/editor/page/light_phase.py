@@ -91,22 +91,24 @@ class LightPhase:
         if session.state.light is not None:
             return session.state.light
         state = session.placed_state()
-        return session.preview.relit(state).light if session.preview.is_lit(state) else None
+        return session.transfers.relit(state).light if session.transfers.is_lit(state) else None
 
     def _why_none(self) -> str:
         session = self._page.need()
         if not session.files.transfers_light:
-            return f"The light is no physical transfer: {session.preview.light_note()}. There is nothing to aim."
+            return f"The light is no physical transfer: {session.transfers.note()}. There is nothing to aim."
         if not session.objects():
             return "No object is placed yet: see step 3."
         state = session.placed_state()
         return (
-            " ".join(session.preview.relit(state).report) if session.preview.is_lit(state) else "Looking for the light."
+            " ".join(session.transfers.relit(state).report)
+            if session.transfers.is_lit(state)
+            else "Looking for the light."
         )
 
     def _found(self) -> None:
         session = self._page.need()
-        relit = session.preview.relit(session.placed_state())
+        relit = session.transfers.relit(session.placed_state())
         for sentence in relit.report[:1]:
             self._page.say(sentence)
 

@@ -16,9 +16,10 @@ import viser
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
+from splatgraft.editor.kept import same_inputs
 from splatgraft.editor.latest import Latest
 from splatgraft.editor.page.stage_view import view_of
-from splatgraft.editor.preview import KINDS, NEEDS_LIGHT, Kind, Size, same_inputs, wiped
+from splatgraft.editor.preview import KINDS, NEEDS_LIGHT, Kind, Size, wiped
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState
 from splatgraft.images import write_image
@@ -56,7 +57,7 @@ class PreviewPanel:
         self._size = Size()
         self._drawn: dict[Kind, tuple[tuple[object, ...], np.ndarray]] = {}
         self._moving: EditState | None = None
-        self._draft_took = float("inf")
+        self._draft_took, self._rest_took = float("inf"), 0.0
         self._latest = Latest(self._work, lambda error: self._say(" ".join(str(error).split())))
         self._panel = gui.add_panel()
         with self._panel.add_tab("True picture", viser.Icon.PHOTO):
@@ -177,8 +178,8 @@ class PreviewPanel:
             self._to_camera()
 
     def _work(self, wish: _Wish) -> None:
-        preview = wish.session.preview
-        if not {wish.left, wish.right} & set(NEEDS_LIGHT) or preview.is_lit(wish.state):
+        transfers = wish.session.transfers
+        if not {wish.left, wish.right} & set(NEEDS_LIGHT) or transfers.is_lit(wish.state):
             self._draw(wish, note="")
             return
         if self._draft_took > _AT_ONCE:
@@ -188,14 +189,15 @@ class PreviewPanel:
             if self._latest.overtaken:
                 return
         start = time.monotonic()
-        preview.drafted(wish.state)
+        transfers.drafted(wish.state)
         self._draft_took = time.monotonic() - start
         self._draw(replace(wish, draft=True), note=f"a draft of the light in {self._draft_took:.1f} s")
-        if wish.moving or self._latest.overtaken:
+        if wish.moving or not self._latest.idle(min(1.5, 0.3 * self._rest_took)):
             return
         start = time.monotonic()
-        preview.relit(wish.state)
-        self._draw(wish, note=f"light in {time.monotonic() - start:.1f} s")
+        transfers.relit(wish.state)
+        self._rest_took = time.monotonic() - start
+        self._draw(wish, note=f"light in {self._rest_took:.1f} s")
         self._page.light_found()
 
     def _draw(self, wish: _Wish, *, note: str) -> None:
@@ -207,7 +209,7 @@ class PreviewPanel:
         self._size = replace(self._size, width=self._size.after(spent))
         height, width = left.shape[:2]
         files, shown = wish.session.files, (wish.left, wish.right)
-        notes = [note, wish.session.preview.light_note() if "Light transfer" in shown else ""]
+        notes = [note, wish.session.transfers.note() if "Light transfer" in shown else ""]
         if "Photograph" in shown and files.pictured[1]:
             notes.append("no photograph: a picture made of the scene, which came without any")
         self._say(
