@@ -16,10 +16,10 @@ from torch import Tensor
 from splatgraft.cameras import Cameras
 from splatgraft.gaussians import Gaussians
 from splatgraft.relight.neighbours import nearest_neighbours
-from splatgraft.rendering import render
+from splatgraft.relight.viewers import seen_from, spread_over
 
 NEIGHBOURS = 16
-_VIEWERS, _VIEWER_WIDTH = 8, 128
+_VIEWERS = 8
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,8 @@ def raised(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor,
 def _towards_viewers(gaussians: Gaussians, cameras: Cameras) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
     """Sum of unit vectors to the cameras that see each Gaussian (to all, where none does), and whether any does."""
     total = np.zeros((2, gaussians.count, 3), np.float32)
-    means, widths = gaussians.means.numpy(), gaussians.scales.mean(1).numpy()
-    count = len(cameras)
-    for i in sorted({round(j * (count - 1) / max(_VIEWERS - 1, 1)) for j in range(min(_VIEWERS, count))}):
-        camera = cameras[i].resized(_VIEWER_WIDTH / int(cameras.sizes[i, 0]))
-        seen = render(gaussians, camera, outputs=frozenset({"depth"}))
-        assert seen.depth is not None
-        surface = torch.where(seen.alpha[0] > 0.5, seen.depth[0], torch.inf).numpy()
-        pose, center = camera.camera_from_world[0].numpy(), camera.centers[0].numpy()
-        _look(means, widths, (pose, camera.intrinsics[0].numpy(), center), surface, total)
+    for i in spread_over(cameras, count=_VIEWERS):
+        _look(gaussians.means.numpy(), cameras[i].centers[0].numpy(), seen_from(gaussians, cameras[i]).numpy(), total)
     by_viewers, everyone = torch.from_numpy(total)
     seen_at_all = by_viewers.norm(dim=1) > 0
     return torch.where(seen_at_all[:, None], by_viewers, everyone), seen_at_all
@@ -74,27 +67,15 @@ def _towards_viewers(gaussians: Gaussians, cameras: Cameras) -> tuple[Float[Tens
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def _look(means, widths, camera, surface, total):
-    """Add the unit vector to `camera` where a Gaussian is seen (first plane), and everywhere (second plane)."""
-    pose, intrinsics, center = camera
-    height, width = surface.shape
+def _look(means, center, seen, total):
+    """Add the unit vector to a camera where a Gaussian is seen (first plane), and everywhere (second plane)."""
     for i in prange(len(means)):
         x, y, z = center[0] - means[i, 0], center[1] - means[i, 1], center[2] - means[i, 2]
         length = np.float32(np.sqrt(x * x + y * y + z * z)) + np.float32(1e-12)
-        total[1, i, 0] += x / length
-        total[1, i, 1] += y / length
-        total[1, i, 2] += z / length
-        depth = -(pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z)
-        if depth <= 0:
-            continue
-        u = -(pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z) / depth * intrinsics[0, 0] + intrinsics[0, 2]
-        v = -(pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z) / depth * intrinsics[1, 1] + intrinsics[1, 2]
-        if u < 0 or v < 0 or u >= width or v >= height:
-            continue
-        if depth < surface[int(v), int(u)] + np.float32(0.005) * depth + 2 * widths[i]:
-            total[0, i, 0] += x / length
-            total[0, i, 1] += y / length
-            total[0, i, 2] += z / length
+        for plane in range(0 if seen[i] else 1, 2):
+            total[plane, i, 0] += x / length
+            total[plane, i, 1] += y / length
+            total[plane, i, 2] += z / length
 
 
 @njit(cache=True, inline="always")

@@ -15,6 +15,7 @@ from splatgraft.gaussians import Gaussians, concatenate
 from splatgraft.images import linear_from_srgb
 from splatgraft.orbit import estimate_up
 from splatgraft.relight.estimate_light import light_of
+from splatgraft.relight.highlights import find_highlights
 from splatgraft.relight.light import Light, LightSource
 from splatgraft.relight.normals import estimate_normals
 from splatgraft.relight.panorama import Panorama, cube_cameras, render_panorama
@@ -72,7 +73,9 @@ def _asked(
     found: tuple[Vote | None, float] = (None, radius)
     for wide in (radius, 1.5 * radius):
         part = whole.select((whole.means - center).norm(dim=1) < 1.4 * wide)
-        voted = vote(part, estimate_normals(part, cameras), center=center, radius=wide, up=up)
+        normals = estimate_normals(part, cameras)
+        glints = find_highlights(part, normals, cameras, center=center, radius=0.5 * wide)
+        voted = vote(part, normals, center=center, radius=wide, up=up, highlights=glints)
         if voted is not None and (found[0] is None or voted.confidence > found[0].confidence):
             found = (voted, wide)
         if voted is not None and voted.confidence > _CLEAR:

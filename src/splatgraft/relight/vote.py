@@ -1,7 +1,8 @@
-"""Where a scene's dominant light comes from, told by the shadows that the scene casts on itself.
+"""Where a scene's dominant light comes from, told by the shadows that the scene casts on itself, and by what glints.
 
 For each of some 300 directions the scene is shadow-mapped from there; the direction whose visibility times cosine best
-explains the brightness within groups of one material wins. Knows nothing about panoramas, objects or files.
+explains the brightness within groups of one material, and whose mirror image best explains how colours change from
+view to view, wins. Knows nothing about panoramas, objects or files.
 """
 
 import math
@@ -14,6 +15,7 @@ from torch import Tensor
 from splatgraft.gaussians import Gaussians
 from splatgraft.images import linear_from_srgb
 from splatgraft.relight.directions import even_directions, frames_along
+from splatgraft.relight.highlights import Highlights
 from splatgraft.relight.materials import group_materials
 from splatgraft.relight.normals import Normals
 from splatgraft.relight.visibility import Occluders, Window, occluders_of, splat_depth_maps, visibility
@@ -25,14 +27,18 @@ _RECEIVERS = 4000
 _OCCLUDERS = 16000
 _MAP_SIZE = 128
 # errors in visibility make a least-squares slope too small, the more, the less of the brightness it explains
-_ATTENUATION, _ATTENUATED = 1.2, 0.2
+_ATTENUATION, _ATTENUATED = 2.5, 0.25
+_USUAL, _UNTOLD = 4.0, 0.05  # strength of a light that glints, and share that shadows must explain to count as much
 _HIDDEN = 0.6  # openness below which a point is inside something
+_OF_GLINTS = math.radians(9)
+_DISAGREEMENT = 0.2  # of the angle between the witnesses is doubt
+_SILENT = 0.03
 _STRENGTHS = (0.3, 0.8, 2.0, 4.0, 8.0)
 
 
 @dataclass(frozen=True)
 class Vote:
-    """What the shadows say."""
+    """What shadows and highlights say."""
 
     direction: Float[Tensor, "3"]
     """Unit, towards the light."""
@@ -41,21 +47,27 @@ class Vote:
     strength: Float[Tensor, "3"]
     """Irradiance facing the light over the irradiance of the ambient light that was given, linear rgb."""
     confidence: float
-    """0 where shadows say nothing, 1 where one direction explains them alone."""
+    """0 where neither says anything, 1 where one direction explains all."""
     explained: float
-    """Share of the brightness variance within materials that the light explains."""
+    """Share of the brightness variance within materials that the light explains: shadows alone."""
     directions: Float[Tensor, "d 3"]
     """All that were tried."""
     scores: Float[Tensor, "d"]
-    """`explained` of each."""
+    """Share that each explains, of shadows and highlights together."""
 
 
 def vote(
-    scene: Gaussians, normals: Normals, *, center: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"]
+    scene: Gaussians,
+    normals: Normals,
+    *,
+    center: Float[Tensor, "3"],
+    radius: float,
+    up: Float[Tensor, "3"],
+    highlights: Highlights | None = None,
 ) -> Vote | None:
-    """Ask the shadows within `radius` of `center`; None where there are too few surfaces to ask.
+    """Ask the shadows within `radius` of `center`, and `highlights`; None where there are too few surfaces to ask.
 
-    `strength` is relative to an ambient irradiance of 1 on an open plane.
+    `strength` is relative to an ambient irradiance of 1 on an open plane, and told by shadows alone.
     """
     receivers = _receivers(scene, normals, center, radius)
     if len(receivers) < 200:
@@ -70,35 +82,63 @@ def vote(
     directions = directions[directions @ up > math.sin(_LOWEST)]
     lit = _lit(occluders, points, facing, directions, center=center, radius=radius)
     fit = _Fit.of(brightness, ambient, groups, weight * (ambient > _HIDDEN))
-    scores, _ = fit.explained(lit)
-    best = int(scores.argmax())
+    shadows = fit.explained(lit)[0]
+    glints = torch.zeros(len(directions)) if highlights is None else highlights.explained(directions)
+    best = int(_together(shadows, glints).argmax())
     # finer: a cap of directions around the best
     finer = _cap(directions[best], math.radians(7), 48)
     finer = finer[finer @ up > math.sin(_LOWEST)]
     lit_finer = _lit(occluders, points, facing, finer, center=center, radius=radius)
-    directions, scores = torch.cat([directions, finer]), torch.cat([scores, fit.explained(lit_finer)[0]])
-    lit = torch.cat([lit, lit_finer], 1)
+    apart = _apart(directions, shadows, glints)
+    directions, lit = torch.cat([directions, finer]), torch.cat([lit, lit_finer], 1)
+    shadows = torch.cat([shadows, fit.explained(lit_finer)[0]])
+    glints = torch.zeros(len(directions)) if highlights is None else highlights.explained(directions)
+    scores = _together(shadows, glints)
     top = float(scores.max())
     # the top of the curve is the estimate, its width the doubt
     share = ((scores - 0.85 * top) / max(0.15 * top, 1e-9)).clamp_min(0)
     direction = torch.nn.functional.normalize((share[:, None] * directions).sum(0), dim=0)
     angle = torch.acos((directions @ direction).clamp(-1, 1))
-    uncertainty = float(((share * angle**2).sum() / share.sum().clamp_min(1e-9)).sqrt())
+    width = float(((share * angle**2).sum() / share.sum().clamp_min(1e-9)).sqrt())
     nearest = int((directions @ direction).argmax())
-    typical = float(scores.median())
-    contrast = (top - typical) / max(top, 1e-9)
-    # measured on synthetic scenes: the less the best direction explains, the farther it is from the truth
-    uncertainty = math.hypot(uncertainty, math.radians(3 + 16 * math.exp(-top / 0.15)))
-    confidence = top / (top + 0.08) * min(1.0, 1.6 * contrast)
+    told = float(shadows[nearest])
+    # measured on synthetic scenes: the less the best direction explains of the shadows, the farther it is from the
+    # truth; highlights are 9 degrees off
+    heard = float(glints[nearest]) / (float(glints[nearest]) + 0.1)
+    weight = math.radians(3 + 16 * math.exp(-told / 0.15)) ** -2 + heard / _OF_GLINTS**2
+    contrast = (top - float(scores.median())) / max(top, 1e-9)
     return Vote(
         direction=direction,
-        uncertainty=uncertainty,
-        strength=(1 + _ATTENUATION * math.exp(-top / _ATTENUATED)) * fit.strength(lit[:, nearest]),
-        confidence=confidence,
-        explained=top,
+        uncertainty=math.hypot(width, weight**-0.5, _DISAGREEMENT * apart),
+        strength=_shrunk(fit.strength(lit[:, nearest]), told, heard),
+        confidence=top / (top + 0.08) * min(1.0, 1.6 * contrast),
+        explained=told,
         directions=directions,
         scores=scores,
     )
+
+
+def _together(shadows: Float[Tensor, "d"], glints: Float[Tensor, "d"]) -> Float[Tensor, "d"]:
+    """Share that stays unexplained is a likelihood: those of independent witnesses multiply.
+
+    Highlights count twice: where both speak, over rendered scenes with known light, they were nearer to the truth.
+    """
+    return 1 - (1 - shadows) * (1 - glints) ** 2
+
+
+def _shrunk(measured: Float[Tensor, "3"], told: float, heard: float) -> Float[Tensor, "3"]:
+    """Strength as shadows that explain the share `told` measured it, else as strong as what glints usually is."""
+    believed = told / (told + _UNTOLD * heard + 1e-6)
+    grown = measured * (1 + _ATTENUATION * math.exp(-told / _ATTENUATED))
+    return (believed * grown.log() + (1 - believed) * math.log(_USUAL)).exp()
+
+
+def _apart(directions: Float[Tensor, "d 3"], shadows: Float[Tensor, "d"], glints: Float[Tensor, "d"]) -> float:
+    """Angle between what either witness would say alone, radians; 0 where one is silent."""
+    if float(glints.max()) < _SILENT or float(shadows.max()) < _SILENT:
+        return 0.0
+    cosine = float(directions[shadows.argmax()] @ directions[glints.argmax()])
+    return math.acos(max(-1.0, min(1.0, cosine)))
 
 
 def _receivers(scene: Gaussians, normals: Normals, center: Float[Tensor, "3"], radius: float) -> Int[Tensor, "m"]:
