@@ -13,6 +13,7 @@ from ball_pairs import write_ball_pairs
 from splatgraft.cli import main
 from splatgraft.harmonize.compact.features import composed
 from splatgraft.harmonize.compact.network import CompactNetwork, CompactSize
+from splatgraft.harmonize.compact.weights import read_weights
 from splatgraft.relight.light import Light, LightSource, ambient_of
 from splatgraft.synth.pairs import write_manifest
 from splatgraft.train.compact import priors
@@ -40,7 +41,7 @@ def rendered(tmp_path_factory):
 
 
 def pairs_of(rendered, held_out=NOTHING):
-    return CompactPairs(rendered, rendered / "priors", held_out)
+    return CompactPairs(rendered, [rendered / "priors"], held_out)
 
 
 def silent(*words):
@@ -50,7 +51,7 @@ def silent(*words):
 def test_under_the_true_light_the_prior_removes_most_of_the_error(rendered, tmp_path, monkeypatch):
     monkeypatch.setattr(priors, "wrong", lambda light, rng: light)
     priors.write_priors([rendered / "ball_0"], tmp_path / "priors", seed=0)
-    pairs = CompactPairs(rendered, tmp_path / "priors", NOTHING)
+    pairs = CompactPairs(rendered, [tmp_path / "priors"], NOTHING)
     assert len(pairs.entries) == 4
     for index in range(4):
         view, truth = pairs.read(index)
@@ -149,14 +150,24 @@ def test_the_command_makes_weights_that_the_harmoniser_loads(rendered, tmp_path,
     words = ["train", "compact", str(tmp_path), "--pairs", str(rendered), "--device", "cpu", "--steps", "2"]
     words += ["--batch", "2", "--size", "32", "48", "--validation-pairs", "1", "--widths", "8", "8", "16", "16"]
     assert main([*words, "--blocks", "1", "1", "1", "1", "--heads", "2"]) == 0
-    assert (tmp_path / "compact.safetensors").is_file()
+    weights = tmp_path / "compact.safetensors"
+    assert weights.is_file()
+    before = (tmp_path / "priors" / "0" / "ball_0.npz").stat().st_mtime_ns
+    words[2], again = str(tmp_path / "again"), ["--start", str(weights), "--variants", "1"]
+    assert main([*words[:-5], *again]) == 0
+    assert (tmp_path / "priors" / "0" / "ball_0.npz").stat().st_mtime_ns == before
+    one, other = (read_weights(path) for path in (weights, tmp_path / "again" / "compact.safetensors"))
+    assert one.size == other.size
+    # two steps at the end of a schedule from where the first ended: near it, and not it
+    apart = [(a - b).abs().max() for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True)]
+    assert 0 < max(apart) < 0.01
     assert "4 pairs to learn from, 4 held out" in capsys.readouterr().err
 
 
 def test_the_shipped_pairs_are_read_with_their_light(tmp_path):
     shipped = Path(__file__).parents[2] / "data" / "pairs"
     priors.write_priors([shipped / "kitchen_0001_00001"], tmp_path, seed=0)
-    pairs = CompactPairs(shipped, tmp_path, NOTHING)
+    pairs = CompactPairs(shipped, [tmp_path], NOTHING)
     assert len(pairs.training) == 10
     view, truth = pairs.read(0)
     # wherever the object is not and casts nothing, background and truth are one render but for its noise

@@ -1,7 +1,7 @@
 """The command `train compact`: rendered pairs become the small harmoniser that is shipped."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatgraft.steps.step import Device, Positional, choose_device
@@ -22,29 +22,38 @@ class TrainCompact:
     """Folder that `splatgraft synth pairs` rendered."""
     loop: CompactLoop = field(default_factory=CompactLoop)
     held_out: HeldOut = field(default_factory=HeldOut)
+    variants: int = 1
+    """Wrong lights per pair; each more adds 0.25 MB a pair at 240x160."""
+    start: Path | None = None
+    """Weights to begin from, a compact.safetensors: to go on with other pairs, or with your own."""
     device: Device = "auto"
 
     def execute(self, terminal: Terminal) -> int:
         """Make the priors that are missing, train, write the weights."""
         from splatgraft.harmonize.compact.registered import SHIPPED
-        from splatgraft.harmonize.compact.weights import write_weights
+        from splatgraft.harmonize.compact.weights import read_weights, write_weights
 
         device = choose_device(self.device, terminal)
         samples = read_manifest(self.pairs)
         folders = sorted({sample.folder for sample in samples})
         self.out.mkdir(parents=True, exist_ok=True)
-        with terminal.bar("light") as progress:
-            write_priors(folders, self.out / "priors", seed=self.loop.seed, progress=progress)
+        begin = None if self.start is None else read_weights(self.start)
+        loop = self.loop if begin is None else replace(self.loop, network=begin.size)
+        priors = [self.out / "priors" / str(variant) for variant in range(self.variants)]
+        for variant, folder in enumerate(priors):
+            with terminal.bar(f"light {variant + 1}") as progress:
+                write_priors(folders, folder, seed=loop.seed + variant, progress=progress)
         with terminal.bar("read") as progress:
-            pairs = CompactPairs(self.pairs, self.out / "priors", self.held_out, progress)
+            pairs = CompactPairs(self.pairs, priors, self.held_out, progress)
         terminal.say(f"{len(pairs.training)} pairs to learn from, {len(pairs.validation)} held out")
         with terminal.bar("train") as progress:
-            run = CompactTraining(pairs, self.loop, self.out, device, terminal.say, progress)
+            run = CompactTraining(pairs, loop, self.out, device, terminal.say, progress)
+            run = run if begin is None else replace(run, begin=begin.state_dict())
             size, state = train_compact(run)
         notes = {
             "pairs": json.dumps({"folders": [folder.name for folder in folders], **pairs.fingerprint()}),
-            "steps": str(self.loop.steps),
-            "seed": str(self.loop.seed),
+            "steps": str(loop.steps),
+            "seed": str(loop.seed),
         }
         write_weights(self.out / SHIPPED.name, size, state, notes)
         terminal.say(f"{self.out / SHIPPED.name}")

@@ -5,6 +5,7 @@ What a step is given follows from the seed and the step alone. A state holds wei
 
 import json
 import math
+import random
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
@@ -64,6 +65,8 @@ class CompactTraining:
     device: torch.device
     say: Callable[[str], None]
     progress: Progress
+    begin: dict[str, Tensor] | None = None
+    """Weights to begin from; random ones where not given."""
 
 
 def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]:
@@ -76,6 +79,8 @@ def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]
         torch.set_num_threads(loop.threads)
     torch.manual_seed(loop.seed)
     network = CompactNetwork(loop.network).to(run.device)
+    if run.begin is not None:
+        network.load_state_dict(run.begin)
     decayed = [p for p in network.parameters() if p.ndim > 1]
     others = [p for p in network.parameters() if p.ndim <= 1]
     groups = [{"params": decayed, "weight_decay": loop.decay}, {"params": others, "weight_decay": 0.0}]
@@ -124,8 +129,10 @@ def _one_step(run: CompactTraining, network: CompactNetwork, step: int) -> Tenso
     for position in range(step * loop.batch, (step + 1) * loop.batch):
         turn, place = divmod(position, len(pairs.training))
         order = torch.randperm(len(pairs.training), generator=torch.Generator().manual_seed(loop.seed * 7919 + turn))
-        view, truth = pairs.read(pairs.training[int(order[place])])
-        view, truth = augmented(view, truth, loop.size, f"compact-{loop.seed}-{position}")
+        name = f"compact-{loop.seed}-{position}"
+        variant = random.Random(name).randrange(pairs.variants)
+        view, truth = pairs.read(pairs.training[int(order[place])], variant)
+        view, truth = augmented(view, truth, loop.size, name)
         views.append(view)
         truths.append(truth)
     view, truth = batched(views).to(run.device), torch.cat(truths).to(run.device)
@@ -143,7 +150,7 @@ def validated(run: CompactTraining, network: CompactNetwork) -> tuple[dict[str, 
     totals: dict[str, float] = {}
     rows = []
     for number, index in enumerate(chosen):
-        view, truth = pairs.read(index)
+        view, truth = pairs.read(index, number % pairs.variants)
         view, truth = augmented(view, truth, loop.size, f"validation-{number}")
         view, truth = view.to(run.device), truth.to(run.device)
         answer = network(view.channels())
@@ -163,7 +170,8 @@ def _fingerprint(run: CompactTraining) -> dict[str, Any]:
     own = asdict(run.loop)
     for name in ("save_every", "validate_every", "validation_pairs", "threads"):
         own.pop(name)
-    return json.loads(json.dumps(own | {"pairs": run.pairs.fingerprint()}))
+    begin = 0.0 if run.begin is None else sum(float(tensor.double().abs().sum()) for tensor in run.begin.values())
+    return json.loads(json.dumps(own | {"pairs": run.pairs.fingerprint(), "begin": begin}))
 
 
 def _save(run: CompactTraining, network: CompactNetwork, optimizer: Any, average: Average, step: int) -> None:

@@ -42,34 +42,38 @@ class Entry:
 
 
 class CompactPairs:
-    """All pairs of a folder that have a prior, decoded once."""
+    """All pairs of a folder that have priors, decoded once."""
 
-    def __init__(self, pairs: Path, priors: Path, held_out: HeldOut, progress: Progress = silent) -> None:
-        """Read them all; some 0.6 MB each at 240x160.
+    def __init__(self, pairs: Path, priors: Sequence[Path], held_out: HeldOut, progress: Progress = silent) -> None:
+        """Read them all, with the priors of every folder in `priors`; some 0.6 MB each at 240x160.
 
         Raises: ValueError where the manifest or a picture is missing or broken, or no pair has a prior.
         """
         self._arrays: dict[tuple[str, str, int], np.ndarray] = {}
-        self._trust: dict[tuple[str, str, str], float] = {}
+        self._trust: dict[tuple[str, str], float] = {}
+        self.variants = len(priors)
         self.entries: list[Entry] = []
         samples = read_manifest(pairs)
         folders = sorted({sample.folder for sample in samples})
         for number, folder in enumerate(folders):
-            path = priors / f"{folder.name}.npz"
-            if path.is_file():
-                self._read_folder(folder, path, [s for s in samples if s.folder == folder], held_out)
+            paths = [found / f"{folder.name}.npz" for found in priors]
+            if all(path.is_file() for path in paths):
+                own = [sample for sample in samples if sample.folder == folder]
+                for variant, path in enumerate(paths):
+                    self._read_priors(path, own, variant)
+                self._read_folder(folder, own, held_out)
             progress(number + 1, len(folders), folder.name)
         if not self.entries:
-            raise ValueError(f"{priors}: expected priors of the pairs in {pairs}, found none")
+            raise ValueError(f"{', '.join(map(str, priors))}: expected priors of the pairs in {pairs}, found none")
         self.training = [i for i, entry in enumerate(self.entries) if not entry.held_out]
         self.validation = [i for i, entry in enumerate(self.entries) if entry.held_out]
 
     def fingerprint(self) -> dict[str, int]:
         """What must be the same for a training to be gone on with."""
-        return {"training": len(self.training), "validation": len(self.validation)}
+        return {"training": len(self.training), "validation": len(self.validation), "variants": self.variants}
 
-    def read(self, index: int) -> tuple[View, Float[Tensor, "1 3 h w"]]:
-        """A pair at full size, composite not normalised, and its truth in linear light."""
+    def read(self, index: int, variant: int = 0) -> tuple[View, Float[Tensor, "1 3 h w"]]:
+        """A pair at full size with one of its priors, composite not normalised, and its truth in linear light."""
         entry = self.entries[index]
 
         def array(take: str) -> Tensor:
@@ -86,29 +90,35 @@ class CompactPairs:
             composite=_first(composite),
             background=_first(background),
             mask=covered[..., 0][None, None],
-            log_ratio=_first(array(f"{entry.object}_{entry.light} prior").float()),
+            log_ratio=_first(array(f"{entry.object}_{entry.light} {variant}").float()),
             depth=relative_depth(depth, mask)[None, None],
             normal=_first(array(f"{entry.object} normal").float() / 127),
-            trust=torch.tensor([self._trust[entry.folder, entry.object, entry.light]]),
+            trust=torch.tensor([self._trust[entry.folder, f"{entry.object}_{entry.light} {variant}"]]),
         )
         return view, _first(target)
 
-    def _read_folder(self, folder: Path, prior: Path, samples: Sequence[PairSample], held_out: HeldOut) -> None:
+    def _read_priors(self, path: Path, samples: Sequence[PairSample], variant: int) -> None:
+        with np.load(path, allow_pickle=False) as arrays:
+            found = {name: arrays[name] for name in arrays.files}
+        for sample in samples:
+            take = f"{sample.object}_{sample.light}"
+            if take not in found:
+                raise ValueError(f"{path}: expected a prior of {take}, found none; remove the file to remake it")
+            key = f"{take} {variant}"
+            self._arrays[sample.folder.name, key, sample.camera] = found[take][sample.camera]
+            self._trust[sample.folder.name, key] = float(found[f"{take}_trust"])
+
+    def _read_folder(self, folder: Path, samples: Sequence[PairSample], held_out: HeldOut) -> None:
         job = json.loads((folder / "job.json").read_text())
         count = len(job["cameras"])
         cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(count)))
         worlds = {take["name"]: take["world"].get("path", "") for take in job["takes"] if take.get("world")}
-        with np.load(prior, allow_pickle=False) as arrays:
-            for sample in samples:
-                take, i = f"{sample.object}_{sample.light}", sample.camera
-                if take not in arrays:
-                    raise ValueError(f"{prior}: expected a prior of {take}, found none; remove the file to remake it")
-                self._arrays[folder.name, f"{take} prior", i] = arrays[take][i]
-                self._trust[folder.name, sample.object, sample.light] = float(arrays[f"{take}_trust"])
-                patterns = {part["material"]["pattern"] for part in job["objects"][sample.object]}
-                kept_back = bool(patterns & set(held_out.materials)) or worlds[take] in held_out.lights
-                self.entries.append(Entry(folder.name, sample.object, sample.light, i, kept_back))
-                self._read_pictures(sample, cameras.camera_from_world[i, :3, :3].numpy())
+        for sample in samples:
+            patterns = {part["material"]["pattern"] for part in job["objects"][sample.object]}
+            light = worlds[f"{sample.object}_{sample.light}"]
+            kept_back = bool(patterns & set(held_out.materials)) or light in held_out.lights
+            self.entries.append(Entry(folder.name, sample.object, sample.light, sample.camera, kept_back))
+            self._read_pictures(sample, cameras.camera_from_world[sample.camera, :3, :3].numpy())
 
     def _read_pictures(self, sample: PairSample, camera_from_world: np.ndarray) -> None:
         name, i = sample.folder.name, sample.camera
