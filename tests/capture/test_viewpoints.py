@@ -80,6 +80,27 @@ def test_a_wall_is_not_looked_at_from_behind() -> None:
     assert any("as given" in sentence for sentence in found.report)
 
 
+def room() -> Gaussians:
+    """Four walls, a floor and a ceiling."""
+    a, b = torch.meshgrid(torch.linspace(-1, 1, 24), torch.linspace(-1, 1, 24), indexing="ij")
+    sides = [torch.stack([a, b, torch.full_like(a, c)], -1).reshape(-1, 3) for c in (-1.0, 1.0)]
+    faces = torch.cat([side.roll(turn, 1) for side in sides for turn in range(3)])
+    return blobs(faces, 0.08)
+
+
+def test_a_room_is_looked_at_from_within_where_one_says_so_and_is_told_to_be_hollow() -> None:
+    around = find_viewpoints(room(), LookOptions(views=8, up=(0.0, 0.0, 1.0)))
+    assert any("look = within" in sentence for sentence in around.report)
+    within = find_viewpoints(room(), LookOptions(views=8, up=(0.0, 0.0, 1.0), look="within"))
+    assert len(within.cameras) == 8
+    assert float(within.cameras.centers.abs().max()) < 0.9
+    # in all directions, on the whole slightly down
+    forward = within.cameras.world_from_camera[:, :3, 2]
+    assert float(forward[:, :2].mean(0).norm()) < 0.05
+    assert float(forward[:, 2].mean()) < 0
+    assert not any("hollow" in s for s in find_viewpoints(blobs(table()), LookOptions(views=8)).report)
+
+
 def test_a_scene_that_shows_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 20 solid"):
         find_viewpoints(blobs(table()[:10]), LookOptions())

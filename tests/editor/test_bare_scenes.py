@@ -77,15 +77,21 @@ def test_a_box_alone_cuts_and_the_whole_file_may_be_the_object(tmp_path: Path) -
 def test_up_can_be_put_right_and_that_is_no_step(tmp_path: Path) -> None:
     project = bare_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, mask_source="box")
     session = Session(StepsProject(project))
-    session.set_up("target", (0.0, 0.0, -1.0))
+    session.set_view("target", up=(0.0, 0.0, -1.0), look=None)
     assert not session.reload()
     assert not session.undo()
     assert main(["run", str(project), "--to", "reconstruct"]) == 0
     cameras = read_cameras(project.parent / "target" / "capture")
     assert torch.allclose(estimate_up(cameras), torch.tensor([0.0, 0.0, -1.0]), atol=0.02)  # two rings of eight cameras
     assert bool((cameras.centers[:, 2] < 0).all())
-    session.set_up("target", None)
-    assert "up" not in read_toml(project)["target"]
+    session.set_view("target", up=None, look="within")
+    assert read_toml(project)["target"] == {
+        "scene": "../target.ply",
+        "views": 8,
+        "picture_width": 160,
+        "look": "within",
+    }
+    assert main(["run", str(project), "--to", "target/reconstruct"]) == 0
 
 
 def test_what_is_named_wrongly_is_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

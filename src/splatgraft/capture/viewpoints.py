@@ -6,22 +6,20 @@ Knows nothing about files, and nothing of how the scene was made.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.cameras import Cameras, look_at, pinhole
+from splatgraft.cameras import Cameras, pinhole
+from splatgraft.capture.stands import HALF_FOV, LEAST_VIEWS, best_poses, stands_around, stands_within
 from splatgraft.gaussians import Gaussians
 from splatgraft.progress import Progress, silent
 from splatgraft.rendering import render
 
-_HALF_FOV = math.radians(30)
-"""Of the width."""
-_ELEVATIONS_DEG = (20.0, 42.0)
-_DISTANCES = (2.4, 1.7, 3.4, 1.2)
-"""Over the radius of the dense part, the best first: at 2.4 it fills the picture."""
-_LEAST_VIEWS = 8
+_HOLLOW = 0.08
+"""Of the points within half the radius of the dense part: a filled ball has 0.06 there, a table with things more."""
 _POINTS = 20_000
 _TRIALS = 1000
 _ALIGNED = math.cos(math.radians(25))
@@ -32,7 +30,9 @@ class LookOptions:
     """How a scene without photographs is looked at."""
 
     views: int = 36
-    """Of a trained scene: how many pictures are made of it, from all around; fewer where things stand in the way."""
+    """Of a trained scene: how many pictures are made of it; fewer where things stand in the way."""
+    look: Literal["around", "within"] = "around"
+    """Of a trained scene: at its dense part from all around, or out of its middle, as of a room seen from within."""
     picture_width: int = 640
     """Of these pictures, pixels; their height is three quarters of it."""
     up: tuple[float, float, float] | None = None
@@ -40,8 +40,8 @@ class LookOptions:
 
     def __post_init__(self) -> None:
         """Raises: ValueError where there would be too few views, or up has no length."""
-        if self.views < _LEAST_VIEWS:
-            raise ValueError(f"--views: expected at least {_LEAST_VIEWS}, found {self.views}")
+        if self.views < LEAST_VIEWS:
+            raise ValueError(f"--views: expected at least {LEAST_VIEWS}, found {self.views}")
         if self.picture_width < 16:
             raise ValueError(f"--picture-width: expected at least 16, found {self.picture_width}")
         if self.up is not None and not math.hypot(*self.up) > 0:
@@ -53,7 +53,7 @@ class Viewpoints:
     """Places from which a scene can be looked at."""
 
     cameras: Cameras
-    """Around the dense part, looking at its middle."""
+    """Around the dense part, looking at its middle; or in it, looking out."""
     points: Float[Tensor, "m 3"]
     """Centres of solid Gaussians: what structure from motion would have found."""
     point_colors: Float[Tensor, "m 3"]
@@ -63,7 +63,7 @@ class Viewpoints:
 
 
 def find_viewpoints(scene: Gaussians, options: LookOptions, *, progress: Progress = silent) -> Viewpoints:
-    """Rings of cameras around the scene's dense part, those left out that see only what stands in the way.
+    """Rings of cameras around the scene's dense part or in it, those left out that see only what stands in the way.
 
     Raises: ValueError where the scene has too few solid Gaussians to tell what it shows.
     """
@@ -73,16 +73,20 @@ def find_viewpoints(scene: Gaussians, options: LookOptions, *, progress: Progres
         up, reason = find_up(solid.means, centre, radius)
     else:
         up, reason = torch.nn.functional.normalize(torch.tensor(options.up), dim=0), "as given"
-    poses, dropped = _seeing(scene, centre, radius, up=up, views=options.views, progress=progress)
+    stands = stands_around if options.look == "around" else stands_within
+    poses, dropped = best_poses(scene, stands(centre, radius, up=up, views=options.views), up=up, progress=progress)
     width = options.picture_width
-    focal = 0.5 * width / math.tan(_HALF_FOV)
+    focal = 0.5 * width / math.tan(HALF_FOV)
     cameras = pinhole(poses, focal, width=width, height=width * 3 // 4, prefix="look")
     report = [
-        f"a scene without photographs: {len(cameras)} pictures are made of it, from around {_shown(centre)}",
+        f"a scene without photographs: {len(cameras)} pictures are made of it, from {options.look} {_shown(centre)}",
         f"up is taken to be {_shown(up)}: {reason}",
     ]
     if dropped:
         report.append(f"{dropped} of {options.views} views were left out: something stands in their way")
+    inner = float(((solid.means - centre).norm(dim=1) < 0.5 * radius).float().mean())
+    if options.look == "around" and inner < _HOLLOW:
+        report.append("it is hollow: where it was seen from within, as a room from its middle, say look = within")
     return Viewpoints(cameras, solid.means, (0.5 + 0.28209479 * solid.sh[:, 0]).clamp(0, 1), tuple(report))
 
 
@@ -149,60 +153,6 @@ def _solid(scene: Gaussians) -> Gaussians:
     if len(which) < 20:
         raise ValueError(f"scene: expected at least 20 solid Gaussians, found {len(which)} of {scene.count}")
     return scene.select(which[:: math.ceil(len(which) / _POINTS)])
-
-
-def _seeing(
-    scene: Gaussians,
-    centre: Float[Tensor, "3"],
-    radius: float,
-    *,
-    up: Float[Tensor, "3"],
-    views: int,
-    progress: Progress,
-) -> tuple[Float[Tensor, "v 4 4"], int]:
-    """Along every direction the best distance from which the middle is in view; and how many directions have none."""
-    directions = _directions(views, up)
-    chosen: list[Tensor] = []
-    poor: list[tuple[float, Tensor]] = []
-    for index, direction in enumerate(directions):
-        offsets = [k * radius * direction for k in _DISTANCES]
-        tried = [_tried(scene, centre, offset=offset, radius=radius, up=up) for offset in offsets]
-        good = [pose for pose, blocked in tried if blocked < 0.1]
-        if good:
-            chosen.append(good[0])
-        else:
-            poor.append(min(((blocked, pose) for pose, blocked in tried), key=lambda pair: pair[0]))
-        progress(index + 1, views, "places to look from")
-    missing = max(0, _LEAST_VIEWS - len(chosen))
-    chosen += [pose for _, pose in sorted(poor, key=lambda pair: pair[0])[:missing]]
-    return torch.stack(chosen), len(poor)
-
-
-def _tried(
-    scene: Gaussians, centre: Float[Tensor, "3"], *, offset: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"]
-) -> tuple[Float[Tensor, "4 4"], float]:
-    """A pose, and the share of its picture in which something stands in the way of the dense part."""
-    pose, distance = look_at((centre + offset)[None], centre, up), float(offset.norm())
-    small = pinhole(pose, 24 / math.tan(_HALF_FOV), width=48, height=36)
-    seen = render(scene, small, outputs=frozenset({"depth"}))
-    assert seen.depth is not None
-    depth, alpha = seen.depth[0], seen.alpha[0]
-    close = float((alpha * (depth < 0.35 * distance)).mean())
-    # a wall before the dense part: in the middle of the picture nothing of that part is nearer
-    hidden = float((alpha * (depth < distance - 1.1 * radius))[12:24, 16:32].mean())
-    return pose[0], max(close, 0.3 * hidden)
-
-
-def _directions(views: int, up: Float[Tensor, "3"]) -> Float[Tensor, "v 3"]:
-    """Unit directions from the centre to the cameras: rings at several elevations, turned against one another."""
-    side = torch.eye(3)[int(up.abs().argmin())]
-    x = torch.nn.functional.normalize(torch.linalg.cross(side, up), dim=0)
-    y = torch.linalg.cross(up, x)
-    index = torch.arange(views)
-    azimuth = 2 * math.pi * index / views
-    elevation = torch.deg2rad(torch.tensor(_ELEVATIONS_DEG))[index % len(_ELEVATIONS_DEG)]
-    flat = azimuth.cos()[:, None] * x + azimuth.sin()[:, None] * y
-    return elevation.cos()[:, None] * flat + elevation.sin()[:, None] * up
 
 
 def _shown(vector: Float[Tensor, "3"]) -> str:

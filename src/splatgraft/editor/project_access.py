@@ -91,8 +91,8 @@ class Project(Protocol):
         """
         ...
 
-    def set_up(self, side: Side, up: Triple | None) -> None:
-        """Say what is up in a scene without photographs; None: it is found."""
+    def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
+        """Say how a scene without photographs is looked at; None: its up is found, it is looked at from around."""
         ...
 
     def run_command(self, to: str, title: str) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -16,7 +16,7 @@ from splatgraft.editor.history import History
 from splatgraft.editor.jobs import Jobs, JobState
 from splatgraft.editor.placing import Placeable
 from splatgraft.editor.preview import Preview
-from splatgraft.editor.project_access import Project, ProjectFiles
+from splatgraft.editor.project_access import Project, ProjectFiles, Triple
 from splatgraft.editor.scenes import Scenes
 from splatgraft.editor.state import EditState, as_written, read_state, state_files, write_state
 from splatgraft.editor.state_store import StateStore
@@ -156,15 +156,15 @@ class Session:
         paths = [path for path in state_files(self.files.file) if path.is_file()]
         return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in paths}
 
-    def set_up(self, side: Side, up: tuple[float, float, float] | None) -> None:
-        """Say what is up in a scene without photographs: it shapes the pictures, and is no step to be undone.
+    def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
+        """Say how a scene without photographs is looked at: it shapes the pictures, and is no step to be undone.
 
         Raises: ValueError as `change`.
         """
         with self._lock:
             if self.reload():
                 raise ValueError(f"{self.files.file.name}: changed outside the editor; please do it again")
-            self.project.set_up(side, up)
+            self.project.set_view(side, up=up, look=look)
             self._stamps = self._read_stamps()
             self._refresh_files()
 

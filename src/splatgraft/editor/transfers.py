@@ -4,7 +4,7 @@ Knows nothing about pictures and browsers.
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -137,7 +137,12 @@ class Transfers:
         return carried_over(relit, composite, [target, *objects])
 
     def _transferred(
-        self, composite: Composite, sources: list[SourceScene | None], *, light: Light | None, is_draft: bool = False
+        self,
+        composite: Composite,
+        sources: Sequence[SourceScene | None],
+        *,
+        light: Light | None,
+        is_draft: bool = False,
     ) -> Relit:
         cameras, options = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.files.relighting
         options = replace(options, most_added=0.0) if is_draft else options

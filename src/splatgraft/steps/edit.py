@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatgraft.editor.gate import LOOPBACK, Gate
-from splatgraft.editor.project_access import ProjectFiles
+from splatgraft.editor.project_access import ProjectFiles, Triple
 from splatgraft.editor.session import EDITOR_FOLDER
 from splatgraft.editor.toml_edit import with_keys
 from splatgraft.editor.uploads import LIMIT_BYTES
@@ -108,9 +108,9 @@ class StepsProject:
         with whole_file(self.file) as stream:
             stream.write(text.encode())
 
-    def set_up(self, side: Side, up: tuple[float, float, float] | None) -> None:
-        """Say what is up in a scene without photographs."""
-        text = with_keys(self.file.read_text(encoding="utf-8"), side, {"up": up})
+    def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
+        """Say how a scene without photographs is looked at."""
+        text = with_keys(self.file.read_text(encoding="utf-8"), side, {"up": up, "look": look})
         with whole_file(self.file) as stream:
             stream.write(text.encode())
 

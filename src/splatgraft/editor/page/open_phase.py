@@ -31,6 +31,7 @@ _UPS: dict[str, Triple | None] = {
     "+x": (1.0, 0.0, 0.0),
     "-x": (-1.0, 0.0, 0.0),
 }
+_LOOKS: dict[str, str | None] = {"from around": None, "from within": "within"}
 
 
 class OpenPhase:
@@ -54,12 +55,14 @@ class OpenPhase:
             self._upload = gui.add_upload_button("Upload a video or a scene", icon=viser.Icon.UPLOAD, color="gray")
         self._start = gui.add_button("Start the project", icon=viser.Icon.PLUS)
         self._facts = gui.add_html("")
+        self._looks = {side: gui.add_dropdown(f"Seen: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}
         self._ups = {side: gui.add_dropdown(f"Up: {side}", tuple(_UPS), visible=False) for side, _ in _SIDES}
         self._build = gui.add_button("Reconstruct both scenes", icon=viser.Icon.PLAYER_PLAY)
         self._start.on_click(page.act(lambda _: self._create()))
         self._upload.on_upload(page.act(self._uploaded))
         for side, _ in _SIDES:
-            self._ups[side].on_update(page.act(partial(self._set_up, side)))
+            for control in (self._looks[side], self._ups[side]):
+                control.on_update(page.act(partial(self._set_view, side)))
         self._build.on_click(page.act(lambda _: page.run("reconstruct", "Reconstruct both scenes")))
 
     def enter(self) -> None:
@@ -79,7 +82,8 @@ class OpenPhase:
             control.visible = session is None
         self._facts.visible = self._build.visible = session is not None
         for index, (side, _) in enumerate(_SIDES):
-            self._ups[side].visible = session is not None and session.files.pictured[index]
+            pictured = session is not None and session.files.pictured[index]
+            self._looks[side].visible = self._ups[side].visible = pictured
         if session is None:
             return
         lines = [self._line(session, index) for index in range(len(_SIDES))]
@@ -109,9 +113,9 @@ class OpenPhase:
     def _title(self, session: Session) -> str:
         return "Take over both scenes" if all(session.files.pictured) else "Reconstruct both scenes"
 
-    def _set_up(self, side: Side, _: viser.GuiEvent) -> None:
+    def _set_view(self, side: Side, _: viser.GuiEvent) -> None:
         session = self._page.need()
-        session.set_up(side, _UPS[self._ups[side].value])
+        session.set_view(side, up=_UPS[self._ups[side].value], look=_LOOKS[self._looks[side].value])
         self._page.run("reconstruct", "Look at the scene again")
 
     def _create(self) -> None:
