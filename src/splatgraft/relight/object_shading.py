@@ -33,12 +33,12 @@ def shade_ratio(
 
     Floored, clamped around the object's mean, and drawn towards that mean where the normal is unsure. The mean is drawn
     towards 1 the less of both lights was `seen`, in [0, 1], and its tint more so: both captures were exposed and white
-    balanced for their own light. The powers, 1 and 3, are near least squares over rendered scenes with known light.
+    balanced for their own light. The powers, 1/2 and 3, are near least squares over rendered scenes with known light.
     """
     log_ratio = (_floored(target, opacities) / _floored(source, opacities)).log()
     middle = _mean(log_ratio, opacities)
     gray = middle.mean()
-    return _safe(log_ratio - middle + seen * gray + seen**3 * (middle - gray), normals, opacities)
+    return _safe(log_ratio - middle + seen**0.5 * gray + seen**3 * (middle - gray), normals, opacities)
 
 
 def unknown_origin_ratio(

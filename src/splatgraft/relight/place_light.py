@@ -34,6 +34,8 @@ _ALBEDO = 0.4  # of a mean surface, linear
 _UNSEEN = 0.25
 _LEVEL = math.log(9)
 _GLARE_DEG = 12.0
+_WINDOW = 3.0  # facing it, over the ambient light
+_UNTOLD = 0.05  # share that shadows must explain to count as much as what is usual
 
 
 def light_at(
@@ -59,7 +61,8 @@ def unlevelled_light_at(
     orbit = float((cameras.centers - ball.center).norm(dim=1).median())
     radius = max(3 * ball.radius, min(orbit, 8 * ball.radius))
     voted, radius = _asked(whole, cameras, ball.center, radius, up)
-    light = combine(panorama, voted, up, asked_within=radius)
+    reflected = _told_by_surfaces(scene, ball, cameras)
+    light = combine(panorama, voted, up, asked_within=radius, reflected=reflected)
     return _through_windows(light, scene, ball), None
 
 
@@ -90,22 +93,28 @@ def levelled(light: Light, scene: Gaussians, ball: Ball, cameras: Cameras) -> Li
     The surfaces around the place reflect that light; under the albedo of a mean surface they tell it as well. They
     count as much as the panorama where `_UNSEEN` of it is missing, and nothing where it is whole.
     """
-    up = estimate_up(cameras)
-    near = (scene.means - ball.center).norm(dim=1) < _AROUND * ball.radius
-    part = scene.select(near & (scene.opacities > 0.3))
-    if part.count < 50:
+    told = _told_by_surfaces(scene, ball, cameras)
+    if told is None:
         return light
-    upward = estimate_normals(part, cameras).vectors @ up > 0.7
-    area = part.opacities * part.scales.sort(1).values[:, 1:].prod(1) * upward
-    if int(upward.sum()) < 30:
-        return light
-    reflected = linear_from_srgb(rgb_from_dc(part.sh[:, 0]).clamp(0.002, 1)).mean(1)
-    told = math.pi * float((area * reflected).sum() / area.sum()) / _ALBEDO
-    seen = float(light.irradiance(up[None]).mean())
+    seen = float(light.irradiance(estimate_up(cameras)[None]).mean())
     share = 0.5 * min(1.0, (1 - light.coverage) / _UNSEEN)
     factor = math.exp(share * max(-_LEVEL, min(_LEVEL, math.log(told / max(seen, 1e-9)))))
     sources = [replace(s, irradiance=tuple(factor * v for v in s.irradiance)) for s in light.sources]
     return replace(light, sources=tuple(sources), ambient=factor * light.ambient)
+
+
+def _told_by_surfaces(scene: Gaussians, ball: Ball, cameras: Cameras) -> float | None:
+    """Irradiance under which a mean surface looks as those that face up around the place; None without any."""
+    near = (scene.means - ball.center).norm(dim=1) < _AROUND * ball.radius
+    part = scene.select(near & (scene.opacities > 0.3))
+    if part.count < 50:
+        return None
+    upward = estimate_normals(part, cameras).vectors @ estimate_up(cameras) > 0.7
+    area = part.opacities * part.scales.sort(1).values[:, 1:].prod(1) * upward
+    if int(upward.sum()) < 30:
+        return None
+    reflected = linear_from_srgb(rgb_from_dc(part.sh[:, 0]).clamp(0.002, 1)).mean(1)
+    return math.pi * float((area * reflected).sum() / area.sum()) / _ALBEDO
 
 
 def _through_windows(light: Light, scene: Gaussians, ball: Ball) -> Light:
@@ -144,10 +153,18 @@ def panorama_at(scene: Gaussians, ball: Ball) -> tuple[Panorama | None, str | No
     return panorama, None
 
 
-def combine(panorama: Panorama, voted: Vote | None, up: Float[Tensor, "3"], *, asked_within: float) -> Light:
+def combine(
+    panorama: Panorama,
+    voted: Vote | None,
+    up: Float[Tensor, "3"],
+    *,
+    asked_within: float,
+    reflected: float | None = None,
+) -> Light:
     """One light from both answers: sources that the panorama shows, that the shadows demand, or both.
 
     A source that only shadows speak for is blocked by what they were cast by: things `asked_within` that distance.
+    `reflected` is the irradiance that surfaces around tell.
     """
     seen = light_of(panorama, up)
     patches = [s for s in seen.sources if float(torch.tensor(s.direction) @ up) > math.sin(_LOWEST)]
@@ -155,7 +172,8 @@ def combine(panorama: Panorama, voted: Vote | None, up: Float[Tensor, "3"], *, a
     main: LightSource | None = None
     used: set[int] = set()
     if voted is not None and voted.confidence > 0.1:
-        main = replace(_from_vote(voted, ambient), blockers_within=asked_within)
+        usual = _usual(voted, ambient, up, reflected)
+        main = replace(_from_vote(voted, ambient, usual), blockers_within=asked_within)
         for i, patch in enumerate(patches):
             apart = math.acos(max(-1.0, min(1.0, float(torch.tensor(patch.direction) @ voted.direction))))
             if apart < max(2.5 * voted.uncertainty, math.radians(15)) + math.radians(patch.angular_radius_deg):
@@ -175,10 +193,21 @@ def _name(source: LightSource) -> str:
     return "sun" if solid_angle < _SUN else "window"
 
 
-def _from_vote(voted: Vote, ambient: float) -> LightSource:
+def _usual(voted: Vote, ambient: float, up: Float[Tensor, "3"], reflected: float | None) -> float:
+    """Strength of a light that glints where shadows do not tell: as of a window, more where surfaces are too bright.
+
+    What they reflect beyond the ambient light is the source's; as albedo is known to a factor of two, it counts half.
+    """
+    missing = 0.0 if reflected is None else (reflected - ambient) / (ambient * max(0.2, float(voted.direction @ up)))
+    return _WINDOW * math.sqrt(1 + max(0.0, missing))
+
+
+def _from_vote(voted: Vote, ambient: float, usual: float) -> LightSource:
+    # the less shadows tell, the more what glints is as strong as such things are
+    believed = voted.explained / (voted.explained + _UNTOLD * voted.heard + 1e-6)
+    gray = math.exp(believed * float(voted.strength.mean().log()) + (1 - believed) * math.log(usual))
     # the tint of a light is known less well than its strength
-    gray = voted.strength.mean()
-    tint = (voted.strength / gray.clamp_min(1e-6)).clamp(0.6, 1.6) ** 0.5
+    tint = (voted.strength / voted.strength.mean().clamp_min(1e-6)).clamp(0.6, 1.6) ** 0.5
     rgb = gray * tint * ambient
     return LightSource(
         direction=tuple(voted.direction.tolist()),

@@ -28,9 +28,8 @@ _OCCLUDERS = 16000
 _MAP_SIZE = 128
 # errors in visibility make a least-squares slope too small, the more, the less of the brightness it explains
 _ATTENUATION, _ATTENUATED = 2.5, 0.25
-_USUAL, _UNTOLD = 4.0, 0.05  # strength of a light that glints, and share that shadows must explain to count as much
 _HIDDEN = 0.6  # openness below which a point is inside something
-_OF_GLINTS = math.radians(9)
+_OF_GLINTS = math.radians(6)
 _DISAGREEMENT = 0.2  # of the angle between the witnesses is doubt
 _SILENT = 0.03
 _STRENGTHS = (0.3, 0.8, 2.0, 4.0, 8.0)
@@ -50,6 +49,8 @@ class Vote:
     """0 where neither says anything, 1 where one direction explains all."""
     explained: float
     """Share of the brightness variance within materials that the light explains: shadows alone."""
+    heard: float
+    """How much highlights say, in [0, 1]."""
     directions: Float[Tensor, "d 3"]
     """All that were tried."""
     scores: Float[Tensor, "d"]
@@ -103,16 +104,17 @@ def vote(
     nearest = int((directions @ direction).argmax())
     told = float(shadows[nearest])
     # measured on synthetic scenes: the less the best direction explains of the shadows, the farther it is from the
-    # truth; highlights are 9 degrees off
+    # truth; highlights know the azimuth, and err by 9 degrees in height: a round doubt of 6 spreads as much
     heard = float(glints[nearest]) / (float(glints[nearest]) + 0.1)
     weight = math.radians(3 + 16 * math.exp(-told / 0.15)) ** -2 + heard / _OF_GLINTS**2
     contrast = (top - float(scores.median())) / max(top, 1e-9)
     return Vote(
         direction=direction,
-        uncertainty=math.hypot(width, weight**-0.5, _DISAGREEMENT * apart),
-        strength=_shrunk(fit.strength(lit[:, nearest]), told, heard),
+        uncertainty=math.hypot((1 - heard) * width, weight**-0.5, _DISAGREEMENT * apart),
+        strength=(1 + _ATTENUATION * math.exp(-told / _ATTENUATED)) * fit.strength(lit[:, nearest]),
         confidence=top / (top + 0.08) * min(1.0, 1.6 * contrast),
         explained=told,
+        heard=heard,
         directions=directions,
         scores=scores,
     )
@@ -124,13 +126,6 @@ def _together(shadows: Float[Tensor, "d"], glints: Float[Tensor, "d"]) -> Float[
     Highlights count twice: where both speak, over rendered scenes with known light, they were nearer to the truth.
     """
     return 1 - (1 - shadows) * (1 - glints) ** 2
-
-
-def _shrunk(measured: Float[Tensor, "3"], told: float, heard: float) -> Float[Tensor, "3"]:
-    """Strength as shadows that explain the share `told` measured it, else as strong as what glints usually is."""
-    believed = told / (told + _UNTOLD * heard + 1e-6)
-    grown = measured * (1 + _ATTENUATION * math.exp(-told / _ATTENUATED))
-    return (believed * grown.log() + (1 - believed) * math.log(_USUAL)).exp()
 
 
 def _apart(directions: Float[Tensor, "d 3"], shadows: Float[Tensor, "d"], glints: Float[Tensor, "d"]) -> float:
