@@ -25,7 +25,7 @@ from splatgraft.train.compact.wrong_light import wrong
 
 TINY = CompactSize(widths=(8, 8, 16, 16), blocks=(1, 1, 1, 1), heads=2)
 QUICK = CompactLoop(steps=6, batch=2, size=(32, 48), save_every=2, validate_every=3, validation_pairs=2, network=TINY)
-NOTHING = HeldOut(materials=(), lights=())
+NOTHING = HeldOut(materials=(), lights=(), every=0)
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +87,10 @@ def test_priors_that_are_there_are_kept(rendered):
 
 
 def test_families_held_out_are_never_trained_on(rendered):
-    by_material = pairs_of(rendered, HeldOut(materials=("brick",), lights=()))
+    by_material = pairs_of(rendered, HeldOut(materials=("brick",), lights=(), every=0))
     assert {by_material.entries[i].folder for i in by_material.training} == {"ball_0"}
     assert {by_material.entries[i].folder for i in by_material.validation} == {"ball_1"}
-    by_light = pairs_of(rendered, HeldOut(materials=(), lights=("map1.exr",)))
+    by_light = pairs_of(rendered, HeldOut(materials=(), lights=("map1.exr",), every=0))
     assert {by_light.entries[i].light for i in by_light.training} == {"light0"}
 
 

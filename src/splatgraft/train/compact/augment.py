@@ -1,5 +1,6 @@
 """Views cut, mirrored and spoilt at random, as captures spoil them; all from one seed. Knows no network."""
 
+import math
 import random
 from dataclasses import replace
 
@@ -33,7 +34,7 @@ def augmented(
         pictures = {name: x.flip(-1) for name, x in pictures.items()}
         target = target.flip(-1)
         pictures["normal"] = pictures["normal"] * torch.tensor([-1.0, 1, 1])[:, None, None]
-    out = View(**pictures, trust=view.trust)
+    out, target = _another_world(View(**pictures, trust=view.trust), target, rng)
     return _another_exposure(_rough(out, rng), rng), target
 
 
@@ -53,6 +54,21 @@ def _cut(mask: Float[Tensor, "h w"], size: tuple[int, int], rng: random.Random) 
         return rng.randint(low, high) if low <= high else max(0, min(whole - cut, (low + high) // 2))
 
     return place(int(rows[0]), tall, height, h), place(int(columns[0]), wide, width, w), height, width
+
+
+def _another_world(view: View, target: Tensor, rng: random.Random) -> tuple[View, Tensor]:
+    """All light of other colours and strength: a scene is not to be known again by its colours."""
+    order = rng.sample(range(3), 3)
+    gain = torch.tensor([math.exp(rng.gauss(0.0, 0.12)) for _ in range(3)])[:, None, None] * math.exp(
+        rng.gauss(0, 0.25)
+    )
+
+    def changed(x: Tensor) -> Tensor:
+        return x[:, order] * gain[:, None, None]
+
+    swapped = view.log_ratio[:, order]
+    composite, background = changed(view.composite), changed(view.background)
+    return replace(view, composite=composite, background=background, log_ratio=swapped), changed(target)
 
 
 def _another_exposure(view: View, rng: random.Random) -> View:

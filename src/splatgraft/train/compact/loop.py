@@ -33,11 +33,11 @@ STATE_FILE = "state.pt"
 class CompactLoop:
     """Length and rhythm."""
 
-    steps: int = 3000
+    steps: int = 2000
     batch: int = 8
     rate: float = 1e-3
     """Of AdamW; rises over the first hundredth, falls as a cosine."""
-    decay: float = 0.02
+    decay: float = 0.05
     """Of weights."""
     ema: float = 0.998
     """Decay of the averaged weights, which are what is kept."""
@@ -158,7 +158,7 @@ def validated(run: CompactTraining, network: CompactNetwork) -> tuple[dict[str, 
         for region in ("object", "shadow", "rest"):
             for who, errors in (("", found), ("_prior", before)):
                 key = f"{region}{who}"
-                totals[key] = totals.get(key, 0.0) + float(getattr(errors, region)) / len(chosen)
+                totals[key] = totals.get(key, 0.0) + float(getattr(errors, region).mean()) / len(chosen)
         if number < 12:
             pictures = (view.composite, view.prior(), composed(view, answer), truth)
             line = [srgb_from_linear(p[0].clamp(0, 1)).permute(1, 2, 0).cpu() for p in pictures]

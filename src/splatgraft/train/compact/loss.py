@@ -16,11 +16,11 @@ _SHADOW = 0.95
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean errors of a batch, per region."""
+    """Mean errors of every picture of a batch (b,), per region."""
 
-    object: Tensor
-    shadow: Tensor
-    rest: Tensor
+    object: Float[Tensor, "b"]
+    shadow: Float[Tensor, "b"]
+    rest: Float[Tensor, "b"]
 
 
 def regions(view: View, truth: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -43,10 +43,10 @@ def loss_of(view: View, answer: Answer, truth: Float[Tensor, "b 3 h w"]) -> tupl
     image = composed(view, answer)
     found, before = errors_of(image, truth, view), errors_of(view.prior(), truth, view)
     loss = 0.6 * (found.object + found.shadow) + 4 * found.rest
+    for name in ("object", "shadow", "rest"):
+        loss = loss + (getattr(found, name) - getattr(before, name)).clamp_min(0)
     loss = loss + _squares(image, truth, view) + 0.5 * _gradients(image, truth, view)
-    hinge = [(getattr(found, k) - getattr(before, k)).clamp_min(0) for k in ("object", "shadow", "rest")]
-    loss = loss + 0.5 * hinge[0] + 0.5 * hinge[1] + hinge[2]
-    return loss + 0.02 * _doubt(image.detach(), truth, answer), found, before
+    return loss.mean() + 0.02 * _doubt(image.detach(), truth, answer), found, before
 
 
 def _apart(image: Tensor, truth: Tensor) -> Float[Tensor, "b 1 h w"]:
@@ -61,7 +61,7 @@ def _seen(image: Tensor, truth: Tensor) -> Tensor:
     return torch.where(truth < 0.99, image.clamp_max(4), image.clamp_max(1)).clamp_min(1e-6)
 
 
-def _squares(image: Tensor, truth: Tensor, view: View) -> Tensor:
+def _squares(image: Tensor, truth: Tensor, view: View) -> Float[Tensor, "b"]:
     """Squared errors, which ask for the mean of what may be: of sRGB on the object, of light over before in shadows.
 
     Absolute errors ask for the median, and the median of an unsure shadow is none at all.
@@ -73,15 +73,14 @@ def _squares(image: Tensor, truth: Tensor, view: View) -> Tensor:
     return 4 * _mean(apart.mean(1, keepdim=True), object_) + 2 * _mean(ratio.mean(1, keepdim=True), shadow)
 
 
-def _mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Mean over a region of each picture, then over pictures; small regions count less than their share."""
+def _mean(values: Tensor, weight: Tensor) -> Float[Tensor, "b"]:
+    """Mean over a region of each picture; small regions count less than their share."""
     area = weight.sum((1, 2, 3))
     whole = values.shape[-1] * values.shape[-2]
-    each = (values * weight).sum((1, 2, 3)) / (area + 0.003 * whole)
-    return each.mean()
+    return (values * weight).sum((1, 2, 3)) / (area + 0.003 * whole)
 
 
-def _gradients(image: Tensor, truth: Tensor, view: View) -> Tensor:
+def _gradients(image: Tensor, truth: Tensor, view: View) -> Float[Tensor, "b"]:
     """Edges of light: differences of the log ratio between neighbours, near the object."""
     ratio = ((_seen(image, truth) + _LIFT) / (truth + _LIFT)).log().clamp(-2, 2)
     object_, shadow, _ = regions(view, truth)

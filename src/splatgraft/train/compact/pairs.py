@@ -28,6 +28,8 @@ class HeldOut:
     """Patterns: pairs whose object has one."""
     lights: tuple[str, ...] = ("interior.exr",)
     """Environment maps: pairs whose object was lit by one."""
+    every: int = 12
+    """Every so manyth scene is held out whole; 0 for none."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +58,13 @@ class CompactPairs:
         samples = read_manifest(pairs)
         folders = sorted({sample.folder for sample in samples})
         for number, folder in enumerate(folders):
+            kept_back = held_out.every > 0 and number % held_out.every == held_out.every - 1
             paths = [found / f"{folder.name}.npz" for found in priors]
             if all(path.is_file() for path in paths):
                 own = [sample for sample in samples if sample.folder == folder]
                 for variant, path in enumerate(paths):
                     self._read_priors(path, own, variant)
-                self._read_folder(folder, own, held_out)
+                self._read_folder(folder, own, None if kept_back else held_out)
             progress(number + 1, len(folders), folder.name)
         if not self.entries:
             raise ValueError(f"{', '.join(map(str, priors))}: expected priors of the pairs in {pairs}, found none")
@@ -108,7 +111,8 @@ class CompactPairs:
             self._arrays[sample.folder.name, key, sample.camera] = found[take][sample.camera]
             self._trust[sample.folder.name, key] = float(found[f"{take}_trust"])
 
-    def _read_folder(self, folder: Path, samples: Sequence[PairSample], held_out: HeldOut) -> None:
+    def _read_folder(self, folder: Path, samples: Sequence[PairSample], held_out: HeldOut | None) -> None:
+        """`held_out`: families; None where the whole folder is."""
         job = json.loads((folder / "job.json").read_text())
         count = len(job["cameras"])
         cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(count)))
@@ -116,7 +120,7 @@ class CompactPairs:
         for sample in samples:
             patterns = {part["material"]["pattern"] for part in job["objects"][sample.object]}
             light = worlds[f"{sample.object}_{sample.light}"]
-            kept_back = bool(patterns & set(held_out.materials)) or light in held_out.lights
+            kept_back = held_out is None or bool(patterns & set(held_out.materials)) or light in held_out.lights
             self.entries.append(Entry(folder.name, sample.object, sample.light, sample.camera, kept_back))
             self._read_pictures(sample, cameras.camera_from_world[sample.camera, :3, :3].numpy())
 
