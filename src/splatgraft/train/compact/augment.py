@@ -59,9 +59,7 @@ def _cut(mask: Float[Tensor, "h w"], size: tuple[int, int], rng: random.Random) 
 def _another_world(view: View, target: Tensor, rng: random.Random) -> tuple[View, Tensor]:
     """All light of other colours and strength: a scene is not to be known again by its colours."""
     order = rng.sample(range(3), 3)
-    gain = torch.tensor([math.exp(rng.gauss(0.0, 0.12)) for _ in range(3)])[:, None, None] * math.exp(
-        rng.gauss(0, 0.25)
-    )
+    gain = math.exp(rng.gauss(0.0, 0.25)) * torch.tensor([math.exp(rng.gauss(0.0, 0.12)) for _ in range(3)])
 
     def changed(x: Tensor) -> Tensor:
         return x[:, order] * gain[:, None, None]
