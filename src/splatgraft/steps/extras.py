@@ -19,7 +19,7 @@ EXTRAS = {
     "sfm": Extra("poses for photos and videos that have none", {"pycolmap": "pycolmap"}),
     "flux": Extra(
         "the paper's image model and its training",
-        {"diffusers": "diffusers", "safetensors": "safetensors", "accelerate": "accelerate"},
+        {"diffusers": "diffusers", "accelerate": "accelerate"},
     ),
     "text": Extra("text encoders, to embed the empty prompt once", {"transformers": "transformers"}),
     "blender": Extra("made-up scenes with ground truth", {"bpy": "bpy"}),
