@@ -33,7 +33,7 @@ _AROUND = 3.0  # object radii within which surfaces tell how bright the light is
 _ALBEDO = 0.4  # of a mean surface, linear
 _UNSEEN = 0.25
 _LEVEL = math.log(9)
-_GLARE_DEG = 12.0
+_GLARE_DEG = 25.0  # from a bright patch to the light behind it, over rendered scenes: what is above was not captured
 _WINDOW = 3.0  # facing it, over the ambient light
 _UNTOLD = 0.05  # share that shadows must explain to count as much as what is usual
 

@@ -29,9 +29,7 @@ _MAP_SIZE = 128
 # errors in visibility make a least-squares slope too small, the more, the less of the brightness it explains
 _ATTENUATION, _ATTENUATED = 2.5, 0.25
 _HIDDEN = 0.6  # openness below which a point is inside something
-_OF_GLINTS = math.radians(6)
-_DISAGREEMENT = 0.2  # of the angle between the witnesses is doubt
-_SILENT = 0.03
+_OF_GLINTS = math.radians(9)
 _STRENGTHS = (0.3, 0.8, 2.0, 4.0, 8.0)
 
 
@@ -90,7 +88,6 @@ def vote(
     finer = _cap(directions[best], math.radians(7), 48)
     finer = finer[finer @ up > math.sin(_LOWEST)]
     lit_finer = _lit(occluders, points, facing, finer, center=center, radius=radius)
-    apart = _apart(directions, shadows, glints)
     directions, lit = torch.cat([directions, finer]), torch.cat([lit, lit_finer], 1)
     shadows = torch.cat([shadows, fit.explained(lit_finer)[0]])
     glints = torch.zeros(len(directions)) if highlights is None else highlights.explained(directions)
@@ -104,13 +101,13 @@ def vote(
     nearest = int((directions @ direction).argmax())
     told = float(shadows[nearest])
     # measured on synthetic scenes: the less the best direction explains of the shadows, the farther it is from the
-    # truth; highlights know the azimuth, and err by 9 degrees in height: a round doubt of 6 spreads as much
+    # truth; highlights know the azimuth, and err by 9 degrees in height
     heard = float(glints[nearest]) / (float(glints[nearest]) + 0.1)
     weight = math.radians(3 + 16 * math.exp(-told / 0.15)) ** -2 + heard / _OF_GLINTS**2
     contrast = (top - float(scores.median())) / max(top, 1e-9)
     return Vote(
         direction=direction,
-        uncertainty=math.hypot((1 - heard) * width, weight**-0.5, _DISAGREEMENT * apart),
+        uncertainty=math.hypot((1 - heard) * width, weight**-0.5),
         strength=(1 + _ATTENUATION * math.exp(-told / _ATTENUATED)) * fit.strength(lit[:, nearest]),
         confidence=top / (top + 0.08) * min(1.0, 1.6 * contrast),
         explained=told,
@@ -126,14 +123,6 @@ def _together(shadows: Float[Tensor, "d"], glints: Float[Tensor, "d"]) -> Float[
     Highlights count twice: where both speak, over rendered scenes with known light, they were nearer to the truth.
     """
     return 1 - (1 - shadows) * (1 - glints) ** 2
-
-
-def _apart(directions: Float[Tensor, "d 3"], shadows: Float[Tensor, "d"], glints: Float[Tensor, "d"]) -> float:
-    """Angle between what either witness would say alone, radians; 0 where one is silent."""
-    if float(glints.max()) < _SILENT or float(shadows.max()) < _SILENT:
-        return 0.0
-    cosine = float(directions[shadows.argmax()] @ directions[glints.argmax()])
-    return math.acos(max(-1.0, min(1.0, cosine)))
 
 
 def _receivers(scene: Gaussians, normals: Normals, center: Float[Tensor, "3"], radius: float) -> Int[Tensor, "m"]:
