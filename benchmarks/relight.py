@@ -49,7 +49,7 @@ def main() -> None:
     cameras = pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 300.0, width=352, height=248)
     sun = LightSource(direction=(0.6, 0.0, 0.8), irradiance=(3.0, 2.8, 2.5), uncertainty_deg=5.0, name="sun")
     light = Light(sources=(sun,), ambient=ambient_of(torch.tensor([0.5, 0.6, 0.8])))
-    origin = SourceScene(courtyard(ORIGIN), cameras)
+    origin = SourceScene(courtyard(ORIGIN).with_sh_degree(3), cameras)
 
     def transfer(shift: float, cache: RelightCache) -> tuple[float, float]:
         moved = Similarity(1.0, torch.eye(3), torch.tensor([shift, 0.0, 0.0]))

@@ -18,7 +18,7 @@ from splatgraft.images import linear_from_srgb
 from splatgraft.relight.normals import Normals
 from splatgraft.relight.viewers import seen_from, spread_over
 
-_VIEWERS = 20
+_VIEWERS = 16
 _RECEIVERS = 2000
 _FEWEST = 200
 _FLATTEST = 0.1  # cosine
@@ -65,7 +65,7 @@ def find_highlights(
     chosen = chosen[torch.randperm(len(chosen), generator=torch.Generator().manual_seed(0))[:_RECEIVERS]]
     some, facing = scene.select(chosen), normals.vectors[chosen]
     viewers = spread_over(cameras, count=_VIEWERS)
-    seen = torch.stack([seen_from(scene, cameras[i])[chosen] for i in viewers], 1)
+    seen = torch.stack([seen_from(some, cameras[i], among=scene) for i in viewers], 1)
     towards = torch.nn.functional.normalize(cameras.centers[viewers][None] - some.means[:, None], dim=-1)
     cosine = (towards * facing[:, None]).sum(-1)
     basis = spherical_harmonics.basis(-towards.reshape(-1, 3), some.sh_degree).reshape(*towards.shape[:2], -1)

@@ -34,14 +34,17 @@ class Normals:
     """Whether some camera sees it, not behind others: what none sees was never given its true colour."""
 
 
-def estimate_normals(gaussians: Gaussians, cameras: Cameras) -> Normals:
-    """Normals turned towards the cameras that see each Gaussian, not behind others; less sure where none does."""
+def estimate_normals(gaussians: Gaussians, cameras: Cameras, *, among: Gaussians | None = None) -> Normals:
+    """Normals turned towards the cameras that see each Gaussian, not behind others; less sure where none does.
+
+    `among` are the others that may hide it; they are itself where none are given.
+    """
     n = gaussians.count
     if n == 0:
         return Normals(vectors=torch.zeros(0, 3), confidence=torch.zeros(0), seen=torch.zeros(0, dtype=torch.bool))
     neighbours = nearest_neighbours(gaussians.means, count=NEIGHBOURS).numpy()
     cloud = (gaussians.means.numpy(), gaussians.covariances.numpy(), gaussians.opacities.numpy())
-    towards, seen = _towards_viewers(gaussians, cameras)
+    towards, seen = _towards_viewers(gaussians, cameras, gaussians if among is None else among)
     out = np.zeros((n, 4), np.float32)
     _estimate(cloud, neighbours, towards.numpy(), out)
     result = torch.from_numpy(_agree(out, neighbours))
@@ -55,11 +58,18 @@ def raised(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor,
     return gaussians.means + 1.5 * half.norm(dim=1, keepdim=True) * normals
 
 
-def _towards_viewers(gaussians: Gaussians, cameras: Cameras) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+def _towards_viewers(
+    gaussians: Gaussians, cameras: Cameras, among: Gaussians
+) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
     """Sum of unit vectors to the cameras that see each Gaussian (to all, where none does), and whether any does."""
     total = np.zeros((2, gaussians.count, 3), np.float32)
     for i in spread_over(cameras, count=_VIEWERS):
-        _look(gaussians.means.numpy(), cameras[i].centers[0].numpy(), seen_from(gaussians, cameras[i]).numpy(), total)
+        _look(
+            gaussians.means.numpy(),
+            cameras[i].centers[0].numpy(),
+            seen_from(gaussians, cameras[i], among=among).numpy(),
+            total,
+        )
     by_viewers, everyone = torch.from_numpy(total)
     seen_at_all = by_viewers.norm(dim=1) > 0
     return torch.where(seen_at_all[:, None], by_viewers, everyone), seen_at_all

@@ -4,20 +4,20 @@ Knows nothing about where the light is from, nor about files.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatgraft.gaussians import Gaussians, concatenate
 from splatgraft.relight.scene_shading import ObjectMaps, SceneRatio, light_sums, ratio_of
-from splatgraft.splitting import NARROWER, split_along
+from splatgraft.splitting import NARROWER, PIECES, split_along
 
 _ROUNDS = 12
 RIM = 2.4
 """Standard deviations; beyond, a Gaussian's alpha is below 0.05."""
-_GRID = (-RIM, -RIM / 2, 0.0, RIM / 2, RIM)
+_STEPS = (-RIM, -RIM / 2, 0.0, RIM / 2, RIM)
 _BROAD, _FINEST = 0.1, 0.02  # object radii
 _VARIATION = 0.005  # share of light times alpha: a tenth of the contrast at which an edge is seen, as many overlap
 
@@ -50,16 +50,15 @@ def shade_receivers(
     receivers: Receivers, maps: ObjectMaps, *, budget: int
 ) -> tuple[Receivers, Int[Tensor, "j"], SceneRatio]:
     """Receivers, some split (at most `budget` added); which one each was; their ratios, averaged over their extent."""
-    # narrower ones are finer than an edge that matters at the size of the object
-    smallest = _FINEST * maps.ambient_maps.window.radius
     done: list[tuple[Receivers, Tensor, SceneRatio]] = []
     pending, which = receivers, torch.arange(len(receivers.origin))
+    ambient = _sums(pending, maps, sources=False)
     for round_ in range(_ROUNDS + 1):
-        ratio, variation = _extended_ratio(pending, maps, smallest=smallest)
+        ratio, variation = _extended_ratio(pending, maps, ambient)
         axis = variation.argmax(1)
         wanted = variation.max(1).values
         wanted = torch.where((wanted > _VARIATION) & (pending.gaussians.opacities > 0.05), wanted, 0)
-        room = budget // 4  # one becomes five
+        room = budget // (PIECES - 1)
         if round_ == _ROUNDS or room == 0 or not bool((wanted > 0).any()):
             done.append((pending, which, ratio))
             break
@@ -68,17 +67,14 @@ def shade_receivers(
         keep[order] = False
         kept = SceneRatio(shadow=ratio.shadow[keep], bounce=ratio.bounce[keep])
         done.append((pending.select(keep), which[keep], kept))
-        pieces, parent = split_along(pending.gaussians.select(order), axis[order])
         parents = pending.select(order)
-        pending = Receivers(
-            gaussians=pieces,
-            normals=parents.normals[parent],
-            arrives=parents.arrives[parent],
-            trust=parents.trust[parent],
-            origin=parents.origin[parent],
-        )
-        which = which[order][parent]
-        budget -= 4 * len(order)
+        pieces, parent = split_along(parents.gaussians, axis[order])
+        pending = replace(parents.select(parent), gaussians=pieces)
+        which, ambient = which[order][parent], ambient[:, order][:, parent]
+        # ambient light differs between pieces only where the whole was broad
+        anew = _broad(parents.gaussians, maps)[parent].nonzero()[:, 0]
+        ambient[:, anew] = _sums(pending.select(anew), maps, sources=False)
+        budget -= (PIECES - 1) * len(order)
     joined = Receivers(
         gaussians=concatenate([r.gaussians for r, _, _ in done]),
         normals=torch.cat([r.normals for r, _, _ in done]),
@@ -93,8 +89,13 @@ def shade_receivers(
     return joined, parents, SceneRatio(shadow=1 - (1 - shadow) * trust, bounce=bounce * trust)
 
 
+def _broad(gaussians: Gaussians, maps: ObjectMaps) -> Bool[Tensor, "m"]:
+    """Whether ambient light may differ within one: it has no edge that is finer than a part of the object."""
+    return gaussians.scales.max(1).values > _BROAD * maps.ambient_maps.window.radius
+
+
 def _extended_ratio(
-    receivers: Receivers, maps: ObjectMaps, *, smallest: float
+    receivers: Receivers, maps: ObjectMaps, ambient: Float[Tensor, "3 m 3"]
 ) -> tuple[SceneRatio, Float[Tensor, "m 3"]]:
     """Ratio averaged over each Gaussian, and how much it varies along each own axis (0 along narrow ones).
 
@@ -102,17 +103,15 @@ def _extended_ratio(
     centres, so the rims of those in front cover what lies between them and the object.
     """
     g = receivers.gaussians
-    center = [_sums(receivers, maps, sources=flag) for flag in (True, False)]
-    ratio, variation = ratio_of(center[0] + center[1]), torch.zeros(g.count, 3)
-    widest = g.scales.max(1).values
-    # ambient light has no edge that is finer than a part of the object
-    broad = widest > _BROAD * maps.ambient_maps.window.radius
-    fine = (widest > smallest / math.sqrt(NARROWER)) & ~broad
-    if bool(center[0].any()):
-        fine = _at_an_edge(receivers, maps, fine.nonzero()[:, 0], center)
-        _average(receivers, maps, fine, ratio, variation, ambient=center[1][:, fine])
-    _average(receivers, maps, broad.nonzero()[:, 0], ratio, variation, ambient=None)
-    variation[g.scales < smallest / math.sqrt(NARROWER)] = 0
+    by_sources = _sums(receivers, maps, sources=True)
+    ratio, variation = ratio_of(by_sources + ambient), torch.zeros(g.count, 3)
+    smallest = _FINEST * maps.ambient_maps.window.radius / math.sqrt(NARROWER)
+    broad = _broad(g, maps)
+    fine = ((g.scales.max(1).values > smallest) & ~broad).nonzero()[:, 0]
+    fine = _at_an_edge(receivers, maps, fine, (by_sources, ambient)) if bool(by_sources.any()) else fine[:0]
+    _average(receivers, maps, fine, (ratio, variation), ambient=ambient[:, fine])
+    _average(receivers, maps, broad.nonzero()[:, 0], (ratio, variation), ambient=None)
+    variation[g.scales < smallest] = 0
     return ratio, variation
 
 
@@ -126,53 +125,53 @@ def _sums(receivers: Receivers, maps: ObjectMaps, *, sources: bool, points: Tens
 
 
 def _at_an_edge(
-    receivers: Receivers, maps: ObjectMaps, which: Int[Tensor, "f"], center: list[Tensor]
+    receivers: Receivers, maps: ObjectMaps, which: Int[Tensor, "f"], center: tuple[Tensor, Tensor]
 ) -> Int[Tensor, "g"]:
     """Those of `which` that see a source differently at their rims than in their middle."""
     if not len(which):
         return which
-    part = receivers.select(which)
+    part, ambient = receivers.select(which), center[1][:, which, None]
     rims = _points(part.gaussians, torch.tensor([[RIM, -RIM, 0.0, 0.0], [0.0, 0.0, RIM, -RIM]]))
-    sums = _sums(part, maps, sources=True, points=rims).reshape(3, len(which), -1, 3)
-    after, before = sums[1] + center[1][1, which, None], sums[0] + center[1][0, which, None]
-    there = after / before.clamp_min(1e-9)
-    middle = (center[0] + center[1])[:, which]
-    here = middle[1] / middle[0].clamp_min(1e-9)
-    return which[(there - here[:, None]).abs().amax((1, 2)) > _VARIATION]
+    there = _sums(part, maps, sources=True, points=rims).reshape(3, len(which), -1, 3) + ambient
+    here = center[0][:, which, None] + ambient
+    changes = (there[1] / there[0].clamp_min(1e-9) - here[1] / here[0].clamp_min(1e-9)).abs()
+    return which[changes.amax((1, 2)) > _VARIATION]
 
 
 def _average(
     receivers: Receivers,
     maps: ObjectMaps,
     which: Int[Tensor, "f"],
-    ratio: SceneRatio,
-    variation: Float[Tensor, "m 3"],
+    found: tuple[SceneRatio, Float[Tensor, "m 3"]],
     *,
     ambient: Float[Tensor, "3 f 3"] | None,
 ) -> None:
-    """Fill in mean and variation of those Gaussians, from points all over them; `ambient` is even there if given."""
+    """Fill in mean and variation of those Gaussians from points along both wide axes; `ambient`, if given, is even."""
     if not len(which):
         return
-    part, size = receivers.select(which), len(_GRID)
-    u, v = torch.meshgrid(torch.tensor(_GRID), torch.tensor(_GRID), indexing="ij")
-    points = _points(part.gaussians, torch.stack([u.flatten(), v.flatten()]))
+    part, steps = receivers.select(which), len(_STEPS)
+    line, zero = torch.tensor(_STEPS), torch.zeros(steps)
+    points = _points(part.gaussians, torch.stack([torch.cat([line, zero]), torch.cat([zero, line])]))
     sums = _sums(part, maps, sources=True, points=points)
-    if ambient is None:
-        sums = sums + _sums(part, maps, sources=False, points=points)
-    else:
-        sums = sums + ambient.repeat_interleave(size * size, 1)
-    found = ratio_of(sums)
-    there, sent = (t.reshape(len(which), size, size, 3) for t in (found.shadow, found.bounce))
+    even = (
+        _sums(part, maps, sources=False, points=points) if ambient is None else ambient.repeat_interleave(2 * steps, 1)
+    )
+    there = ratio_of(sums + even)
+    shadow, bounce = (t.reshape(len(which), 2, steps, 3) for t in (there.shadow, there.bounce))
+    ratio, variation = found
     # what is seen of a Gaussian is mostly its middle: half the weight of its width
-    seen = torch.exp(-(u**2 + v**2))[..., None]
+    seen = torch.exp(-(line**2))[:, None]
     seen = seen / seen.sum()
-    ratio.shadow[which] = (there * seen).sum((1, 2)).clamp(0, 1)
-    ratio.bounce[which] = (sent * seen).sum((1, 2)).clamp_min(0)
-    alpha = part.gaussians.opacities[:, None, None] * torch.exp(-0.5 * (u**2 + v**2))
-    axes = part.gaussians.scales.argsort(1, descending=True)
-    for i, axis in enumerate((1, 2)):
-        moves = ((there - there.mean(axis, keepdim=True)).abs().amax(3) * alpha).amax((1, 2))
-        variation[which, axes[:, i]] = moves
+    ratio.shadow[which] = _both_ways((shadow * seen).sum(2), shadow[:, 0, steps // 2]).clamp(0, 1)
+    ratio.bounce[which] = _both_ways((bounce * seen).sum(2), bounce[:, 0, steps // 2]).clamp_min(0)
+    alpha = part.gaussians.opacities[:, None, None] * torch.exp(-0.5 * line**2)
+    moves = ((shadow - shadow.mean(2, keepdim=True)).abs().amax(3) * alpha).amax(2)
+    variation[which[:, None], part.gaussians.scales.argsort(1, descending=True)[:, :2]] = moves
+
+
+def _both_ways(along: Float[Tensor, "f 2 3"], middle: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
+    """Mean over an ellipse from those along its axes: what they differ from the middle by adds up."""
+    return along[:, 0] + along[:, 1] - middle
 
 
 def _points(gaussians: Gaussians, offsets: Float[Tensor, "2 p"]) -> Float[Tensor, "n p 3"]:

@@ -3,6 +3,7 @@
 What is kept stays valid while objects move within the inner half of the region; then it is made anew.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,7 +21,8 @@ from splatgraft.relight.litness import lit_share
 from splatgraft.relight.normals import Normals, estimate_normals, raised
 from splatgraft.relight.object_shading import irradiance
 from splatgraft.relight.place_light import levelled, panorama_at, unlevelled_light_at
-from splatgraft.relight.scene_shading import Ball, SceneMaps, map_scene, scene_visibility
+from splatgraft.relight.receivers import RIM
+from splatgraft.relight.scene_shading import Ball, SceneMaps, map_scene, reachable, scene_visibility
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Stage:
     scene: Gaussians
     """All of it, erased Gaussians left out."""
     members: Int[Tensor, "m"]
-    """Positions of the scene's Gaussians around the place."""
+    """Positions of the scene's Gaussians that objects may reach."""
     around: Gaussians
     """The members."""
     normals: Normals
@@ -44,21 +46,22 @@ class Stage:
 
 
 def set_stage(
-    scene: Gaussians, cameras: Cameras, *, place: Ball, reach: float, light: Light | None, cache: RelightCache
+    scene: Gaussians, cameras: Cameras, *, balls: Sequence[Ball], reach: float, light: Light | None, cache: RelightCache
 ) -> tuple[Stage | None, str | None]:
-    """The stage around `place`, `reach` of its radii wide, or a sentence that says why there is none.
+    """The stage for objects in `balls`, `reach` of their radii wide, or a sentence that says why there is none.
 
     `light` is estimated where none is given.
     """
+    place = Ball(torch.stack([ball.center for ball in balls]).mean(0), max(ball.radius for ball in balls))
     region = _region(scene, place, reach, cache)
-    members = cache.get("members", (scene, region), lambda: _members(scene, region))
-    around = cache.get("around", (members,), lambda: scene.select(members))
-    normals = cache.get("normals", (around, cameras), lambda: estimate_normals(around, cameras))
     if light is None:
         light, problem = _estimated(scene, cameras, place, region, cache)
         if light is None:
             return None, problem
     lit = light
+    members = _members(scene, region, balls, lit, cache)
+    around = cache.get("around", (members,), lambda: scene.select(members))
+    normals = cache.get("normals", (around, cameras), lambda: estimate_normals(around, cameras, among=scene))
     maps = cache.get("maps", (scene, region, lit.sources), lambda: map_scene(scene, region, beams_of(lit)))
     points = cache.get("points", (normals,), lambda: raised(around, normals.vectors))
     arrives = cache.get(
@@ -82,8 +85,25 @@ def _region(scene: Gaussians, place: Ball, reach: float, cache: RelightCache) ->
     return region
 
 
-def _members(scene: Gaussians, region: Ball) -> Int[Tensor, "m"]:
-    return ((scene.means - region.center).norm(dim=1) < region.radius).nonzero()[:, 0]
+def _members(
+    scene: Gaussians, region: Ball, balls: Sequence[Ball], light: Light, cache: RelightCache
+) -> Int[Tensor, "m"]:
+    """What the objects may reach from where they are, and from a radius around."""
+    kept = cache.peek("members", (scene, region, light.sources))
+    if kept is not None:
+        members, before = kept
+        moves = [float((new.center - old.center).norm()) for new, old in zip(balls, before, strict=False)]
+        if len(before) == len(balls) and all(m <= b.radius for m, b in zip(moves, balls, strict=True)):
+            return members
+    beams = beams_of(light)
+    reached = torch.zeros(scene.count, dtype=torch.bool)
+    rims = RIM * scene.scales.max(1).values
+    for ball in balls:
+        wide = rims + ball.radius
+        reached |= reachable(scene.means, ball, beams, farthest=region.radius, rims=wide)
+    members = (reached & ((scene.means - region.center).norm(dim=1) < region.radius)).nonzero()[:, 0]
+    cache.put("members", (scene, region, light.sources), (members, tuple(balls)))
+    return members
 
 
 def _estimated(

@@ -26,7 +26,6 @@ from splatgraft.relight.normals import raised
 from splatgraft.relight.object_shading import irradiance, shade_ratio, unknown_origin_ratio
 from splatgraft.relight.receivers import RIM, Receivers, shade_receivers
 from splatgraft.relight.scene_shading import (
-    Ball,
     SceneRatio,
     ball_of,
     reachable,
@@ -81,8 +80,7 @@ def relight(
     cache = cache or RelightCache()
     scene = cache.get("scene", (composite.target, composite.erased), lambda: composite.target.select(~composite.erased))
     balls = [ball_of(p.in_target()) for p, _ in placed]
-    place = Ball(torch.stack([b.center for b in balls]).mean(0), max(b.radius for b in balls))
-    stage, problem = set_stage(scene, cameras, place=place, reach=options.reach, light=light, cache=cache)
+    stage, problem = set_stage(scene, cameras, balls=balls, reach=options.reach, light=light, cache=cache)
     if stage is None:
         return unchanged(baked, is_object, report=(f"{problem} The object is pasted as it is.",))
     beams = beams_of(stage.light)
@@ -92,6 +90,8 @@ def relight(
         body = set_body(one, source, cameras, light=stage.light, index=i, cache=cache)
         if body.story is not None:
             report.append(f"Where object {i + 1} comes from: {body.story}")
+        if body.before is None:
+            report.append(f"The light that object {i + 1} had is not known: it keeps its mean brightness.")
         facing = body.normals.vectors
         actor = _Actor(body, scene_visibility(stage.maps, raised(body.gaussians, facing), facing))
         actors.append(actor)

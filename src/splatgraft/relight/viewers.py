@@ -21,10 +21,10 @@ def spread_over(cameras: Cameras, *, count: int) -> list[int]:
     return sorted({round(j * last / max(count - 1, 1)) for j in range(min(count, len(cameras)))})
 
 
-def seen_from(gaussians: Gaussians, camera: Cameras) -> Bool[Tensor, "n"]:
-    """Whether one `camera` sees each Gaussian's centre, or only what is in front of it."""
+def seen_from(gaussians: Gaussians, camera: Cameras, *, among: Gaussians) -> Bool[Tensor, "n"]:
+    """Whether one `camera` sees each Gaussian's centre, or only what of `among` is in front of it."""
     small = camera.resized(_WIDTH / int(camera.sizes[0, 0]))
-    seen = render(gaussians, small, outputs=frozenset({"depth"}))
+    seen = render(among, small, outputs=frozenset({"depth"}))
     assert seen.depth is not None
     surface = torch.where(seen.alpha[0] > 0.5, seen.depth[0], torch.inf).numpy()
     pose, intrinsics = small.camera_from_world[0].numpy(), small.intrinsics[0].numpy()

@@ -1,6 +1,6 @@
 """Where a scene's dominant light comes from, told by the shadows that the scene casts on itself, and by what glints.
 
-For each of some 300 directions the scene is shadow-mapped from there; the direction whose visibility times cosine best
+For each of some 200 directions the scene is shadow-mapped from there; the direction whose visibility times cosine best
 explains the brightness within groups of one material, and whose mirror image best explains how colours change from
 view to view, wins. Knows nothing about panoramas, objects or files.
 """
@@ -21,7 +21,7 @@ from splatgraft.relight.normals import Normals
 from splatgraft.relight.visibility import Occluders, Window, occluders_of, splat_depth_maps, visibility
 from splatgraft.spherical_harmonics import rgb_from_dc
 
-_DIRECTIONS = 512  # on the sphere; those above the horizon, about half, are tried
+_DIRECTIONS = 320  # on the sphere; those above the horizon, about half, are tried
 _LOWEST = math.radians(5)
 _RECEIVERS = 4000
 _OCCLUDERS = 16000
@@ -82,15 +82,15 @@ def vote(
     lit = _lit(occluders, points, facing, directions, center=center, radius=radius)
     fit = _Fit.of(brightness, ambient, groups, weight * (ambient > _HIDDEN))
     shadows = fit.explained(lit)[0]
-    glints = torch.zeros(len(directions)) if highlights is None else highlights.explained(directions)
+    glints = _glints(highlights, directions)
     best = int(_together(shadows, glints).argmax())
     # finer: a cap of directions around the best
-    finer = _cap(directions[best], math.radians(7), 48)
+    finer = _cap(directions[best], math.radians(9), 48)
     finer = finer[finer @ up > math.sin(_LOWEST)]
     lit_finer = _lit(occluders, points, facing, finer, center=center, radius=radius)
     directions, lit = torch.cat([directions, finer]), torch.cat([lit, lit_finer], 1)
     shadows = torch.cat([shadows, fit.explained(lit_finer)[0]])
-    glints = torch.zeros(len(directions)) if highlights is None else highlights.explained(directions)
+    glints = torch.cat([glints, _glints(highlights, finer)])
     scores = _together(shadows, glints)
     top = float(scores.max())
     # the top of the curve is the estimate, its width the doubt
@@ -115,6 +115,10 @@ def vote(
         directions=directions,
         scores=scores,
     )
+
+
+def _glints(highlights: Highlights | None, directions: Float[Tensor, "d 3"]) -> Float[Tensor, "d"]:
+    return torch.zeros(len(directions)) if highlights is None else highlights.explained(directions)
 
 
 def _together(shadows: Float[Tensor, "d"], glints: Float[Tensor, "d"]) -> Float[Tensor, "d"]:
@@ -172,7 +176,7 @@ def _openness(
     radius: float,
 ) -> Float[Tensor, "m"]:
     """Share of an even sky that reaches each point; what is blocked brings half."""
-    around = even_directions(64)
+    around = even_directions(48)
     lit = _lit(occluders, points, normals, around, center=center, radius=radius)
     return 0.5 + 0.5 * lit.sum(1) / (normals @ around.T).clamp_min(0).sum(1)
 

@@ -30,7 +30,8 @@ class Relight:
     out: Path = Path("relit")
     """Folder for scene.ply, is_object.npy, light.json and the same in words, light.txt."""
     surroundings: Path | None = None
-    """The source without the object, a .ply: the light that is to be taken off. Without it brightness is kept."""
+    """The source without the first object, a .ply: the light that is to be taken off. Other objects, and the first
+    without it, keep their mean brightness."""
     object_cameras: Path | None = None
     """The source's cameras, a transforms.json."""
     light: Literal["transfer", "gain", "off"] = "transfer"
@@ -89,7 +90,7 @@ class Relight:
             if self.object_cameras is None:
                 raise ValueError("--surroundings: expected --object-cameras beside it, found none")
             source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
-        # only the first object is known to come from these surroundings; further ones keep their mean brightness
+        # only the first object is known to come from these surroundings; the report says so of further ones
         return [source if index == 0 else None for index in range(len(composite.objects))]
 
 
