@@ -18,7 +18,7 @@ from splatgraft.images import linear_from_srgb
 from splatgraft.relight.normals import Normals
 from splatgraft.relight.viewers import seen_from, spread_over
 
-_VIEWERS = 16
+_VIEWERS = 20
 _RECEIVERS = 2000
 _FEWEST = 200
 _FLATTEST = 0.1  # cosine

@@ -22,6 +22,7 @@ from splatgraft.relight.visibility import Occluders, Window, occluders_of, splat
 from splatgraft.spherical_harmonics import rgb_from_dc
 
 _DIRECTIONS = 320  # on the sphere; those above the horizon, about half, are tried
+_CAP, _FINER = math.radians(14), 64  # around the best, where directions are tried more closely
 _LOWEST = math.radians(5)
 _RECEIVERS = 4000
 _OCCLUDERS = 16000
@@ -49,10 +50,6 @@ class Vote:
     """Share of the brightness variance within materials that the light explains: shadows alone."""
     heard: float
     """How much highlights say, in [0, 1]."""
-    directions: Float[Tensor, "d 3"]
-    """All that were tried."""
-    scores: Float[Tensor, "d"]
-    """Share that each explains, of shadows and highlights together."""
 
 
 def vote(
@@ -81,30 +78,26 @@ def vote(
     directions = directions[directions @ up > math.sin(_LOWEST)]
     lit = _lit(occluders, points, facing, directions, center=center, radius=radius)
     fit = _Fit.of(brightness, ambient, groups, weight * (ambient > _HIDDEN))
-    shadows = fit.explained(lit)[0]
-    glints = _glints(highlights, directions)
-    best = int(_together(shadows, glints).argmax())
+    coarse = _together(fit.explained(lit)[0], _glints(highlights, directions))
     # finer: a cap of directions around the best
-    finer = _cap(directions[best], math.radians(9), 48)
+    finer = _cap(directions[int(coarse.argmax())], _CAP, _FINER)
     finer = finer[finer @ up > math.sin(_LOWEST)]
-    lit_finer = _lit(occluders, points, facing, finer, center=center, radius=radius)
-    directions, lit = torch.cat([directions, finer]), torch.cat([lit, lit_finer], 1)
-    shadows = torch.cat([shadows, fit.explained(lit_finer)[0]])
-    glints = torch.cat([glints, _glints(highlights, finer)])
+    lit = _lit(occluders, points, facing, finer, center=center, radius=radius)
+    shadows, glints = fit.explained(lit)[0], _glints(highlights, finer)
     scores = _together(shadows, glints)
-    top = float(scores.max())
+    top, typical = float(scores.max()), float(coarse.median())
     # the top of the curve is the estimate, its width the doubt
     share = ((scores - 0.85 * top) / max(0.15 * top, 1e-9)).clamp_min(0)
-    direction = torch.nn.functional.normalize((share[:, None] * directions).sum(0), dim=0)
-    angle = torch.acos((directions @ direction).clamp(-1, 1))
+    direction = torch.nn.functional.normalize((share[:, None] * finer).sum(0), dim=0)
+    angle = torch.acos((finer @ direction).clamp(-1, 1))
     width = float(((share * angle**2).sum() / share.sum().clamp_min(1e-9)).sqrt())
-    nearest = int((directions @ direction).argmax())
+    nearest = int((finer @ direction).argmax())
     told = float(shadows[nearest])
     # measured on synthetic scenes: the less the best direction explains of the shadows, the farther it is from the
     # truth; highlights know the azimuth, and err by 9 degrees in height
     heard = float(glints[nearest]) / (float(glints[nearest]) + 0.1)
     weight = math.radians(3 + 16 * math.exp(-told / 0.15)) ** -2 + heard / _OF_GLINTS**2
-    contrast = (top - float(scores.median())) / max(top, 1e-9)
+    contrast = (top - typical) / max(top, 1e-9)
     return Vote(
         direction=direction,
         uncertainty=math.hypot((1 - heard) * width, weight**-0.5),
@@ -112,8 +105,6 @@ def vote(
         confidence=top / (top + 0.08) * min(1.0, 1.6 * contrast),
         explained=told,
         heard=heard,
-        directions=directions,
-        scores=scores,
     )
 
 
