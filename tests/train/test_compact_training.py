@@ -13,6 +13,7 @@ from ball_pairs import write_ball_pairs
 from splatgraft.cli import main
 from splatgraft.harmonize.compact.features import composed
 from splatgraft.harmonize.compact.network import CompactNetwork, CompactSize
+from splatgraft.harmonize.compact.registered import SHIPPED
 from splatgraft.harmonize.compact.weights import read_weights
 from splatgraft.relight.light import Light, LightSource, ambient_of
 from splatgraft.synth.pairs import write_manifest
@@ -174,6 +175,23 @@ def test_the_shipped_pairs_are_read_with_their_light(tmp_path):
     far = (view.mask == 0) & (view.log_ratio.abs().sum(1, keepdim=True) == 0)
     assert float((view.background - truth).abs().mean(1, keepdim=True)[far].median()) < 0.02
     assert 0 < pairs.read(0)[0].trust < 1
+
+
+def test_the_shipped_weights_are_those_of_a_training(tmp_path):
+    # these pairs were trained on: this tells that the file is whole and fits its features, not how good it is
+    shipped = Path(__file__).parents[2] / "data" / "pairs"
+    priors.write_priors([shipped / "kitchen_0001_00001"], tmp_path, seed=0)
+    pairs, network = CompactPairs(shipped, [tmp_path], NOTHING), read_weights(SHIPPED)
+    assert SHIPPED.stat().st_size < 10e6
+    before = after = 0.0
+    for index in range(10):
+        view, truth = pairs.read(index)
+        with torch.no_grad():
+            made = composed(view, network(view.resized(160, 240).channels()))
+        assert made.isfinite().all()
+        before += float(errors_of(view.prior(), truth, view).object)
+        after += float(errors_of(made, truth, view).object)
+    assert after < 0.9 * before
 
 
 def test_a_missing_probe_is_named(tmp_path):
