@@ -18,6 +18,7 @@ _ROUNDS = 12
 RIM = 2.4
 """Standard deviations; beyond, a Gaussian's alpha is below 0.05."""
 _STEPS = (-RIM, -RIM / 2, 0.0, RIM / 2, RIM)
+_LINES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.7, 0.7], [0.7, -0.7]])
 _BROAD, _FINEST = 0.1, 0.02  # object radii
 _VARIATION = 0.005  # share of light times alpha: a tenth of the contrast at which an edge is seen, as many overlap
 
@@ -146,18 +147,22 @@ def _average(
     *,
     ambient: Float[Tensor, "3 f 3"] | None,
 ) -> None:
-    """Fill in mean and variation of those Gaussians from points along both wide axes; `ambient`, if given, is even."""
+    """Fill in mean and variation of those Gaussians from points along both wide axes, and between them.
+
+    `ambient`, if given, is even over each; then so narrow ones are not asked between their axes.
+    """
     if not len(which):
         return
-    part, steps = receivers.select(which), len(_STEPS)
-    line, zero = torch.tensor(_STEPS), torch.zeros(steps)
-    points = _points(part.gaussians, torch.stack([torch.cat([line, zero]), torch.cat([zero, line])]))
+    part, steps, lines = receivers.select(which), len(_STEPS), 2 if ambient is not None else 4
+    line = torch.tensor(_STEPS)
+    points = _points(part.gaussians, (_LINES[:lines, :, None] * line).transpose(0, 1).flatten(1))
     sums = _sums(part, maps, sources=True, points=points)
-    even = (
-        _sums(part, maps, sources=False, points=points) if ambient is None else ambient.repeat_interleave(2 * steps, 1)
-    )
-    there = ratio_of(sums + even)
-    shadow, bounce = (t.reshape(len(which), 2, steps, 3) for t in (there.shadow, there.bounce))
+    if ambient is None:
+        sums = sums + _sums(part, maps, sources=False, points=points)
+    else:
+        sums = sums + ambient.repeat_interleave(lines * steps, 1)
+    there = ratio_of(sums)
+    shadow, bounce = (t.reshape(len(which), lines, steps, 3) for t in (there.shadow, there.bounce))
     ratio, variation = found
     # what is seen of a Gaussian is mostly its middle: half the weight of its width
     seen = torch.exp(-(line**2))[:, None]
@@ -166,10 +171,13 @@ def _average(
     ratio.bounce[which] = _both_ways((bounce * seen).sum(2), bounce[:, 0, steps // 2]).clamp_min(0)
     alpha = part.gaussians.opacities[:, None, None] * torch.exp(-0.5 * line**2)
     moves = ((shadow - shadow.mean(2, keepdim=True)).abs().amax(3) * alpha).amax(2)
+    if lines > 2:
+        # half of what varies between the axes is along either
+        moves = torch.maximum(moves[:, :2], 0.5 * moves[:, 2:].amax(1, keepdim=True))
     variation[which[:, None], part.gaussians.scales.argsort(1, descending=True)[:, :2]] = moves
 
 
-def _both_ways(along: Float[Tensor, "f 2 3"], middle: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
+def _both_ways(along: Float[Tensor, "f l 3"], middle: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
     """Mean over an ellipse from those along its axes: what they differ from the middle by adds up."""
     return along[:, 0] + along[:, 1] - middle
 

@@ -31,6 +31,7 @@ _MAP_SIZE = 128
 _ATTENUATION, _ATTENUATED = 2.5, 0.25
 _HIDDEN = 0.6  # openness below which a point is inside something
 _OF_GLINTS = math.radians(9)
+_NOISE = 0.02  # of log brightness: what no light explains
 _STRENGTHS = (0.3, 0.8, 2.0, 4.0, 8.0)
 
 
@@ -202,7 +203,8 @@ class _Fit:
         """Weighted squares around each group's mean."""
         total = self.member.sum(1, keepdim=True).clamp_min(1e-9)
         sums = self.member @ values
-        return self.member.sum(0) @ (values * values) - (sums * sums / total).sum(0)
+        # rounding takes what is even below zero
+        return (self.member.sum(0) @ (values * values) - (sums * sums / total).sum(0)).clamp_min(0)
 
     def explained(self, lit: Float[Tensor, "m d"]) -> tuple[Float[Tensor, "d"], Float[Tensor, "d"]]:
         """Share of the ambient-only model's error that a light removes, and the strength that removes most."""
@@ -212,7 +214,8 @@ class _Fit:
             self._residual(value[:, None] - (self.ambient[:, None] + strength * lit).log()) for strength in _STRENGTHS
         ]
         residual, which = torch.stack(tried).min(0)
-        return (1 - residual / without.clamp_min(1e-12)).clamp_min(0), torch.tensor(_STRENGTHS)[which]
+        noise = _NOISE**2 * self.member.sum()
+        return (1 - (residual + noise) / (without + noise)).clamp(0, 0.99), torch.tensor(_STRENGTHS)[which]
 
     def strength(self, lit: Float[Tensor, "m"]) -> Float[Tensor, "3"]:
         """Irradiance facing the light over ambient irradiance, per channel."""
