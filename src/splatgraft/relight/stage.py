@@ -22,7 +22,8 @@ from splatgraft.relight.normals import Normals, estimate_normals, raised
 from splatgraft.relight.object_shading import irradiance
 from splatgraft.relight.place_light import levelled, panorama_at, unlevelled_light_at
 from splatgraft.relight.receivers import RIM
-from splatgraft.relight.scene_shading import Ball, SceneMaps, map_scene, reachable, scene_visibility
+from splatgraft.relight.scene_shading import AMBIENT_SIZE, Ball, SceneMaps, map_scene, reachable, scene_visibility
+from splatgraft.relight.visibility import thinned
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,9 @@ def set_stage(
     lit = light
     members = _members(scene, region, balls, lit, cache)
     around = cache.get("around", (members,), lambda: scene.select(members))
-    normals = cache.get("normals", (around, cameras), lambda: estimate_normals(around, cameras, among=scene))
+    # what hides them need not be finer than the maps are
+    hiding = cache.get("hiding", (scene, region), lambda: thinned(scene, width=2 * region.radius / AMBIENT_SIZE))
+    normals = cache.get("normals", (around, cameras), lambda: estimate_normals(around, cameras, among=hiding))
     maps = cache.get("maps", (scene, region, lit.sources), lambda: map_scene(scene, region, beams_of(lit)))
     points = cache.get("points", (normals,), lambda: raised(around, normals.vectors))
     arrives = cache.get(
