@@ -13,10 +13,11 @@ from editor_driver import wait_until
 from splatgraft.editor.jobs import Jobs, JobState, PlannedStep, seconds_left, seconds_left_in_all, write_state
 
 WORK = """
-import sys, os, time
+import sys, os, signal, time
 from pathlib import Path
 from splatgraft.editor.jobs import JobState, hold, write_state
 folder, seconds = Path(sys.argv[1]), float(sys.argv[2])
+signal.signal(signal.SIGINT, signal.default_int_handler)
 lock = hold(folder)
 state = JobState("work", ("run",), os.getpid(), "running", time.time(), step="render", done=3, total=4)
 write_state(folder, state)

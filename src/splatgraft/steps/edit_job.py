@@ -63,7 +63,9 @@ def main(arguments: Sequence[str]) -> int:
     from splatgraft.steps.run import Run
 
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # a shell starts what it puts in the background deaf to the first of them
+    for asked in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(asked, signal.default_int_handler)
     folder, title, project, to = Path(arguments[0]), arguments[1], Path(arguments[2]), arguments[3]
     out = Path(arguments[4]) if len(arguments) > 4 else None
     shown = ("run", str(project), "--to", to)
