@@ -20,7 +20,8 @@ RIM = 2.4
 _STEPS = (-RIM, -RIM / 2, 0.0, RIM / 2, RIM)
 _LINES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.7, 0.7], [0.7, -0.7]])
 _BROAD, _FINEST = 0.1, 0.02  # object radii
-_VARIATION = 0.005  # share of light times alpha: a tenth of the contrast at which an edge is seen, as many overlap
+_VARIATION = 0.003  # share of light times alpha: what many that overlap may each leave out
+_AT_RIMS = 0.02  # share of light: a rim shows a twentieth of it
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def _at_an_edge(
     there = _sums(part, maps, sources=True, points=rims).reshape(3, len(which), -1, 3) + ambient
     here = center[0][:, which, None] + ambient
     changes = (there[1] / there[0].clamp_min(1e-9) - here[1] / here[0].clamp_min(1e-9)).abs()
-    return which[changes.amax((1, 2)) > _VARIATION]
+    return which[changes.amax((1, 2)) > _AT_RIMS]
 
 
 def _average(
