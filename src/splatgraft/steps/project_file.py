@@ -117,6 +117,4 @@ def _check_side(path: Path, side: Side, table: Mapping[str, Any]) -> None:
     if is_scene(Path(table.get("capture", ""))):
         raise ValueError(f"{path} [{side}] capture: expected photographs, found a scene; write scene = instead")
     if "scene" in table and "reconstruct" in table:
-        raise ValueError(
-            f"{path} [{side}.reconstruct]: expected none beside a trained scene, found one"
-        )
+        raise ValueError(f"{path} [{side}.reconstruct]: expected none beside a trained scene, found one")

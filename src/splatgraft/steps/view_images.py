@@ -122,7 +122,7 @@ class ViewFolder:
         try:
             return float(json.loads(path.read_text())["trust"])
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: expected {{\"trust\": 0 to 1}}, found {path.read_text()[:80]!r}") from error
+            raise ValueError(f'{path}: expected {{"trust": 0 to 1}}, found {path.read_text()[:80]!r}') from error
 
 
 def _normal_from_rgb(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
