@@ -178,14 +178,18 @@ class Window:
 
     def handle_of_the_gizmo(self) -> tuple[float, float]:
         """Where the vertical arrow of the gizmo is: the bluest place of the canvas."""
+        # after it stands still: a screenshot of a canvas that is drawn in software may be one frame late
         self.page.wait_for_timeout(1500)
-        picture = np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")).astype(int)
-        # viser's blue for z; the panels have none of it
-        blue = (abs(picture - np.array([48, 144, 240])).sum(-1) < 90).nonzero()
-        assert len(blue[0]) > 20, "the gizmo's blue arrow is not in view"
-        rows, columns = blue
+        wait_until(lambda: len(self._blue()[0]) > 20, timeout=20, what="the gizmo's blue arrow")
+        rows, columns = self._blue()
         top = rows.argsort()[: max(10, len(rows) // 8)]
         return float(np.median(columns[top])), float(np.median(rows[top]))
+
+    def _blue(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of viser's blue for z; the panels have none of it."""
+        picture = np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")).astype(int)
+        rows, columns = (abs(picture - np.array([48, 144, 240])).sum(-1) < 90).nonzero()
+        return rows, columns
 
     def unknown_complaints(self) -> list[str]:
         """What the browser's console says but for what viser is known to cause."""
