@@ -18,6 +18,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from splatgraft.editor.state import EditState, read_state
+
 ARGUMENTS = (
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
@@ -198,6 +200,16 @@ class Window:
     def quiet(self, *, timeout: float = 120) -> None:
         """Wait until no job is shown."""
         self.page.wait_for_selector(".sg-job", state="detached", timeout=timeout * 1000)
+
+
+def state_of(project: Path) -> EditState:
+    """What the files say once the editor, which writes them one after another, is between two changes."""
+    for _ in range(20):
+        try:
+            return read_state(project)
+        except ValueError:
+            time.sleep(0.1)
+    return read_state(project)
 
 
 def wait_until(true: Callable[[], bool], *, timeout: float, what: str) -> None:

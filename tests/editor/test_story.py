@@ -10,11 +10,10 @@ from typing import Any
 
 import pytest
 import torch
-from editor_driver import Editor, Window, wait_until, with_browser
+from editor_driver import Editor, Window, state_of, wait_until, with_browser
 from tiny_project import OPTIONS, ball, photograph, plane
 
 from splatgraft.editor.jobs import Jobs
-from splatgraft.editor.state import read_state
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import read_placement
 
@@ -84,7 +83,7 @@ def leave_and_come_back(window: Window, browser: Any, editor: Editor) -> Window:
 def select(window: Window, project: Path) -> None:
     window.turn("Select")
     window.check("Box around the object")
-    wait_until(lambda: read_state(project).box is not None, timeout=20, what="a box in project.toml")
+    wait_until(lambda: state_of(project).box is not None, timeout=20, what="a box in project.toml")
     window.says("are inside the box")
     window.click("Cut out the object")
     window.says("Cut out the object: done")
@@ -96,11 +95,11 @@ def select(window: Window, project: Path) -> None:
     window.page.wait_for_timeout(150)
     window.drag((640, 300), (60, 400))
     window.page.keyboard.up("Shift")
-    wait_until(lambda: read_state(project).corrections is not None, timeout=20, what="strokes")
+    wait_until(lambda: state_of(project).corrections is not None, timeout=20, what="strokes")
     window.click("Undo")
-    wait_until(lambda: read_state(project).corrections is None, timeout=20, what="the stroke undone")
+    wait_until(lambda: state_of(project).corrections is None, timeout=20, what="the stroke undone")
     window.click("Redo")
-    wait_until(lambda: read_state(project).corrections is not None, timeout=20, what="the stroke again")
+    wait_until(lambda: state_of(project).corrections is not None, timeout=20, what="the stroke again")
     # the ball is in the middle between the two panels
     window.check("Brush")
     window.says("the brush is on")
@@ -134,9 +133,9 @@ def place(window: Window, project: Path) -> None:
     window.click("Drop")
     window.says("dropped")
     window.click("Duplicate")
-    wait_until(lambda: len(read_state(project).objects or ()) == 2, timeout=20, what="two objects")
+    wait_until(lambda: len(state_of(project).objects or ()) == 2, timeout=20, what="two objects")
     window.page.keyboard.press("Control+z")
-    wait_until(lambda: len(read_state(project).objects or ()) == 1, timeout=20, what="one object again")
+    wait_until(lambda: len(state_of(project).objects or ()) == 1, timeout=20, what="one object again")
     window.page.wait_for_function(
         "() => [...document.querySelectorAll('.sg-caption')].some(e => e.textContent.includes('Light transfer'))",
         timeout=60_000,
@@ -166,7 +165,7 @@ def killed_while_dragging(window: Window, browser: Any, editor: Editor, project:
 def light(window: Window, project: Path) -> None:
     window.turn("Light")
     window.write("Shadow", "0.5")
-    wait_until(lambda: read_state(project).weights.shadow == 0.5, timeout=20, what="the shadow's strength")
+    wait_until(lambda: state_of(project).weights.shadow == 0.5, timeout=20, what="the shadow's strength")
 
 
 def killed_while_running(window: Window, browser: Any, editor: Editor, project: Path) -> tuple[Editor, Window]:

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from editor_driver import Editor, Window, wait_until, with_browser
+from editor_driver import Editor, Window, state_of, wait_until, with_browser
 from PIL import Image
 from test_bare_scenes import AROUND_THE_BALL
 from tiny_project import ball, plane
 
-from splatgraft.editor.state import read_state
 from splatgraft.editor.toml_edit import with_keys
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.gaussians import concatenate
@@ -76,10 +75,10 @@ def cut_by_the_box(window: Window, project: Path) -> None:
     window.turn("Select")
     window.choose("Masks from", "no masks: all that is in the box")
     window.check("Box around the object")
-    wait_until(lambda: read_state(project).box is not None, timeout=20, what="a box in project.toml")
+    wait_until(lambda: state_of(project).box is not None, timeout=20, what="a box in project.toml")
     window.write_all("Box to", AROUND_THE_BALL[3:])
     window.write_all("Box from", AROUND_THE_BALL[:3])
-    wait_until(lambda: list(read_state(project).box or ()) == AROUND_THE_BALL, timeout=20, what="the typed box")
+    wait_until(lambda: list(state_of(project).box or ()) == AROUND_THE_BALL, timeout=20, what="the typed box")
     window.choose("Keep pieces", "all")
     window.says("80 of 224 Gaussians are inside the box")
     window.click("Cut out the object")
@@ -89,7 +88,7 @@ def cut_by_the_box(window: Window, project: Path) -> None:
 
 def strokes(project: Path) -> tuple[int, int]:
     """How many Gaussians were added and removed."""
-    found = read_state(project).corrections
+    found = state_of(project).corrections
     return (0, 0) if found is None else (int((found > 0).sum()), int((found < 0).sum()))
 
 
@@ -120,21 +119,21 @@ def paint(window: Window, project: Path) -> None:
 def fill_the_target(window: Window, project: Path, root: Path) -> None:
     window.turn("Place")
     window.click("Find a place for it")
-    wait_until(lambda: len(read_state(project).objects or ()) == 1, timeout=30, what="a placed object")
+    wait_until(lambda: len(state_of(project).objects or ()) == 1, timeout=30, what="a placed object")
     window.unfold("Another object")
     window.upload("Upload a file", root / "another.spz")
-    wait_until(lambda: len(read_state(project).objects or ()) == 2, timeout=30, what="an object from a file")
+    wait_until(lambda: len(state_of(project).objects or ()) == 2, timeout=30, what="an object from a file")
     chosen = window.field("Object")
     wait_until(lambda: chosen.input_value() == "2: another.spz", timeout=20, what="the new object chosen")
     window.unfold("Erase from the target")
     window.check("Show the box")
     window.click("Erase what is in the box")
     window.says("Gaussians of the target")
-    erased = read_state(project).erased
+    erased = state_of(project).erased
     assert erased is not None
     assert 0 < int(erased.sum()) < len(erased)
     window.click("Undo")
-    wait_until(lambda: read_state(project).erased is None, timeout=20, what="all back")
+    wait_until(lambda: state_of(project).erased is None, timeout=20, what="all back")
 
 
 def pixels_like(window: Window, color: tuple[int, int, int]) -> int:
@@ -166,7 +165,7 @@ def aim_the_sun(window: Window, project: Path) -> None:
 
 
 def height_of_the_sun(project: Path) -> float:
-    light = read_state(project).light
+    light = state_of(project).light
     assert light is not None
     return light.sources[0].direction[2]
 
