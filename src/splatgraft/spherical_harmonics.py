@@ -69,6 +69,12 @@ def basis(directions: Float[Tensor, "*n 3"], degree: int) -> Float[Tensor, "*n k
     return torch.stack(values, -1)
 
 
+def band_from_slope(slope: Float[Tensor, "*n 3 c"]) -> Float[Tensor, "*n 3 c"]:
+    """Coefficients of band 1 whose value along the unit vector d is slope . d; world axes first."""
+    x, y, z = slope.unbind(-2)
+    return torch.stack([-y, z, -x], -2) / _C1
+
+
 def colors(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """sRGB seen along unit `directions` (from the camera to the Gaussian): the expansion plus one half, at least 0."""
     values = basis(directions, degree_of(sh.shape[1]))

@@ -72,6 +72,7 @@ def carried_over(relit: Relit, composite: Composite, parts: Sequence[Thinned]) -
         shade=relit.shade[row],
         shadow=relit.shadow[row],
         bounce=relit.bounce[row],
+        slope=torch.zeros_like(relit.slope[row]),  # holds for the width of the thinned only
         gloss=relit.gloss[row],
         light=relit.light,
         report=relit.report,

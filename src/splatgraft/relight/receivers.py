@@ -21,6 +21,11 @@ _STEPS = (-RIM, -RIM / 2, 0.0, RIM / 2, RIM)
 _LINES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.7, 0.7], [0.7, -0.7]])
 _BROAD, _FINEST = 0.1, 0.02  # object radii
 _VARIATION = 0.003  # share of light times alpha: what many that overlap may each leave out
+SHOWS_BEHIND = 1.2
+"""Standard deviations. Splats are blended in the order of their centres, so that what shows of one among others lies
+behind its centre, seen from the camera; without this every edge stands too far from all cameras. Measured on planes: 1.0
+for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
+_UNSEEN = 0.25
 _AT_RIMS = 0.02  # share of light: a rim shows a twentieth of it
 
 
@@ -67,7 +72,7 @@ def shade_receivers(
         order = wanted.argsort(descending=True)[: min(room, int((wanted > 0).sum()))]
         keep = torch.ones(len(wanted), dtype=torch.bool)
         keep[order] = False
-        kept = SceneRatio(shadow=ratio.shadow[keep], bounce=ratio.bounce[keep])
+        kept = SceneRatio(shadow=ratio.shadow[keep], bounce=ratio.bounce[keep], slope=ratio.slope[keep])
         done.append((pending.select(keep), which[keep], kept))
         parents = pending.select(order)
         pieces, parent = split_along(parents.gaussians, axis[order])
@@ -87,8 +92,9 @@ def shade_receivers(
     trust = joined.trust[:, None]
     shadow = torch.cat([ratio.shadow for _, _, ratio in done])
     bounce = torch.cat([ratio.bounce for _, _, ratio in done])
+    slope = torch.cat([ratio.slope for _, _, ratio in done])
     parents = torch.cat([w for _, w, _ in done])
-    return joined, parents, SceneRatio(shadow=1 - (1 - shadow) * trust, bounce=bounce * trust)
+    return joined, parents, SceneRatio(1 - (1 - shadow) * trust, bounce * trust, slope * trust)
 
 
 def _broad(gaussians: Gaussians, maps: ObjectMaps) -> Bool[Tensor, "m"]:
@@ -113,6 +119,7 @@ def _extended_ratio(
     fine = _at_an_edge(receivers, maps, fine, (by_sources, ambient)) if bool(by_sources.any()) else fine[:0]
     _average(receivers, maps, fine, (ratio, variation), ambient=ambient[:, fine])
     _average(receivers, maps, broad.nonzero()[:, 0], (ratio, variation), ambient=None)
+    _lean(receivers, maps, _in_penumbra(g, by_sources, ratio, smallest), ratio, ambient=ambient)
     variation[g.scales < smallest] = 0
     return ratio, variation
 
@@ -175,7 +182,40 @@ def _average(
     if lines > 2:
         # half of what varies between the axes is along either
         moves = torch.maximum(moves[:, :2], 0.5 * moves[:, 2:].amax(1, keepdim=True))
+    along = (((shadow + bounce).mean(3) * seen[:, 0] * line).sum(2) / (seen[:, 0] * line**2).sum())[:, :2]
+    ratio.slope[which] = SHOWS_BEHIND * _in_world(part.gaussians, along)
     variation[which[:, None], part.gaussians.scales.argsort(1, descending=True)[:, :2]] = moves
+
+
+def _in_penumbra(
+    gaussians: Gaussians, by_sources: Float[Tensor, "3 m 3"], ratio: SceneRatio, smallest: float
+) -> Int[Tensor, "p"]:
+    """Those too narrow to be averaged, yet not so narrow that an edge crosses them unseen."""
+    before, after, _ = by_sources.mean(-1)
+    cut = (after > _AT_RIMS * before) & (after < (1 - _AT_RIMS) * before)
+    widest = gaussians.scales.max(1).values
+    unknown = (ratio.slope == 0).all(1)
+    return (cut & unknown & (widest > _UNSEEN * smallest) & (gaussians.opacities > 0.05)).nonzero()[:, 0]
+
+
+def _lean(
+    receivers: Receivers, maps: ObjectMaps, which: Int[Tensor, "p"], ratio: SceneRatio, *, ambient: Tensor
+) -> None:
+    """Fill in the slope of those Gaussians from points beside their middle; ambient light is even over each."""
+    if not len(which):
+        return
+    part = receivers.select(which)
+    beside = _points(part.gaussians, torch.eye(2))
+    there = ratio_of(_sums(part, maps, sources=True, points=beside) + ambient[:, which].repeat_interleave(2, 1))
+    here = (ratio.shadow[which] + ratio.bounce[which]).mean(1, keepdim=True)
+    along = (there.shadow + there.bounce).mean(1).reshape(-1, 2) - here
+    ratio.slope[which] = SHOWS_BEHIND * _in_world(part.gaussians, along)
+
+
+def _in_world(gaussians: Gaussians, along: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
+    """A vector given along the two widest axes."""
+    axes = gaussians.scales.argsort(1, descending=True)[:, None, :2].expand(-1, 3, -1)
+    return (torch.gather(gaussians.rotations, 2, axes) @ along[..., None])[..., 0]
 
 
 def _both_ways(along: Float[Tensor, "f l 3"], middle: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:

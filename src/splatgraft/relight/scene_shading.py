@@ -137,6 +137,8 @@ class SceneRatio:
     """Share of linear light left, in (0, 1]; exactly 1 out of reach."""
     bounce: Float[Tensor, "m 3"]
     """Light from the object, as a share of the light before."""
+    slope: Float[Tensor, "m 3"]
+    """Change of both by the direction of view, world axes: seen along the unit vector d, slope . d is added (grey)."""
 
 
 def scene_ratio(
@@ -173,7 +175,7 @@ def ratio_of(sums: Float[Tensor, "3 m 3"]) -> SceneRatio:
     ratio = torch.where(before > 1e-8, after / total, 1).clamp(_DARKEST, 1)
     lost = _beyond_dead_zone(1 - ratio)
     gained = _beyond_dead_zone(torch.where(before > 1e-8, bounce / total, 0).clamp(0, 1))
-    return SceneRatio(shadow=1 - lost, bounce=gained)
+    return SceneRatio(shadow=1 - lost, bounce=gained, slope=torch.zeros_like(lost))
 
 
 def _beyond_dead_zone(change: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:

@@ -34,6 +34,8 @@ from splatgraft.relight.scene_shading import (
 )
 from splatgraft.relight.stage import Stage, set_stage
 
+_ENOUGH = 40_000  # pieces hold the edges of one shadow on a surface of many layers
+
 
 @dataclass(frozen=True)
 class RelightOptions:
@@ -42,7 +44,7 @@ class RelightOptions:
     reach: float = 8.0
     """Shadows are followed this many object radii far."""
     most_added: float = 0.3
-    """At most this share of the composite's Gaussians is added by splitting."""
+    """At most this share of the composite's Gaussians is added by splitting, or 40,000 where that is more; 0: none."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,8 @@ def _assembled(  # noqa: PLR0913
     report: list[str],
 ) -> Relit:
     """Objects on the scene, objects on each other, and all layers in one list."""
-    lit, ratio = _on_scene(stage, actors, beams, budget=int(options.most_added * baked.count), degree=baked.sh_degree)
+    budget = max(int(options.most_added * baked.count), _ENOUGH) if options.most_added > 0 else 0
+    lit, ratio = _on_scene(stage, actors, beams, budget=budget, degree=baked.sh_degree)
     scene_count = stage.scene.count
     rest = torch.ones(scene_count, dtype=torch.bool)
     rest[lit.origin] = False
@@ -142,6 +145,7 @@ def _assembled(  # noqa: PLR0913
         shade=torch.cat([torch.ones(count, 3), *shades])[order],
         shadow=torch.cat([ones, ratio.shadow, *[r.shadow for r in on_objects]])[order],
         bounce=torch.cat([zeros, ratio.bounce, *[r.bounce for r in on_objects]])[order],
+        slope=torch.cat([zeros, ratio.slope, *[r.slope for r in on_objects]])[order],
         gloss=torch.cat([torch.zeros_like(gaussians.sh[:count]), *glosses])[order],
         light=stage.light,
         report=tuple(report),
@@ -163,17 +167,20 @@ def _on_scene(
         trust=torch.ones(int(reached.sum())),
         origin=stage.members[reached],
     )
-    shadow: Tensor | None = None
-    bounce: Tensor | None = None
+    found: SceneRatio | None = None
     for actor in actors:
         receivers, parents, ratio = shade_receivers(receivers, actor.body.maps, budget=budget // len(actors))
-        if shadow is None or bounce is None:
-            shadow, bounce = ratio.shadow, ratio.bounce
-        else:
-            shadow, bounce = shadow[parents] * ratio.shadow, bounce[parents] + ratio.bounce
-    assert shadow is not None
-    assert bounce is not None
-    return receivers, SceneRatio(shadow=shadow, bounce=bounce)
+        if found is None:
+            found = ratio
+            continue
+        found = SceneRatio(
+            shadow=found.shadow[parents] * ratio.shadow,
+            bounce=found.bounce[parents] + ratio.bounce,
+            slope=found.slope[parents] * ratio.shadow.mean(1, keepdim=True)
+            + found.shadow[parents].mean(1, keepdim=True) * ratio.slope,
+        )
+    assert found is not None
+    return receivers, found
 
 
 def _gloss(actor: _Actor, shade: Float[Tensor, "n 3"], stage: Stage, degree: int) -> Float[Tensor, "n k 3"]:
@@ -194,4 +201,4 @@ def _on_object(index: int, actors: list[_Actor]) -> SceneRatio:
             points, facing = actor.body.gaussians.means, actor.body.normals.vectors
             ratio = scene_ratio(other.body.maps, points, facing, arrives=actor.arrives)
             shadow, bounce = shadow * ratio.shadow, bounce + ratio.bounce
-    return SceneRatio(shadow=shadow, bounce=bounce)
+    return SceneRatio(shadow=shadow, bounce=bounce, slope=torch.zeros_like(shadow))
