@@ -23,8 +23,8 @@ _BROAD, _FINEST = 0.1, 0.02  # object radii
 _VARIATION = 0.003  # share of light times alpha: what many that overlap may each leave out
 SHOWS_BEHIND = 1.2
 """Standard deviations. Splats are blended in the order of their centres, so that what shows of one among others lies
-behind its centre, seen from the camera; without this every edge stands too far from all cameras. Measured on planes: 1.0
-for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
+behind its centre, seen from the camera; without this every edge stands too far from all cameras. Measured on planes:
+1.0 for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
 _UNSEEN = 0.25
 _AT_RIMS = 0.02  # share of light: a rim shows a twentieth of it
 
