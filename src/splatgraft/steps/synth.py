@@ -15,7 +15,7 @@ from splatgraft.steps.step import Positional
 from splatgraft.steps.terminal import Terminal
 from splatgraft.steps.true_light import write_true_light
 from splatgraft.synth import benchmark, pairs
-from splatgraft.synth.jobs import Job, RenderSize, check_blender, render_job
+from splatgraft.synth.jobs import Job, RenderSize, check_blender, render_job, take_over
 from splatgraft.synth.outdoors import SUPPLIED_MAPS
 from splatgraft.workers import Task, run_tasks
 
@@ -127,17 +127,29 @@ class Benchmark:
         chosen, size = self._chosen(), self._size()
         python = self.workers.python(terminal)
         with locked(self.out):
-            tasks: list[Task] = []
-            for which in chosen:
-                for job, folder in zip(benchmark.plan(which, size), self._folders(which), strict=True):
-                    tasks.append(Task(folder.name, partial(render_job, job, folder, python)))
-            failures = self.workers.run(tasks, self.out, terminal)
+            failures = []
+            # what several turns of one object share is rendered once: with the first of them
+            first = [which for i, which in enumerate(chosen) if not set(chosen[:i]) & set(benchmark.twins(which))]
+            for wave in (first, [which for which in chosen if which not in first]):
+                tasks = []
+                for which in wave:
+                    self._take_over(which, size)
+                    for job, folder in zip(benchmark.plan(which, size), self._folders(which), strict=True):
+                        tasks.append(Task(folder.name, partial(render_job, job, folder, python)))
+                failures += self.workers.run(tasks, self.out, terminal) if tasks else []
             for which in chosen:
                 target, source = benchmark.plan(which, size)
                 if _done(target, self._folders(which)[0]) and _done(source, self._folders(which)[1]):
                     failures += self._gather(which, terminal)
             _write_failures(self.out, failures, terminal)
         return 1 if failures else 0
+
+    def _take_over(self, which: benchmark.BenchmarkScene, size: benchmark.BenchmarkSize) -> None:
+        for twin in benchmark.twins(which):
+            ours, theirs = benchmark.plan(which, size), benchmark.plan(twin, size)
+            for job, folder, elder, there in zip(ours, self._folders(which), theirs, self._folders(twin), strict=True):
+                if not job.is_done(folder):
+                    take_over(job, folder, elder, there)
 
     def _gather(self, which: benchmark.BenchmarkScene, terminal: Terminal) -> list[str]:
         out = self.out / which.name

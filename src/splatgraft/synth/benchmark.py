@@ -67,6 +67,15 @@ ROTATIONS: tuple[BenchmarkScene, ...] = tuple(
 )
 
 
+def twins(which: BenchmarkScene) -> tuple[BenchmarkScene, ...]:
+    """The other scenes of the same place and object: they differ in the turn of the object only, and share views."""
+    return tuple(
+        other
+        for other in (*SCENES, *ROTATIONS)
+        if (other.seed, other.object_seed) == (which.seed, which.object_seed) and other != which
+    )
+
+
 @dataclass(frozen=True)
 class BenchmarkSize:
     """How large the benchmark is rendered."""

@@ -1,9 +1,10 @@
 """Render jobs: what to render, and rendering it in a Blender process. Knows not what a job is for."""
 
 import json
+import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -126,6 +127,33 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
             (line for line in reversed(tail) if "Error" in line and "freed" not in line), tail[-1] if tail else ""
         )
         raise ValueError(f"{log}: expected Blender to render every picture, found exit code {code}: {said}")
+
+
+def take_over(job: Job, out: Path, elder: Job, elder_out: Path) -> None:
+    """Copy from `elder_out` the whole takes that `job` would render just the same; what `out` has stays.
+
+    The first take decides the exposure, so where that is not shared, nothing is.
+    """
+    alike = (elder.scene, elder.cameras, elder.size, elder.seed) == (job.scene, job.cameras, job.size, job.seed)
+    shared = [
+        take
+        for take in job.takes
+        if alike
+        and take in elder.takes
+        and job.objects.get(take.object) == elder.objects.get(take.object)
+        and replace(elder, takes=(take,)).is_done(elder_out)
+    ]
+    if job.takes[0] not in shared:
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ("cameras.json", "exposure.json"):
+        shutil.copyfile(elder_out / name, out / name)
+    for take in shared:
+        # marks last: killed here, the pictures without one are rendered again
+        for path in sorted((elder_out / take.name).iterdir(), key=lambda path: path.suffix == ".done"):
+            (out / take.name).mkdir(exist_ok=True)
+            if not (out / take.name / path.name).exists():
+                shutil.copyfile(path, out / take.name / path.name)
 
 
 def check_blender(blender_python: Path) -> str:
