@@ -161,22 +161,23 @@ def _average(
     """
     if not len(which):
         return
-    part, steps, lines = receivers.select(which), len(_STEPS), 2 if ambient is not None else 4
-    line = torch.tensor(_STEPS)
-    points = _points(part.gaussians, (_LINES[:lines, :, None] * line).transpose(0, 1).flatten(1))
+    part, lines, line = receivers.select(which), 2 if ambient is not None else 4, torch.tensor(_STEPS)
+    beside = line[line != 0]
+    points = _points(part.gaussians, (_LINES[:lines, :, None] * beside).transpose(0, 1).flatten(1))
     sums = _sums(part, maps, sources=True, points=points)
     if ambient is None:
         sums = sums + _sums(part, maps, sources=False, points=points)
     else:
-        sums = sums + ambient.repeat_interleave(lines * steps, 1)
+        sums = sums + ambient.repeat_interleave(lines * len(beside), 1)
     there = ratio_of(sums)
-    shadow, bounce = (t.reshape(len(which), lines, steps, 3) for t in (there.shadow, there.bounce))
     ratio, variation = found
+    shadow = _with_middle(there.shadow.reshape(len(which), lines, len(beside), 3), ratio.shadow[which])
+    bounce = _with_middle(there.bounce.reshape(len(which), lines, len(beside), 3), ratio.bounce[which])
     # what is seen of a Gaussian is mostly its middle: half the weight of its width
     seen = torch.exp(-(line**2))[:, None]
     seen = seen / seen.sum()
-    ratio.shadow[which] = _both_ways((shadow * seen).sum(2), shadow[:, 0, steps // 2]).clamp(0, 1)
-    ratio.bounce[which] = _both_ways((bounce * seen).sum(2), bounce[:, 0, steps // 2]).clamp_min(0)
+    ratio.shadow[which] = _both_ways((shadow * seen).sum(2), ratio.shadow[which]).clamp(0, 1)
+    ratio.bounce[which] = _both_ways((bounce * seen).sum(2), ratio.bounce[which]).clamp_min(0)
     alpha = part.gaussians.opacities[:, None, None] * torch.exp(-0.5 * line**2)
     moves = ((shadow - shadow.mean(2, keepdim=True)).abs().amax(3) * alpha).amax(2)
     if lines > 2:
@@ -185,6 +186,13 @@ def _average(
     along = (((shadow + bounce).mean(3) * seen[:, 0] * line).sum(2) / (seen[:, 0] * line**2).sum())[:, :2]
     ratio.slope[which] = SHOWS_BEHIND * _in_world(part.gaussians, along)
     variation[which[:, None], part.gaussians.scales.argsort(1, descending=True)[:, :2]] = moves
+
+
+def _with_middle(beside: Float[Tensor, "f l s 3"], middle: Float[Tensor, "f 3"]) -> Float[Tensor, "f l t 3"]:
+    """Values along lines, t = s + 1, from those at the steps but the middle one."""
+    half = beside.shape[2] // 2
+    there = middle[:, None, None].expand(-1, beside.shape[1], 1, 3)
+    return torch.cat([beside[:, :, :half], there, beside[:, :, half:]], 2)
 
 
 def _in_penumbra(
