@@ -92,13 +92,13 @@ class Scenes:
         return self.derive(f"others {name}", (flags,), lambda: ~flags)
 
     def source_scenes(self, state: EditState) -> list[SourceScene | None]:
-        """What each object was taken from, as the step `relight` knows it: of the first alone."""
-        count = len(state.objects or ())
-        if not count or not self.files.surroundings.is_file():
-            return [None] * count
+        """What each object was taken from, as the step `relight` knows it: of the project's own and its copies."""
+        own = [self.object_path(item) == self.files.object for item in state.objects or ()]
+        if not any(own) or not self.files.surroundings.is_file():
+            return [None] * len(own)
         parts = (self.gaussians(self.files.surroundings), self.cameras(self.files.source_cameras))
         source = self.derive("source", parts, lambda: SourceScene(*parts))
-        return [source, *[None] * (count - 1)]
+        return [source if flag else None for flag in own]
 
     def _read(self, kind: str, path: Path, read: Callable[[Path], Any]) -> Any:
         with self._lock:

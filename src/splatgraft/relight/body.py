@@ -68,9 +68,7 @@ def set_body(
     maps = map_object(gaussians, ball, beams)
     then, before, story = None, None, None
     if source is not None:
-        before, problem = cache.get(
-            f"origin {index}", (placed.gaussians, source), lambda: _origin_light(placed.gaussians, source)
-        )
+        before, problem = _origin(placed.gaussians, source, index, cache)
         story = problem if before is None else before.describe(estimate_up(source.cameras)) + "."
         if before is not None:
             before = before.rotated(placed.target_from_object.rotation)
@@ -103,6 +101,15 @@ def _moved(body: Body, placed: PlacedObject, beams: Beams) -> Body:
         ball=Ball(center, body.ball.radius),
         maps=ObjectMaps(replace(body.maps.ambient_maps, window=window), occlusions),
     )
+
+
+def _origin(own: Gaussians, source: SourceScene, index: int, cache: RelightCache) -> tuple[Light | None, str | None]:
+    """The light that object `index` had, found once for all copies of one object."""
+    for earlier in range(index):
+        kept = cache.peek(f"origin {earlier}", (own, source))
+        if kept is not None:
+            return kept
+    return cache.get(f"origin {index}", (own, source), lambda: _origin_light(own, source))
 
 
 def _origin_light(own: Gaussians, source: SourceScene) -> tuple[Light | None, str | None]:

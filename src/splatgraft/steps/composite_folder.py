@@ -28,10 +28,13 @@ def read_composite(target: Path, placement: Path) -> Composite:
     """
     found = read_placement(placement)
     objects: list[Gaussians] = []
+    read: dict[Path, Gaussians] = {}
     for index, item in enumerate(found.objects):
         if item.object_path is None:
             raise ValueError(f'{placement}: expected objects[{index}] to name its "object", found none')
-        objects.append(read_gaussians(item.object_path))
+        if item.object_path not in read:
+            read[item.object_path] = read_gaussians(item.object_path)
+        objects.append(read[item.object_path])
     return assemble(read_gaussians(target), objects, found)
 
 

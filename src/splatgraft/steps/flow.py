@@ -112,7 +112,7 @@ def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:
     place |= {"cameras": cameras, "object_cameras": source_cameras}
     place |= {"placement": placement} if placement.is_file() else {}
     light = {"target": target, "placement": layout.composite / PLACEMENT_FILE, "cameras": cameras}
-    light |= {"surroundings": surroundings, "object_cameras": source_cameras}
+    light |= {"surroundings": surroundings, "object_cameras": source_cameras, "taken": layout.object / OBJECT_FILE}
     draw = {"scene": composite, "cameras": cameras, "prior": relit, "is_object": layout.composite / IS_OBJECT_FILE}
     fit = {"scene": relit, "views": layout.views, "images": layout.harmonized}
     judge = {"result": layout.result / SCENE_FILE, "composite": layout.composite, "cameras": cameras}

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from splatgraft.composite import Composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
+from splatgraft.formats.placement import read_placement
 from splatgraft.project import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_TEXT_FILE, SCENE_FILE
 from splatgraft.relight.exposure import relight_by_gain
 from splatgraft.relight.layers import LayerWeights
@@ -30,10 +30,12 @@ class Relight:
     out: Path = Path("relit")
     """Folder for scene.ply, is_object.npy, light.json and the same in words, light.txt."""
     surroundings: Path | None = None
-    """The source without the first object, a .ply: the light that is to be taken off. Other objects, and the first
-    without it, keep their mean brightness."""
+    """The source without the object that was taken from it, a .ply: the light that is to be taken off. Objects of other
+    files, and all of them without it, keep their mean brightness."""
     object_cameras: Path | None = None
     """The source's cameras, a transforms.json."""
+    taken: Path | None = None
+    """That object's file, as the placement names it; the first object's where not given."""
     light: Literal["transfer", "gain", "off"] = "transfer"
     """transfer: shading and shadows; gain: exposure and white balance of the object alone; off: the object as it was
     captured (the paper's configuration)."""
@@ -58,12 +60,10 @@ class Relight:
             gaussians, is_object = composite.bake()
             sentences = ("The light transfer was off: the object is pasted as it was captured.",)
         elif self.light == "gain":
-            adjusted, sentences = relight_by_gain(
-                composite, read_cameras(self.cameras), sources=self._sources(composite)
-            )
+            adjusted, sentences = relight_by_gain(composite, read_cameras(self.cameras), sources=self._sources())
             gaussians, is_object = adjusted.bake()
         else:
-            cameras, sources = read_cameras(self.cameras), self._sources(composite)
+            cameras, sources = read_cameras(self.cameras), self._sources()
             relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
             found = relit.light
             gaussians, is_object, sentences = relit.bake(self.weights), relit.is_object, relit.report
@@ -84,14 +84,18 @@ class Relight:
             raise ValueError(f"{self.given_light}: expected a light.json, found no such file")
         return light_from_json(self.given_light.read_text(), name=str(self.given_light))
 
-    def _sources(self, composite: Composite) -> list[SourceScene | None]:
+    def _sources(self) -> list[SourceScene | None]:
         source = None
         if self.surroundings is not None:
             if self.object_cameras is None:
                 raise ValueError("--surroundings: expected --object-cameras beside it, found none")
             source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
-        # only the first object is known to come from these surroundings; the report says so of further ones
-        return [source if index == 0 else None for index in range(len(composite.objects))]
+        paths = [item.object_path for item in read_placement(self.placement).objects]
+        taken = self.taken or (paths[0] if paths else None)
+        if taken is None:
+            return [None] * len(paths)
+        # copies of one object have one origin; of others none is known, and the report says so
+        return [source if path is not None and path.resolve() == taken.resolve() else None for path in paths]
 
 
 COMMAND = Relight
