@@ -31,6 +31,7 @@ _MAP_SIZE = 128
 _ATTENUATION, _ATTENUATED = 2.5, 0.25
 _HIDDEN = 0.6  # openness below which a point is inside something
 _OF_GLINTS = math.radians(9)
+_PLAIN_GLINT = 0.25
 _NOISE = 0.02  # of log brightness: what no light explains
 _STRENGTHS = (0.3, 0.8, 2.0, 4.0, 8.0)
 
@@ -79,13 +80,15 @@ def vote(
     directions = directions[directions @ up > math.sin(_LOWEST)]
     lit = _lit(occluders, points, facing, directions, center=center, radius=radius)
     fit = _Fit.of(brightness, ambient, groups, weight * (ambient > _HIDDEN))
-    coarse = _together(fit.explained(lit)[0], _glints(highlights, directions))
+    glints = _glints(highlights, directions)
+    trust = _trust(glints)
+    coarse = _together(fit.explained(lit)[0], glints, trust)
     # finer: a cap of directions around the best
     finer = _cap(directions[int(coarse.argmax())], _CAP, _FINER)
     finer = finer[finer @ up > math.sin(_LOWEST)]
     lit = _lit(occluders, points, facing, finer, center=center, radius=radius)
     shadows, glints = fit.explained(lit)[0], _glints(highlights, finer)
-    scores = _together(shadows, glints)
+    scores = _together(shadows, glints, trust)
     top, typical = float(scores.max()), float(coarse.median())
     # the top of the curve is the estimate, its width the doubt
     share = ((scores - 0.85 * top) / max(0.15 * top, 1e-9)).clamp_min(0)
@@ -96,7 +99,7 @@ def vote(
     told = float(shadows[nearest])
     # measured on synthetic scenes: the less the best direction explains of the shadows, the farther it is from the
     # truth; highlights know the azimuth, and err by 9 degrees in height
-    heard = float(glints[nearest]) / (float(glints[nearest]) + 0.1)
+    heard = trust * float(glints[nearest]) / (float(glints[nearest]) + 0.1)
     weight = math.radians(3 + 16 * math.exp(-told / 0.15)) ** -2 + heard / _OF_GLINTS**2
     contrast = (top - typical) / max(top, 1e-9)
     return Vote(
@@ -113,12 +116,21 @@ def _glints(highlights: Highlights | None, directions: Float[Tensor, "d 3"]) -> 
     return torch.zeros(len(directions)) if highlights is None else highlights.explained(directions)
 
 
-def _together(shadows: Float[Tensor, "d"], glints: Float[Tensor, "d"]) -> Float[Tensor, "d"]:
+def _trust(glints: Float[Tensor, "d"]) -> float:
+    """How far the best direction of highlights may be the main light's, in [0, 1].
+
+    Over rendered scenes with known light it was so wherever it explained more than a quarter of what changes from view
+    to view. A lamp close overhead has no one direction to mirror: then what is left of a far window glints instead.
+    """
+    return min(1.0, (float(glints.max()) / _PLAIN_GLINT) ** 2) if len(glints) else 0.0
+
+
+def _together(shadows: Float[Tensor, "d"], glints: Float[Tensor, "d"], trust: float) -> Float[Tensor, "d"]:
     """Share that stays unexplained is a likelihood: those of independent witnesses multiply.
 
-    Highlights count twice: where both speak, over rendered scenes with known light, they were nearer to the truth.
+    Trusted highlights count twice: where both speak, over the same scenes, they were nearer to the truth.
     """
-    return 1 - (1 - shadows) * (1 - glints) ** 2
+    return 1 - (1 - shadows) * (1 - glints) ** (2 * trust)
 
 
 def _receivers(scene: Gaussians, normals: Normals, center: Float[Tensor, "3"], radius: float) -> Int[Tensor, "m"]:
