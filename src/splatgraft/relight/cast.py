@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from numba import njit, prange
 from torch import Tensor
 
+from splatgraft.kernels import alone
 from splatgraft.relight.visibility import FAR, DepthMaps
 
 _COARSEST = 4  # pixels; the top of the pyramids
@@ -117,6 +118,7 @@ def _soft_cosine(cosine, softness):
     return (cosine + edge) * (cosine + edge) / (4 * edge)
 
 
+@alone
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
 def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one kernel: search, filter, sums)

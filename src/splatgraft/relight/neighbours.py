@@ -11,6 +11,8 @@ from jaxtyping import Float, Int
 from numba import njit, prange
 from torch import Tensor
 
+from splatgraft.kernels import alone
+
 _LEAF = 8  # points per lowest box
 
 
@@ -74,6 +76,7 @@ def _gap(box, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
+@alone
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
 def _search(points, order, boxes, found):  # noqa: PLR0912  (one kernel: descent and insertion)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.gaussians import Gaussians
+from splatgraft.kernels import alone
 from splatgraft.relight.neighbours import nearest_neighbours
 from splatgraft.relight.viewers import seen_from, spread_over
 
@@ -75,6 +76,7 @@ def _towards_viewers(
     return torch.where(seen_at_all[:, None], by_viewers, everyone), seen_at_all
 
 
+@alone
 @njit(cache=True, parallel=True)
 @no_type_check
 def _look(means, center, seen, total):
@@ -120,6 +122,7 @@ def _shortest_axis(xx, xy, xz, yy, yz, zz):
     return best_x / length, best_y / length, best_z / length, flatness
 
 
+@alone
 @njit(cache=True, parallel=True)
 @no_type_check
 def _estimate(cloud, neighbours, towards, out):
@@ -157,6 +160,7 @@ def _estimate(cloud, neighbours, towards, out):
         out[i, 3] = min(1.0, max(0.0, 2 * flatness))
 
 
+@alone
 @njit(cache=True, parallel=True)
 @no_type_check
 def _agree(normals, neighbours):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatgraft.cameras import Cameras
 from splatgraft.gaussians import Gaussians
+from splatgraft.kernels import alone
 from splatgraft.rendering import render
 
 _WIDTH = 128  # pixels; finer than any light's edge that matters here
@@ -33,6 +34,7 @@ def seen_from(gaussians: Gaussians, camera: Cameras, *, among: Gaussians) -> Boo
     return torch.from_numpy(out)
 
 
+@alone
 @njit(cache=True, parallel=True)
 @no_type_check
 def _in_sight(means, widths, camera, surface, out):

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splatgraft.gaussians import Gaussians
 from splatgraft.images import linear_from_srgb
+from splatgraft.kernels import alone
 from splatgraft.rendering.cpu_rows import LANES, lanes, largest, load, smaller, store, where_at_least, where_below
 from splatgraft.spherical_harmonics import rgb_from_dc
 
@@ -230,6 +231,7 @@ def _blend(splat, at, dv, du, maps):
     return weight, weight * place, largest(after) < _SPENT
 
 
+@alone
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
 def _splat(geometry, rgb, view, limits, maps, threads):
@@ -270,6 +272,7 @@ def _splat(geometry, rgb, view, limits, maps, threads):
                                 store(plane, at, load(plane, at) + weight * rgb[int(who), channel])
 
 
+@alone
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
 def _look_up(points, normals, view, maps, bias, out):
