@@ -13,15 +13,13 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
-from splatgraft.composite import Composite
-from splatgraft.editor.kept import Kept
 from splatgraft.editor.scenes import Scenes
 from splatgraft.editor.state import EditState
 from splatgraft.editor.transfers import Transfers
 from splatgraft.formats import read_capture
 from splatgraft.gaussians import Gaussians
+from splatgraft.kept import Kept
 from splatgraft.rendering import render
-from splatgraft.splitting import split_around
 
 Kind = Literal[
     "Copy-paste",
@@ -101,8 +99,7 @@ class Preview:
     def source_picture(self, which: Bool[Tensor, "n"] | None, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         """The source scene, or those of its Gaussians that `which` names."""
         scene = self._scenes.gaussians(self._scenes.files.source_scene)
-        with self._transfers.work:
-            color = render(scene if which is None else scene.select(which), camera).color
+        color = render(scene if which is None else scene.select(which), camera).color
         assert color is not None
         return _bytes(color[0])
 
@@ -117,23 +114,18 @@ class Preview:
         if kind == "Target alone":
             inputs = (composite.target, composite.erased)
             return self._kept.get("bare", inputs, lambda: composite.target.select(~composite.erased))
-        return self._pasted(composite)[0]
-
-    def _pasted(self, composite: Composite) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-        """What the step `compose` would write."""
-        placed = [one.in_target() for one in composite.objects]
-        return self._kept.get("pasted", (composite,), lambda: split_around(*composite.bake(), placed))
+        return self._transfers.pasted(composite)[0]
 
     def _mask(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         composite = self._transfers.composite(state)
-        gaussians, is_object = self._pasted(composite)
+        gaussians, is_object = self._transfers.pasted(composite)
         features = render(gaussians, camera, outputs=frozenset(), features=is_object[:, None].float()).features
         assert features is not None
         return _bytes(features[0].expand(-1, -1, 3))
 
     def _depth(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         composite = self._transfers.composite(state)
-        gaussians, _ = self._pasted(composite)
+        gaussians, _ = self._transfers.pasted(composite)
         depth = render(gaussians, camera, outputs=frozenset({"depth"})).depth
         assert depth is not None
         near = depth[0][depth[0] > 0]

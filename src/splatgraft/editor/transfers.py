@@ -8,6 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from jaxtyping import Bool
+from torch import Tensor
+
 from splatgraft.composite import Composite
 from splatgraft.editor.drafting import (
     OBJECT_BUDGET,
@@ -17,10 +20,10 @@ from splatgraft.editor.drafting import (
     thinned,
     thinned_composite,
 )
-from splatgraft.editor.kept import Kept
 from splatgraft.editor.scenes import Scenes
 from splatgraft.editor.state import EditState
 from splatgraft.gaussians import Gaussians
+from splatgraft.kept import Kept
 from splatgraft.relight import Light, RelightCache, Relit, SourceScene, relight
 from splatgraft.relight.exposure import relight_by_gain
 from splatgraft.splitting import split_around
@@ -35,7 +38,7 @@ class Transfers:
         self._cache, self._draft_cache = RelightCache(), RelightCache()
         self._kept = Kept()
         self.work = threading.RLock()
-        """Held by whoever computes light or pictures: compiled kernels of two threads at once may end the process."""
+        """Held by whoever makes what is kept, so that two threads do not make it twice."""
 
     def composite(self, state: EditState) -> Composite:
         """The target with what is placed in it; the same object for the same decisions.
@@ -78,7 +81,7 @@ class Transfers:
         composite, light_by = self.composite(state), self._scenes.files.light_by
         placed = [one.in_target() for one in composite.objects]
         if light_by == "off":
-            return self._kept.get("as it is", (composite,), lambda: split_around(*composite.bake(), placed))[0]
+            return self.pasted(composite)[0]
         if light_by == "gain":
             return self._kept.get("gained", (composite,), lambda: self._gained(composite, state))
         relit = self.soonest(state) if draft else self.relit(state)
@@ -87,6 +90,11 @@ class Transfers:
             return split_around(relit.bake(state.weights), relit.is_object, placed)[0]
 
         return self._kept.get("scene", (relit, state.weights), make)
+
+    def pasted(self, composite: Composite) -> tuple[Gaussians, Bool[Tensor, "n"]]:
+        """What the step `compose` would write."""
+        placed = [one.in_target() for one in composite.objects]
+        return self._kept.get("pasted", (composite,), lambda: split_around(*composite.bake(), placed))
 
     def note(self) -> str:
         """What `Light transfer` shows where project.toml asks for less than the physical one."""

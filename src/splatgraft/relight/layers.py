@@ -90,8 +90,7 @@ def _seen_change(
     room = torch.minimum(_LEAST_LEFT * ratio, (1 - ratio).clamp_min(0))
     reach = torch.minimum(height, room).clamp_min(1e-6)
     linear = linear_from_srgb(srgb.clamp(0, 1))
-    ends = (srgb_from_linear(linear * (ratio + way * reach)) for way in (1, -1))
-    top, bottom = ends
+    top, bottom = (srgb_from_linear(linear * (ratio + way * reach)) for way in (1, -1))
     return (slope / height)[:, :, None] * (0.5 * (top - bottom))[:, None]
 
 

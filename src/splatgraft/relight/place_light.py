@@ -41,18 +41,18 @@ _UNTOLD = 0.05  # share that shadows must explain to count as much as what is us
 def light_at(
     scene: Gaussians, ball: Ball, cameras: Cameras, *, also: Gaussians | None = None
 ) -> tuple[Light | None, str | None]:
-    """The light in the middle of `ball`, `levelled`, or a sentence that says why there is none.
+    """The light in the middle of `ball`, levelled, or a sentence that says why there is none.
 
     `also` stands in the scene too and casts shadows, but is not seen from the middle: the object itself.
     """
-    light, problem = unlevelled_light_at(scene, ball, cameras, also=also)
-    return (None if light is None else levelled(light, scene, ball, cameras)), problem
+    lights, problem = lights_at(scene, ball, cameras, also=also)
+    return (None if lights is None else lights[1]), problem
 
 
-def unlevelled_light_at(
+def lights_at(
     scene: Gaussians, ball: Ball, cameras: Cameras, *, also: Gaussians | None = None
-) -> tuple[Light | None, str | None]:
-    """As `light_at`, as bright as the panorama alone says."""
+) -> tuple[tuple[Light, Light] | None, str | None]:
+    """As `light_at`: first as bright as the panorama alone says, then levelled."""
     panorama, problem = panorama_at(scene, ball)
     if panorama is None:
         return None, problem
@@ -63,7 +63,8 @@ def unlevelled_light_at(
     voted, radius = _asked(whole, cameras, ball.center, radius, up)
     reflected = _told_by_surfaces(scene, ball, cameras)
     light = combine(panorama, voted, up, asked_within=radius, reflected=reflected)
-    return _through_windows(light, scene, ball), None
+    light = _through_windows(light, scene, ball)
+    return (light, _levelled(light, reflected, up)), None
 
 
 def _asked(
@@ -86,17 +87,16 @@ def _asked(
     return found
 
 
-def levelled(light: Light, scene: Gaussians, ball: Ball, cameras: Cameras) -> Light:
+def _levelled(light: Light, told: float | None, up: Float[Tensor, "3"]) -> Light:
     """`light` as bright as two witnesses say in the mean (geometric): what is seen around, and what is lit by it.
 
     Much of what shines on a place was never photographed, so the panorama alone is off by a factor of two or more.
     The surfaces around the place reflect that light; under the albedo of a mean surface they tell it as well. They
     count as much as the panorama where `_UNSEEN` of it is missing, and nothing where it is whole.
     """
-    told = _told_by_surfaces(scene, ball, cameras)
     if told is None:
         return light
-    seen = float(light.irradiance(estimate_up(cameras)[None]).mean())
+    seen = float(light.irradiance(up[None]).mean())
     share = 0.5 * min(1.0, (1 - light.coverage) / _UNSEEN)
     factor = math.exp(share * max(-_LEVEL, min(_LEVEL, math.log(told / max(seen, 1e-9)))))
     sources = [replace(s, irradiance=tuple(factor * v for v in s.irradiance)) for s in light.sources]

@@ -25,7 +25,7 @@ SHOWS_BEHIND = 1.2
 """Standard deviations. Splats are blended in the order of their centres, so that what shows of one among others lies
 behind its centre, seen from the camera; without this every edge stands too far from all cameras. Measured on planes:
 1.0 for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
-_UNSEEN = 0.25
+_UNSEEN = 0.25  # of the finest width that is split: an edge in narrower ones is not looked for
 _AT_RIMS = 0.02  # share of light: a rim shows a twentieth of it
 
 
@@ -134,7 +134,10 @@ def _sums(receivers: Receivers, maps: ObjectMaps, *, sources: bool, points: Tens
 
 
 def _at_an_edge(
-    receivers: Receivers, maps: ObjectMaps, which: Int[Tensor, "f"], center: tuple[Tensor, Tensor]
+    receivers: Receivers,
+    maps: ObjectMaps,
+    which: Int[Tensor, "f"],
+    center: tuple[Float[Tensor, "3 m 3"], Float[Tensor, "3 m 3"]],
 ) -> Int[Tensor, "g"]:
     """Those of `which` that see a source differently at their rims than in their middle."""
     if not len(which):
@@ -207,7 +210,12 @@ def _in_penumbra(
 
 
 def _lean(
-    receivers: Receivers, maps: ObjectMaps, which: Int[Tensor, "p"], ratio: SceneRatio, *, ambient: Tensor
+    receivers: Receivers,
+    maps: ObjectMaps,
+    which: Int[Tensor, "p"],
+    ratio: SceneRatio,
+    *,
+    ambient: Float[Tensor, "3 m 3"],
 ) -> None:
     """Fill in the slope of those Gaussians from points beside their middle; ambient light is even over each."""
     if not len(which):
@@ -222,8 +230,7 @@ def _lean(
 
 def _in_world(gaussians: Gaussians, along: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
     """A vector given along the two widest axes."""
-    axes = gaussians.scales.argsort(1, descending=True)[:, None, :2].expand(-1, 3, -1)
-    return (torch.gather(gaussians.rotations, 2, axes) @ along[..., None])[..., 0]
+    return (_widest(gaussians)[1] @ along[..., None])[..., 0]
 
 
 def _both_ways(along: Float[Tensor, "f l 3"], middle: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
@@ -233,6 +240,11 @@ def _both_ways(along: Float[Tensor, "f l 3"], middle: Float[Tensor, "f 3"]) -> F
 
 def _points(gaussians: Gaussians, offsets: Float[Tensor, "2 p"]) -> Float[Tensor, "n p 3"]:
     """Points at `offsets`, standard deviations, along the two widest axes."""
+    widths, axes = _widest(gaussians)
+    return gaussians.means[:, None] + ((axes * widths[:, None]) @ offsets).transpose(1, 2)
+
+
+def _widest(gaussians: Gaussians) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 3 2"]]:
+    """The two largest scales, and their axes as columns in the world."""
     widths, axes = gaussians.scales.sort(1, descending=True)
-    along = torch.gather(gaussians.rotations, 2, axes[:, None, :2].expand(-1, 3, -1)) * widths[:, None, :2]
-    return gaussians.means[:, None] + (along @ offsets).transpose(1, 2)
+    return widths[:, :2], torch.gather(gaussians.rotations, 2, axes[:, None, :2].expand(-1, 3, -1))

@@ -20,7 +20,7 @@ from splatgraft.relight.light import Light
 from splatgraft.relight.litness import lit_share
 from splatgraft.relight.normals import Normals, estimate_normals, raised
 from splatgraft.relight.object_shading import irradiance
-from splatgraft.relight.place_light import levelled, panorama_at, unlevelled_light_at
+from splatgraft.relight.place_light import lights_at, panorama_at
 from splatgraft.relight.receivers import RIM
 from splatgraft.relight.scene_shading import AMBIENT_SIZE, Ball, SceneMaps, map_scene, reachable, scene_visibility
 from splatgraft.relight.visibility import thinned
@@ -115,12 +115,11 @@ def _estimated(
     """The light at `place`; after a move within the region its sources are kept and the rest is looked at again."""
     kept = cache.peek("light", (scene, region))
     if kept is None:
-        light, problem = unlevelled_light_at(scene, place, cameras)
-        if light is None:
+        lights, problem = lights_at(scene, place, cameras)
+        if lights is None:
             return None, problem
-        level = levelled(light, scene, place, cameras)
-        cache.put("light", (scene, region), (light, level))
-        return level, None
+        cache.put("light", (scene, region), lights)
+        return lights[1], None
     panorama, problem = panorama_at(scene, place)
     if panorama is None:
         return None, problem

@@ -16,13 +16,13 @@ import viser
 from torch import Tensor
 
 from splatgraft.cameras import Cameras
-from splatgraft.editor.kept import same_inputs
 from splatgraft.editor.latest import Latest
 from splatgraft.editor.page.stage_view import view_of
 from splatgraft.editor.preview import KINDS, NEEDS_LIGHT, Kind, Size, wiped
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState
 from splatgraft.images import write_image
+from splatgraft.kept import same_inputs
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page

@@ -16,13 +16,17 @@ class Kept:
         made = self._made.get(name)
         if made is None or not same_inputs(made[0], inputs):
             made = (inputs, make())
-            self._made[name] = made
+            self.put(name, *made)
         return made[1]
 
     def peek(self, name: str, inputs: tuple[Any, ...]) -> Any | None:
         """The result of that name if it was made of these inputs, else None."""
         made = self._made.get(name)
         return made[1] if made is not None and same_inputs(made[0], inputs) else None
+
+    def put(self, name: str, inputs: tuple[Any, ...], result: Any) -> None:
+        """Keep `result` in place of what was there."""
+        self._made[name] = (inputs, result)
 
     def has(self, name: str) -> bool:
         """Whether there is one of that name, of whatever inputs."""
