@@ -7,9 +7,9 @@ import time
 
 import torch
 
-from splatgraft.harmonize import HarmonizerInputs
-from splatgraft.harmonize.compact.harmonizer import Compact
-from splatgraft.harmonize.compact.network import CompactNetwork
+from splatgraft.harmonization import HarmonizerInputs
+from splatgraft.harmonization.compact.harmonizer import Compact
+from splatgraft.harmonization.compact.network import CompactNetwork
 
 WIDTH, HEIGHT, VIEWS = 704, 496, 8
 
@@ -20,7 +20,7 @@ def example() -> HarmonizerInputs:
     mask = torch.zeros(HEIGHT, WIDTH)
     mask[150:350, 250:450] = 1
     normal = torch.nn.functional.normalize(torch.randn(HEIGHT, WIDTH, 3, generator=generator), dim=-1)
-    return HarmonizerInputs(image, image, mask, torch.ones(HEIGHT, WIDTH), normal, 0.8 * image, trust=0.5)
+    return HarmonizerInputs(image, image, mask, torch.ones(HEIGHT, WIDTH), normal, 0.8 * image, prior_confidence=0.5)
 
 
 def main() -> None:

@@ -15,18 +15,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from splatgraft.cameras import Cameras
-from splatgraft.consolidate import ConsolidateOptions, DescentOptions, consolidate
+from splatgraft.consolidation import ConsolidateOptions, DescentOptions, consolidate
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.image_metrics import psnr
+from splatgraft.core.posed_images import PosedImages, held_out
+from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.fitting import l1_dssim
+from splatgraft.fitting.perceptual_losses import ImageLoss, l1, lpips_vgg, windowed_fourier
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
-from splatgraft.gaussians import Gaussians
-from splatgraft.image_losses import ImageLoss, l1, lpips_vgg, windowed_fourier
-from splatgraft.image_metrics import psnr
-from splatgraft.peak_memory import peak_memory_bytes, reset_peak_memory
-from splatgraft.posed_images import PosedImages, held_out
-from splatgraft.reconstruct import ReconstructOptions, reconstruct
+from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import render
-from splatgraft.spherical_harmonics import dc_from_rgb, rgb_from_dc
+from splatgraft.runtime.peak_memory import peak_memory_bytes, reset_peak_memory
 
 ROOT = Path(__file__).parents[1]
 LOSSES: dict[str, ImageLoss] = {"fourier": windowed_fourier, "l1-dssim": l1_dssim, "l1": l1}

@@ -18,14 +18,14 @@ from typing import Any
 
 import torch
 
-from splatgraft.harmonize import HarmonizerInputs
-from splatgraft.harmonize.flux.baked import bake, fuse_projections
-from splatgraft.harmonize.flux.harmonizer import FluxHarmonizer, FluxSettings
-from splatgraft.harmonize.flux.latents import pad_by_reflection
-from splatgraft.harmonize.flux.library import autoencoder_class, flux_transformer_class
-from splatgraft.harmonize.flux.network import Autoencoder, FluxNetwork, velocity
-from splatgraft.harmonize.flux.prompt import Prompt
-from splatgraft.harmonize.flux.sampling import noise, sample, schnell_levels
+from splatgraft.harmonization import HarmonizerInputs
+from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
+from splatgraft.harmonization.flux.empty_prompt import Prompt
+from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer, FluxSettings
+from splatgraft.harmonization.flux.latents import pad_by_reflection
+from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork, velocity
+from splatgraft.harmonization.flux.sampling import noise, sample, schnell_levels
+from splatgraft.harmonization.flux.weights.library import autoencoder_class, flux_transformer_class
 
 REAL = {"in_channels": 192, "out_channels": 64}
 TINY = {

@@ -13,12 +13,12 @@ import tyro
 from jaxtyping import Bool
 from torch import Tensor
 
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
-from splatgraft.gaussians import Gaussians
-from splatgraft.posed_images import PosedImages, held_out
-from splatgraft.reconstruct import ReconstructOptions, reconstruct
+from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import RenderOptions, view_operator
-from splatgraft.segment import LiftOptions, SelectOptions, lift_masks, select_object
+from splatgraft.segmentation import LiftOptions, SelectOptions, lift_masks, select_object
 
 REPOSITORY = Path(__file__).parents[1]
 

@@ -12,10 +12,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as cli.py does; read when
 
 import torch
 
+from splatgraft.core.image_metrics import psnr, ssim
+from splatgraft.core.posed_images import held_out
 from splatgraft.formats import read_capture
-from splatgraft.image_metrics import psnr, ssim
-from splatgraft.posed_images import held_out
-from splatgraft.reconstruct import ReconstructOptions, reconstruct
+from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import render
 
 ROOM = Path(__file__).parents[1] / "data" / "room"

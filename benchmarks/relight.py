@@ -10,15 +10,16 @@ import time
 import numba
 import torch
 
-from splatgraft.cameras import look_at, pinhole
-from splatgraft.composite import Composite, PlacedObject
-from splatgraft.gaussians import Gaussians, quaternion_from_rotation
-from splatgraft.relight import Light, LightSource, RelightCache, SourceScene, relight
-from splatgraft.relight.directions import even_directions, frames_along
-from splatgraft.relight.light import ambient_of
-from splatgraft.relight.place_light import light_at
-from splatgraft.relight.scene_shading import ball_of
-from splatgraft.similarity import Similarity
+from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.composite import Composite, PlacedObject
+from splatgraft.core.directions import even_directions, frames_along
+from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation
+from splatgraft.core.similarity import Similarity
+from splatgraft.relighting import Light, LightSource, SourceScene, relight
+from splatgraft.relighting.light.estimate import estimate_light
+from splatgraft.relighting.light.light import fit_ambient
+from splatgraft.runtime.memo import Memo
 
 RECEIVERS, OCCLUDERS, ORIGIN = 300_000, 50_000, 20_000
 
@@ -48,10 +49,10 @@ def main() -> None:
     eyes = torch.stack([2 * turns.cos(), 2 * turns.sin(), torch.full((36,), 1.2)], 1)
     cameras = pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 300.0, width=352, height=248)
     sun = LightSource(direction=(0.6, 0.0, 0.8), irradiance=(3.0, 2.8, 2.5), uncertainty_deg=5.0, name="sun")
-    light = Light(sources=(sun,), ambient=ambient_of(torch.tensor([0.5, 0.6, 0.8])))
+    light = Light(sources=(sun,), ambient=fit_ambient(torch.tensor([0.5, 0.6, 0.8])))
     origin = SourceScene(courtyard(ORIGIN).with_sh_degree(3), cameras)
 
-    def transfer(shift: float, cache: RelightCache) -> tuple[float, float]:
+    def transfer(shift: float, cache: Memo) -> tuple[float, float]:
         moved = Similarity(1.0, torch.eye(3), torch.tensor([shift, 0.0, 0.0]))
         composite = Composite(scene, (PlacedObject(ball, moved),), erased)
         wall, cpu = time.perf_counter(), time.process_time()
@@ -59,14 +60,14 @@ def main() -> None:
         return time.perf_counter() - wall, time.process_time() - cpu
 
     erased = torch.zeros(RECEIVERS, dtype=torch.bool)
-    transfer(0.0, RelightCache())
+    transfer(0.0, Memo())
     whole, moves = [], []
     for _ in range(3):
-        cache = RelightCache()
+        cache = Memo()
         whole.append(transfer(0.0, cache))
         moves += [transfer(0.1, cache), transfer(-0.1, cache)]
     start = time.perf_counter()
-    light_at(scene, ball_of(ball), cameras)
+    estimate_light(scene, bounding_sphere(ball), cameras)
     estimated = time.perf_counter() - start
     print(f"{RECEIVERS} receivers, {OCCLUDERS} occluders, 2 threads; light estimated in {estimated:.2f} s")
     print(f"CPU seconds: whole {min(c for _, c in whole):.2f}, after a move {min(c for _, c in moves):.2f}")

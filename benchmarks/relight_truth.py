@@ -16,16 +16,16 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
-from splatgraft.cameras import Cameras, look_at, pinhole
-from splatgraft.composite import Composite, PlacedObject
-from splatgraft.gaussians import Gaussians, quaternion_from_rotation
-from splatgraft.images import linear_from_srgb
-from splatgraft.relight import Light, LightSource, RelightOptions, relight
-from splatgraft.relight.directions import even_directions, frames_along
-from splatgraft.relight.light import ambient_of
+from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.composite import Composite, PlacedObject
+from splatgraft.core.directions import even_directions, frames_along
+from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation
+from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.similarity import Similarity
+from splatgraft.core.spherical_harmonics import dc_from_rgb
+from splatgraft.relighting import Light, LightSource, RelightOptions, relight
+from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.rendering import render
-from splatgraft.similarity import Similarity
-from splatgraft.spherical_harmonics import dc_from_rgb
 
 SUN = (0.5, -0.3, 0.8)
 SIZES = {"small": 0.006, "middle": 0.03, "large": 0.15}  # of the plane's Gaussians; the ball's radius is 0.3
@@ -35,7 +35,7 @@ VIEW = 7
 
 
 @dataclass(frozen=True)
-class Ball:
+class BoundingSphere:
     """Standing on the plane z = 0."""
 
     radius: float = 0.3
@@ -125,7 +125,7 @@ def disk(direction: Tensor, radius_deg: float, count: int) -> Float[Tensor, "n 3
     return (r * angle.cos())[:, None] * right + (r * angle.sin())[:, None] * down + cosine[:, None] * direction
 
 
-def true_ratio(shape: Ball | Box, light: Light, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
+def true_ratio(shape: BoundingSphere | Box, light: Light, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
     """Irradiance on the plane with the object over that without, by rays."""
     hemisphere = even_directions(8192)
     hemisphere = hemisphere[hemisphere[:, 2] > 0]
@@ -145,7 +145,7 @@ def true_ratio(shape: Ball | Box, light: Light, points: Float[Tensor, "m 3"]) ->
 
 def lights() -> dict[str, Light]:
     direction = tuple(torch.nn.functional.normalize(torch.tensor(SUN), dim=0).tolist())
-    sky = ambient_of(torch.full((3,), 0.25))
+    sky = fit_ambient(torch.full((3,), 0.25))
 
     def round_light(radius_deg: float) -> Light:
         return Light(sources=(LightSource(direction, (3.0, 3.0, 3.0), angular_radius_deg=radius_deg),), ambient=sky)
@@ -189,7 +189,9 @@ class Measured:
         return float(((self.truth - self.found)[self.band] ** 2).mean().sqrt())
 
 
-def measure(shape: Ball | Box, light: Light, truth: Float[Tensor, "h w"], *, width: float, split: bool) -> Measured:
+def measure(
+    shape: BoundingSphere | Box, light: Light, truth: Float[Tensor, "h w"], *, width: float, split: bool
+) -> Measured:
     """The transfer's shadow on a plane of Gaussians `width` wide, in one view, beside the truth."""
     scene, thing, cameras = plane(width), shape.gaussians(), views()
     nothing_erased = torch.zeros(scene.count, dtype=torch.bool)
@@ -225,7 +227,7 @@ def main() -> None:
     errors: dict[tuple[str, bool], list[float]] = {(kind, split): [] for kind in KINDS for split in (False, True)}
     for light_name, light in lights().items():
         kind = "hard" if light_name == "hard" else "soft"
-        for shape in (Ball(), Box()):
+        for shape in (BoundingSphere(), Box()):
             truth = true_ratio(shape, light, on_plane(camera)).reshape(height, wide)
             for size, width in SIZES.items():
                 row = {}

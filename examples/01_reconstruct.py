@@ -3,9 +3,9 @@
 import tempfile
 from pathlib import Path
 
+from splatgraft.core.images import write_image
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
-from splatgraft.images import write_image
-from splatgraft.reconstruct import ReconstructOptions, reconstruct
+from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import render
 
 DATA = Path(__file__).parents[1] / "data"

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from splatgraft.formats import read_capture
-from splatgraft.reconstruct import ReconstructOptions, reconstruct
-from splatgraft.segment import lift_masks, select_object
+from splatgraft.reconstruction import ReconstructOptions, reconstruct
+from splatgraft.segmentation import lift_masks, select_object
 
 DATA = Path(__file__).parents[1] / "data"
 

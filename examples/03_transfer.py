@@ -2,17 +2,17 @@
 
 from pathlib import Path
 
-from splatgraft.compose import compose
-from splatgraft.consolidate import consolidate
+from splatgraft.composition import compose
+from splatgraft.consolidation import consolidate
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.core.similarity import Similarity
 from splatgraft.formats import read_capture
-from splatgraft.gaussians import Gaussians
-from splatgraft.harmonize import HarmonizerInputs, make_harmonizer
-from splatgraft.posed_images import PosedImages
-from splatgraft.reconstruct import ReconstructOptions, reconstruct
-from splatgraft.relight import SourceScene, relight
+from splatgraft.harmonization import HarmonizerInputs, make_harmonizer
+from splatgraft.reconstruction import ReconstructOptions, reconstruct
+from splatgraft.relighting import SourceScene, relight
 from splatgraft.rendering import render
-from splatgraft.segment import lift_masks, select_object
-from splatgraft.similarity import Similarity
+from splatgraft.segmentation import lift_masks, select_object
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -24,7 +24,7 @@ def main() -> None:
     masks = [mask for index in range(len(vase_capture)) if (mask := vase_capture.mask(index)) is not None]
     selection = select_object(stage, lift_masks(stage, vase_capture.cameras, masks))
 
-    # these two captures share world coordinates; otherwise splatgraft.compose.place_object finds a place
+    # these two captures share world coordinates; otherwise splatgraft.composition.place_object finds a place
     composite = compose(room, [stage.select(selection)], target_from_objects=[Similarity.identity()])
     source = SourceScene(stage.select(~selection), vase_capture.cameras)
     relit = relight(composite, room_capture.cameras, sources=[source])

@@ -3,10 +3,10 @@
 import tempfile
 from pathlib import Path
 
-from splatgraft.project import why_stale
-from splatgraft.steps.flow import read_flow
-from splatgraft.steps.step import job_of, perform
-from splatgraft.steps.terminal import Terminal
+from splatgraft.project.results import why_stale
+from splatgraft.project.step import job_of, perform
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.flow import read_flow
 
 DATA = Path(__file__).parents[1] / "data"
 PROJECT = f"""
@@ -27,7 +27,7 @@ def main() -> None:
     flow = read_flow(folder)
     for name, step in flow.up_to("segment").items():
         print(f"{name}: {why_stale(job_of(step))}")
-        perform(step, Terminal(), name=name)
+        perform(step, Console(), name=name)
         assert why_stale(job_of(step)) is None
     print(f"the object: {flow.steps['segment'].out / 'object.ply'}")
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from splatgraft.cli import COMMANDS, main
-from splatgraft.steps.extras import EXTRAS, extra_of
+from splatgraft.cli import COMMANDS, main, module_of
+from splatgraft.runtime.optional_dependencies import OPTIONAL_DEPENDENCIES, extra_providing
 
 ROOT = Path(__file__).parents[1]
 
@@ -17,7 +17,7 @@ def test_help_names_every_command_and_every_command_has_a_step(capsys: pytest.Ca
     printed = capsys.readouterr().out
     for command in COMMANDS:
         assert f"  {command} " in printed
-        assert hasattr(importlib.import_module(f"splatgraft.steps.{command.replace(' ', '_')}"), "COMMAND")
+        assert hasattr(importlib.import_module(module_of(command)), "COMMAND")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -84,20 +84,20 @@ def test_an_interruption_is_no_crash(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_extras_are_those_of_the_package() -> None:
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    for name, extra in EXTRAS.items():
+    for name, extra in OPTIONAL_DEPENDENCIES.items():
         for module, package in extra.packages.items():
             assert any(line.lower().startswith(package) for line in declared[name])
-            assert extra_of(f"{module}.inner") == name
-    assert set(EXTRAS) == set(declared) - {"dev"}
+            assert extra_providing(f"{module}.inner") == name
+    assert set(OPTIONAL_DEPENDENCIES) == set(declared) - {"dev"}
 
 
 def test_doctor_says_what_is_missing_and_how_to_get_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("splatgraft.steps.doctor._version", lambda package: None)
+    monkeypatch.setattr("splatgraft.commands.doctor._version", lambda package: None)
     assert main(["doctor"]) == 0
     printed = capsys.readouterr().out
-    for name in EXTRAS:
+    for name in OPTIONAL_DEPENDENCIES:
         assert f"missing: pip install 'splatgraft[{name}]'" in printed
 
 

@@ -22,7 +22,9 @@ def test_the_package_loads_nothing_heavy() -> None:
 
 
 def test_all_steps_load_no_optional_library() -> None:
-    assert not loaded_by("import splatgraft.steps.flow, splatgraft.steps.doctor, splatgraft.steps.train") & set(HEAVY)
+    assert not loaded_by(
+        "import splatgraft.workflow.flow, splatgraft.commands.doctor, splatgraft.commands.train.train"
+    ) & set(HEAVY)
 
 
 @pytest.mark.parametrize("words", [[], ["--help"], ["--version"], ["nonsense"]])

@@ -1,4 +1,4 @@
-"""The command line: one command per file in steps/. Holds no work of its own and loads only what the command needs."""
+"""The command line: finds the command in `commands/`, and imports only what that command needs."""
 
 import importlib
 import os
@@ -29,6 +29,17 @@ COMMANDS = {
 }
 
 
+_MODULES = {
+    **{name: f"steps.{name}" for name in ("capture", "adopt", "reconstruct", "segment", "compose", "relight")},
+    **{name: f"steps.{name}" for name in ("render", "harmonize", "consolidate", "evaluate")},
+    "synth": "synth.synth",
+    "synth_generated": "synth.generated",
+    "synth_orida": "synth.orida",
+    "train": "train.train",
+}
+"""Modules in splatgraft.commands of the commands that are in one of its sub-folders."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do one command; 0 where all went well, 2 where the user's data or arguments are at fault, 130 on Ctrl-C."""
     # torch and numba each have a pool of threads; one that spins while it waits takes the cores from the other
@@ -50,9 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _fail("interrupted; earlier results are whole, and the same command goes on from here", 130)
     except ModuleNotFoundError as error:
-        from splatgraft.steps.extras import extra_of
+        from splatgraft.runtime.optional_dependencies import extra_providing
 
-        extra = extra_of(error.name or "")
+        extra = extra_providing(error.name or "")
         if debug or extra is None:
             raise
         return _fail(f"{error.name}: expected an installed package, found none; pip install 'splatgraft[{extra}]'", 2)
@@ -73,21 +84,27 @@ def _dispatch(words: list[str]) -> int:
 
     import tyro
 
-    module = importlib.import_module(f"splatgraft.steps.{command}")
+    module = importlib.import_module(module_of(command))
     options = tyro.cli(
         module.COMMAND,
         prog=f"splatgraft {' '.join(words[:length])}",
         args=rest,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
-    from splatgraft.steps.step import perform
-    from splatgraft.steps.terminal import Terminal
+    from splatgraft.project.step import perform
+    from splatgraft.runtime.console import Console
 
-    terminal = Terminal()
+    console = Console()
     if hasattr(options, "execute"):
-        return options.execute(terminal)
-    terminal.result(perform(options, terminal))
+        return options.execute(console)
+    console.result(perform(options, console))
     return 0
+
+
+def module_of(command: str) -> str:
+    """The module that has `COMMAND` for the command of that name, e.g. "evaluate benchmark"."""
+    name = command.replace(" ", "_")
+    return f"splatgraft.commands.{_MODULES.get(name, name)}"
 
 
 def _help() -> str:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from splatgraft.cameras import look_at, pinhole
 from splatgraft.capture import PoseOptions, pose_photos, structure_from_motion
-from splatgraft.images import write_image
+from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.images import write_image
 
 UP = torch.tensor([0.0, 0, 1])
 

@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from splatgraft.cameras import look_at, pinhole
 from splatgraft.capture import upright
-from splatgraft.gaussians import rotation_from_quaternion
-from splatgraft.level_plane import dominant_level_plane
-from splatgraft.similarity import Similarity
+from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.gaussians import rotation_from_quaternion
+from splatgraft.core.level_plane import dominant_level_plane
+from splatgraft.core.similarity import Similarity
 
 
 def orbit(count=12):

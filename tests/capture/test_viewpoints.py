@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from splatgraft.capture import LookOptions, find_viewpoints, photographed
-from splatgraft.capture.viewpoints import dense_part, find_up
-from splatgraft.gaussians import Gaussians, concatenate
-from splatgraft.orbit import estimate_up, focus_point
+from splatgraft.capture.virtual_cameras import dense_part, find_up
+from splatgraft.core.capture_orientation import estimate_up, focus_point
+from splatgraft.core.gaussians import Gaussians, concatenate
 
 
 def blobs(means: torch.Tensor, size: float = 0.05) -> Gaussians:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatgraft.editor.state import EditState, read_state
+from splatgraft.editor.session.edit_state import EditState, read_state
 
 ARGUMENTS = (
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),

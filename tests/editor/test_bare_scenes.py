@@ -7,14 +7,14 @@ import torch
 from tiny_project import ball, plane
 
 from splatgraft.cli import main
-from splatgraft.editor.session import Session
-from splatgraft.editor.toml_edit import with_keys
+from splatgraft.commands.edit import StepsProject
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.gaussians import concatenate
+from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
-from splatgraft.gaussians import concatenate
-from splatgraft.orbit import estimate_up
-from splatgraft.settings import read_toml
-from splatgraft.steps.edit import StepsProject
+from splatgraft.runtime.settings import read_toml
 
 AROUND_THE_BALL = [-0.35, -0.35, 0.03, 0.35, 0.35, 0.65]
 

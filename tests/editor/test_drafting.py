@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import torch
 
-from splatgraft.compose import compose
-from splatgraft.editor.drafting import carried_over, thinned, thinned_composite
-from splatgraft.gaussians import Gaussians
-from splatgraft.relight.layers import LayerWeights, unchanged
-from splatgraft.similarity import Similarity
+from splatgraft.composition import compose
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.similarity import Similarity
+from splatgraft.editor.previews.draft_preview import carried_over, thinned, thinned_composite
+from splatgraft.relighting.layers import LayerWeights, unchanged
 
 
 def cloud(count: int, seed: int) -> Gaussians:

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from editor_driver import wait_until
 
-from splatgraft.editor.jobs import Jobs, JobState, PlannedStep, seconds_left, seconds_left_in_all, write_state
+from splatgraft.editor.jobs.jobs import Jobs, JobState, PlannedStep, seconds_left, seconds_left_in_all, write_state
 
 WORK = """
 import sys, os, signal, time
 from pathlib import Path
-from splatgraft.editor.jobs import JobState, hold, write_state
+from splatgraft.editor.jobs.jobs import JobState, hold, write_state
 folder, seconds = Path(sys.argv[1]), float(sys.argv[2])
 signal.signal(signal.SIGINT, signal.default_int_handler)
 lock = hold(folder)

@@ -10,28 +10,28 @@ import torch
 from tiny_project import OPTIONS, write_project
 
 from splatgraft.cli import main
-from splatgraft.editor import placing
-from splatgraft.editor.exports import export_scene, export_turntable
-from splatgraft.editor.preview import KINDS, Size, wiped
-from splatgraft.editor.session import Session
-from splatgraft.editor.state import EditState, read_state, state_files, write_state
-from splatgraft.editor.toml_edit import with_keys
-from splatgraft.editor.uploads import SCENES, keep_upload
-from splatgraft.evaluate.pictures import write_animation
+from splatgraft.commands.edit import StepsProject
+from splatgraft.core.images import read_rgb
+from splatgraft.core.similarity import Similarity
+from splatgraft.editor.access.uploads import SCENES, keep_upload
+from splatgraft.editor.jobs.exports import export_scene, export_turntable
+from splatgraft.editor.previews.preview import KINDS, Size, wiped
+from splatgraft.editor.session import placement_moves as placing
+from splatgraft.editor.session.edit_state import EditState, read_state, state_files, write_state
+from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.evaluation.pictures import write_animation
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
-from splatgraft.images import read_rgb
-from splatgraft.project import read_record
-from splatgraft.relight import LayerWeights, light_from_json, light_to_json
-from splatgraft.relight.light import Light, LightSource, ambient_of
-from splatgraft.similarity import Similarity
-from splatgraft.steps.edit import StepsProject
-from splatgraft.steps.expected_time import expected_steps
-from splatgraft.steps.flow import read_flow
+from splatgraft.project.results import read_record
+from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
+from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
+from splatgraft.workflow.flow import read_flow
+from splatgraft.workflow.time_estimate import estimate_step_times
 
 LIGHT = Light(
     sources=(LightSource(direction=(0.0, 0.6, 0.8), irradiance=(2.0, 2.0, 2.0), name="sun"),),
-    ambient=ambient_of(torch.tensor([0.3, 0.3, 0.4])),
+    ambient=fit_ambient(torch.tensor([0.3, 0.3, 0.4])),
 )
 
 
@@ -295,7 +295,7 @@ def test_a_project_with_trained_scenes_takes_those_over(session: Session, tmp_pa
 
 def test_the_plan_of_a_run_is_what_is_stale_as_long_as_it_took_before(session: Session) -> None:
     flow = read_flow(session.files.file)
-    planned = expected_steps(flow, ["segment", "relight", "render"])
+    planned = estimate_step_times(flow, ["segment", "relight", "render"])
     assert [step.name for step in planned] == ["segment", "relight", "render"]
     assert [step.is_measured for step in planned] == [True, False, False]
     record = read_record(flow.steps["segment"].out)

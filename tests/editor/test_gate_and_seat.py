@@ -2,8 +2,8 @@
 
 import pytest
 
-from splatgraft.editor.gate import COOKIE, Gate
-from splatgraft.editor.seat import Seat
+from splatgraft.editor.access.access_control import COOKIE, AccessControl
+from splatgraft.editor.access.edit_lock import EditLock
 
 HERE = {"Host": "127.0.0.1:8080"}
 PAGE = HERE | {"Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
@@ -11,7 +11,7 @@ PAGE = HERE | {"Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
 
 def test_the_page_itself_comes_in() -> None:
     for headers in (HERE, PAGE, {"Host": "localhost:8080"}, {"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}):
-        assert Gate().ask(headers, "/").allowed, headers
+        assert AccessControl().ask(headers, "/").allowed, headers
 
 
 @pytest.mark.parametrize(
@@ -31,11 +31,11 @@ def test_the_page_itself_comes_in() -> None:
     ],
 )
 def test_strangers_do_not(headers: dict[str, str]) -> None:
-    assert not Gate().ask(headers, "/").allowed
+    assert not AccessControl().ask(headers, "/").allowed
 
 
 def test_others_than_this_machine_need_the_token_and_keep_it_as_a_cookie() -> None:
-    gate = Gate(hosts=(), token="secret")
+    gate = AccessControl(hosts=(), token="secret")
     away = {"Host": "studio.lan:8080"}
     assert not gate.ask(away, "/").allowed
     assert not gate.ask(away, "/?token=other").allowed
@@ -50,15 +50,15 @@ def test_others_than_this_machine_need_the_token_and_keep_it_as_a_cookie() -> No
 
 def test_an_open_door_without_a_token_cannot_be_made() -> None:
     with pytest.raises(ValueError, match="token"):
-        Gate(hosts=())
+        AccessControl(hosts=())
 
 
 def test_one_window_edits_until_it_leaves_or_another_takes_the_seat() -> None:
-    seat = Seat().joined(1).joined(2).joined(3)
+    seat = EditLock().joined(1).joined(2).joined(3)
     assert seat.holder == 1
     assert seat.left(2).holder == 1
     assert seat.left(1).holder == 2
     assert seat.taken(3).holder == 3
     assert seat.taken(9).holder == 1
     assert seat.taken(3).left(3).holder == 1
-    assert Seat().joined(1).left(1) == Seat()
+    assert EditLock().joined(1).left(1) == EditLock()

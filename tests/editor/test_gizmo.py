@@ -7,8 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatgraft.editor.gizmo import Gizmo, degrees_of, gizmo_of, similarity_of, wxyz_of
-from splatgraft.gaussians import rotation_from_quaternion
+from splatgraft.core.gaussians import rotation_from_quaternion
+from splatgraft.editor.session.gizmo import Gizmo, degrees_of, gizmo_of, similarity_of, wxyz_of
 
 ANGLE = st.floats(-179, 179)
 TURNS = st.tuples(ANGLE, st.floats(-89, 89), ANGLE)

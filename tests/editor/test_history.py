@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatgraft.editor.history import History
+from splatgraft.editor.session.history import History
 
 
 @given(st.lists(st.integers()))

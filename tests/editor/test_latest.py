@@ -2,7 +2,7 @@
 
 import threading
 
-from splatgraft.editor.latest import Latest
+from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
 
 
 def test_what_was_overtaken_is_never_done_and_a_failure_ends_nothing() -> None:
@@ -17,7 +17,7 @@ def test_what_was_overtaken_is_never_done_and_a_failure_ends_nothing() -> None:
         if request == 4:
             finished.set()
 
-    latest = Latest(work, lambda error: failed.append(str(error)))
+    latest = LatestOnlyWorker(work, lambda error: failed.append(str(error)))
     latest.ask(0)
     while latest.overtaken:
         pass
@@ -45,7 +45,7 @@ def test_idle_ends_when_something_newer_comes() -> None:
             answers.append(latest.idle(0.01))
             started.set()
 
-    latest = Latest(work, errors.append)
+    latest = LatestOnlyWorker(work, errors.append)
     latest.ask(0)
     assert started.wait(20)
     started.clear()

@@ -2,11 +2,11 @@
 
 import torch
 
-from splatgraft.cameras import Cameras, look_at, pinhole
-from splatgraft.editor.picking import Ray, Rectangle, between, first_hit, in_brush, in_rectangle, painted
-from splatgraft.editor.thinning import shown_indices
-from splatgraft.gaussians import Gaussians
-from splatgraft.segment import corrected, with_correction
+from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.previews.level_of_detail import shown_indices
+from splatgraft.editor.session.picking import Ray, Rectangle, between, first_hit, in_brush, in_rectangle, painted
+from splatgraft.segmentation import corrected, with_correction
 
 
 def scene(means: list[list[float]], *, size: float = 0.1, logit: float = 3.0) -> Gaussians:

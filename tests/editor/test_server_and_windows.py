@@ -87,10 +87,10 @@ def test_from_other_machines_one_needs_the_token(project: Path) -> None:
 def test_large_uploads_and_public_tunnels_are_not_let_in() -> None:
     from viser import _messages
 
-    from splatgraft.editor.gate import Gate
+    from splatgraft.editor.access.access_control import AccessControl
     from splatgraft.editor.page.server import GuardedServer
 
-    guarded = GuardedServer(Gate(), host="127.0.0.1", port=18090, upload_limit=10)
+    guarded = GuardedServer(AccessControl(), host="127.0.0.1", port=18090, upload_limit=10)
     try:
         told: list[str] = []
         guarded.on_large_upload = lambda name, size: told.append(name)

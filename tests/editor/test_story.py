@@ -13,7 +13,7 @@ import torch
 from editor_driver import Editor, Window, state_of, wait_until, with_browser
 from tiny_project import OPTIONS, ball, photograph, plane
 
-from splatgraft.editor.jobs import Jobs
+from splatgraft.editor.jobs.jobs import Jobs
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import read_placement
 

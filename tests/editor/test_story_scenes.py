@@ -13,15 +13,15 @@ from PIL import Image
 from test_bare_scenes import AROUND_THE_BALL
 from tiny_project import ball, plane
 
-from splatgraft.editor.toml_edit import with_keys
+from splatgraft.core.gaussians import concatenate
+from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.formats import read_gaussians, write_gaussians
-from splatgraft.gaussians import concatenate
-from splatgraft.relight import light_to_json
-from splatgraft.relight.light import Light, LightSource, ambient_of
+from splatgraft.relighting import light_to_json
+from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
 
 SUN = Light(
     sources=(LightSource(direction=(0.0, 0.6, 0.8), irradiance=(2.0, 2.0, 2.0), name="sun"),),
-    ambient=ambient_of(torch.tensor([0.3, 0.3, 0.4])),
+    ambient=fit_ambient(torch.tensor([0.3, 0.3, 0.4])),
 )
 
 

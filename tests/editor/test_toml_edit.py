@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatgraft.editor.toml_edit import with_keys
-from splatgraft.steps.project_file import TEMPLATE
+from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.project.project_file import TEMPLATE
 
 TEXT = """\
 # a comment

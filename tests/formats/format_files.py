@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from splatgraft.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians
 
 GOLDEN = Path(__file__).parent / "golden"
 

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from splatgraft import formats
-from splatgraft.gaussians import Gaussians, empty
-from splatgraft.similarity import Similarity
+from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.core.similarity import Similarity
 
 GOLDEN = Path(__file__).parent / "golden"
 HALF_TURN = Similarity(scale=1.0, rotation=torch.diag(torch.tensor([1.0, -1, -1])), translation=torch.zeros(3))

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from splatgraft import formats
-from splatgraft.images import read_alpha, read_mask, read_rgb, stored_size
+from splatgraft.core.images import read_alpha, read_mask, read_rgb, stored_size
 
 EXAMPLES = 60
 

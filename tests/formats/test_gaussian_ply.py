@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from splatgraft import formats
-from splatgraft.gaussians import empty
+from splatgraft.core.gaussians import empty
 
 BASE = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
 BASE += ("rot_0", "rot_1", "rot_2", "rot_3")

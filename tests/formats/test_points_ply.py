@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from splatgraft import formats
-from splatgraft.spherical_harmonics import rgb_from_dc
+from splatgraft.core.spherical_harmonics import rgb_from_dc
 
 
 def test_round_trip(tmp_path):

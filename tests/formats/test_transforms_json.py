@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from splatgraft import formats
-from splatgraft.cameras import Cameras, look_at, pinhole
+from splatgraft.core.cameras import Cameras, look_at, pinhole
 
 
 def test_opengl_axes_become_opencv_axes(tmp_path):

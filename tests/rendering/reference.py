@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatgraft import spherical_harmonics
-from splatgraft.cameras import Cameras
-from splatgraft.gaussians import Gaussians
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import Render, RenderOptions
 
 MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99

@@ -2,8 +2,8 @@
 
 import torch
 
-from splatgraft.cameras import Cameras, look_at, pinhole
-from splatgraft.gaussians import Gaussians
+from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.gaussians import Gaussians
 
 
 def random_scene(n: int, degree: int, seed: int) -> Gaussians:

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scenes import camera, random_scene
 
 from splatgraft import rendering
-from splatgraft.cameras import Cameras
-from splatgraft.gaussians import Gaussians, concatenate, empty, rotation_from_quaternion
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians, concatenate, empty, rotation_from_quaternion
+from splatgraft.core.similarity import Similarity
 from splatgraft.rendering import RenderOptions
-from splatgraft.similarity import Similarity
 
 ALL = frozenset({"color", "depth", "normal"})
 PICTURES = ["color", "alpha", "depth", "normal", "features"]
@@ -139,9 +139,9 @@ def test_views_of_a_batch_are_the_single_views():
     )
     both = rendering.render(scene, pair, outputs=ALL)
     for i, single in enumerate([one, moved]):
-        alone = rendering.render(scene, single, outputs=ALL)
-        assert torch.equal(both.color[i], alone.color[0])
-        assert torch.equal(both.visible[i], alone.visible[0])
+        serialized = rendering.render(scene, single, outputs=ALL)
+        assert torch.equal(both.color[i], serialized.color[0])
+        assert torch.equal(both.visible[i], serialized.visible[0])
 
 
 def test_a_tiny_image_and_a_wide_one():

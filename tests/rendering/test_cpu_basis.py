@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatgraft import spherical_harmonics
+from splatgraft.core import spherical_harmonics
 from splatgraft.rendering.cpu_basis import basis_and_slope
 
 

@@ -4,8 +4,9 @@ import pytest
 import torch
 from scenes import camera, random_scene
 
-from splatgraft import rendering, spherical_harmonics
-from splatgraft.gaussians import empty
+from splatgraft import rendering
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.gaussians import empty
 from splatgraft.rendering import RenderOptions, ViewOperator
 
 

@@ -3,7 +3,7 @@
 from splatgraft.capture.orientation import upright
 from splatgraft.capture.structure_from_motion import PoseOptions, PoseReport, pose_photos
 from splatgraft.capture.video import extract_frames
-from splatgraft.capture.viewpoints import LookOptions, Viewpoints, find_viewpoints, photographed
+from splatgraft.capture.virtual_cameras import LookOptions, Viewpoints, find_viewpoints, photographed
 
 __all__ = [
     "LookOptions",

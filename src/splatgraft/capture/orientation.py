@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.cameras import Cameras
-from splatgraft.level_plane import dominant_level_plane
-from splatgraft.orbit import estimate_up
-from splatgraft.similarity import Similarity
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.level_plane import dominant_level_plane
+from splatgraft.core.similarity import Similarity
 
 
 def upright(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Similarity:

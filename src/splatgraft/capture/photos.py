@@ -6,9 +6,9 @@ from pathlib import Path
 import torch
 from PIL import Image, ImageOps
 
-from splatgraft.distortion import Distortion
-from splatgraft.images import read_rgb
-from splatgraft.whole_file import whole_file
+from splatgraft.core.distortion import Distortion
+from splatgraft.core.images import read_rgb
+from splatgraft.runtime.atomic_file import atomic_write
 
 _EXIF_ORIENTATION = 0x0112
 
@@ -51,6 +51,6 @@ def write_undistorted(copy: Path, path: Path, distortion: Distortion) -> torch.T
     intrinsics = torch.from_numpy(distortion.pinhole())
     pixels = distortion.undistort(read_rgb(copy), intrinsics, width=width, height=height)
     array = (pixels.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    with whole_file(path) as stream:
+    with atomic_write(path) as stream:
         Image.fromarray(array).save(stream, "JPEG", quality=95, subsampling=0)
     return intrinsics.float()

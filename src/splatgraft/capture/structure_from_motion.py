@@ -12,13 +12,13 @@ from typing import Any, Literal
 
 import torch
 
-from splatgraft.cameras import Cameras
 from splatgraft.capture.orientation import upright
 from splatgraft.capture.photos import camera_mode, working_copies, write_undistorted
-from splatgraft.distortion import Distortion
-from splatgraft.images import stored_size
-from splatgraft.posed_images import PosedImages
-from splatgraft.progress import Progress, silent
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.distortion import Distortion
+from splatgraft.core.images import stored_size
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.runtime.progress import Progress, silent
 
 _PHASES = 3
 _ADVICE = (

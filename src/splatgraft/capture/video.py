@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatgraft.progress import Progress, silent
+from splatgraft.runtime.progress import Progress, silent
 
 
 def extract_frames(video: Path, folder: Path, *, count: int = 120, progress: Progress = silent) -> list[Path]:

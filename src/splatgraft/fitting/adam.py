@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatgraft.kernels import alone
+from splatgraft.runtime.kernel_lock import serialized
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
@@ -138,7 +138,7 @@ def _update_part(value, gradient, moments, part, rate):
     return bad
 
 
-@alone
+@serialized
 @numba.njit(parallel=True, cache=True)
 @no_type_check
 def _update_rows(values, gradients, moments, counts, rates):

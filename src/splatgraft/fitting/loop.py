@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatgraft.cameras import Cameras
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import adam
 from splatgraft.fitting.photometric import l1_dssim
 from splatgraft.fitting.rates import Rates
-from splatgraft.gaussians import Gaussians
-from splatgraft.progress import Checkpoint, NoCheckpoint, Progress, silent
 from splatgraft.rendering import RenderOptions, render
+from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 Loss = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], Float[Tensor, ""]]
 """Of the rendered and the wanted image."""

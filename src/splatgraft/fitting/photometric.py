@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.image_metrics import ssim
-from splatgraft.kernels import alone
+from splatgraft.core.image_metrics import ssim
+from splatgraft.runtime.kernel_lock import serialized
 
 _TAPS = np.exp(-((np.arange(6, dtype=np.float64) - 5) ** 2) / (2 * 1.5**2))
 _T0, _T1, _T2, _T3, _T4, _T5 = (np.float32(tap) for tap in _TAPS / (2 * _TAPS.sum() - _TAPS[5]))
@@ -167,7 +167,7 @@ def _gradient_of_row(out, spread, row, pair, scales):
     return total
 
 
-@alone
+@serialized
 @numba.njit(parallel=True, cache=True, fastmath=_FAST)
 @no_type_check
 def _loss_and_gradient(x, y, weight):

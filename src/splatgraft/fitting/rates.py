@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.spherical_harmonics import coefficient_count
+from splatgraft.core.spherical_harmonics import coefficient_count
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,14 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from splatgraft.cameras import Cameras
-from splatgraft.formats import cameras_json, colmap, transforms_json
-from splatgraft.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from splatgraft.formats.points_ply import read_points, write_points
-from splatgraft.formats.splat import read_splat, write_splat
-from splatgraft.formats.spz import read_spz, write_spz
-from splatgraft.gaussians import Gaussians
-from splatgraft.posed_images import PosedImages
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.formats.captures import cameras_json, colmap, transforms_json
+from splatgraft.formats.captures.points_ply import read_points, write_points
+from splatgraft.formats.scenes.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from splatgraft.formats.scenes.splat import read_splat, write_splat
+from splatgraft.formats.scenes.spz import read_spz, write_spz
 
 __all__ = [
     "is_scene",

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Int8
 from torch import Tensor
 
-from splatgraft.whole_file import whole_file
+from splatgraft.runtime.atomic_file import atomic_write
 
 
 def read_corrections(path: Path) -> Int8[Tensor, "n"]:
@@ -32,5 +32,5 @@ def read_corrections(path: Path) -> Int8[Tensor, "n"]:
 
 def write_corrections(path: Path, corrections: Int8[Tensor, "n"]) -> None:
     """Write the array; the file appears whole or not at all."""
-    with whole_file(path) as stream:
+    with atomic_write(path) as stream:
         np.save(stream, corrections.cpu().numpy())

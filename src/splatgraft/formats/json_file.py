@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from splatgraft.formats.views import MAX_SIDE
+from splatgraft.formats.captures.described_view import MAX_SIDE
 
 _LONGEST = 60
 

@@ -19,9 +19,9 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from splatgraft.gaussians import rotation_from_quaternion
-from splatgraft.similarity import Similarity
-from splatgraft.whole_file import whole_file
+from splatgraft.core.gaussians import rotation_from_quaternion
+from splatgraft.core.similarity import Similarity
+from splatgraft.runtime.atomic_file import atomic_write
 
 _OBJECT_KEYS = frozenset({"object", "scale", "rotation", "translation"})
 
@@ -81,9 +81,9 @@ def write_placement(path: Path, placement: Placement) -> None:
     content: dict[str, Any] = {"objects": entries}
     if placement.erased is not None:
         content["erased"] = "erased.npy"
-        with whole_file(path.parent / "erased.npy") as stream:
+        with atomic_write(path.parent / "erased.npy") as stream:
             np.save(stream, placement.erased.cpu().numpy())
-    with whole_file(path) as stream:
+    with atomic_write(path) as stream:
         stream.write((json.dumps(content, indent=1) + "\n").encode())
 
 

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.cameras import Cameras
-from splatgraft.gaussians import Gaussians
-from splatgraft.kernels import KERNELS
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import cpu_blend, cpu_project, cpu_tiles
 from splatgraft.rendering.channels import WIDTHS, pictures
 from splatgraft.rendering.interface import Output, Render, RenderOptions
+from splatgraft.runtime.kernel_lock import KERNEL_LOCK
 
 
 def render(
@@ -147,7 +147,7 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx, view: _View, outputs: frozenset[Output], *fields: Tensor):
         means, log_scales, quaternions, logits, sh, features = (_array(field) for field in fields)
-        with KERNELS:
+        with KERNEL_LOCK:
             lists = _TileLists.of(view, means, log_scales, quaternions, logits)
             columns = []
             if "color" in outputs:
@@ -177,7 +177,7 @@ class _Splat(torch.autograd.Function):
         for name, width in WIDTHS.items():
             if name in ctx.outputs:
                 places[name], at = at, at + width
-        with KERNELS:
+        with KERNEL_LOCK:
             sums = np.empty((len(lists.entries), cpu_blend.MOMENTS + values.shape[1]), np.float32)
             cpu_blend.blend_backward(
                 lists.splats, lists.start, lists.entries, lists.slots, values[lists.order],
@@ -201,7 +201,7 @@ class CpuViewOperator:
     def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> None:
         """Project, sort, list, and drop what is hidden."""
         self._view = _View.of(camera, options)
-        with KERNELS:
+        with KERNEL_LOCK:
             lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
             self._lists = lists.shown(self._view)
             _, alpha = self._lists.blend(np.empty((gaussians.count, 0), np.float32), self._view, cpu_blend.ALL)
@@ -218,7 +218,7 @@ class CpuViewOperator:
 
 
 def _transpose(lists: _TileLists, image: Tensor) -> Tensor:
-    with KERNELS:
+    with KERNEL_LOCK:
         return torch.from_numpy(lists.sum_slots(lists.gather(_array(image.permute(2, 0, 1)), cpu_blend.ALL)))
 
 
@@ -226,7 +226,7 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, lists: _TileLists, view: _View, values: Tensor) -> Tensor:
         ctx.lists = lists
-        with KERNELS:
+        with KERNEL_LOCK:
             image, _ = lists.blend(_array(values), view, cpu_blend.ALL)
         return torch.from_numpy(image).permute(1, 2, 0)
 

@@ -8,8 +8,8 @@ from typing import Literal, Protocol, runtime_checkable
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatgraft.cameras import Cameras
-from splatgraft.gaussians import Gaussians
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
 
 Output = Literal["color", "depth", "normal"]
 

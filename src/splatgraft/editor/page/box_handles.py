@@ -6,8 +6,8 @@ import numpy as np
 import torch
 import viser
 
-from splatgraft.editor.page.stage_view import StageView
-from splatgraft.segment import Box
+from splatgraft.editor.page.scene_view import SceneView
+from splatgraft.segmentation import Box
 
 _LEAST = 1e-4
 """Of an edge over the largest one: a box that was dragged flat stays a box."""
@@ -16,7 +16,7 @@ _LEAST = 1e-4
 class BoxHandles:
     """Edges and two corner gizmos."""
 
-    def __init__(self, server: viser.ViserServer, view: StageView, name: str, *, color: tuple[int, int, int]) -> None:
+    def __init__(self, server: viser.ViserServer, view: SceneView, name: str, *, color: tuple[int, int, int]) -> None:
         """Nothing shown yet."""
         self._server, self._view, self._name, self._color = server, view, name, color
         self._box: Box | None = None

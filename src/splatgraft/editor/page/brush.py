@@ -10,10 +10,10 @@ import torch
 import viser
 from torch import Tensor
 
-from splatgraft.editor.latest import Latest
-from splatgraft.editor.page.stage_view import Color
-from splatgraft.editor.picking import Ray, between, painted
-from splatgraft.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.page.scene_view import Color
+from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
+from splatgraft.editor.session.picking import Ray, between, painted
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
@@ -32,7 +32,7 @@ class Brush:
         self._canvas: viser.IcosphereHandle | None = None
         self._rays: tuple[Ray, ...] = ()
         self._done, self._touched = 0, torch.zeros(0, dtype=torch.bool)
-        self._latest = Latest(self._paint, lambda error: page.say(" ".join(str(error).split()), bad=True))
+        self._latest = LatestOnlyWorker(self._paint, lambda error: page.say(" ".join(str(error).split()), bad=True))
         page.at_end.append(self._latest.close)
 
     def on(self, scene: Gaussians, *, size: float) -> None:

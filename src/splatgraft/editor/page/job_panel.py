@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import viser
 
-from splatgraft.editor.jobs import JobState, seconds_left, seconds_left_in_all
+from splatgraft.editor.jobs.jobs import JobState, seconds_left, seconds_left_in_all
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page

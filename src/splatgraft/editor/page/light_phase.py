@@ -10,10 +10,10 @@ import numpy as np
 import torch
 import viser
 
-from splatgraft.editor.lighting import aimed, arrow_points, ring_points
 from splatgraft.editor.page.place_phase import NO_NAMES, hide_target, show_target
-from splatgraft.editor.state import EditState
-from splatgraft.relight import LayerWeights, Light
+from splatgraft.editor.previews.light_handles import aimed, arrow_points, ring_points
+from splatgraft.editor.session.edit_state import EditState
+from splatgraft.relighting import LayerWeights, Light
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page

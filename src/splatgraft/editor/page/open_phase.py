@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import viser
 
-from splatgraft.editor.project_access import Triple
-from splatgraft.editor.session import Session
-from splatgraft.editor.uploads import SCENES, SUFFIXES, keep_upload
-from splatgraft.orbit import estimate_up
-from splatgraft.project import Side
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.editor.access.uploads import SCENES, SUFFIXES, keep_upload
+from splatgraft.editor.session.project_access import Triple
+from splatgraft.editor.session.session import Session
+from splatgraft.project.results import Side
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page

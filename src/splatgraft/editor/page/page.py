@@ -15,18 +15,18 @@ from typing import Any, Protocol, runtime_checkable
 
 import viser
 
-from splatgraft.cameras import Cameras
+from splatgraft.core.cameras import Cameras
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.light_phase import LightPhase
 from splatgraft.editor.page.open_phase import OpenPhase
 from splatgraft.editor.page.place_phase import PlacePhase
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.page.run_phase import RunPhase
+from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.select_phase import SelectPhase
 from splatgraft.editor.page.server import GuardedServer
-from splatgraft.editor.page.stage_view import StageView
-from splatgraft.editor.project_access import Project
-from splatgraft.editor.session import Session
+from splatgraft.editor.session.project_access import Project
+from splatgraft.editor.session.session import Session
 
 PHASES = ("Open", "Select", "Place", "Light", "Run")
 _TICK = 0.4
@@ -69,7 +69,7 @@ class Page:
         self.guarded, self.project, self.options = guarded, project, options
         self.server = guarded.viser
         self.session: Session | None = None if project.files() is None else Session(project)
-        self.view = StageView(self.server, budget=options.budget)
+        self.view = SceneView(self.server, budget=options.budget)
         self.phase = "Open"
         self._lock = threading.RLock()
         self._notices: dict[int, Any] = {}

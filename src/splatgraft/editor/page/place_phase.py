@@ -11,15 +11,15 @@ import numpy as np
 import torch
 import viser
 
-from splatgraft.editor import placing
-from splatgraft.editor.gizmo import Gizmo, degrees_of, gizmo_of, similarity_of, wxyz_of
+from splatgraft.core.similarity import Similarity
+from splatgraft.editor.access.uploads import SCENES, keep_upload
 from splatgraft.editor.page.box_handles import BoxHandles
-from splatgraft.editor.session import Session
-from splatgraft.editor.uploads import SCENES, keep_upload
+from splatgraft.editor.session import placement_moves as placing
+from splatgraft.editor.session.gizmo import Gizmo, degrees_of, gizmo_of, similarity_of, wxyz_of
+from splatgraft.editor.session.session import Session
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
-from splatgraft.segment import Box
-from splatgraft.similarity import Similarity
+from splatgraft.segmentation import Box
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page

@@ -15,14 +15,14 @@ import torch
 import viser
 from torch import Tensor
 
-from splatgraft.cameras import Cameras
-from splatgraft.editor.latest import Latest
-from splatgraft.editor.page.stage_view import view_of
-from splatgraft.editor.preview import KINDS, NEEDS_LIGHT, Kind, Size, wiped
-from splatgraft.editor.session import Session
-from splatgraft.editor.state import EditState
-from splatgraft.images import write_image
-from splatgraft.kept import same_inputs
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.images import write_image
+from splatgraft.editor.page.scene_view import view_of
+from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
+from splatgraft.editor.previews.preview import KINDS, NEEDS_LIGHT, Kind, Size, wiped
+from splatgraft.editor.session.edit_state import EditState
+from splatgraft.editor.session.session import Session
+from splatgraft.runtime.memo import same_inputs
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
@@ -58,7 +58,7 @@ class PreviewPanel:
         self._drawn: dict[Kind, tuple[tuple[object, ...], np.ndarray]] = {}
         self._moving: EditState | None = None
         self._draft_took, self._rest_took = float("inf"), 0.0
-        self._latest = Latest(self._work, lambda error: self._say(" ".join(str(error).split())))
+        self._latest = LatestOnlyWorker(self._work, lambda error: self._say(" ".join(str(error).split())))
         self._panel = gui.add_panel()
         with self._panel.add_tab("True picture", viser.Icon.PHOTO):
             self._image = gui.add_image(np.full((270, 400, 3), 40, np.uint8), format="jpeg", jpeg_quality=88)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import viser
 
-from splatgraft.editor import exports
+from splatgraft.editor.jobs import exports
 from splatgraft.editor.page.place_phase import hide_target, show_target
 from splatgraft.editor.page.server import FILES_PREFIX
-from splatgraft.harmonize import HARMONIZERS
+from splatgraft.harmonization import HARMONIZERS
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page

@@ -10,10 +10,10 @@ import viser
 
 from splatgraft.editor.page.box_handles import BoxHandles
 from splatgraft.editor.page.brush import Brush
-from splatgraft.editor.page.stage_view import TINT, Color, view_of
-from splatgraft.editor.picking import Rectangle, in_rectangle
+from splatgraft.editor.page.scene_view import TINT, Color, view_of
+from splatgraft.editor.session.picking import Rectangle, in_rectangle
 from splatgraft.formats import read_capture
-from splatgraft.segment import Box, Keep, default_box
+from splatgraft.segmentation import Box, Keep, default_box
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page

@@ -19,8 +19,8 @@ from viser import _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from splatgraft.editor.gate import Gate
-from splatgraft.editor.seat import Seat
+from splatgraft.editor.access.access_control import AccessControl
+from splatgraft.editor.access.edit_lock import EditLock
 
 FILES_PREFIX = "/files/"
 _LOOKING_ON = (_messages.ViewerCameraMessage, _messages.GetRenderResponseMessage)
@@ -40,12 +40,12 @@ _SERVING = threading.Lock()
 class GuardedServer:
     """viser behind a gate."""
 
-    def __init__(self, gate: Gate, *, host: str, port: int, upload_limit: int) -> None:
+    def __init__(self, gate: AccessControl, *, host: str, port: int, upload_limit: int) -> None:
         """Start to listen; at once, or at the next free port.
 
         Raises: OSError where the gate does not hold.
         """
-        self.seat = Seat()
+        self.seat = EditLock()
         self.on_seat: Callable[[], None] = lambda: None
         self.on_large_upload: Callable[[str, int], None] = lambda name, size: None
         self.files: Callable[[str], Path | None] = lambda name: None
@@ -82,7 +82,7 @@ class GuardedServer:
         with contextlib.redirect_stdout(io.StringIO()):
             self.viser.stop()
 
-    def _seated(self, seat: Seat) -> None:
+    def _seated(self, seat: EditLock) -> None:
         self.seat = seat
         self.on_seat()
 

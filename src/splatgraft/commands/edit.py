@@ -1,0 +1,176 @@
+"""The command `edit`: the web editor on a project, with the steps that its clicks call. Knows nothing of the page."""
+
+import os
+import secrets
+import signal
+import sys
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from splatgraft.commands.init import Init
+from splatgraft.commands.steps.capture import Capture
+from splatgraft.commands.steps.compose import Compose
+from splatgraft.commands.steps.relight import Relight
+from splatgraft.commands.steps.segment import Segment
+from splatgraft.editor.access.access_control import LOOPBACK, AccessControl
+from splatgraft.editor.access.uploads import LIMIT_BYTES
+from splatgraft.editor.session.project_access import ProjectFiles, Triple
+from splatgraft.editor.session.session import EDITOR_FOLDER
+from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.formats import is_scene
+from splatgraft.project.results import (
+    CAMERAS_FILE,
+    LIGHT_FILE,
+    PLACEMENT_FILE,
+    PROJECT_FILE,
+    SCENE_FILE,
+    SELECTION_FILE,
+    SURROUNDINGS_FILE,
+    Side,
+    locked,
+)
+from splatgraft.project.step import Positional
+from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.flow import Flow, read_flow
+from splatgraft.workflow.staleness import reasons
+
+
+@dataclass(frozen=True)
+class StepsProject:
+    """A project as the editor sees it, by the steps of the command line."""
+
+    file: Path
+    """project.toml, there or about to be."""
+    out: Path | None = None
+    """Where results go; beside it where not given."""
+    console: Console = field(default_factory=Console)
+    """For sentences."""
+
+    def files(self) -> ProjectFiles | None:
+        """Its files; None where there is no project.toml yet.
+
+        Raises: ValueError where it is broken.
+        """
+        if not self.file.is_file():
+            return None
+        flow = read_flow(self.file, self.out)
+        layout = flow.layout
+        segment, compose, relight = (flow.steps[name] for name in ("segment", "compose", "relight"))
+        assert isinstance(segment, Segment)
+        assert isinstance(compose, Compose)
+        assert isinstance(relight, Relight)
+        return ProjectFiles(
+            file=self.file,
+            root=layout.root,
+            source_scene=segment.scene,
+            target_scene=compose.target,
+            source_cameras=layout.capture("source") / CAMERAS_FILE,
+            target_cameras=layout.capture("target") / CAMERAS_FILE,
+            target_capture=layout.capture("target"),
+            object=compose.object,
+            surroundings=layout.object / SURROUNDINGS_FILE,
+            selection=layout.object / SELECTION_FILE,
+            composite=layout.composite / SCENE_FILE,
+            placement=layout.composite / PLACEMENT_FILE,
+            relit=layout.relit / SCENE_FILE,
+            light=layout.relit / LIGHT_FILE,
+            result=layout.result / SCENE_FILE,
+            report=layout.report,
+            pictured=(_is_pictured(flow, "source"), _is_pictured(flow, "target")),
+            light_by=relight.light,
+            relighting=relight.options,
+            placing=compose.options,
+        )
+
+    def reasons(self) -> Mapping[str, str | None]:
+        """Why each step is stale, as `status` says it; a file that is missing is the reason of what reads it."""
+        try:
+            return reasons(read_flow(self.file, self.out))
+        except ValueError as error:
+            return {"project": str(error)}
+
+    def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
+        """Write project.toml.
+
+        Raises: ValueError where a capture or a scene is not there, or a project is.
+        """
+        for scene in scenes:
+            if scene is not None and not scene.is_file():
+                raise ValueError(f"{scene}: expected a trained scene, found no such file")
+        Init(folder=self.file.parent, source=captures[0], target=captures[1]).execute(self.console)
+        text = self.file.read_text(encoding="utf-8")
+        for side, scene in zip(("source", "target"), scenes, strict=True):
+            if scene is not None:
+                text = with_keys(text, side, {"scene": os.path.relpath(scene, self.file.parent)})
+        with atomic_write(self.file) as stream:
+            stream.write(text.encode())
+
+    def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
+        """Say how a scene without photographs is looked at."""
+        text = with_keys(self.file.read_text(encoding="utf-8"), side, {"up": up, "look": look})
+        with atomic_write(self.file) as stream:
+            stream.write(text.encode())
+
+    def run_command(self, to: str, title: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The child process for the steps up to `to`, and what a person would type."""
+        found = self.files()
+        root = self.file.parent if found is None else found.root
+        words = (str(root / EDITOR_FOLDER), title, str(self.file), to, *(() if self.out is None else (str(self.out),)))
+        out = () if self.out is None else ("--out", str(self.out))
+        command = (sys.executable, "-m", "splatgraft.workflow.background_job", *words)
+        return command, ("splatgraft", "run", str(self.file), "--to", to, *out)
+
+
+def _is_pictured(flow: Flow, side: Side) -> bool:
+    step = flow.steps[f"{side}/capture"]
+    return isinstance(step, Capture) and is_scene(step.capture)
+
+
+@dataclass(frozen=True)
+class Edit:
+    """Open a project in the browser; where there is none yet, start one there."""
+
+    project: Positional = Path(PROJECT_FILE)
+    """The project file, or its folder; it need not exist."""
+    out: Path | None = None
+    """Where all results go; the folder of the project file where not given."""
+    host: str = "127.0.0.1"
+    """Address to listen at; any but the machine's own makes the page ask for a token, and takes no paths outside the
+    project's folder."""
+    port: int = 8080
+    """Port to listen at; the next free one where it is taken."""
+    budget: int = 300_000
+    """Most Gaussians of a scene that the browser is given; files keep all."""
+
+    def execute(self, console: Console) -> int:
+        """Serve until Ctrl-C."""
+        from splatgraft.editor.page.page import Page, PageOptions
+        from splatgraft.editor.page.server import GuardedServer
+
+        is_file = self.project.suffix == ".toml"
+        file = (self.project if is_file else self.project / PROJECT_FILE).absolute()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        home = self.host in LOOPBACK
+        token = None if home else secrets.token_urlsafe(16)
+        out = None if self.out is None else self.out.absolute()
+        with locked(file.parent / "edit"):
+            gate = AccessControl(hosts=LOOPBACK if home else (), token=token)
+            guarded = GuardedServer(gate, host=self.host, port=self.port, upload_limit=LIMIT_BYTES)
+            project = StepsProject(file, out, console)
+            page = Page(guarded, project, PageOptions(budget=self.budget, inside=None if home else file.parent))
+            query = "" if token is None else f"?token={token}"
+            console.result(f"http://{self.host}:{guarded.port}/{query}")
+            console.say("open this address in a browser; Ctrl-C ends the editor, not the work that it started")
+            stop = threading.Event()
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, lambda *_: stop.set())
+            stop.wait()
+            page.close()
+            guarded.close()
+        return 0
+
+
+COMMAND = Edit

@@ -1,0 +1,52 @@
+"""The command `init`: a folder with a commented project.toml."""
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.formats import is_scene
+from splatgraft.project.project_file import TEMPLATE
+from splatgraft.project.results import PROJECT_FILE
+from splatgraft.project.step import Positional
+from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.console import Console
+
+
+@dataclass(frozen=True)
+class Init:
+    """Write a commented project.toml."""
+
+    folder: Positional
+    """The project's folder; made where it does not exist."""
+    source: Path
+    """The capture with the object: photos, a video, a COLMAP folder or a folder with transforms.json; or a trained
+    scene (.ply, .spz, .splat) without photographs."""
+    target: Path
+    """The capture or the scene that receives it."""
+
+    def execute(self, console: Console) -> int:
+        """Write the file; one that is there is never replaced."""
+        path = self.folder / PROJECT_FILE
+        if path.exists():
+            raise ValueError(f"{path}: expected no project here yet, found one")
+        for capture in (self.source, self.target):
+            if not capture.exists():
+                raise ValueError(f"{capture}: expected photos, a video, a posed capture or a scene, found nothing")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        text = TEMPLATE.replace("{source}", self._key(self.source)).replace("{target}", self._key(self.target))
+        if is_scene(self.source):
+            # nothing but a box can say where the object is
+            text = with_keys(text, "segment", {"mask_source": "grabcut"})
+        with atomic_write(path) as stream:
+            stream.write(text.encode())
+        console.result(path)
+        return 0
+
+    def _key(self, capture: Path) -> str:
+        # a JSON string is a TOML string
+        return f"{'scene' if is_scene(capture) else 'capture'} = {json.dumps(os.path.relpath(capture, self.folder))}"
+
+
+COMMAND = Init

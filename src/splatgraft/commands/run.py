@@ -1,0 +1,30 @@
+"""The command `run`: everything in a project that is stale, in order."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatgraft.project.step import Positional
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.run_steps import run_steps
+
+
+@dataclass(frozen=True)
+class Run:
+    """Do what is stale in a project; a step that was killed goes on from its last checkpoint."""
+
+    project: Positional = Path("project.toml")
+    """The project file, or its folder."""
+    out: Path | None = None
+    """Where all results go; the folder of the project file where not given."""
+    to: str | None = None
+    """Stop after this step (reconstruct, or source/reconstruct for one of the two)."""
+    force: tuple[str, ...] = ()
+    """Do these steps even where they are fresh."""
+
+    def execute(self, console: Console) -> int:
+        """Do the steps; the paths of what was wanted are the last lines of standard output."""
+        run_steps(self.project, console, out=self.out, to=self.to, force=self.force)
+        return 0
+
+
+COMMAND = Run

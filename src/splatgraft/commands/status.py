@@ -1,0 +1,36 @@
+"""The command `status`: what is done in a project, what is stale and why."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatgraft.project.results import Record, read_record
+from splatgraft.project.step import Positional
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.flow import read_flow
+from splatgraft.workflow.staleness import reasons
+
+
+@dataclass(frozen=True)
+class Status:
+    """Say for every step of a project whether its result stands, and why not."""
+
+    project: Positional = Path("project.toml")
+    """The project file, or its folder."""
+    out: Path | None = None
+    """Where the results are; the folder of the project file where not given."""
+
+    def execute(self, console: Console) -> int:
+        """Print one line per step."""
+        flow = read_flow(self.project, self.out)
+        console.result(f"{'step':<20} {'seconds':>8} {'memory':>9}  state")
+        for name, reason in reasons(flow).items():
+            seconds, memory = _cost(read_record(flow.steps[name].out))
+            console.result(f"{name:<20} {seconds:>8} {memory:>9}  {f'stale: {reason}' if reason else 'up to date'}")
+        return 0
+
+
+def _cost(record: Record | None) -> tuple[str, str]:
+    return (f"{record.seconds:.1f}", f"{record.peak_memory_bytes / 2**30:.2f} GiB") if record else ("", "")
+
+
+COMMAND = Status

@@ -1,0 +1,77 @@
+"""The command `capture`: photos, a video, a posed capture or a trained scene become a folder with transforms.json."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from splatgraft.capture import LookOptions, PoseOptions, extract_frames, find_viewpoints, photographed, pose_photos
+from splatgraft.core.images import list_images, write_image
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.folders.capture_files import capture_inputs, has_poses
+from splatgraft.formats import is_scene, read_capture, read_gaussians, write_capture
+from splatgraft.project.step import Context, Inputs, Positional
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Pose photos or a video; poses that are there already are taken over, and images are then referred to. Of a
+    trained scene without photographs, pictures are made from all around."""
+
+    capture: Positional
+    """A folder of photos, a video, a COLMAP folder, a folder with transforms.json, or a .ply, .spz or .splat."""
+    out: Path = Path("capture")
+    """Folder for transforms.json and points.ply."""
+    max_side: int = 1600
+    """Longest side at which images are served from here on, pixels; 0 keeps all."""
+    options: PoseOptions = field(default_factory=PoseOptions)
+    look: LookOptions = field(default_factory=LookOptions)
+
+    def inputs(self) -> Inputs:
+        """The photos, or the video, or the scene, or the files of the posed capture."""
+        if has_poses(self.capture):
+            return capture_inputs(self.capture, read_capture(self.capture), masks=True)
+        return {"photos": tuple(list_images(self.capture)) if self.capture.is_dir() else (self.capture,)}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the posed capture."""
+        if is_scene(self.capture):
+            posed = self._pictures(folder, context)
+        elif has_poses(self.capture):
+            posed = read_capture(self.capture)
+            context.console.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points")
+        else:
+            posed, report = pose_photos(
+                self._photos(folder, context), folder, options=self.options, progress=context.progress
+            )
+            context.console.say(f"{self.capture}: {report}")
+        write_capture(folder, _limited(posed, self.max_side))
+
+    def _pictures(self, folder: Path, context: Context) -> PosedImages:
+        """Pictures of a scene that came without photographs."""
+        scene = read_gaussians(self.capture)
+        found = find_viewpoints(scene, self.look, progress=context.progress)
+        for sentence in found.report:
+            context.console.say(f"{self.capture}: {sentence}")
+        (folder / "images").mkdir()
+        paths = {name: folder / "images" / f"{name}.png" for name in found.cameras.names}
+        photographed(
+            scene, found, write=lambda name, picture: write_image(paths[name], picture), progress=context.progress
+        )
+        return PosedImages(
+            image_paths=tuple(paths.values()),
+            cameras=found.cameras,
+            points=found.points,
+            point_colors=found.point_colors,
+        )
+
+    def _photos(self, folder: Path, context: Context) -> list[Path]:
+        if self.capture.is_dir():
+            return list_images(self.capture)
+        return extract_frames(self.capture, folder / "frames", progress=context.progress)
+
+
+def _limited(posed: PosedImages, max_side: int) -> PosedImages:
+    longest = int(posed.cameras.sizes.max()) if len(posed) else 0
+    return posed.resized(max_side / longest) if 0 < max_side < longest else posed
+
+
+COMMAND = Capture

@@ -1,0 +1,156 @@
+"""The command `evaluate`: pictures before and after, figures where there is a truth, and the page that shows them."""
+
+import os
+import platform
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.images import write_image
+from splatgraft.evaluation import (
+    Report,
+    ReportView,
+    StepTime,
+    TurntableOptions,
+    change_map,
+    describe_change,
+    measure,
+    side_by_side,
+    turntable_cameras,
+    write_animation,
+    write_report,
+)
+from splatgraft.fitting.perceptual_losses import lpips_vgg
+from splatgraft.folders.evaluated_scenes import EvaluatedScenes, Pictures, TrueViews, truth_files
+from splatgraft.project.results import RESULTS_IN_ORDER, SCENE_FILE, read_record
+from splatgraft.project.step import Context, Device, Inputs, choose_device
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare the result with copy-paste and, where there is one, with the truth; write pictures and index.html."""
+
+    result: Path
+    """The consolidated scene, a .ply."""
+    composite: Path
+    """The folder of the composite: the object as it was captured."""
+    cameras: Path
+    """The target's cameras, a transforms.json."""
+    out: Path = Path("report")
+    """Folder for index.html, pictures and metrics.json."""
+    ground_truth: Path | None = None
+    """A capture of the target with the object really in it, with masks; its views are compared."""
+    target_capture: Path | None = None
+    """The target's own images, without the object; needed beside a ground truth."""
+    views: Path | None = None
+    """The folder of views that were harmonised: views of the truth that are not among them are held out."""
+    light: Path | None = None
+    """A text in which the light transfer explains itself."""
+    project: Path | None = None
+    """The folder of all results: the page then says what each step took."""
+    lpips_weights: Path | None = None
+    """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache where not given."""
+    pictured: int = 8
+    """How many views the page shows."""
+    frames: int = 48
+    """Frames of the turntable; 0 makes none."""
+    device: Device = "auto"
+    """Where to render."""
+
+    def inputs(self) -> Inputs:
+        """The scenes, the cameras and the truth."""
+        composite = (self.composite / SCENE_FILE, self.composite / "is_object.npy")
+        light = () if self.light is None else (self.light,)
+        truth = truth_files(self.ground_truth, self.target_capture)
+        return {"scenes": (self.result, *composite), "cameras": (self.cameras,), "light": light, "truth": truth}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the report."""
+        device = choose_device(self.device, context.console)
+        scenes = EvaluatedScenes.read(self.result, self.composite, self.cameras, device=device)
+        metrics, missing = None, {}
+        truth = None
+        if self.ground_truth is not None:
+            truth = TrueViews(scenes, self.ground_truth, target_capture=self.target_capture, harmonized=self.views)
+            metrics, missing = self._measure(truth, context)
+        shown = _spread(len(truth.names if truth else scenes.cameras), self.pictured)
+        pictures = [(truth or scenes).pictures(index) for index in shown]
+        changes = [describe_change(p.result, p.copy_paste, p.mask) for p in pictures]
+        best = max(pictures, key=lambda p: float(p.mask.sum()))
+        self._write_pictures(folder, best)
+        turntable = _turntable(scenes, self.frames, context) if self.frames else []
+        if turntable:
+            write_animation(folder / "turntable.gif", turntable)
+        report = Report(
+            title="Object transfer: before and after",
+            subtitle=f"{int(scenes.is_object.sum()):,} Gaussians of the object among {scenes.result.count:,} in all.",
+            metrics=metrics,
+            changes={key: sum(c[key] for c in changes) / len(changes) for key in changes[0]} if changes else {},
+            not_measured=missing,
+            light=self.light.read_text() if self.light is not None else "",
+            steps=_step_times(self.project) if self.project is not None else (),
+            machine=f"{os.cpu_count()} cores of {platform.machine()}, {device}",
+            limits=_LIMITS if truth is None else (),
+        )
+        write_report(folder, report, views=(_report_view(p) for p in pictures), turntable=turntable)
+
+    def _measure(self, truth: TrueViews, context: Context) -> tuple[dict, dict[str, str]]:
+        try:
+            perceptual, missing = lpips_vgg(self.lpips_weights), {}
+        except ValueError as error:
+            if self.lpips_weights is not None:
+                raise
+            perceptual, missing = None, {"lpips": str(error)}
+        return measure(truth, perceptual), missing
+
+    def _write_pictures(self, folder: Path, best: Pictures) -> None:
+        write_image(folder / "before.png", best.before)
+        write_image(folder / "copy_paste.png", best.copy_paste)
+        write_image(folder / "after.png", best.result)
+        three = side_by_side((best.before, best.copy_paste, best.result), ("Before", "Copy-paste", "After"))
+        write_image(folder / "before_after.png", three)
+
+
+_LIMITS = (
+    "There is no ground truth for these captures: the pictures show what was done, not how right it is.",
+    "Viewpoints far from the captured ones show less than the captured ones do.",
+)
+
+
+def _spread(count: int, wanted: int) -> list[int]:
+    """At most `wanted` of `count` indices, evenly taken."""
+    return sorted({round(i) for i in torch.linspace(0, count - 1, min(count, wanted)).tolist()})
+
+
+def _report_view(pictures: Pictures) -> ReportView:
+    shown = {"Copy-paste": pictures.copy_paste, "Result": pictures.result}
+    if pictures.truth is not None:
+        shown["Ground truth"] = pictures.truth
+    shown |= {"Before": pictures.before, "Change of light": change_map(pictures.result, pictures.copy_paste)}
+    return ReportView(name=pictures.name, held_out=pictures.held_out, pictures=shown)
+
+
+def _turntable(scenes: EvaluatedScenes, frames: int, context: Context) -> list[torch.Tensor]:
+    cameras = turntable_cameras(
+        scenes.cameras, scenes.object_center, up=estimate_up(scenes.cameras), options=TurntableOptions(frames=frames)
+    )
+    pictures: list[torch.Tensor] = []
+    for index, camera in enumerate(cameras):
+        pictures.append(scenes.picture(scenes.result, camera))
+        context.progress(index + 1, frames, "turntable")
+    return pictures
+
+
+def _step_times(project: Path) -> tuple[StepTime, ...]:
+    times: list[StepTime] = []
+    for name in RESULTS_IN_ORDER:
+        if (record := read_record(project / name)) is not None:
+            label = f"{name.split('/')[0]}: {record.step}" if "/" in name else record.step
+            note = f"at most {record.peak_memory_bytes / 2**30:.2f} GiB of memory"
+            times.append(StepTime(name=label, seconds=record.seconds, note=note))
+    return tuple(times)
+
+
+COMMAND = Evaluate

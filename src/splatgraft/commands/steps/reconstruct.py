@@ -1,0 +1,66 @@
+"""The command `reconstruct`: a capture folder becomes a folder with scene.ply."""
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.image_metrics import psnr, ssim
+from splatgraft.core.posed_images import PosedImages, held_out
+from splatgraft.folders.capture_files import capture_inputs
+from splatgraft.formats import read_capture, write_gaussians
+from splatgraft.project.results import METRICS_FILE, SCENE_FILE
+from splatgraft.project.step import Context, Inputs, Positional, choose_device
+from splatgraft.reconstruction import ReconstructOptions, predict_memory, reconstruct
+from splatgraft.rendering import RenderOptions, render
+
+EVAL_EVERY = 8
+"""As in 3DGS."""
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Train a 3DGS scene on posed images."""
+
+    capture: Positional
+    """A COLMAP folder, a folder with transforms.json, or the result of `splatgraft capture`."""
+    out: Path = Path("scene")
+    """Folder for scene.ply."""
+    eval: bool = False
+    """Hold out every 8th view and measure how well the scene predicts it: --eval-every 8."""
+    options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(device="auto"))
+
+    def inputs(self) -> Inputs:
+        """The files of the capture, without masks."""
+        return capture_inputs(self.capture, read_capture(self.capture))
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make scene.ply, and metrics.json where views are held out."""
+        capture = read_capture(self.capture)
+        device = choose_device(self.options.device, context.console)
+        options = replace(self.options, device=str(device))
+        if self.eval and not options.eval_every:
+            options = replace(options, eval_every=EVAL_EVERY)
+        context.console.say(f"memory: at most about {predict_memory(capture, options) / 2**30:.1f} GiB")
+        scene = reconstruct(capture, options, progress=context.progress, checkpoint=context.checkpoint)
+        write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
+        if options.eval_every:
+            metrics = _held_out_metrics(scene, options.served(capture), options)
+            context.console.say(f"held out: {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}")
+            (folder / METRICS_FILE).write_text(json.dumps(metrics, indent=1))
+
+
+def _held_out_metrics(scene: Gaussians, capture: PosedImages, options: ReconstructOptions) -> dict[str, float]:
+    """Means over the held-out views."""
+    views = capture.select(held_out(len(capture), options.eval_every))
+    values: list[tuple[float, float]] = []
+    for index, camera in enumerate(views.cameras.to(scene.device)):
+        picture = render(scene, camera, options=RenderOptions(background=options.background)).color
+        assert picture is not None
+        image, truth = picture[0].cpu().clamp(0, 1), views.image(index)
+        values.append((float(psnr(image, truth)), float(ssim(image, truth))))
+    means = [sum(column) / len(values) for column in zip(*values, strict=True)]
+    return {"psnr": means[0], "ssim": means[1], "views": len(values), "gaussians": scene.count}
+
+
+COMMAND = Reconstruct

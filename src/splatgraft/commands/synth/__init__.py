@@ -1,0 +1,1 @@
+"""The commands `synth ...`: scenes and training pairs with a known truth."""

@@ -1,0 +1,70 @@
+"""The command `synth orida`: training pairs from ORIDa's photographs (paper, Sec. 4.2)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from splatgraft.core.images import read_mask, read_rgb
+from splatgraft.project.results import locked
+from splatgraft.project.step import Positional
+from splatgraft.runtime.console import Console
+from splatgraft.training.sources.generate import Unlit, Wanted, generate
+from splatgraft.training.sources.orida import LICENCE, Photograph, balanced, read_orida
+from splatgraft.training.sources.relighting_options import Relighting
+from splatgraft.training.sources.source import fitted
+
+
+@dataclass(frozen=True)
+class OridaPairs:
+    """Choose photographs of ORIDa, balanced by object and scene, and relight them; goes on where it was killed."""
+
+    out: Positional
+    """Folder for one folder a photograph, manifest.jsonl and sheet.png to look at."""
+    orida: Path
+    """A folder with index.csv (image, mask, background, object, scene), or OBJECT/SCENE/images, masks, background.*."""
+    relighting: Relighting = field(default_factory=Relighting)
+    number: int = 2000
+    """Photographs to choose."""
+    size: str = "704x496"
+    """Pixels, WIDTHxHEIGHT; the middle is kept where the shape differs."""
+    seed: int = 0
+    """The choice and the lights follow from it."""
+
+    def execute(self, console: Console) -> int:
+        """Make what is missing."""
+        parts = self.size.split("x")
+        if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
+            raise ValueError(f"--size: expected WIDTHxHEIGHT, found {self.size}")
+        there = read_orida(self.orida)
+        chosen = balanced(there, self.number, self.seed)
+        objects, scenes = len({p.object for p in chosen}), len({p.scene for p in chosen})
+        console.say(f"{len(chosen)} of {len(there)} photographs, {objects} objects in {scenes} scenes")
+        lighting = self.relighting.open(self.seed)
+        with locked(self.out), console.bar("orida") as progress:
+            wanted = _wanted(chosen, int(parts[0]), int(parts[1]), self.seed)
+            made = generate(self.out, wanted, lighting, total=len(chosen), progress=progress)
+        console.say(f"{made} samples; look at sheet.png")
+        console.result(self.out / "manifest.jsonl")
+        return 0
+
+
+def _wanted(chosen: list[Photograph], width: int, height: int, seed: int) -> Iterator[Wanted]:
+    for photograph in chosen:
+        record = {"image": photograph.image.name, "object": photograph.object, "scene": photograph.scene}
+        record |= {"licence": LICENCE, "chosen_by": f"balanced, seed {seed}"}
+        yield Wanted(photograph.name, photograph.scene, partial(_read, photograph, width, height), record)
+
+
+def _read(photograph: Photograph, width: int, height: int) -> Unlit:
+    target, background = read_rgb(photograph.image), read_rgb(photograph.background)
+    mask = read_mask(photograph.mask)
+    for path, picture in ((photograph.background, background), (photograph.mask, mask)):
+        if picture.shape[:2] != target.shape[:2]:
+            wanted, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
+            raise ValueError(f"{path}: expected {wanted} pixels as {photograph.image.name}, found {found}")
+    images = (fitted(image, width, height).clamp(0, 1) for image in (target, background, mask))
+    return Unlit(*images)
+
+
+COMMAND = OridaPairs

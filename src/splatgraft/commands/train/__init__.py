@@ -1,0 +1,1 @@
+"""The commands `train ...`: image models trained on pairs."""

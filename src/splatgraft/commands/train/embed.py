@@ -1,0 +1,35 @@
+"""The command `train embed`: the empty prompt, embedded once and kept, so that no text encoder is loaded."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from splatgraft.project.step import Positional
+from splatgraft.runtime.console import Console
+
+
+@dataclass(frozen=True)
+class TrainEmbed:
+    """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or of Stable Diffusion; needs transformers, once."""
+
+    out: Positional
+    """File to write: empty_prompt.safetensors; beside the weights it is found by itself."""
+    base: str = "black-forest-labs/FLUX.1-schnell"
+    """Folder or hub id with the text encoders and tokenizers."""
+    tokens: int = 256
+    """Length of FLUX's text sequence; schnell was distilled at 256."""
+    kind: Literal["flux", "stable-diffusion"] = "flux"
+    """Which text encoders."""
+
+    def execute(self, console: Console) -> int:
+        """Write the file."""
+        from splatgraft.harmonization.flux.weights.text_encoders import (
+            embed_empty_prompt,
+            embed_empty_prompt_stable_diffusion,
+        )
+
+        if self.kind == "flux":
+            embed_empty_prompt(self.base, self.out, tokens=self.tokens, say=console.say)
+        else:
+            embed_empty_prompt_stable_diffusion(self.base, self.out, say=console.say)
+        console.result(self.out)
+        return 0

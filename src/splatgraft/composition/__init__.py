@@ -1,0 +1,30 @@
+"""Compose: objects are placed in a target scene. Knows nothing about light, images or files."""
+
+from splatgraft.composition.assemble import compose
+from splatgraft.composition.burial import hidden_fraction
+from splatgraft.composition.object_base import ObjectBase, object_base
+from splatgraft.composition.place_suggestion import Suggestion, suggest_place
+from splatgraft.composition.placement import Placed, PlaceOptions, place_object
+from splatgraft.composition.resting_pose import RestOptions, rest_on_surface
+from splatgraft.composition.support_surface import Support, support_below
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.composite import Composite, PlacedObject
+
+__all__ = [
+    "Composite",
+    "ObjectBase",
+    "PlaceOptions",
+    "Placed",
+    "PlacedObject",
+    "RestOptions",
+    "Suggestion",
+    "Support",
+    "compose",
+    "estimate_up",
+    "hidden_fraction",
+    "object_base",
+    "place_object",
+    "rest_on_surface",
+    "suggest_place",
+    "support_below",
+]

@@ -1,0 +1,86 @@
+"""Adam on the colours under an image loss, one view per iteration: the paper's reference, and the polish of `fast`.
+
+Geometry and opacity are frozen in the views' operators. Knows nothing about the normal equations.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.consolidation.corrected_targets import Corrections
+from splatgraft.consolidation.options import DescentOptions
+from splatgraft.fitting import adam
+from splatgraft.fitting.perceptual_losses import ImageLoss
+from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
+
+
+def descend(  # noqa: PLR0913 - the last two are the services of every long stage
+    sh: Float[Tensor, "m k 3"],
+    corrections: Corrections,
+    options: DescentOptions,
+    *,
+    loss: ImageLoss,
+    seed: int = 0,
+    progress: Progress = silent,
+    checkpoint: Checkpoint = NoCheckpoint(),
+) -> Float[Tensor, "m k 3"]:
+    """Colours after `options.iterations` steps of Adam over views in shuffled order, from `sh`.
+
+    Gaussians move when the view sees them.
+
+    Raises: ValueError where a gradient is not finite, which a loss that divides can cause.
+    """
+    views, start = corrections.views, 0
+    sh = sh.clone().contiguous()
+    moments = adam.no_moments({"sh": sh}, len(sh))
+    saved = checkpoint.load()
+    if saved is not None:
+        start, sh = int(saved["iteration"]), saved["sh"].clone()
+        moments = adam.Moments({"sh": saved["first"].clone()}, {"sh": saved["second"].clone()}, saved["steps"].clone())
+    shares = torch.full((3 * sh.shape[1],), options.rest_ratio, device=sh.device)
+    shares[:3] = 1.0
+    for iteration in range(start, options.iterations):
+        index = _view_of(iteration, len(views), seed)
+        view, leaf = views[index], sh.detach().requires_grad_()
+        picture = view.render(leaf)
+        picture, target = _confident(picture, corrections.target(index), views.weight(index))
+        value = loss(picture, target)
+        (gradient,) = torch.autograd.grad(value, leaf)
+        rates = options.rate * _decay(iteration / options.iterations, options.final_ratio) * shares
+        if not adam.step({"sh": sh}, {"sh": gradient}, moments=moments, rates={"sh": rates}, visible=view.visible):
+            name = views.cameras.names[index]
+            raise ValueError(f"consolidate: expected finite gradients, found others in {name} at iteration {iteration}")
+        if (iteration + 1) % options.save_every == 0:
+            checkpoint.save(
+                {
+                    "iteration": iteration + 1,
+                    "sh": sh,
+                    "first": moments.first["sh"],
+                    "second": moments.second["sh"],
+                    "steps": moments.steps,
+                }
+            )
+        progress(iteration + 1, options.iterations, f"loss {float(value.detach()):.4f}")
+    return sh
+
+
+def _view_of(iteration: int, count: int, seed: int) -> int:
+    """The view of an iteration: each pass visits all in an order that depends on seed and pass alone."""
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + iteration // count))
+    return int(order[iteration % count])
+
+
+def _decay(done: float, final_ratio: float) -> float:
+    return final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * done))
+
+
+def _confident(
+    picture: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], weight: Float[Tensor, "h w"] | None
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]]:
+    """Both images with the render, taken as a constant, in place of what is not trusted: serves every loss."""
+    if weight is None:
+        return picture, target
+    share, constant = weight[..., None], picture.detach()
+    return share * picture + (1 - share) * constant, share * target + (1 - share) * constant

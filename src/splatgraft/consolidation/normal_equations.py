@@ -1,0 +1,169 @@
+"""Least squares for SH colours by block-preconditioned conjugate gradient on the views' fixed maps.
+
+With geometry frozen a pixel is a fixed weighted sum of colours, and a colour a fixed weighted sum of SH coefficients:
+sum_v |W_v B_v x - image_v|^2 + ridge |x - prior|^2 is quadratic (after "Instant Colorization of Gaussian Splats",
+2026). Renderers clamp colours at zero; the equations do not, and leave that to the descent. Knows nothing about losses.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.consolidation.corrected_targets import Corrections
+from splatgraft.consolidation.frozen_views import Views
+from splatgraft.consolidation.options import SolveOptions
+from splatgraft.runtime.progress import Progress, silent
+
+_FACTORED_AT_ONCE = 2**14
+# views left out while ridges are tried: every 5th
+_JUDGE_EVERY = 5
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """The quadratic over some of the views, up to the images."""
+
+    views: Views
+    """All views."""
+    which: Sequence[int]
+    """Those that count."""
+    seen: Float[Tensor, "m 1"]
+    """Pixels that each Gaussian makes up, summed over all views."""
+    factor: Float[Tensor, "m k k"]
+    """Cholesky factors of the preconditioner: each Gaussian alone, with the others moving along."""
+    ridge: Float[Tensor, "m k"]
+    """Weight of the prior, pixels."""
+
+    def with_ridge(self, band_ridge: float, prior_px: float) -> "_Equations":
+        """The same with another weight of zero for the higher bands."""
+        return replace(self, ridge=_ridge(self.seen, self.ridge.shape[1], band_ridge, prior_px))
+
+    def apply(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m k 3"]:
+        """The matrix times coefficients."""
+        out = self.ridge[..., None] * sh
+        for index in self.which:
+            view, weight = self.views[index], self.views.weight(index)
+            picture = view.blend(torch.einsum("mk,mkc->mc", view.basis, sh))
+            if weight is not None:
+                picture = picture * weight[..., None]
+            out += view.basis[:, :, None] * view.gather(picture)[:, None, :]
+        return out
+
+
+@torch.no_grad()
+def solve(
+    prior: Float[Tensor, "m k 3"],
+    corrections: Corrections,
+    options: SolveOptions,
+    *,
+    progress: Progress = silent,
+) -> Float[Tensor, "m k 3"]:
+    """The colours that explain all views best, from and towards `prior`.
+
+    The weight of zero for the higher bands is the one of `options.band_ridges` that predicts views left out best.
+    """
+    trials = len(options.band_ridges) if len(corrections.views) >= 2 * _JUDGE_EVERY else 0
+    total = options.rounds + trials + 1
+    progress(0, total, "setting up the equations")
+    # the strongest first: colours that hardly turn with the view cannot take a view's own error for a highlight
+    equations = _set_up(prior, corrections.views, max(options.band_ridges), options.prior_px)
+    sh, error = prior, 0.0
+    for turn in range(options.rounds):
+        residual, error = _residual(sh, corrections, equations.which, refine=turn > 0)
+        corrections.center()
+        if turn == 1 and trials > 1:
+            chosen = _choose(prior, corrections, equations, options)
+            equations = equations.with_ridge(chosen, options.prior_px)
+        residual -= equations.ridge[..., None] * (sh - prior)
+        sh = sh + _conjugate_gradient(residual, equations, options.steps)
+        progress(turn + 1 + (trials if turn else 0), total, f"rmse {error:.4f}")
+    progress(total, total, f"rmse {error:.4f}")
+    return sh
+
+
+def _choose(
+    prior: Float[Tensor, "m k 3"], corrections: Corrections, equations: _Equations, options: SolveOptions
+) -> float:
+    """The ridge whose short solution without every 5th view comes closest to those views, corrected."""
+    judges = range(_JUDGE_EVERY // 2, len(corrections.views), _JUDGE_EVERY)
+    fitted = [index for index in equations.which if index not in judges]
+    residual, _ = _residual(prior, corrections, fitted, refine=False)
+    errors = {}
+    for band_ridge in options.band_ridges:
+        trial = replace(equations, which=fitted).with_ridge(band_ridge, options.prior_px)
+        sh = prior + _conjugate_gradient(residual, trial, options.steps)
+        errors[band_ridge] = _error(sh, corrections, judges)
+    return min(errors, key=errors.__getitem__)
+
+
+def _set_up(prior: Float[Tensor, "m k 3"], views: Views, band_ridge: float, prior_px: float) -> _Equations:
+    """Blocks sum_v (W^T W 1) b b^T: W is non-negative, so these row sums bound what neighbours add to a Gaussian."""
+    m, k = prior.shape[:2]
+    blocks, seen = prior.new_zeros(m, k, k), prior.new_zeros(m, 1)
+    for index in range(len(views)):
+        view, weight = views[index], views.weight(index)
+        share = view.blend(prior.new_ones(m, 1))
+        share = view.gather(share if weight is None else share * weight[..., None])
+        blocks.baddbmm_((share * view.basis)[:, :, None], view.basis[:, None, :])
+        seen += share
+    ridge = _ridge(seen, k, band_ridge, prior_px)
+    blocks.diagonal(dim1=1, dim2=2).add_(ridge)
+    for part in blocks.split(_FACTORED_AT_ONCE):  # in place: the blocks are the largest thing in memory
+        part.copy_(torch.linalg.cholesky(part))
+    return _Equations(views, range(len(views)), seen, factor=blocks, ridge=ridge)
+
+
+def _ridge(seen: Float[Tensor, "m 1"], k: int, band_ridge: float, prior_px: float) -> Float[Tensor, "m k"]:
+    higher = (seen * band_ridge + prior_px).expand(-1, k - 1)
+    return torch.cat([torch.full_like(seen, prior_px), higher], 1)
+
+
+def _residual(
+    sh: Float[Tensor, "m k 3"], corrections: Corrections, which: Sequence[int], *, refine: bool
+) -> tuple[Float[Tensor, "m k 3"], float]:
+    """What the images still ask for, and the root mean square error over their pixels."""
+    views, out, squares, count = corrections.views, torch.zeros_like(sh), 0.0, 0
+    for index in which:
+        view = views[index]
+        picture = view.render(sh)
+        if refine:
+            corrections.refine(index, picture)
+        difference = _difference(corrections, index, picture)
+        out += view.basis[:, :, None] * view.gather(difference)[:, None, :]
+        squares += float((difference**2).sum())
+        count += difference.numel()
+    return out, (squares / count) ** 0.5
+
+
+def _error(sh: Float[Tensor, "m k 3"], corrections: Corrections, which: Sequence[int]) -> float:
+    views = corrections.views
+    return sum(float(_difference(corrections, i, views[i].render(sh)).square().mean()) for i in which)
+
+
+def _difference(corrections: Corrections, index: int, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    difference, weight = corrections.target(index) - picture, corrections.views.weight(index)
+    return difference if weight is None else difference * weight[..., None]
+
+
+def _conjugate_gradient(residual: Float[Tensor, "m k 3"], equations: _Equations, steps: int) -> Float[Tensor, "m k 3"]:
+    """`steps` steps on the correction, each colour channel by itself; the products are summed in double precision."""
+    solution = torch.zeros_like(residual)
+    conditioned = torch.cholesky_solve(residual, equations.factor)
+    direction, before = conditioned, _dot(residual, conditioned)
+    for _ in range(steps):
+        image_of = equations.apply(direction)
+        length = before / _dot(direction, image_of).clamp_min(1e-30)
+        solution += length * direction
+        residual = residual - length * image_of
+        conditioned = torch.cholesky_solve(residual, equations.factor)
+        now = _dot(residual, conditioned)
+        direction = conditioned + (now / before.clamp_min(1e-30)) * direction
+        before = now
+    return solution
+
+
+def _dot(a: Float[Tensor, "m k 3"], b: Float[Tensor, "m k 3"]) -> Float[Tensor, "3"]:
+    return (a.double() * b.double()).sum((0, 1)).to(a.dtype)

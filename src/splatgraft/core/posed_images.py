@@ -1,0 +1,72 @@
+"""The value `PosedImages`: a capture with poses and sparse points. Image files are read when asked for, not before."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.distortion import Distortion
+from splatgraft.core.images import read_alpha, read_mask, read_stored_rgb, resize
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """v images with their cameras, and m sparse points from structure from motion."""
+
+    image_paths: tuple[Path, ...]
+    """One file per camera, in the cameras' order, as photographed: `image` serves their undistorted pixels."""
+    cameras: Cameras
+    """Poses and intrinsics, at the size at which images are served."""
+    points: Float[Tensor, "m 3"]
+    """Sparse surface points, world units; m may be 0."""
+    point_colors: Float[Tensor, "m 3"]
+    """sRGB in [0, 1]."""
+    mask_paths: tuple[Path | None, ...] = ()
+    """Object mask of each image where there is one (the image itself where that is its alpha channel); empty where the
+    capture has none."""
+    distortions: tuple[Distortion | None, ...] = ()
+    """Lens distortion of each image file, removed when it is read; empty where no file has any."""
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def image(self, index: int) -> Float[Tensor, "h w 3"]:
+        """The image of camera `index`, sRGB, undistorted and resampled to that camera's size."""
+        return self._served(read_stored_rgb(self.image_paths[index]), index)
+
+    def mask(self, index: int) -> Float[Tensor, "h w"] | None:
+        """The object mask of camera `index` in [0, 1], or None."""
+        path = self.mask_paths[index] if self.mask_paths else None
+        if path is None:
+            return None
+        return self._served(read_alpha(path) if path == self.image_paths[index] else read_mask(path), index)
+
+    def _served(self, pixels: Float[Tensor, "h w *c"], index: int) -> Float[Tensor, "j i *c"]:
+        width, height = self.cameras.sizes[index].tolist()
+        distortion = self.distortions[index] if self.distortions else None
+        if distortion is not None:
+            pixels = distortion.undistort(pixels, self.cameras.intrinsics[index], width=width, height=height)
+        return resize(pixels, width, height)
+
+    def select(self, which: Bool[Tensor, "v"]) -> "PosedImages":
+        """The views that the mask keeps; points stay."""
+        indices = [int(i) for i in torch.nonzero(which).flatten()]
+        return replace(
+            self,
+            image_paths=tuple(self.image_paths[i] for i in indices),
+            cameras=self.cameras[indices],
+            mask_paths=tuple(self.mask_paths[i] for i in indices) if self.mask_paths else (),
+            distortions=tuple(self.distortions[i] for i in indices) if self.distortions else (),
+        )
+
+    def resized(self, factor: float) -> "PosedImages":
+        """The same capture served at `factor` times its size."""
+        return replace(self, cameras=self.cameras.resized(factor))
+
+
+def held_out(count: int, every: int = 8) -> Bool[Tensor, "v"]:
+    """Which of `count` views are for testing: every 8th from the first, as in Mip-NeRF 360."""
+    return torch.arange(count) % every == 0

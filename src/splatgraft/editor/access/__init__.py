@@ -1,0 +1,1 @@
+"""Who may use the editor, who may edit, and what may be uploaded."""

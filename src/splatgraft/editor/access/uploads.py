@@ -1,0 +1,40 @@
+"""Files that a person uploads: kept in the project under a plain name, read once to see that they are what they say.
+
+Knows nothing about browsers.
+"""
+
+import re
+from pathlib import Path
+
+from splatgraft.formats import read_gaussians
+from splatgraft.runtime.atomic_file import atomic_write
+
+UPLOADS_FOLDER = "uploads"
+SCENES = (".ply", ".spz", ".splat")
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+SUFFIXES = (*SCENES, *VIDEOS)
+LIMIT_BYTES = 1 << 30
+
+
+def keep_upload(folder: Path, name: str, content: bytes, *, suffixes: tuple[str, ...]) -> Path:
+    """The file as uploads/NAME; one of the same name takes the place of an earlier one.
+
+    Raises: ValueError where its kind is not among `suffixes`, or a scene cannot be read.
+    """
+    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", Path(name.replace("\\", "/")).name).lstrip(".") or "upload"
+    path = folder / UPLOADS_FOLDER / plain
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{plain}: expected a file that ends in {', '.join(suffixes)}, found '{path.suffix}'")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trial = path.with_name(f".trial{path.suffix.lower()}")
+    with atomic_write(trial) as stream:
+        stream.write(content)
+    try:
+        if path.suffix.lower() in SCENES:
+            read_gaussians(trial)
+        trial.replace(path)
+    except ValueError as error:
+        raise ValueError(str(error).replace(str(trial), plain)) from None
+    finally:
+        trial.unlink(missing_ok=True)
+    return path

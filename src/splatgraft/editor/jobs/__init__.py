@@ -1,0 +1,1 @@
+"""Long work that the editor starts: child processes, exports, videos."""

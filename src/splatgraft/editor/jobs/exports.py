@@ -1,0 +1,68 @@
+"""What a person takes home: the scene in any format, a picture, the report. Knows nothing about browsers."""
+
+import shutil
+from pathlib import Path
+
+from splatgraft.editor.jobs.orbit_video import write_orbit_video
+from splatgraft.editor.session.project_access import ProjectFiles
+from splatgraft.formats import read_gaussians, write_gaussians
+from splatgraft.project.results import REPORT_FILE
+from splatgraft.runtime.atomic_file import atomic_write
+
+EXPORTS_FOLDER = "export"
+
+
+def export_scene(files: ProjectFiles, suffix: str) -> Path:
+    """The finished scene as export/scene.SUFFIX; a .ply is the result byte for byte.
+
+    Raises: ValueError where nothing is finished yet.
+    """
+    if not files.result.is_file():
+        raise ValueError(f"{files.result}: expected a finished scene, found none yet; run the transfer first")
+    path = _folder(files) / f"scene{suffix}"
+    if suffix == files.result.suffix:
+        with files.result.open("rb") as source, atomic_write(path) as stream:
+            shutil.copyfileobj(source, stream)
+    else:
+        write_gaussians(path, read_gaussians(files.result))
+    return path
+
+
+def export_turntable(files: ProjectFiles, suffix: str) -> tuple[Path, str]:
+    """The turntable of the report as export/turntable.SUFFIX, and what is to be said of it.
+
+    Raises: ValueError where there is none yet.
+    """
+    found = next((p for p in (files.report / "turntable.webp", files.report / "turntable.gif") if p.is_file()), None)
+    if found is None:
+        raise ValueError(f"{files.report}: expected a turntable, found none yet; run the report first")
+    path = _folder(files) / f"turntable{suffix}"
+    if suffix != ".mp4":
+        return Path(shutil.copy2(found, path.with_suffix(found.suffix))), ""
+    try:
+        codec = write_orbit_video(path, found)
+    except ValueError as error:
+        return Path(shutil.copy2(found, _folder(files) / found.name)), f"{error}; here is {found.name} instead"
+    return path, "" if codec == "H.264" else f"in {codec}, which players show but browsers do not; .webp is for those"
+
+
+def report_page(files: ProjectFiles) -> Path:
+    """The report.
+
+    Raises: ValueError where there is none yet.
+    """
+    page = files.report / REPORT_FILE
+    if not page.is_file():
+        raise ValueError(f"{page}: expected a report, found none yet; run it first")
+    return page
+
+
+def picture_path(files: ProjectFiles, name: str) -> Path:
+    """Where an exported picture goes."""
+    return _folder(files) / f"{name}.png"
+
+
+def _folder(files: ProjectFiles) -> Path:
+    folder = files.root / EXPORTS_FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -1,0 +1,27 @@
+"""Evaluate: pictures become numbers and a page that explains them. Knows nothing about scenes or how they were made."""
+
+from splatgraft.evaluation.light_change import change_map, describe_change
+from splatgraft.evaluation.measure import ComparedView, compare, measure
+from splatgraft.evaluation.pictures import side_by_side, write_animation
+from splatgraft.evaluation.regions import Regions, Truth, find_regions
+from splatgraft.evaluation.report import Report, ReportView, StepTime, write_report
+from splatgraft.evaluation.turntable import TurntableOptions, turntable_cameras
+
+__all__ = [
+    "ComparedView",
+    "Regions",
+    "Report",
+    "ReportView",
+    "StepTime",
+    "Truth",
+    "TurntableOptions",
+    "change_map",
+    "compare",
+    "describe_change",
+    "find_regions",
+    "measure",
+    "side_by_side",
+    "turntable_cameras",
+    "write_animation",
+    "write_report",
+]

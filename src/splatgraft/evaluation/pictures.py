@@ -1,0 +1,92 @@
+"""Pictures for people: side by side with labels, and animations as GIF or WebP. Knows nothing about scenes."""
+
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from splatgraft.runtime.atomic_file import atomic_write
+
+_GAP_PX = 6
+
+
+def side_by_side(images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str]) -> Float[Tensor, "h _ 3"]:
+    """Images of one height in a row with thin white gaps, each with its label in the lower left corner."""
+    height = images[0].shape[0]
+    gap = torch.ones(height, max(2, height * _GAP_PX // 480), 3)
+    parts: list[Tensor] = []
+    for image, label in zip(images, labels, strict=True):
+        parts += [_labelled(image, label), gap]
+    return torch.cat(parts[:-1], 1)
+
+
+def write_animation(
+    path: Path, frames: Sequence[Float[Tensor, "h w 3"]], *, fps: float = 20.0, max_bytes: int = 6_000_000
+) -> None:
+    """A looping .gif (one palette of 256 colours, dithered) or .webp; frames shrink until the file fits `max_bytes`.
+
+    Raises: ValueError for another suffix, or no frames.
+    """
+    if path.suffix not in (".gif", ".webp") or not frames:
+        raise ValueError(f"{path}: expected .gif or .webp and at least one frame, found {len(frames)} frames")
+    encode = _gif if path.suffix == ".gif" else _webp
+    pictures = [_pil(frame) for frame in frames]
+    data = encode(pictures, fps)
+    while len(data) > max_bytes and pictures[0].width > 16:
+        # bytes go with area; 0.95 leaves room, so that one or two rounds are enough
+        factor = 0.95 * math.sqrt(max_bytes / len(data))
+        size = (max(16, int(pictures[0].width * factor)), max(1, int(pictures[0].height * factor)))
+        pictures = [picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures]
+        data = encode(pictures, fps)
+    with atomic_write(path) as stream:
+        stream.write(data)
+
+
+def _pil(image: Float[Tensor, "h w 3"]) -> Image.Image:
+    return Image.fromarray((image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
+
+
+def _labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3"]:
+    picture = _pil(image).convert("RGBA")
+    size = max(11, picture.height // 20)
+    font = ImageFont.load_default(size)
+    layer = Image.new("RGBA", picture.size, (0, 0, 0, 0))
+    draw = ImageDraw.Draw(layer)
+    left, top, right, bottom = draw.textbbox((0, 0), label, font=font)
+    pad, margin = size * 0.45, size * 0.6
+    box_height = (bottom - top) + 2 * pad
+    y = picture.height - margin - box_height
+    draw.rounded_rectangle(
+        (margin, y, margin + (right - left) + 2 * pad, y + box_height), radius=pad, fill=(16, 18, 22, 170)
+    )
+    draw.text((margin + pad - left, y + pad - top), label, font=font, fill=(255, 255, 255, 255))
+    joined = Image.alpha_composite(picture, layer).convert("RGB")
+    return torch.from_numpy(np.array(joined)).float() / 255
+
+
+def _gif(pictures: Sequence[Image.Image], fps: float) -> bytes:
+    # one palette for all frames, from a spread of them: colours do not flicker and the file is smaller
+    spread = pictures[:: max(1, len(pictures) // 8)]
+    sheet = Image.new("RGB", (spread[0].width, spread[0].height * len(spread)))
+    for i, picture in enumerate(spread):
+        sheet.paste(picture, (0, i * picture.height))
+    palette = sheet.quantize(256, method=Image.Quantize.MEDIANCUT)
+    frames = [picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for picture in pictures]
+    # GIF counts in hundredths of a second
+    return _animated(frames, "GIF", duration=max(2, round(100 / fps)) * 10, optimize=False, disposal=1)
+
+
+def _webp(pictures: Sequence[Image.Image], fps: float) -> bytes:
+    return _animated(pictures, "WEBP", duration=round(1000 / fps), quality=85, method=4)
+
+
+def _animated(frames: Sequence[Image.Image], kind: str, *, duration: int, **settings: int | bool) -> bytes:
+    buffer = io.BytesIO()
+    frames[0].save(buffer, kind, save_all=True, append_images=list(frames[1:]), loop=0, duration=duration, **settings)
+    return buffer.getvalue()

@@ -1,0 +1,52 @@
+"""The folder of a composite: scene.ply, is_object.npy, placement.json that names its objects. Knows no algorithm."""
+
+from pathlib import Path
+
+from splatgraft.composition import Composite, compose
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.splitting import split_wide_around
+from splatgraft.folders.selection_file import write_selection
+from splatgraft.formats import read_gaussians, write_gaussians
+from splatgraft.formats.placement import Placement, read_placement, write_placement
+from splatgraft.project.results import IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
+
+
+def placement_files(path: Path) -> tuple[Path, ...]:
+    """placement.json and all files that it names.
+
+    Raises: ValueError where it is missing or broken.
+    """
+    placement = read_placement(path)
+    erased = (path.parent / "erased.npy",) if placement.erased is not None else ()
+    return (path, *erased, *(item.object_path for item in placement.objects if item.object_path is not None))
+
+
+def read_composite(target: Path, placement: Path) -> Composite:
+    """The composite of a target scene and the objects that a placement names.
+
+    Raises: ValueError where a file is missing or broken, or an object is not named.
+    """
+    found = read_placement(placement)
+    objects: list[Gaussians] = []
+    read: dict[Path, Gaussians] = {}
+    for index, item in enumerate(found.objects):
+        if item.object_path is None:
+            raise ValueError(f'{placement}: expected objects[{index}] to name its "object", found none')
+        if item.object_path not in read:
+            read[item.object_path] = read_gaussians(item.object_path)
+        objects.append(read[item.object_path])
+    return assemble(read_gaussians(target), objects, found)
+
+
+def assemble(target: Gaussians, objects: list[Gaussians], placement: Placement) -> Composite:
+    """The composite of scenes that are already read."""
+    moves = [item.target_from_object for item in placement.objects]
+    return compose(target, objects, target_from_objects=moves, erased=placement.erased)
+
+
+def write_composite(folder: Path, composite: Composite, placement: Placement) -> None:
+    """Write the three files; `placement` names every object."""
+    gaussians, is_object = split_wide_around(*composite.bake(), [placed.in_target() for placed in composite.objects])
+    write_gaussians(folder / SCENE_FILE, gaussians)
+    write_selection(folder / IS_OBJECT_FILE, is_object)
+    write_placement(folder / PLACEMENT_FILE, placement)

@@ -1,0 +1,161 @@
+"""Result, composite and target as pictures of the same views, with the truth beside them where there is one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.evaluation import ComparedView, Truth
+from splatgraft.folders.capture_files import capture_inputs
+from splatgraft.folders.selection_file import read_selection
+from splatgraft.formats import read_cameras, read_gaussians, read_images
+from splatgraft.project.results import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
+from splatgraft.rendering import render
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """One view, before and after; sRGB in [0, 1]."""
+
+    name: str
+    """The view's name."""
+    before: Float[Tensor, "h w 3"]
+    """The target without the object."""
+    copy_paste: Float[Tensor, "h w 3"]
+    """The object as it was captured."""
+    result: Float[Tensor, "h w 3"]
+    """The final scene."""
+    mask: Float[Tensor, "h w"]
+    """The object's coverage."""
+    truth: Float[Tensor, "h w 3"] | None = None
+    """The object really there."""
+    held_out: bool = False
+    """Whether no step has seen a harmonised image of this view."""
+
+
+@dataclass(frozen=True)
+class EvaluatedScenes:
+    """The scenes that are compared, on one device."""
+
+    result: Gaussians
+    """After consolidation."""
+    composite: Gaussians
+    """The object as it was captured, in the target."""
+    is_object: Bool[Tensor, "n"]
+    """Which Gaussians of the composite are the object's."""
+    cameras: Cameras
+    """The target's."""
+
+    @staticmethod
+    def read(result: Path, composite: Path, cameras: Path, *, device: torch.device) -> "EvaluatedScenes":
+        """Raises: ValueError where a file is missing or broken, or they do not belong together."""
+        scene = read_gaussians(composite / SCENE_FILE)
+        is_object = read_selection(composite / IS_OBJECT_FILE, scene.count, composite / SCENE_FILE)
+        return EvaluatedScenes(
+            result=read_gaussians(result).to(device),
+            composite=scene.to(device),
+            is_object=is_object.to(device),
+            cameras=read_cameras(cameras).to(device),
+        )
+
+    @property
+    def object_center(self) -> Float[Tensor, "3"]:
+        """The median of the object's Gaussians; of all where there is no object."""
+        chosen = self.composite.select(self.is_object) if bool(self.is_object.any()) else self.composite
+        return chosen.means.median(0).values
+
+    def picture(self, scene: Gaussians, camera: Cameras) -> Float[Tensor, "h w 3"]:
+        """One view of one scene, on the CPU."""
+        color = render(scene, camera).color
+        assert color is not None
+        return color[0].cpu().clamp(0, 1)
+
+    def pictures(self, index: int) -> Pictures:
+        """One of the target's views."""
+        return self.pictures_from(self.cameras[index])
+
+    def pictures_from(self, camera: Cameras) -> Pictures:
+        """One view from any camera."""
+        coverage = render(self.composite, camera, features=self.is_object[:, None].float()).features
+        assert coverage is not None
+        return Pictures(
+            name=camera.names[0],
+            before=self.picture(self.composite.select(~self.is_object), camera),
+            copy_paste=self.picture(self.composite, camera),
+            result=self.picture(self.result, camera),
+            mask=coverage[0, ..., 0].cpu().clamp(0, 1),
+        )
+
+
+class TrueViews(Sequence[ComparedView]):
+    """Every view of the truth beside renders of the same camera, made when asked for."""
+
+    def __init__(
+        self, scenes: EvaluatedScenes, truth: Path, *, target_capture: Path | None, harmonized: Path | None
+    ) -> None:
+        """Raises: ValueError where the truth has no masks or the target no image of the same name."""
+        self._scenes, self._truth = scenes, read_images(truth)
+        if target_capture is None:
+            raise ValueError("--ground-truth: expected --target-capture, the images without the object, found none")
+        if not self._truth.mask_paths or None in self._truth.mask_paths:
+            raise ValueError(f"{truth}: expected a mask for every view of the ground truth, found some missing")
+        self._target = read_images(target_capture)
+        self._backgrounds = _matched(self._truth, self._target, target_capture)
+        seen = read_cameras(harmonized / CAMERAS_FILE).names if harmonized is not None else self._target.cameras.names
+        self._seen = {Path(name).stem for name in seen}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the views."""
+        return self._truth.cameras.names
+
+    def __len__(self) -> int:
+        return len(self._truth)
+
+    def __getitem__(self, index: int) -> ComparedView:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        shown, mask = self.pictures(index), self._truth.mask(index)
+        assert shown.truth is not None
+        assert mask is not None
+        background = self._target.image(self._backgrounds[index])
+        return ComparedView(
+            name=shown.name,
+            held_out=shown.held_out,
+            copy_paste=shown.copy_paste,
+            result=shown.result,
+            background=shown.before,
+            truth=Truth(image=shown.truth, background=background, mask=mask),
+        )
+
+    def pictures(self, index: int) -> Pictures:
+        """One view with its truth."""
+        camera = self._truth.cameras[index].to(self._scenes.result.device)
+        shown = self._scenes.pictures_from(camera)
+        held_out = Path(shown.name).stem not in self._seen
+        return Pictures(**{**vars(shown), "truth": self._truth.image(index), "held_out": held_out})
+
+
+def truth_files(truth: Path | None, target_capture: Path | None) -> tuple[Path, ...]:
+    """All files of the ground truth and of the images without the object."""
+    files: list[Path] = []
+    for path in (truth, target_capture):
+        if path is not None:
+            for part in capture_inputs(path, read_images(path), masks=True).values():
+                files += part
+    return tuple(files)
+
+
+def _matched(truth: PosedImages, target: PosedImages, folder: Path) -> list[int]:
+    """For each view of the truth the target's view of the same name."""
+    places = {Path(name).stem: index for index, name in enumerate(target.cameras.names)}
+    stems = [Path(name).stem for name in truth.cameras.names]
+    if missing := [stem for stem in stems if stem not in places]:
+        raise ValueError(f"{folder}: expected an image named {missing[0]} as in the ground truth, found none")
+    return [places[stem] for stem in stems]

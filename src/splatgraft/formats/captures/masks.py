@@ -1,0 +1,65 @@
+"""Which mask belongs to which photograph: by stem in a folder masks/, or the photographs' own alpha channels."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from splatgraft.core.images import has_transparency, list_images, read_alpha, stored_size
+from splatgraft.formats.captures.described_view import View, same_shape
+
+_ALPHA_SAMPLES = 8
+"""Files decoded to find out whether alpha channels are meant as masks."""
+
+
+def with_masks(views: list[View], folder: Path) -> list[View]:
+    """The views with the masks of `folder`/masks; else, where photographs have transparent parts, with their own.
+
+    0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask the view already has stays.
+
+    Raises: ValueError where masks/ has no mask for any view, two for one, or one of another shape.
+    """
+    masks = folder / "masks"
+    if not any(view.mask_path for view in views):
+        if masks.is_dir():
+            files = _by_folder_and_stem(masks)
+            views = [replace(view, mask_path=_mask_of(view, masks, files)) for view in views]
+            if not any(view.mask_path for view in views):
+                raise ValueError(f"{masks}: expected masks named like the images ({views[0].name}), found none")
+        else:
+            views = _with_alpha_masks(views)
+    for view in views:
+        if view.mask_path is not None and view.mask_path != view.image_path:
+            found = stored_size(view.mask_path)
+            if not same_shape(found, view.size):
+                expected = f"{view.size[0]}x{view.size[1]} px, as its image has, or those scaled"
+                raise ValueError(f"{view.mask_path}: expected {expected}, found {found[0]}x{found[1]}")
+    return views
+
+
+def _with_alpha_masks(views: list[View]) -> list[View]:
+    """Many files have an alpha channel that is 1 everywhere: one of a few that varies settles that it is meant."""
+    transparent = [v.image_path is not None and has_transparency(v.image_path) for v in views]
+    paths = [v.image_path for v, t in zip(views, transparent, strict=True) if t and v.image_path]
+    sample = paths[:: max(1, len(paths) // _ALPHA_SAMPLES)]
+    if not any(bool((read_alpha(path) < 1).any()) for path in sample):
+        return views
+    return [replace(v, mask_path=v.image_path) if t else v for t, v in zip(transparent, views, strict=True)]
+
+
+def _mask_of(view: View, masks: Path, files: dict[tuple[Path, str], list[Path]]) -> Path | None:
+    name = Path(view.name)
+    inner = Path(*name.parts[1:]) if name.parts[0] == "images" and len(name.parts) > 1 else name
+    for folder in dict.fromkeys([(masks / inner).parent, masks]):
+        found = [path for stem in (name.stem, name.name) for path in files.get((folder, stem), [])]
+        if len(found) > 1:
+            raise ValueError(f"{masks}: expected one mask for {view.name}, found {[p.name for p in found[:4]]}")
+        if found:
+            return found[0]
+    return None
+
+
+def _by_folder_and_stem(masks: Path) -> dict[tuple[Path, str], list[Path]]:
+    files: dict[tuple[Path, str], list[Path]] = {}
+    for folder in (masks, *(path for path in sorted(masks.rglob("*")) if path.is_dir())):
+        for path in list_images(folder):
+            files.setdefault((folder, path.stem), []).append(path)
+    return files

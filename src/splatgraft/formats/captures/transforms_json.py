@@ -1,0 +1,194 @@
+"""transforms.json: cameras and photographs with Blender's and nerfstudio's keys, OpenGL axes. Knows no other format."""
+
+import json
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.distortion import Distortion
+from splatgraft.core.images import IMAGE_SUFFIXES, stored_size
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.formats.captures.assembly import cameras_of, fitted_to_file, posed_images_of
+from splatgraft.formats.captures.described_view import View, existing_file, rigid
+from splatgraft.formats.captures.points_ply import read_points, write_points
+from splatgraft.formats.json_file import array, load, number, shown, text, whole_side
+from splatgraft.runtime.atomic_file import atomic_write
+
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+_CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+
+
+def read_capture(path: Path) -> PosedImages:
+    """The capture that a transforms.json describes; each image file must be there.
+
+    Raises: ValueError where the file or one that it names is missing or broken.
+    """
+    images, meta = read_images(path), _load(path)
+    if meta.get("ply_file_path") is None:
+        return images
+    points, colors = read_points(path.parent / text(path, meta, "ply_file_path"))
+    return replace(images, points=points, point_colors=colors)
+
+
+def read_images(path: Path) -> PosedImages:
+    """The capture without its points, whose file need not be there.
+
+    Raises: ValueError where the file or an image that it names is missing or broken.
+    """
+    none = torch.zeros(0, 3)
+    return posed_images_of(_views(path, _load(path)), path, folder=path.parent, points=none, colors=none)
+
+
+def read_cameras(path: Path) -> Cameras:
+    """The cameras of a transforms.json; images need not exist where it gives w and h.
+
+    Raises: ValueError where the file is missing or broken.
+    """
+    return cameras_of([fitted_to_file(view, path) for view in _views(path, _load(path))], path)[0]
+
+
+def _load(path: Path) -> dict[str, Any]:
+    meta = load(path)
+    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list):
+        raise ValueError(f"{path}: expected a JSON object with a list 'frames', found {shown(meta)}")
+    if not meta["frames"]:
+        raise ValueError(f"{path}: expected at least one frame, found none")
+    return meta
+
+
+def _views(path: Path, meta: dict[str, Any]) -> list[View]:
+    return [_view(path, index, meta, frame) for index, frame in enumerate(meta["frames"])]
+
+
+def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> View:
+    if not isinstance(frame, dict):
+        raise ValueError(f"{path}: expected frame {index} to be an object, found {type(frame).__name__}")
+    camera = {**{k: v for k, v in meta.items() if k != "frames"}, **frame}
+    model = camera.get("camera_model", "OPENCV")
+    if model not in _CAMERA_MODELS or camera.get("is_fisheye") or number(path, camera, "k4", 0.0):
+        found = (
+            f"{shown(model)}, k4 = {shown(camera.get('k4', 0))}, is_fisheye = {shown(camera.get('is_fisheye', False))}"
+        )
+        raise ValueError(f"{path}: expected camera_model {', '.join(_CAMERA_MODELS)} without k4, found {found}")
+    name = text(path, camera, "file_path")
+    image_path = _image_file(path.parent / name)
+    width, height = _size(path, camera, image_path)
+    fl_x = _focal(path, camera, "x", width)
+    fl_y = _focal(path, camera, "y", height) or fl_x
+    if fl_x is None or fl_y is None:
+        raise ValueError(f"{path}: expected fl_x or camera_angle_x for frame {index}, found neither")
+    return View(
+        name=name,
+        image_path=image_path,
+        mask_path=_mask_file(path, camera),
+        world_from_camera=_pose(path, index, frame),
+        focal=(fl_x, fl_y),
+        center=(number(path, camera, "cx", width / 2), number(path, camera, "cy", height / 2)),
+        size=(width, height),
+        distortion=tuple(number(path, camera, key, 0.0) for key in _COEFFICIENTS),
+    )
+
+
+def _pose(path: Path, index: int, frame: dict[str, Any]) -> np.ndarray:
+    matrix = array(path, frame, "transform_matrix", ((4, 4), (3, 4)))
+    if len(matrix) == 3:
+        matrix = np.concatenate([matrix, [[0, 0, 0, 1]]])
+    return rigid(matrix, f"{path}: frame {index}") @ _OPENCV_FROM_OPENGL
+
+
+def _size(path: Path, camera: dict[str, Any], image_path: Path | None) -> tuple[int, int]:
+    if "w" not in camera and "h" not in camera:
+        if image_path is None:
+            raise ValueError(
+                f"{path}: expected w and h, or the image file {shown(camera.get('file_path'))}, found neither"
+            )
+        return stored_size(image_path)
+    return whole_side(path, camera, "w"), whole_side(path, camera, "h")
+
+
+def _focal(path: Path, camera: dict[str, Any], axis: str, extent: int) -> float | None:
+    if f"fl_{axis}" in camera:
+        return number(path, camera, f"fl_{axis}", 0.0)
+    if f"camera_angle_{axis}" in camera:
+        angle = number(path, camera, f"camera_angle_{axis}", 0.0)
+        if not 0 < angle < math.pi:
+            raise ValueError(f"{path}: expected camera_angle_{axis} in (0, pi), found {angle:g}")
+        return extent / 2 / math.tan(angle / 2)
+    return None
+
+
+def _image_file(path: Path) -> Path | None:
+    """The file, or with Blender's missing suffix added."""
+    suffixes = ["", *sorted(IMAGE_SUFFIXES)] if path.suffix.lower() not in IMAGE_SUFFIXES else [""]
+    candidates = [path.with_name(path.name + suffix) for suffix in suffixes]
+    return next((found for found in map(existing_file, candidates) if found), None)
+
+
+def _mask_file(path: Path, camera: dict[str, Any]) -> Path | None:
+    if camera.get("mask_path") is None:
+        return None
+    mask = path.parent / text(path, camera, "mask_path")
+    if existing_file(mask) is None:
+        raise ValueError(f"{path}: expected the mask {mask}, found no such file")
+    return mask
+
+
+def write_cameras(path: Path, cameras: Cameras) -> None:
+    """Write cameras alone; the poses and intrinsics come back bit for bit."""
+    frames = [{"file_path": name, **_frame(cameras, i, None)} for i, name in enumerate(cameras.names)]
+    _dump(path, {"camera_model": "OPENCV"}, frames)
+
+
+def write_capture(folder: Path, posed_images: PosedImages) -> None:
+    """Write transforms.json and points.ply; images and masks are referred to by relative path, not copied."""
+    frames = []
+    for i, image_path in enumerate(posed_images.image_paths):
+        frame: dict[str, Any] = {"file_path": _relative(image_path, folder)}
+        mask_path = posed_images.mask_paths[i] if posed_images.mask_paths else None
+        if mask_path is not None:
+            frame["mask_path"] = _relative(mask_path, folder)
+        distortion = posed_images.distortions[i] if posed_images.distortions else None
+        frames.append({**frame, **_frame(posed_images.cameras, i, distortion)})
+    write_points(folder / "points.ply", posed_images.points, posed_images.point_colors)
+    _dump(folder / "transforms.json", {"camera_model": "OPENCV", "ply_file_path": "points.ply"}, frames)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """A link keeps its own name: only the folders are resolved."""
+    return (Path(os.path.relpath(path.parent.resolve(), folder.resolve())) / path.name).as_posix()
+
+
+def _frame(cameras: Cameras, index: int, distortion: Distortion | None) -> dict[str, Any]:
+    """Intrinsics are those of the file's pixels: the distorted camera's where there is one, at the served size."""
+    width, height = cameras.sizes[index].tolist()
+    matrix = cameras.intrinsics[index].double().cpu().numpy()
+    out: dict[str, Any] = {"w": width, "h": height}
+    if distortion is not None:
+        scale = np.diag([width / distortion.size[0], height / distortion.size[1], 1])
+        matrix = scale @ distortion.intrinsics.numpy()
+        out |= dict(zip(_COEFFICIENTS, distortion.coefficients.tolist(), strict=True))
+    out |= {"fl_x": matrix[0, 0], "fl_y": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+    pose = cameras.world_from_camera[index].double().cpu().numpy() @ _OPENCV_FROM_OPENGL
+    return {
+        **{key: float(value) if isinstance(value, np.floating) else value for key, value in out.items()},
+        "transform_matrix": (pose + 0.0).tolist(),
+    }
+
+
+def _dump(path: Path, shared: dict[str, Any], frames: list[dict[str, Any]]) -> None:
+    """Keys on which all frames agree are written once, as nerfstudio does."""
+    if not frames:
+        raise ValueError(f"{path}: expected at least one camera to write, found none")
+    same = [k for k in ("w", "h", "fl_x", "fl_y", "cx", "cy", *_COEFFICIENTS) if k in frames[0]]
+    if all(frame.get(k) == frames[0].get(k) for frame in frames for k in (*same, *_COEFFICIENTS)):
+        shared = {**shared, **{k: frames[0][k] for k in same}}
+        frames = [{k: v for k, v in frame.items() if k not in same} for frame in frames]
+    with atomic_write(path) as stream:
+        stream.write((json.dumps({**shared, "frames": frames}, indent=1) + "\n").encode("utf-8"))

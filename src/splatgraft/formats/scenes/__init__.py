@@ -1,0 +1,1 @@
+"""Gaussian scene files: one module per format."""

@@ -1,0 +1,108 @@
+"""3DGS scenes as .ply, raw: the fields come back bit for bit. Knows the names and order of the properties only.
+
+Layout of the original code (Kerbl et al. 2023): x y z, nx ny nz (zeros), f_dc_0..2, f_rest (channel-major), opacity,
+scale_0..2, rot_0..3 (wxyz), all float32. Read in any order, with extra properties or without normals and f_rest.
+Values that are not finite are kept as they are: a file survives reading and writing, and renderers cull them.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.formats.scenes import ply
+from splatgraft.formats.scenes.compressed_ply import is_compressed, read_compressed_ply
+from splatgraft.runtime.atomic_file import atomic_write
+
+_MEANS = ("x", "y", "z")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_ROWS_PER_WRITE = 1 << 14
+_REST_COUNTS = tuple(3 * (spherical_harmonics.coefficient_count(d) - 1) for d in range(4))
+
+
+def read_gaussian_ply(path: Path) -> Gaussians:
+    """The scene in a 3DGS .ply, or SuperSplat's compressed form of one; other number types become float32.
+
+    Raises: ValueError where the file is no whole PLY with the properties of Gaussians.
+    """
+    header = ply.read_header(path)
+    vertex = header.element("vertex")
+    if vertex is None:
+        raise ValueError(f"{path}: expected an element 'vertex', found {[e.name for e in header.elements]}")
+    if is_compressed(header):
+        return read_compressed_ply(header)
+    rest = _rest_names(path, vertex)
+    _require_gaussians(path, vertex)
+    n, k = vertex.count, 1 + len(rest) // 3
+    means, log_scales = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+    quaternions, logits = np.empty((n, 4), np.float32), np.empty((n, 1), np.float32)
+    sh = np.empty((n, k, 3), np.float32)
+    columns = [
+        *((name, means[:, i]) for i, name in enumerate(_MEANS)),
+        *((name, log_scales[:, i]) for i, name in enumerate(_SCALES)),
+        *((name, quaternions[:, i]) for i, name in enumerate(_QUATERNION)),
+        ("opacity", logits[:, 0]),
+        *((name, sh[:, 0, i]) for i, name in enumerate(_DC)),
+        *((name, sh[:, 1 + i % (k - 1), i // (k - 1)]) for i, name in enumerate(rest)),
+    ]
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is culled as such
+        for start, rows in ply.read_chunks(header, vertex):
+            for name, column in columns:
+                column[start : start + len(rows)] = rows[name]
+    return Gaussians(
+        means=torch.from_numpy(means),
+        log_scales=torch.from_numpy(log_scales),
+        quaternions=torch.from_numpy(quaternions),
+        opacity_logits=torch.from_numpy(logits[:, 0]),
+        sh=torch.from_numpy(sh),
+    )
+
+
+def _rest_names(path: Path, vertex: ply.Element) -> tuple[str, ...]:
+    """f_rest_0 .. in their number's order, wherever they stand in the row."""
+    count = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in vertex.names)
+    names = tuple(f"f_rest_{i}" for i in range(count))
+    missing = [name for name in names if name not in vertex.names]
+    if count not in _REST_COUNTS or missing:
+        detail = f"{count}, without {missing[0]}" if missing else str(count)
+        raise ValueError(f"{path}: expected 0, 9, 24 or 45 properties f_rest_0 .. (SH degree 0 to 3), found {detail}")
+    return names
+
+
+def _require_gaussians(path: Path, vertex: ply.Element) -> None:
+    needed = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATERNION)
+    missing = [name for name in needed if name not in vertex.names]
+    if not missing:
+        return
+    if set(_MEANS) <= set(vertex.names) and not {"opacity", *_SCALES, *_QUATERNION} & set(vertex.names):
+        raise ValueError(
+            f"{path}: expected 3D Gaussians (opacity, scale_0.., rot_0.., f_dc_0..), "
+            f"found a plain point cloud with {', '.join(vertex.names)[:80]}"
+        )
+    raise ValueError(f"{path}: expected the properties of 3D Gaussians, found none called {', '.join(missing)}")
+
+
+def write_gaussian_ply(path: Path, gaussians: Gaussians) -> None:
+    """Write the original code's layout, byte for byte; the file appears whole or not at all."""
+    n, k = gaussians.sh.shape[:2]
+    rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
+    names = [*_MEANS, "nx", "ny", "nz", *_DC, *rest, "opacity", *_SCALES, *_QUATERNION]
+    with atomic_write(path) as stream:
+        ply.write_header(stream, n, [("float", name) for name in names])
+        for start in range(0, n, _ROWS_PER_WRITE):
+            part = gaussians.map(lambda t, i=start: t[i : i + _ROWS_PER_WRITE].detach().cpu().float())
+            columns = [
+                part.means,
+                torch.zeros_like(part.means),
+                part.sh[:, 0],
+                part.sh[:, 1:].transpose(1, 2).flatten(1),
+                part.opacity_logits[:, None],
+                part.log_scales,
+                part.quaternions,
+            ]
+            stream.write(torch.cat(columns, 1).numpy().astype("<f4", copy=False).tobytes())

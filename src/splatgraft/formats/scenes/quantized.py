@@ -1,0 +1,33 @@
+"""Bytes to raw Gaussian fields and back, as all compressed scene formats need it. Knows no format."""
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from splatgraft.core.gaussians import Gaussians
+
+
+def logits_from_bytes(alphas: UInt8[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Opacity logits; 0 and 255 become a quarter step inside (0, 1), so that they stay finite and round back."""
+    return (alphas.float().clamp(0.25, 254.75) / 255).logit()
+
+
+def bytes_from_unit(values: Float[Tensor, "*n"]) -> UInt8[Tensor, "*n"]:
+    """The nearest byte of values meant for [0, 1]; those outside saturate."""
+    return (values * 255).round().clamp(0, 255).to(torch.uint8)
+
+
+def require_finite(path: Path, gaussians: Gaussians) -> None:
+    """Integers hold no nan and no infinity.
+
+    Raises: ValueError where a field of any Gaussian is not finite.
+    """
+    fields = [gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh.flatten(1)]
+    bad = ~torch.isfinite(torch.cat(fields, 1)).all(1) | gaussians.opacity_logits.isnan()
+    if bool(bad.any()):
+        raise ValueError(
+            f"{path}: expected finite Gaussians in a {path.suffix} file, "
+            f"found {int(bad.sum())} of {gaussians.count} that are not (only .ply keeps them)"
+        )

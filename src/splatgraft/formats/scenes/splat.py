@@ -1,0 +1,62 @@
+""".splat scenes: 32 bytes per Gaussian, colour without view dependence. Knows no other format.
+
+Layout (antimatter15/splat): position 3 x float32, scale 3 x float32, colour and opacity 4 x uint8,
+quaternion wxyz 4 x uint8 as 128 + 128 q.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, require_finite
+from splatgraft.runtime.atomic_file import atomic_write
+
+_ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)])
+_SMALLEST_SCALE = 1e-30
+"""World units; what a scale of exactly 0 becomes, since its logarithm is stored."""
+
+
+def read_splat(path: Path) -> Gaussians:
+    """The scene in a .splat file, SH degree 0.
+
+    Raises: ValueError where the file is no whole number of records, or they hold no positions and scales.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a .splat file, found none")
+    data = path.read_bytes()
+    if not data or len(data) % _ROW.itemsize:
+        raise ValueError(f"{path}: expected a multiple of {_ROW.itemsize} bytes above 0, found {len(data)}")
+    rows = np.frombuffer(data, _ROW)
+    positions, scales = rows["position"].astype(np.float32), rows["scale"].astype(np.float32)
+    if not (np.isfinite(positions).all() and np.isfinite(scales).all() and (scales >= 0).all()):
+        raise ValueError(f"{path}: expected finite positions and scales of 0 or more, found others: is this a .splat?")
+    return Gaussians(
+        means=torch.from_numpy(positions),
+        log_scales=torch.from_numpy(scales).clamp_min(_SMALLEST_SCALE).log(),
+        quaternions=(torch.from_numpy(rows["quaternion"].astype(np.float32)) - 128) / 128,
+        opacity_logits=logits_from_bytes(torch.from_numpy(rows["rgba"][:, 3].copy())),
+        sh=spherical_harmonics.dc_from_rgb(torch.from_numpy(rows["rgba"][:, :3].astype(np.float32)) / 255)[:, None],
+    )
+
+
+def write_splat(path: Path, gaussians: Gaussians) -> None:
+    """Write positions and scales exactly, the rest in 8 bits; bands above 0 are lost, as the format has none.
+
+    Raises: ValueError where there are no Gaussians, or some are not finite.
+    """
+    if gaussians.count == 0:
+        raise ValueError(f"{path}: expected at least one Gaussian for a .splat file, found none")
+    require_finite(path, gaussians)
+    g = gaussians.map(lambda tensor: tensor.detach().cpu().float())
+    rows = np.empty(g.count, _ROW)
+    rows["position"] = g.means.numpy()
+    rows["scale"] = g.scales.numpy()
+    rows["rgba"][:, :3] = bytes_from_unit(spherical_harmonics.rgb_from_dc(g.sh[:, 0])).numpy()
+    rows["rgba"][:, 3] = bytes_from_unit(g.opacities).numpy()
+    unit = torch.nn.functional.normalize(g.quaternions, dim=-1)
+    rows["quaternion"] = (unit * 128 + 128).round().clamp(0, 255).to(torch.uint8).numpy()
+    with atomic_write(path) as stream:
+        stream.write(rows.tobytes())

@@ -1,0 +1,44 @@
+"""Harmonize: one view at a time, an image model makes the light agree. Knows nothing about scenes or other views."""
+
+from collections.abc import Callable
+
+from splatgraft.harmonization.compact.factory import make_compact
+from splatgraft.harmonization.flux.factory import make_flux
+from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
+from splatgraft.harmonization.keep_prior import KeepPrior
+from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.peers.factory import make_ic_light, make_image_editing, make_lbm, make_mv_colight
+from splatgraft.harmonization.reinhard import Reinhard
+
+__all__ = [
+    "HARMONIZERS",
+    "BatchHarmonizer",
+    "Harmonized",
+    "Harmonizer",
+    "HarmonizerInputs",
+    "HarmonizerOptions",
+    "make_harmonizer",
+]
+
+HARMONIZERS: dict[str, Callable[[HarmonizerOptions], Harmonizer]] = {
+    "none": lambda options: KeepPrior(),
+    "reinhard": lambda options: Reinhard(),
+    "compact": make_compact,
+    "flux": make_flux,
+    "lbm": make_lbm,
+    "ic-light": make_ic_light,
+    "mv-colight": make_mv_colight,
+    "image-editing": make_image_editing,
+}
+"""Name to maker; a maker imports what is heavy only when called."""
+
+
+def make_harmonizer(name: str, options: HarmonizerOptions | None = None) -> Harmonizer:
+    """The harmoniser called `name`.
+
+    Raises: ValueError where there is none of that name (the message lists those there are), or where its weights or
+    packages are missing.
+    """
+    if name not in HARMONIZERS:
+        raise ValueError(f"harmonizer: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
+    return HARMONIZERS[name](options or HarmonizerOptions())

@@ -1,0 +1,42 @@
+"""Weights of the compact network as one safetensors file: float16, its sizes in the header. Knows no pictures."""
+
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
+from splatgraft.runtime.atomic_file import atomic_write
+
+FORMAT = "splatgraft compact 1"
+
+
+def write_weights(path: Path, size: CompactSize, state: dict[str, Tensor], notes: dict[str, str]) -> None:
+    """Write a network; `notes` say how it was trained."""
+    halves = {name: tensor.detach().cpu().to(torch.float16).contiguous() for name, tensor in state.items()}
+    with atomic_write(path) as stream:
+        stream.write(save(halves, {"format": FORMAT, **size.to_text(), **notes}))
+
+
+def read_weights(path: Path) -> CompactNetwork:
+    """The network, ready to be asked.
+
+    Raises: ValueError where the file is missing, broken or of something else.
+    """
+    try:
+        with safe_open(str(path), "pt") as file:
+            header = file.metadata() or {}
+            state = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 not a dict
+    except (OSError, SafetensorError) as error:
+        raise ValueError(f"{path}: expected weights of the compact harmoniser, found {error}") from error
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{path}: expected '{FORMAT}' in its header, found {header.get('format')!r}")
+    try:
+        network = CompactNetwork(CompactSize.from_text(header))
+        network.load_state_dict(state)
+    except (KeyError, ValueError, RuntimeError) as error:
+        found = str(error).splitlines()[0]
+        raise ValueError(f"{path}: expected the tensors of the compact network, found {found}") from error
+    return network.eval().requires_grad_(False)

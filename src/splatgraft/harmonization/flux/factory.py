@@ -1,0 +1,42 @@
+"""Makes the harmoniser `flux` from options. Imports nothing heavy before it is called."""
+
+from splatgraft.harmonization.interface import Harmonizer
+from splatgraft.harmonization.options import HarmonizerOptions
+
+AUTHORS_LINE = "nviolante/dot3d/image-mask"
+
+
+def make_flux(options: HarmonizerOptions) -> Harmonizer:
+    """The paper's image model, loaded.
+
+    Raises: ValueError where no weights are named or they do not fit.
+    """
+    from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer, FluxSettings
+    from splatgraft.harmonization.flux.weights.loading import FluxWeights, load_flux
+
+    if options.weights is None:
+        raise ValueError(
+            f"harmonizer flux: expected --weights FOLDER or a hub id such as {AUTHORS_LINE} (24 GB, by the paper's "
+            "authors under their own licence), found none"
+        )
+    for name in ("strength", "detail"):
+        if not 0 <= getattr(options, name) <= 1:
+            raise ValueError(f"--{name}: expected a number from 0 to 1, found {getattr(options, name)}")
+    wanted = FluxWeights(
+        weights=options.weights,
+        base=options.base,
+        lora=options.lora,
+        variant=options.variant,
+        precision=options.precision,
+        compiled=options.compiled,
+        steps=options.sampling_steps,
+    )
+    network = load_flux(wanted, options.device, say=options.say, pixels=options.pixels, views=options.batch)
+    settings = FluxSettings(
+        seed=options.seed,
+        steps=options.sampling_steps,
+        strength=options.strength,
+        detail=options.detail,
+        at_once=options.batch,
+    )
+    return FluxHarmonizer(network, settings)

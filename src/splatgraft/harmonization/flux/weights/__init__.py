@@ -1,0 +1,1 @@
+"""Weights of the FLUX harmoniser: folders, headers, adapters, precision, and text embeddings."""

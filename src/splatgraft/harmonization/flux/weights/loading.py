@@ -1,0 +1,191 @@
+"""Weights on disk or on the hub become a network on a device, in a precision that fits, said aloud."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
+from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE, read_prompt
+from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork
+from splatgraft.harmonization.flux.sampling import schnell_levels
+from splatgraft.harmonization.flux.weights.folder import (
+    CONDITIONS,
+    VARIANTS,
+    FluxFolder,
+    Variant,
+    local_folder,
+    part,
+    variant_told,
+)
+from splatgraft.harmonization.flux.weights.library import autoencoder_class, flux_transformer_class, nf4_config
+from splatgraft.harmonization.flux.weights.lora import merge_lora
+from splatgraft.harmonization.flux.weights.memory import (
+    PRECISIONS,
+    Placement,
+    activation_bytes,
+    choose_placement,
+    decoder_bytes,
+)
+from splatgraft.harmonization.flux.weights.widening import FirstLayer, widened
+
+Say = Callable[[str], None]
+BASE = "black-forest-labs/FLUX.1-schnell"
+
+
+@dataclass(frozen=True)
+class FluxWeights:
+    """Which weights, and how they are to lie in memory."""
+
+    weights: str
+    """Folder or hub id of a harmoniser; of FLUX itself where `lora` is given."""
+    base: str | None = None
+    """Folder or hub id whose vae/ and prompt serve where `weights` has none; FLUX.1-schnell where not given."""
+    lora: Path | None = None
+    """An adaptation of ours, merged in."""
+    variant: str = "auto"
+    """image-mask, image-background, or auto: by the folder."""
+    precision: str = "auto"
+    """auto, or one of `memory.PRECISIONS`."""
+    compiled: bool = False
+    """torch.compile: pays from some twenty views of one size on."""
+    steps: int = 4
+    """Of the sampling: the modulations are baked for them."""
+
+
+def load_flux(
+    wanted: FluxWeights, device: torch.device, *, say: Say, pixels: int = 704 * 496, views: int = 1
+) -> FluxNetwork:
+    """The network, its modulations baked, its projections fused.
+
+    `pixels` of a view and `views` at once are for the prediction of memory.
+
+    Raises: ValueError where a folder is of another kind, a file is broken, or memory does not do.
+    """
+    if wanted.precision not in ("auto", *PRECISIONS):
+        raise ValueError(f"--precision: expected auto, {', '.join(PRECISIONS)}, found {wanted.precision}")
+    folder = local_folder(wanted.weights, say)
+    checked = FluxFolder.open(folder)
+    lora_variant = wanted.variant if wanted.lora is None else _variant_of_lora(wanted)
+    variant = lora_variant if wanted.lora is not None and checked.inputs == 1 else checked.variant(wanted.variant)
+    base = _Base(folder, wanted.base, say)
+    config = checked.config
+    prompt = read_prompt(
+        part(PROMPT_FILE, folder, *base.folders(PROMPT_FILE)),
+        tokens_width=config.get("joint_attention_dim", 4096),
+        pooled_width=config.get("pooled_projection_dim", 768),
+    )
+    autoencoder = load_autoencoder(part("vae", folder, *base.folders("vae")))
+    placement = _placement(wanted, checked, device, (pixels, views), autoencoder)
+    say(placement.sentence)
+    dtype = torch.float32 if placement.precision == "float32" else torch.bfloat16
+    transformer = load_transformer(checked, dtype=dtype, quantized=placement.precision == "nf4")
+    if wanted.lora is not None:
+        if placement.precision == "nf4":
+            raise ValueError(f"{wanted.lora}: expected a precision that weights can be added to, found nf4")
+        if checked.inputs == 1:
+            widen_transformer(transformer)
+        say(f"lora: {merge_lora(transformer, wanted.lora)} layers adapted by {wanted.lora}")
+    transformer.eval().requires_grad_(False)
+    prompt = prompt.to(torch.device("cpu"), dtype)
+    gone = bake(transformer, prompt, schnell_levels(wanted.steps)[:-1])
+    if placement.precision != "nf4":
+        fuse_projections(transformer)
+    say(f"flux: {gone / 1e9:.2f} billion parameters of modulation baked into a table")
+    _place(transformer, placement, device, dtype)
+    autoencoder.network.to(device, dtype).eval().requires_grad_(False)
+    if placement.tiled:
+        autoencoder.network.enable_tiling()
+    if wanted.compiled:
+        transformer.compile_repeated_blocks()
+    return FluxNetwork(transformer, autoencoder, prompt.to(device, dtype), variant, device, dtype)  # pyright: ignore
+
+
+def load_transformer(checked: FluxFolder, *, dtype: torch.dtype, quantized: bool = False) -> Any:
+    """The transformer of a checked folder, on the CPU (on the GPU where quantised).
+
+    Raises: ValueError where the weights do not fit its config.
+    """
+    settings = {"quantization_config": nf4_config(dtype)} if quantized else {}
+    try:
+        return flux_transformer_class().from_pretrained(checked.transformer, torch_dtype=dtype, **settings)
+    except (OSError, ValueError, RuntimeError) as error:
+        found = " ".join(str(error).split())[:200]
+        raise ValueError(f"{checked.transformer}: expected weights that fit config.json, found {found}") from error
+
+
+def load_autoencoder(folder: Path) -> Autoencoder:
+    """The autoencoder in float32 on the CPU.
+
+    Raises: ValueError where the folder has none.
+    """
+    try:
+        return Autoencoder(autoencoder_class().from_pretrained(folder))
+    except (OSError, ValueError, RuntimeError) as error:
+        found = " ".join(str(error).split())[:200]
+        raise ValueError(f"{folder}: expected an AutoencoderKL, found {found}") from error
+
+
+def widen_transformer(transformer: Any, init: FirstLayer = "repeat") -> None:
+    """Make room for composite and condition in the first layer, in place; the config says so too."""
+    out = transformer.proj_out.out_features
+    transformer.x_embedder = widened(transformer.x_embedder, CONDITIONS + 1, init)
+    transformer.register_to_config(in_channels=transformer.x_embedder.in_features, out_channels=out)
+
+
+class _Base:
+    """The base's folder, fetched only when a part is missing in the weights' own."""
+
+    def __init__(self, weights: Path, base: str | None, say: Say) -> None:
+        self._weights, self._base, self._say = weights, base, say
+
+    def folders(self, name: str) -> tuple[Path, ...]:
+        if (self._weights / name).exists():
+            return ()
+        beside = self._weights.parent  # image-mask/ of a repository whose root has vae/
+        if self._base is None and (beside / name).exists():
+            return (beside,)
+        if self._base is None and name == PROMPT_FILE:
+            return ()
+        return (local_folder(self._base or BASE, self._say),)
+
+
+def _variant_of_lora(wanted: FluxWeights) -> Variant:
+    told = wanted.variant if wanted.variant != "auto" else variant_told(wanted.lora.parent)  # pyright: ignore
+    if told not in VARIANTS:
+        raise ValueError(f"{wanted.lora}: expected harmonizer.json beside it or --variant, found neither")
+    return told  # pyright: ignore
+
+
+def _placement(
+    wanted: FluxWeights, checked: FluxFolder, device: torch.device, work: tuple[int, int], autoencoder: Autoencoder
+) -> Placement:
+    pixels, views = work
+    if wanted.precision != "auto":
+        return Placement(wanted.precision, False, f"flux: {wanted.precision} on {device}, as asked")  # pyright: ignore
+    if device.type != "cuda":
+        return Placement("float32", False, f"flux: float32 on {device}; minutes per view at FLUX's size")
+    config = checked.config
+    width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
+    return choose_placement(
+        # 12 width^2 a stream of a double block and a single block, without modulation
+        parameters=round(width**2 * (24 * config.get("num_layers", 19) + 12 * config.get("num_single_layers", 38))),
+        others=sum(p.numel() for p in autoencoder.network.parameters()),
+        activations=activation_bytes(pixels=pixels, views=views, width=width),
+        decoder=decoder_bytes(pixels=pixels, views=views),
+        free=torch.cuda.mem_get_info(device)[0],
+        can_quantize=find_spec("bitsandbytes") is not None,
+    )
+
+
+def _place(transformer: Any, placement: Placement, device: torch.device, dtype: torch.dtype) -> None:
+    if placement.precision == "offload":
+        transformer.enable_group_offload(device, offload_type="block_level", num_blocks_per_group=1, use_stream=True)
+        return
+    if placement.precision == "fp8":
+        transformer.enable_layerwise_casting(storage_dtype=torch.float8_e4m3fn, compute_dtype=dtype)
+    if placement.precision != "nf4":
+        transformer.to(device)

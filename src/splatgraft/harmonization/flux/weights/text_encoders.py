@@ -1,0 +1,53 @@
+"""Computes the empty prompt's embeddings with the text encoders, once (the only importer of transformers)."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatgraft.harmonization.flux.empty_prompt import Prompt, write_prompt
+from splatgraft.harmonization.flux.weights.library import write_tensors
+
+Say = Callable[[str], None]
+
+
+def embed_empty_prompt(base: str, out: Path, *, tokens: int, say: Say) -> None:
+    """Write what T5 and CLIP of the FLUX folder or id `base` make of the empty string.
+
+    Raises: ValueError where `base` holds no such text encoders.
+    """
+    clip_tokenizer, clip = _load(base, "tokenizer", "CLIPTokenizer"), _load(base, "text_encoder", "CLIPTextModel")
+    say(f"{base}: CLIP embeds the empty prompt")
+    with torch.no_grad():
+        ids = clip_tokenizer([""], padding="max_length", max_length=77, return_tensors="pt").input_ids
+        pooled = clip(ids).pooler_output[0]
+    del clip
+    t5_tokenizer, t5 = _load(base, "tokenizer_2", "T5TokenizerFast"), _load(base, "text_encoder_2", "T5EncoderModel")
+    say(f"{base}: T5 embeds the empty prompt")
+    with torch.no_grad():
+        ids = t5_tokenizer([""], padding="max_length", max_length=tokens, return_tensors="pt").input_ids
+        hidden = t5(ids).last_hidden_state[0]
+    write_prompt(out, Prompt(hidden.float(), pooled.float()), base)
+
+
+def embed_empty_prompt_stable_diffusion(base: str, out: Path, *, say: Say) -> None:
+    """Write what CLIP of the Stable Diffusion folder or id `base` makes of the empty string.
+
+    Raises: ValueError where `base` holds no such text encoder.
+    """
+    tokenizer, clip = _load(base, "tokenizer", "CLIPTokenizer"), _load(base, "text_encoder", "CLIPTextModel")
+    say(f"{base}: CLIP embeds the empty prompt")
+    with torch.no_grad():
+        ids = tokenizer([""], padding="max_length", max_length=77, return_tensors="pt").input_ids
+        write_tensors(out, {"tokens": clip(ids).last_hidden_state[0].float()}, {"text": "", "source": base})
+
+
+def _load(base: str, part: str, kind: str) -> Any:
+    import transformers
+
+    try:
+        return getattr(transformers, kind).from_pretrained(base, subfolder=part)
+    except (OSError, ValueError) as error:
+        found = " ".join(str(error).split())[:160]
+        raise ValueError(f"{base}: expected {kind} in {part}/, found {type(error).__name__}: {found}") from error

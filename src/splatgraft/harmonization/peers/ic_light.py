@@ -1,0 +1,95 @@
+"""IC-Light, foreground and background (Zhang et al. 2024): Stable Diffusion 1.5 whose first layer takes both.
+
+Ours around diffusers: weights by id or folder, the empty prompt's embeddings from a file, DDIM without guidance. Not
+run with real weights where it was written; tested on tiny ones.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
+from splatgraft.harmonization.flux.latents import pad_by_reflection
+from splatgraft.harmonization.flux.network import Autoencoder
+from splatgraft.harmonization.flux.sampling import noise
+from splatgraft.harmonization.flux.stable_diffusion import NoiseSchedule, ddim
+from splatgraft.harmonization.flux.weights.folder import local_folder, part
+from splatgraft.harmonization.flux.weights.library import read_tensors, unet_class
+from splatgraft.harmonization.flux.weights.loading import load_autoencoder
+from splatgraft.harmonization.flux.weights.widening import widened
+from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
+from splatgraft.harmonization.options import HarmonizerOptions
+
+_BASE = "stablediffusionapi/realistic-vision-v51"
+_STEPS = 20
+_MULTIPLE = 64
+
+
+class ICLight:
+    """The network, and the pictures that it is shown."""
+
+    def __init__(self, unet: Any, autoencoder: Autoencoder, tokens: Float[Tensor, "n d"], seed: int) -> None:
+        """A UNet whose first layer takes noisy latent, foreground and background."""
+        self._unet, self._autoencoder, self._tokens, self._seed = unet, autoencoder, tokens, seed
+
+    @torch.no_grad()
+    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+        """The picture that IC-Light makes of the object, on grey, and of the background."""
+        height, width = view.mask.shape
+        mask = view.mask[..., None]
+        shown = torch.stack([view.composite * mask + 127 / 255 * (1 - mask), view.background]).permute(0, 3, 1, 2)
+        device = next(self._unet.parameters()).device
+        latents = self._autoencoder.encode(pad_by_reflection(shown, _MULTIPLE).to(device))
+        condition = torch.cat([latents[:1], latents[1:]], 1)
+
+        def predict(noisy: Tensor, step: int) -> Tensor:
+            given = torch.cat([noisy, condition], 1).to(self._tokens.dtype)
+            return self._unet(given, step, self._tokens[None], return_dict=False)[0].float()
+
+        start = noise(tuple(latents.shape[1:]), self._seed).to(device)[None]  # pyright: ignore
+        made = ddim(predict, start, NoiseSchedule.stable_diffusion(), steps=_STEPS, predicts="noise")
+        image = self._autoencoder.decode(made)[0, :, :height, :width].permute(1, 2, 0).cpu()
+        return Harmonized(image)
+
+
+def load_ic_light(options: HarmonizerOptions) -> ICLight:
+    """The base model and IC-Light's difference to it, `iclight_sd15_fbc.safetensors`.
+
+    Raises: ValueError where a file is missing or of other shapes.
+    """
+    if options.weights is None or not Path(options.weights).is_file():
+        raise ValueError(
+            "harmonizer ic-light: expected --weights iclight_sd15_fbc.safetensors (hub: lllyasviel/ic-light), "
+            f"found {options.weights or 'none'}"
+        )
+    base = local_folder(options.base or _BASE, options.say)
+    beside = Path(options.weights).parent
+    tokens = read_tensors(part(PROMPT_FILE, base, beside))["tokens"]
+    unet = unet_class().from_pretrained(base / "unet")
+    add_difference(unet, Path(options.weights))
+    autoencoder = load_autoencoder(part("vae", base))
+    dtype = torch.float16 if options.device.type == "cuda" else torch.float32
+    unet.to(options.device, dtype).eval().requires_grad_(False)
+    autoencoder.network.to(options.device).eval().requires_grad_(False)
+    return ICLight(unet, autoencoder, tokens.to(options.device, dtype), options.seed)
+
+
+def add_difference(unet: Any, path: Path) -> None:
+    """Widen the first layer by zeros and add the file's tensors to all weights.
+
+    Raises: ValueError where the file belongs to another network.
+    """
+    unet.conv_in = widened(unet.conv_in, 3, "zero")
+    unet.register_to_config(in_channels=unet.conv_in.in_channels)
+    difference, weights = read_tensors(path), unet.state_dict()
+    for name, weight in weights.items():
+        found = difference.get(name)
+        if found is None or found.shape != weight.shape:
+            shape = "none" if found is None else tuple(found.shape)
+            raise ValueError(f"{path}: expected {name} of {tuple(weight.shape)}, found {shape}")
+    with torch.no_grad():
+        for name, parameter in nn.Module.named_parameters(unet):
+            parameter.add_(difference[name].to(parameter))

@@ -1,0 +1,120 @@
+"""project.toml: a table per capture and per step, whose keys are the options of the command. Knows no results."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from splatgraft.formats import is_scene
+from splatgraft.project.results import Side
+from splatgraft.runtime.settings import Table, from_table, read_toml
+
+T = TypeVar("T")
+
+TEMPLATE = """\
+# A splatgraft project: `splatgraft run` does what is stale, `splatgraft status` says what that is.
+# Paths are relative to this file. Every table but the first two may be left out; keys are the options of the command
+# of the same name (splatgraft reconstruct --help), with _ for -.
+
+[source]
+# photos, a video, a COLMAP folder or a folder with transforms.json; masks/ beside images/ is found
+# or, beside it or instead of it: scene = "trained.ply" (.spz, .splat); without a capture, pictures are made of it
+{source}
+
+[target]
+{target}
+
+# [source.reconstruct]       # for one capture alone; [reconstruct] is for both
+# iterations = 7000
+
+# [reconstruct]
+# iterations = 3000
+# budget = 40000             # most Gaussians at any moment
+# eval = true                # hold out every 8th view and say how well it is predicted
+
+# [segment]
+# masks = "masks"            # where they are not beside the images
+# mask_source = "grabcut"    # no masks: from a box around the object, in the source's world
+# box = [-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]
+
+# [compose]                  # placement.json beside this file, where there is one, comes first
+# at = [0.0, 0.0, 0.0]       # rest the object on the surface below or above this point of the target
+
+# [harmonize]
+# method = "none"
+
+# [render]
+# eval = true                # keep every 8th view of the target from all later steps, for [evaluate]
+
+# [evaluate]
+# ground_truth = "truth"     # images of the target's views with the object really there
+"""
+
+
+@dataclass(frozen=True)
+class ProjectFile:
+    """What a project.toml says."""
+
+    path: Path
+    """The file, for messages and as the base of relative paths."""
+    content: Mapping[str, Any]
+    """As read; tables are known, keys not yet checked."""
+
+    def step(self, kind: type[T], given: Mapping[str, Path] | None = None, *, out: Path, side: Side | None = None) -> T:
+        """The step `kind` with its paths `given` and options from its table; those for one side alone win.
+
+        Raises: ValueError where a key is unknown or missing, or a value is not as expected.
+        """
+        name = kind.__name__.lower()
+        values, where = dict(self.content.get(name, {})), f"{self.path} [{name}]"
+        if side is not None:
+            own = self.content[side]
+            is_capture = name == "capture"
+            values |= self._of_capture(side) if is_capture else own.get(name, {})
+            where = f"{self.path} [{side}]" if is_capture else where
+        # a path that the table names wins over the layout's, so that a step can take other files; results stay put
+        layout = {key: path for key, path in (given or {}).items() if key not in values} | {"out": out}
+        return from_table(kind, Table(values, where, self.path.parent), layout)
+
+    def scene(self, side: Side) -> Path | None:
+        """The scene that was trained already, where one is named."""
+        found = self.content[side].get("scene")
+        return None if found is None else self.path.parent / Path(found).expanduser()
+
+    def _of_capture(self, side: Side) -> dict[str, Any]:
+        """The keys of [source] or [target] that are options of `capture`; a scene alone is looked at."""
+        own = {key: value for key, value in self.content[side].items() if not isinstance(value, dict)}
+        scene = own.pop("scene", None)
+        return own if scene is None else {"capture": scene} | own
+
+
+def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
+    """Read project.toml; `tables` may stand beside [source] and [target].
+
+    Raises: ValueError where the file is missing or broken, or a table is unknown.
+    """
+    content = read_toml(path)
+    known = ("source", "target", *tables)
+    for name, table in content.items():
+        if name not in known:
+            raise ValueError(f"{path}: expected tables among {', '.join(known)}; found {name}")
+        if not isinstance(table, dict):
+            raise ValueError(f"{path}: expected [{name}] to be a table, found {table!r}")
+    sides: tuple[Side, ...] = ("source", "target")
+    for side in sides:
+        _check_side(path, side, content.get(side, {}))
+        if inner := [k for k, v in content[side].items() if isinstance(v, dict) and k != "reconstruct"]:
+            raise ValueError(f"{path}: expected no table in [{side}] but [{side}.reconstruct], found {inner[0]}")
+    return ProjectFile(path, content)
+
+
+def _check_side(path: Path, side: Side, table: Mapping[str, Any]) -> None:
+    for key in ("capture", "scene"):
+        if key in table and not isinstance(table[key], str):
+            raise ValueError(f"{path} [{side}] {key}: expected a path, found {table[key]!r}")
+    if "capture" not in table and "scene" not in table:
+        raise ValueError(f"{path} [{side}]: expected the key capture (or scene) with a path, found none")
+    if is_scene(Path(table.get("capture", ""))):
+        raise ValueError(f"{path} [{side}] capture: expected photographs, found a scene; write scene = instead")
+    if "scene" in table and "reconstruct" in table:
+        raise ValueError(f"{path} [{side}.reconstruct]: expected none beside a trained scene, found one")

@@ -1,0 +1,7 @@
+"""Reconstruction of a 3DGS scene from posed images. Knows nothing about files."""
+
+from splatgraft.reconstruction.memory import predict_memory
+from splatgraft.reconstruction.options import ReconstructOptions
+from splatgraft.reconstruction.training import reconstruct
+
+__all__ = ["ReconstructOptions", "predict_memory", "reconstruct"]

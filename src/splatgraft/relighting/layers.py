@@ -1,0 +1,111 @@
+"""The result of a transfer: a composite whose light is kept in layers that can be weighted again and baked.
+
+Knows nothing about how the layers were found.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.shading.gain import apply_gain
+
+_LEAST_LEFT = 0.9  # no direction of view takes more of what a shadow leaves
+
+
+@dataclass(frozen=True)
+class LayerWeights:
+    """How much of each layer is baked; 0 leaves it out, 1 is what physics says, above 1 exaggerates."""
+
+    shade: float = 1.0
+    """The object's own light and dark sides."""
+    shadow: float = 1.0
+    """What the object takes from its surroundings."""
+    bounce: float = 1.0
+    """What the object's lit sides give to its surroundings."""
+    gloss: float = 1.0
+    """Reflections on the object."""
+
+
+@dataclass(frozen=True)
+class Relit:
+    """A composite of m Gaussians with its light transfer in layers."""
+
+    gaussians: Gaussians
+    """The composite as pasted: target's Gaussians, then the objects'; large ones in a shadow are split."""
+    is_object: Bool[Tensor, "m"]
+    """Which Gaussians belong to an object."""
+    origin: Int[Tensor, "m"]
+    """Position in `Composite.bake()` of the Gaussian that each one is, or is a piece of."""
+    shade: Float[Tensor, "m 3"]
+    """Factor on linear rgb; 1 off the objects."""
+    shadow: Float[Tensor, "m 3"]
+    """Factor on linear rgb in (0, 1]; 1 where no light is taken."""
+    bounce: Float[Tensor, "m 3"]
+    """Added to `shadow`, at least 0: light that an object sends, as a share of what was there."""
+    slope: Float[Tensor, "m 3"]
+    """Its product with the unit vector from the camera is added to shadow and bounce; world axes, 0 away from edges."""
+    gloss: Float[Tensor, "m k 3"]
+    """Added to the harmonics after shading."""
+    light: Light | None
+    """The light at the object's place that was used; None where there was no transfer."""
+    report: tuple[str, ...]
+    """Plain sentences: what was found, how sure, and what was not done and why."""
+
+    def bake(self, weights: LayerWeights = LayerWeights()) -> Gaussians:
+        """A plain 3DGS scene; Gaussians that no layer touches keep every bit."""
+        ratio = self.ratio(weights)
+        leaning = (weights.shadow * self.slope != 0).any(1).nonzero()[:, 0]
+        sh = spherical_harmonics.with_degree(self.gaussians.sh, max(self.gaussians.sh_degree, int(len(leaning) > 0)))
+        sh = sh.clone()
+        lit = (ratio != 1).any(1).nonzero()[:, 0]
+        if len(lit):
+            sh[lit] = apply_gain(replace(self.gaussians, sh=sh).select(lit), ratio[lit]).sh
+        if len(leaning):
+            before = spherical_harmonics.rgb_from_dc(self.gaussians.sh[leaning, 0])
+            rise = _seen_change(before, ratio[leaning], weights.shadow * self.slope[leaning])
+            sh[leaning, 1:4] += spherical_harmonics.band_from_slope(rise)
+        glossy = (self.gloss != 0).flatten(1).any(1).nonzero()[:, 0]
+        sh[glossy, : self.gloss.shape[1]] += weights.gloss * self.gloss[glossy]
+        return replace(self.gaussians, sh=sh)
+
+    def ratio(self, weights: LayerWeights = LayerWeights()) -> Float[Tensor, "m 3"]:
+        """Factor on linear rgb that shade, shadow and bounce make together."""
+        return self.shade**weights.shade * (self.shadow**weights.shadow + weights.bounce * self.bounce)
+
+
+def _seen_change(
+    srgb: Float[Tensor, "n 3"], ratio: Float[Tensor, "n 3"], slope: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3 3"]:
+    """Rise of sRGB colours along the world's axes (second dimension) where `ratio` of linear light rises by `slope`.
+
+    By the secant between both ends, of which neither is in the dark, nor brighter than without a shadow.
+    """
+    height = slope.norm(dim=1, keepdim=True)
+    room = torch.minimum(_LEAST_LEFT * ratio, (1 - ratio).clamp_min(0))
+    reach = torch.minimum(height, room).clamp_min(1e-6)
+    linear = linear_from_srgb(srgb.clamp(0, 1))
+    top, bottom = (srgb_from_linear(linear * (ratio + way * reach)) for way in (1, -1))
+    return (slope / height)[:, :, None] * (0.5 * (top - bottom))[:, None]
+
+
+def unchanged(gaussians: Gaussians, is_object: Bool[Tensor, "m"], *, report: tuple[str, ...]) -> Relit:
+    """The copy-paste result, with the sentences that say why."""
+    ones = torch.ones(gaussians.count, 3)
+    return Relit(
+        gaussians=gaussians,
+        is_object=is_object,
+        origin=torch.arange(gaussians.count),
+        shade=ones,
+        shadow=ones,
+        bounce=torch.zeros_like(ones),
+        slope=torch.zeros_like(ones),
+        gloss=torch.zeros_like(gaussians.sh),
+        light=None,
+        report=report,
+    )

@@ -1,0 +1,212 @@
+"""The value `Light`: what shines on a place, as a few sources and a smooth ambient part, and its text form light.json.
+
+Knows nothing about Gaussians, panoramas or files: text in, text out.
+"""
+
+import json
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core import spherical_harmonics
+
+FORMAT = "splatgraft light 1"
+_AMBIENT_DEGREE = 2
+_AMBIENT_COUNT = 9
+# of the doubt blurs shadows: that leaves the least error in rendered scenes; all of it pales those that lie right
+_BLURRED = 0.5
+
+
+@dataclass(frozen=True)
+class LightSource:
+    """One bright, far patch of light."""
+
+    direction: tuple[float, float, float]
+    """Unit vector from the place towards the light, world frame."""
+    irradiance: tuple[float, float, float]
+    """Linear rgb on a plane that faces the light; a white sky of radiance 1 gives pi on the ground."""
+    angular_radius_deg: float = 3.0
+    """Half the angle under which the light is seen, degrees; the sun's is 0.27."""
+    uncertainty_deg: float = 0.0
+    """Standard error of `direction`, degrees; shadows are softened by it."""
+    confidence: float = 1.0
+    """How sure it is that this light is there, in [0, 1]; scales its shadow."""
+    name: str = "light"
+    """What a report calls it: sun, window, lamp."""
+    blockers_within: float = math.inf
+    """Only what is nearer than this, world units, can block it: beyond lies what it comes through, as a window."""
+
+    @property
+    def softness(self) -> float:
+        """Radius of the cone over which a shadow is spread, radians: the light's own size and part of the doubt."""
+        return math.hypot(math.radians(self.angular_radius_deg), _BLURRED * math.radians(self.uncertainty_deg))
+
+    @property
+    def luminance(self) -> float:
+        """Rec. 709 luminance of `irradiance`."""
+        r, g, b = self.irradiance
+        return 0.2126 * r + 0.7152 * g + 0.0722 * b
+
+
+@dataclass(frozen=True)
+class Light:
+    """The light that arrives at one place, world frame, linear rgb."""
+
+    sources: tuple[LightSource, ...]
+    """Brightest first; none under an even sky."""
+    ambient: Float[Tensor, "9 3"]
+    """Radiance of everything else, spherical harmonics of degree 2."""
+    coverage: float = 1.0
+    """Share of the sphere around the place that the capture saw, in [0, 1]."""
+    unseen_up: float = 0.0
+    """Share of the 60 degrees around straight up that the capture did not see, in [0, 1]."""
+
+    def ambient_radiance(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Linear radiance of the ambient part from unit `directions`, never negative."""
+        values = spherical_harmonics.basis(directions, _AMBIENT_DEGREE) @ self.ambient.to(directions)
+        return values.clamp_min(0)
+
+    def irradiance(self, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Linear irradiance on unshadowed planes with unit `normals` (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
+        bands = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5).to(normals)
+        total = spherical_harmonics.basis(normals, _AMBIENT_DEGREE) @ (bands[:, None] * self.ambient.to(normals))
+        total = total.clamp_min(1e-3 * float(self.ambient[0].abs().max()) + 1e-6)
+        for source in self.sources:
+            cosine = (normals @ torch.tensor(source.direction).to(normals)).clamp_min(0)
+            total = total + cosine[:, None] * torch.tensor(source.irradiance).to(normals)
+        return total
+
+    def rotated(self, rotation: Float[Tensor, "3 3"]) -> "Light":
+        """The same light in a frame turned by `rotation`."""
+        turned = [(rotation.double() @ torch.tensor(s.direction, dtype=torch.float64)).tolist() for s in self.sources]
+        sources = tuple(replace(s, direction=(d[0], d[1], d[2])) for s, d in zip(self.sources, turned, strict=True))
+        ambient = spherical_harmonics.rotate(self.ambient[None], rotation)[0]
+        return replace(self, sources=sources, ambient=ambient)
+
+    def describe(self, up: Float[Tensor, "3"]) -> str:
+        """One line for a report, such as 'sun 62 +- 9 degrees high, 71% of the light on it; ceiling unseen 38%'."""
+        parts = []
+        for source in self.sources[:3]:
+            direction = torch.tensor(source.direction)
+            height = math.degrees(math.asin(max(-1.0, min(1.0, float(direction @ up)))))
+            share = sum(source.irradiance) / float(self.irradiance(direction[None]).sum())
+            parts.append(
+                f"{source.name} {height:.0f} +- {source.uncertainty_deg:.0f} degrees high, "
+                f"{100 * share:.0f}% of the light on what faces it"
+            )
+        parts = parts or ["even light without a clear source"]
+        if self.unseen_up > 0.05:
+            parts.append(f"ceiling unseen {100 * self.unseen_up:.0f}%")
+        return "; ".join([*parts, f"{100 * self.coverage:.0f}% of the surroundings seen"])
+
+
+def fit_ambient(radiance: Float[Tensor, "3"]) -> Float[Tensor, "9 3"]:
+    """Coefficients of an even ambient light of linear `radiance`."""
+    out = torch.zeros(_AMBIENT_COUNT, 3)
+    out[0] = radiance / spherical_harmonics.C0
+    return out
+
+
+def light_to_json(light: Light) -> str:
+    """The text of light.json, made to be read and changed by hand."""
+    sources = [
+        {
+            "name": s.name,
+            "direction": [round(float(v), 6) for v in s.direction],
+            "irradiance": [round(float(v), 6) for v in s.irradiance],
+            "angular_radius_deg": round(s.angular_radius_deg, 4),
+            "uncertainty_deg": round(s.uncertainty_deg, 4),
+            "confidence": round(s.confidence, 4),
+        }
+        | ({"blockers_within": round(s.blockers_within, 4)} if math.isfinite(s.blockers_within) else {})
+        for s in light.sources
+    ]
+    record = {
+        "format": FORMAT,
+        "sources": sources,
+        "ambient_sh": [[round(v, 6) for v in row] for row in light.ambient.tolist()],
+        "coverage": round(light.coverage, 4),
+        "unseen_up": round(light.unseen_up, 4),
+    }
+    return json.dumps(record, indent=1) + "\n"
+
+
+def light_from_json(text: str, *, name: str = "light.json") -> Light:
+    """The light that the text of a light.json describes; `name` is what messages call the file.
+
+    Raises: ValueError where the text is no JSON, a key is missing or unknown, or a value is out of its range.
+    """
+    try:
+        record = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"{name}: expected JSON, found {error}") from error
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        found = record.get("format") if isinstance(record, dict) else type(record).__name__
+        raise ValueError(f'{name}: expected "format": "{FORMAT}", found {found!r}')
+    unknown = sorted(set(record) - {"format", "sources", "ambient_sh", "coverage", "unseen_up"})
+    if unknown:
+        raise ValueError(f"{name}: expected sources, ambient_sh, coverage and unseen_up, found {unknown[0]!r}")
+    if not isinstance(record.get("sources"), list):
+        raise ValueError(f"{name}: expected a list under sources, found {record.get('sources')!r:.60}")
+    ambient = record.get("ambient_sh")
+    if not isinstance(ambient, list) or len(ambient) != _AMBIENT_COUNT:
+        raise ValueError(f"{name}: expected 9 rows of rgb under ambient_sh, found {ambient!r:.60}")
+    rows = [_numbers(row, 3, f"{name}: ambient_sh[{i}]", (-1e6, 1e6)) for i, row in enumerate(ambient)]
+    return Light(
+        sources=tuple(_source(entry, f"{name}: sources[{i}]") for i, entry in enumerate(record["sources"])),
+        ambient=torch.tensor(rows),
+        coverage=_numbers([record.get("coverage", 1.0)], 1, f"{name}: coverage", (0.0, 1.0))[0],
+        unseen_up=_numbers([record.get("unseen_up", 0.0)], 1, f"{name}: unseen_up", (0.0, 1.0))[0],
+    )
+
+
+def _source(entry: object, where: str) -> LightSource:
+    if not isinstance(entry, dict):
+        raise ValueError(f"{where}: expected an object with direction and irradiance, found {entry!r:.60}")
+    known = {
+        "name",
+        "direction",
+        "irradiance",
+        "angular_radius_deg",
+        "uncertainty_deg",
+        "confidence",
+        "blockers_within",
+    }
+    unknown = sorted(set(entry) - known)
+    if unknown:
+        raise ValueError(f"{where}: expected only {', '.join(sorted(known))}, found {unknown[0]!r}")
+    direction = _numbers(entry.get("direction"), 3, f"{where}.direction", (-1e6, 1e6))
+    length = math.sqrt(sum(v * v for v in direction))
+    if length < 1e-6:
+        raise ValueError(f"{where}.direction: expected a vector longer than zero, found {direction}")
+    r, g, b = _numbers(entry.get("irradiance"), 3, f"{where}.irradiance", (0.0, 1e6))
+    name = entry.get("name", "light")
+    if not isinstance(name, str):
+        raise ValueError(f"{where}.name: expected a text, found {name!r:.60}")
+    return LightSource(
+        direction=(direction[0] / length, direction[1] / length, direction[2] / length),
+        irradiance=(r, g, b),
+        angular_radius_deg=_scalar(entry, "angular_radius_deg", 3.0, (0.0, 90.0), where),
+        uncertainty_deg=_scalar(entry, "uncertainty_deg", 0.0, (0.0, 90.0), where),
+        confidence=_scalar(entry, "confidence", 1.0, (0.0, 1.0), where),
+        name=name,
+        blockers_within=_scalar(entry, "blockers_within", math.inf, (0.0, math.inf), where),
+    )
+
+
+def _scalar(entry: dict, key: str, default: float, bounds: tuple[float, float], where: str) -> float:
+    return _numbers([entry[key]], 1, f"{where}.{key}", bounds)[0] if key in entry else default
+
+
+def _numbers(values: object, count: int, where: str, bounds: tuple[float, float]) -> list[float]:
+    expected = f"{count} number{'s' if count > 1 else ''} from {bounds[0]:g} to {bounds[1]:g}"
+    if not isinstance(values, list) or len(values) != count:
+        raise ValueError(f"{where}: expected {expected}, found {values!r:.60}")
+    for value in values:
+        good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not good or not bounds[0] <= value <= bounds[1]:
+            raise ValueError(f"{where}: expected {expected}, found {value!r:.60}")
+    return [float(v) for v in values]

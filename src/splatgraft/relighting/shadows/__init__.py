@@ -1,0 +1,1 @@
+"""Visibility of light: samples of a light, shadow maps, occlusion, and the Gaussians that receive shadows."""

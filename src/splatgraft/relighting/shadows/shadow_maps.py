@@ -1,0 +1,309 @@
+"""Orthographic depth maps splatted from Gaussians along many directions, and visibility looked up in them.
+
+Knows nothing about light, colour spaces or objects: occluders in, maps out; points in, visibility out.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numba import get_num_threads, njit, prange
+from torch import Tensor
+
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.spherical_harmonics import rgb_from_dc
+from splatgraft.rendering.cpu_rows import LANES, lanes, largest, load, smaller, store, where_at_least, where_below
+from splatgraft.runtime.kernel_lock import serialized
+
+FAR = np.float32(1e30)
+_BINS = 4096
+_CUTOFF = np.float32(3.04)  # standard deviations, where a splat of opacity 1 falls to `_FAINTEST`
+_FAINTEST = np.float32(0.01)  # alpha
+_SPENT = np.float32(0.02)  # share of light that is not followed further
+_HALF = np.float32(0.5)
+
+
+@dataclass(frozen=True)
+class Window:
+    """The ball that depth maps look at, and their frames."""
+
+    center: Float[Tensor, "3"]
+    """World; the middle of every map and depth 0."""
+    radius: float
+    """Half the width of every map, world units."""
+    frames: Float[Tensor, "k 3 3"]
+    """Rows right, down, away from the light; x_in_light = frame @ (x_in_world - center)."""
+
+    @property
+    def directions(self) -> Float[Tensor, "k 3"]:
+        """Unit vectors towards each light."""
+        return -self.frames[:, 2]
+
+
+@dataclass(frozen=True)
+class Occluders:
+    """What Gaussians' maps need of them, computed once for many maps."""
+
+    means: Float[Tensor, "n 3"]
+    covariances: Float[Tensor, "n 3 3"]
+    opacities: Float[Tensor, "n"]
+    linear_rgb: Float[Tensor, "n 3"]
+    """Mean colour, linear."""
+
+
+def occluders_of(gaussians: Gaussians) -> Occluders:
+    """The Gaussians as things that block light."""
+    return Occluders(
+        means=gaussians.means,
+        covariances=gaussians.covariances,
+        opacities=gaussians.opacities,
+        linear_rgb=linear_from_srgb(rgb_from_dc(gaussians.sh[:, 0]).clamp(0, 1)),
+    )
+
+
+def thinned(gaussians: Gaussians, *, width: float) -> Gaussians:
+    """Fewer, wider Gaussians that cover the same area: those narrower than `width` survive by chance, and grow to it.
+
+    Stochastic simplification (Cook et al. 2007): one survives with probability (its width / `width`)^2.
+    """
+    share = (gaussians.log_scales.sort(1).values[:, 1:].sum(1) - 2 * math.log(width)).exp().clamp(1e-6, 1)
+    lots = torch.rand(gaussians.count, generator=torch.Generator().manual_seed(0))
+    chosen = (lots < share).nonzero()[:, 0]
+    kept = gaussians.select(chosen)
+    return replace(kept, log_scales=kept.log_scales - 0.5 * share[chosen, None].log())
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """What k far lights see of some occluders."""
+
+    window: Window
+    first: Float[Tensor, "k s s"]
+    """Depth at which light is half blocked; 1e30 where less than half is blocked."""
+    alpha: Float[Tensor, "k s s"]
+    """Share of the light blocked, in [0, 1]."""
+    mean: Float[Tensor, "c s s"]
+    """Blended depth of what blocks; 0 where nothing does; c is k, or 0 where no colour was asked for."""
+    color: Float[Tensor, "c 3 s s"]
+    """Blended linear colour of the side towards the light, over black."""
+
+    @property
+    def texel(self) -> float:
+        """Width of a pixel, world units."""
+        return 2 * self.window.radius / self.first.shape[1]
+
+
+def splat_depth_maps(
+    occluders: Occluders, window: Window, *, size: int, with_color: bool, nearest: Float[Tensor, "k"] | None = None
+) -> DepthMaps:
+    """Depth maps of `occluders`, `size` (a multiple of 16) pixels square; blended front to back as the renderer does.
+
+    Colour and mean depth are kept where `with_color` asks for it. Occluders at a depth below `nearest` (that is,
+    farther than -`nearest` from the window's centre towards that light) are left out.
+    """
+    k = len(window.frames)
+    c = k if with_color else 0
+    assert size % LANES == 0
+    first, left = np.zeros((k, size, size), np.float32), np.ones((k, size, size), np.float32)
+    mean, color = np.zeros((c, size, size), np.float32), np.zeros((c, 3, size, size), np.float32)
+    geometry = (_array(occluders.means), _array(occluders.covariances), _array(occluders.opacities))
+    view = (_array(window.frames), _array(window.center), np.float32(window.radius))
+    limits = _array(nearest) if nearest is not None else np.full(k, -FAR, np.float32)
+    _splat(geometry, _array(occluders.linear_rgb), view, limits, (first, left, mean, color), get_num_threads())
+    first[left >= _HALF] = FAR
+    alpha = np.subtract(np.float32(1), left, out=left)
+    mean /= np.maximum(alpha[:c], np.float32(1e-6))
+    return DepthMaps(
+        window=window,
+        first=torch.from_numpy(first),
+        alpha=torch.from_numpy(alpha),
+        mean=torch.from_numpy(mean),
+        color=torch.from_numpy(color),
+    )
+
+
+def visibility(
+    maps: DepthMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], *, bias: float
+) -> Float[Tensor, "m k"]:
+    """Share of each light that reaches `points` on a surface with `normals`; 1 outside the window.
+
+    `bias` is the distance, world units, below which an occluder is the surface itself.
+    """
+    out = np.ones((len(points), len(maps.first)), np.float32)
+    view = (_array(maps.window.frames), _array(maps.window.center), np.float32(maps.window.radius))
+    _look_up(_array(points), _array(normals), view, (_array(maps.first), _array(maps.alpha)), np.float32(bias), out)
+    return torch.from_numpy(out)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32)
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _project(frame, geometry, view, nearest, splats):  # noqa: PLR0915  (one kernel: what touches, order, shapes)
+    """Gaussians that touch a map, in the order of their depth: rows of `splats`, and how many."""
+    means, covariances, opacities = geometry
+    center, radius, size = view
+    f = frame
+    per_unit = np.float32(size / (2 * radius))
+    square = per_unit * per_unit
+    depths, kept = np.empty(len(means), np.float32), np.empty(len(means), np.int32)
+    count = 0
+    low, high = np.float32(1e30), np.float32(-1e30)
+    for i in range(len(means)):
+        x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
+        depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
+        if opacities[i] < _FAINTEST or depth < nearest:
+            continue
+        c = covariances[i]
+        reach = _CUTOFF * np.sqrt(c[0, 0] + c[1, 1] + c[2, 2]) + np.float32(1) / per_unit
+        u = f[0, 0] * x + f[0, 1] * y + f[0, 2] * z
+        v = f[1, 0] * x + f[1, 1] * y + f[1, 2] * z
+        if abs(u) > radius + reach or abs(v) > radius + reach:
+            continue
+        depths[count], kept[count] = depth, i
+        count += 1
+        low, high = min(low, depth), max(high, depth)
+    # counting sort
+    start = np.zeros(_BINS + 1, np.int32)
+    per_depth = np.float32(_BINS - 1) / max(high - low, np.float32(1e-12))
+    for j in range(count):
+        start[int((depths[j] - low) * per_depth) + 1] += 1
+    for b in range(_BINS):
+        start[b + 1] += start[b]
+    for j in range(count):
+        i = kept[j]
+        b = int((depths[j] - low) * per_depth)
+        s = splats[start[b]]
+        start[b] += 1
+        x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
+        c = covariances[i]
+        # rows of F C, then F C F^T for (u, v) and the depth column
+        a0 = f[0, 0] * c[0, 0] + f[0, 1] * c[1, 0] + f[0, 2] * c[2, 0]
+        a1 = f[0, 0] * c[0, 1] + f[0, 1] * c[1, 1] + f[0, 2] * c[2, 1]
+        a2 = f[0, 0] * c[0, 2] + f[0, 1] * c[1, 2] + f[0, 2] * c[2, 2]
+        b0 = f[1, 0] * c[0, 0] + f[1, 1] * c[1, 0] + f[1, 2] * c[2, 0]
+        b1 = f[1, 0] * c[0, 1] + f[1, 1] * c[1, 1] + f[1, 2] * c[2, 1]
+        b2 = f[1, 0] * c[0, 2] + f[1, 1] * c[1, 2] + f[1, 2] * c[2, 2]
+        uu = (a0 * f[0, 0] + a1 * f[0, 1] + a2 * f[0, 2]) * square + np.float32(0.15)
+        uv = (a0 * f[1, 0] + a1 * f[1, 1] + a2 * f[1, 2]) * square
+        vv = (b0 * f[1, 0] + b1 * f[1, 1] + b2 * f[1, 2]) * square + np.float32(0.15)
+        uz = (a0 * f[2, 0] + a1 * f[2, 1] + a2 * f[2, 2]) * per_unit
+        vz = (b0 * f[2, 0] + b1 * f[2, 1] + b2 * f[2, 2]) * per_unit
+        inverse = np.float32(1) / (uu * vv - uv * uv)
+        s[0] = (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z + radius) * per_unit
+        s[1] = (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z + radius) * per_unit
+        s[2] = depths[j]
+        s[3], s[4], s[5] = vv * inverse, -uv * inverse, uu * inverse
+        s[6], s[7] = s[3] * uz + s[4] * vz, s[4] * uz + s[5] * vz
+        s[8], s[9] = opacities[i], vv
+        s[10] = np.float32(2) * np.log(opacities[i] / _FAINTEST)
+        s[11] = np.float32(i)
+    return count
+
+
+@njit(cache=True, fastmath=True, inline="always")
+@no_type_check
+def _blend(splat, at, dv, du, maps):
+    """One splat over a row of pixels; whether no light is left behind all of them."""
+    _, _, depth, ca, cb, cc, su, sv, opacity, _, cut, _ = splat
+    near, through = maps
+    q = du * (du * ca + np.float32(2) * cb * dv) + cc * dv * dv
+    # exp(-q / 2) to 0.004, by squaring (1 - q / 128) six times
+    bell = np.float32(1) - q * np.float32(1 / 128)
+    bell = bell * bell
+    bell = bell * bell
+    bell = bell * bell
+    bell = bell * bell
+    bell = bell * bell
+    bell = bell * bell
+    before = load(through, at)
+    weight = before * where_below(q, cut, smaller(bell * opacity, np.float32(0.99)))
+    after = before - weight
+    place = du * su + (depth + sv * dv)
+    store(near, at, load(near, at) + where_at_least(before, _HALF, where_below(after, _HALF, place)))
+    store(through, at, after)
+    return weight, weight * place, largest(after) < _SPENT
+
+
+@serialized
+@njit(cache=True, parallel=True, fastmath=True)
+@no_type_check
+def _splat(geometry, rgb, view, limits, maps, threads):
+    frames, center, radius = view
+    first, left, mean, color = maps
+    size = first.shape[1]
+    for thread in prange(threads):
+        splats = np.empty((len(geometry[0]), 12), np.float32)
+        for k in range(thread, len(frames), threads):
+            count = _project(frames[k], geometry, (center, radius, size), limits[k], splats)
+            closed = np.zeros((size, size // LANES), np.bool_)  # where light no longer reaches
+            near, through = first[k], left[k]
+            for j in range(count):
+                u, v, _, ca, cb, cc, _, _, _, var_v, cut, who = splats[j]
+                reach = np.sqrt(cut * var_v)
+                for row in range(max(0, int(np.ceil(v - reach - 0.5))), min(size, int(np.floor(v + reach + 0.5)))):
+                    dv = np.float32(row) + np.float32(0.5) - v
+                    # where the ellipse q = cut meets the row
+                    across = cb * dv
+                    root = across * across - ca * (cc * dv * dv - cut)
+                    if root <= 0:
+                        continue
+                    half = np.sqrt(root) / ca
+                    middle = u - across / ca - np.float32(0.5)
+                    low, high = max(0, int(np.ceil(middle - half))), min(size - 1, int(np.floor(middle + half)))
+                    if low > high:
+                        continue
+                    for tile in range(low // LANES, high // LANES + 1):
+                        if closed[row, tile]:
+                            continue
+                        at = row * size + tile * LANES
+                        du = lanes() + (np.float32(tile * LANES) + np.float32(0.5) - u)
+                        weight, placed, closed[row, tile] = _blend(splats[j], at, dv, du, (near, through))
+                        if len(color):
+                            store(mean[k], at, load(mean[k], at) + placed)
+                            for channel in range(3):
+                                plane = color[k, channel]
+                                store(plane, at, load(plane, at) + weight * rgb[int(who), channel])
+
+
+@serialized
+@njit(cache=True, parallel=True, fastmath=True)
+@no_type_check
+def _look_up(points, normals, view, maps, bias, out):
+    frames, center, radius = view
+    first, alpha = maps
+    size = first.shape[1]
+    texel = np.float32(2 * radius / size)
+    for i in prange(len(points)):
+        for k in range(len(frames)):
+            f = frames[k]
+            cosine = -(f[2, 0] * normals[i, 0] + f[2, 1] * normals[i, 1] + f[2, 2] * normals[i, 2])
+            # a map pixel on a tilted surface spans tan(angle) of depth; the offset along the normal takes most of it
+            lift = texel * np.float32(1.5)
+            x = points[i, 0] - center[0] + lift * normals[i, 0]
+            y = points[i, 1] - center[1] + lift * normals[i, 1]
+            z = points[i, 2] - center[2] + lift * normals[i, 2]
+            u = (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z) / texel + np.float32(0.5 * size - 0.5)
+            v = (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z) / texel + np.float32(0.5 * size - 0.5)
+            depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
+            if u < 0 or v < 0 or u >= size - 1 or v >= size - 1:
+                continue
+            slope = np.sqrt(max(np.float32(0), 1 - cosine * cosine)) / max(abs(cosine), np.float32(0.2))
+            limit = depth - bias - texel * slope
+            column, row = int(u), int(v)
+            fu, fv = u - column, v - row
+            blocked = np.float32(0)
+            for dv in range(2):
+                for du in range(2):
+                    at = first[k, row + dv, column + du]
+                    if at < limit:
+                        share = (fu if du == 1 else 1 - fu) * (fv if dv == 1 else 1 - fv)
+                        # fades in over one pixel's depth, so that no hard step shows
+                        blocked += share * alpha[k, row + dv, column + du] * min(1, (limit - at) / texel)
+            out[i, k] = 1 - blocked

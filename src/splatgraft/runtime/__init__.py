@@ -1,0 +1,1 @@
+"""Infrastructure without domain knowledge: atomic files and folders, worker pools, memoising, settings, console."""

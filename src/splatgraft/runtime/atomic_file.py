@@ -1,0 +1,26 @@
+"""Files that appear whole or not at all: written beside their place, then renamed. Knows nothing of their content."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+
+@contextmanager
+def atomic_write(path: Path) -> Iterator[BinaryIO]:
+    """A binary stream that becomes `path` when the block ends well; when it fails, what was there before stays.
+
+    Raises: ValueError where the folder does not exist or `path` is a folder.
+    """
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")
+    if path.is_dir():
+        raise ValueError(f"{path}: expected a file name to write, found a folder")
+    partial = path.with_name(f".{path.name}.partial")  # one name, so that the next write clears what a kill left
+    try:
+        with partial.open("wb") as stream:
+            yield stream
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,36 @@
+"""The optional parts: what each is for and which modules it brings. Imports none of them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class OptionalDependency:
+    """One optional part of the package, installed by `pip install 'splatgraft[name]'`."""
+
+    purpose: str
+    """What it adds."""
+    packages: Mapping[str, str]
+    """Module to the package that brings it."""
+
+
+OPTIONAL_DEPENDENCIES = {
+    "cuda": OptionalDependency("splatting kernels for NVIDIA GPUs", {"gsplat": "gsplat", "packaging": "packaging"}),
+    "sfm": OptionalDependency("poses for photos and videos that have none", {"pycolmap": "pycolmap"}),
+    "flux": OptionalDependency(
+        "the paper's image model and its training",
+        {"diffusers": "diffusers", "accelerate": "accelerate"},
+    ),
+    "text": OptionalDependency("text encoders, to embed the empty prompt once", {"transformers": "transformers"}),
+    "blender": OptionalDependency("made-up scenes with ground truth", {"bpy": "bpy"}),
+    "ray": OptionalDependency("rendering and evaluating on many machines", {"ray": "ray"}),
+    "birefnet": OptionalDependency(
+        "object masks from a network", {"onnxruntime": "onnxruntime", "huggingface_hub": "huggingface_hub"}
+    ),
+}
+
+
+def extra_providing(module: str) -> str | None:
+    """The extra that brings `module`, or None."""
+    top = module.split(".", maxsplit=1)[0]
+    return next((name for name, extra in OPTIONAL_DEPENDENCIES.items() if top in extra.packages), None)

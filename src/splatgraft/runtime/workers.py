@@ -1,0 +1,95 @@
+"""Many independent jobs: a few at a time on this machine, or on many machines through Ray. Knows not what a job does.
+
+A job leaves its result in files and looks first whether they are there: so it may be begun again after a kill, and on
+another machine that sees the same files.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Any
+
+from splatgraft.runtime.progress import Progress, silent
+
+_RETRIES = 5
+"""How often Ray begins a job again whose worker died."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One job, safe to repeat."""
+
+    name: str
+    """What a failure and the progress call it."""
+    work: Callable[[], object]
+    """Does it; for Ray, a `functools.partial` of a module's function. A ValueError says that its data is at fault."""
+
+
+def run_tasks(
+    tasks: Sequence[Task],
+    *,
+    at_once: int = 1,
+    ray_address: str | None = None,
+    progress: Progress = silent,
+    gpus_each: int = 0,
+) -> list[str]:
+    """Do all tasks; what went wrong, a line a task, in the order of the tasks. One that fails does not stop the rest.
+
+    `ray_address` is that of a Ray cluster (`auto`, `host:port`, `ray://host:port`), or `local` for a cluster of this
+    machine's cores that lives as long as the call. All machines must see the same files under the same names.
+    `gpus_each`: GPUs that Ray keeps for a task.
+
+    Raises: whatever but ValueError a task raises on this machine; ModuleNotFoundError where Ray is asked for and not
+    installed.
+    """
+    if ray_address is not None:
+        return _through_ray(tasks, ray_address, progress, gpus_each)
+    failures: dict[int, str] = {}
+    with ThreadPoolExecutor(max(1, at_once)) as pool:
+        running = {pool.submit(task.work): index for index, task in enumerate(tasks)}
+        try:
+            for done, future in enumerate(as_completed(running), 1):
+                index = running[future]
+                error = future.exception()
+                if isinstance(error, ValueError):
+                    failures[index] = f"{tasks[index].name}: {error}"
+                elif error is not None:
+                    raise error
+                progress(done, len(tasks), tasks[index].name)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return [failures[index] for index in sorted(failures)]
+
+
+def _through_ray(tasks: Sequence[Task], address: str, progress: Progress, gpus_each: int) -> list[str]:
+    import ray
+    from ray.exceptions import RayTaskError, WorkerCrashedError
+
+    own = not ray.is_initialized()
+    if own:
+        ray.init(address, include_dashboard=False, log_to_driver=False, configure_logging=False)
+    failures: dict[int, str] = {}
+    try:
+        remote = ray.remote(_call).options(num_cpus=1, num_gpus=gpus_each, max_retries=_RETRIES)
+        running: dict[Any, int] = {remote.remote(task.work): index for index, task in enumerate(tasks)}
+        while running:
+            (reference, *_), _ = ray.wait(list(running))
+            index = running.pop(reference)
+            try:
+                ray.get(reference)
+            except RayTaskError as error:
+                if not isinstance(error.cause, ValueError):
+                    raise
+                failures[index] = f"{tasks[index].name}: {error.cause}"
+            except WorkerCrashedError:
+                failures[index] = f"{tasks[index].name}: expected a worker that lives, found {_RETRIES + 1} that died"
+            progress(len(tasks) - len(running), len(tasks), tasks[index].name)
+    finally:
+        if own:
+            ray.shutdown()
+    return [failures[index] for index in sorted(failures)]
+
+
+def _call(work: Callable[[], object]) -> None:
+    work()

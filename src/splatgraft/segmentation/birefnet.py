@@ -1,0 +1,84 @@
+"""Object masks by BiRefNet through onnxruntime (its only importer). Knows nothing about cameras or Gaussians."""
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.images import resize
+
+DEFAULT_REPOSITORY = "onnx-community/BiRefNet-ONNX"
+_FILE = "onnx/model.onnx"
+_MEAN = torch.tensor([0.485, 0.456, 0.406])
+_STD = torch.tensor([0.229, 0.224, 0.225])
+
+
+@dataclass(frozen=True)
+class BiRefNet:
+    """A loaded network: one picture in, the mask of its foreground out."""
+
+    session: Any
+    """An onnxruntime.InferenceSession with one input (1, 3, side, side) and logits or probabilities out."""
+    side: int
+    """Width and height that the network wants, pixels."""
+
+    def mask(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+        """How much of each pixel is foreground, in [0, 1]."""
+        square = (resize(image, self.side, self.side) - _MEAN) / _STD
+        given = {self.session.get_inputs()[0].name: square.permute(2, 0, 1)[None].contiguous().numpy()}
+        # the last output is the finest where a network gives several
+        found = torch.from_numpy(np.asarray(self.session.run(None, given)[-1], np.float32))
+        found = found.reshape(found.shape[-2:])
+        if float(found.min()) < 0 or float(found.max()) > 1:
+            found = found.sigmoid()
+        return resize(found, image.shape[1], image.shape[0])
+
+
+def load_birefnet(weights: Path | str = DEFAULT_REPOSITORY, *, threads: int = 2) -> BiRefNet:
+    """The network from an .onnx file, or from a repository on the Hugging Face hub (downloaded once; no code runs).
+
+    Raises: ValueError where a package is missing, or the file is no such network.
+    """
+    _require("onnxruntime")
+    import onnxruntime
+
+    path = weights if isinstance(weights, Path) else _from_hub(weights)
+    if not path.is_file():
+        raise ValueError(f"{path}: expected an .onnx file, found none")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's own exceptions share no public base class
+        raise ValueError(f"{path}: expected an ONNX network, found {str(error).splitlines()[0]}") from error
+    shape = session.get_inputs()[0].shape
+    if len(shape) != 4 or shape[1] not in (3, "channels", "num_channels"):
+        raise ValueError(f"{path}: expected an input of shape (1, 3, side, side), found {shape}")
+    # a free side is written as a name; BiRefNet was trained at 1024
+    return BiRefNet(session=session, side=shape[2] if isinstance(shape[2], int) else 1024)
+
+
+def _require(module: str) -> None:
+    if find_spec(module) is None:
+        raise ValueError(
+            f"masks by birefnet: expected {module} (pip install 'splatgraft[birefnet]'), found none; or use grabcut"
+        )
+
+
+def _from_hub(repository: str) -> Path:
+    _require("huggingface_hub")
+    import huggingface_hub
+
+    try:
+        return Path(huggingface_hub.hf_hub_download(repository, _FILE))
+    except Exception as error:  # network, missing repository, missing file: all are the user's to mend
+        raise ValueError(
+            f"{repository}: expected to download {_FILE} from the hub, found {type(error).__name__}; "
+            "give the path of an .onnx file, or use grabcut"
+        ) from error

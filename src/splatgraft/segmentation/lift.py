@@ -1,0 +1,126 @@
+"""Lifts 2D masks to one number per Gaussian. Knows nothing about where masks come from or what is done with the number.
+
+A view's mask is modelled as the blend of the numbers, W f. The closed form is the weighted average W^T m / W^T 1
+(FlashSplat, ECCV 2024, for one bit; Splat Feature Solver, ICLR 2026, for any feature): what a Gaussian contributes to,
+it inherits. The paper's way (section 3.1) trains a logit per Gaussian with binary cross-entropy on its blend.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.rendering import RenderOptions, ViewOperator, view_operator
+from splatgraft.runtime.progress import Progress, silent
+
+_SEEN = 1e-3
+"""Least sum of blending weights over all pixels of all views that counts as seen, pixels."""
+
+
+@dataclass(frozen=True)
+class LiftOptions:
+    """How masks become a number per Gaussian."""
+
+    method: Literal["closed_form", "bce"] = "closed_form"
+    """The weighted average, or the paper's training, which starts from it."""
+    iterations: int = 10_000
+    """Steps of `bce`, one view each."""
+    learning_rate: float = 0.05
+    """Of Adam in `bce`, logits per step."""
+    seed: int = 0
+    """Of the order of views in `bce`."""
+
+
+def lift_masks(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    masks: Sequence[Float[Tensor, "_ _"]],
+    options: LiftOptions = LiftOptions(),
+    *,
+    progress: Progress = silent,
+) -> Float[Tensor, "n"]:
+    """How much each Gaussian belongs to what the masks (1 inside) show, in [0, 1]; 0 for one that no view sees.
+
+    `closed_form`: the share of its blending weight that falls inside, which the object's own Gaussians miss only at
+    the outline. `bce`: the sigmoid of the trained logit. Both are compared with the same threshold, the paper's 0.75.
+
+    Raises: ValueError where masks and cameras do not fit together.
+    """
+    _check(cameras, masks)
+    if options.method == "closed_form":
+        return _closed_form(gaussians, cameras, masks, progress)
+    operators = [view_operator(gaussians, camera, RenderOptions()) for camera in cameras]
+    inside, seen = _sums(gaussians, operators, masks)
+    return _trained(_ratio(inside, seen), operators, masks, options, progress).where(seen > _SEEN, 0.0)
+
+
+def _check(cameras: Cameras, masks: Sequence[Tensor]) -> None:
+    if len(masks) != len(cameras):
+        raise ValueError(f"masks: expected one for each of {len(cameras)} cameras, found {len(masks)}")
+    if not masks:
+        raise ValueError("masks: expected at least one, found none")
+    for name, size, mask in zip(cameras.names, cameras.sizes.tolist(), masks, strict=True):
+        if [mask.shape[1], mask.shape[0]] != size:
+            raise ValueError(
+                f"mask of {name}: expected {size[0]}x{size[1]} pixels, found {mask.shape[1]}x{mask.shape[0]}"
+            )
+
+
+def _closed_form(
+    gaussians: Gaussians, cameras: Cameras, masks: Sequence[Tensor], progress: Progress
+) -> Float[Tensor, "n"]:
+    total = torch.zeros(gaussians.count, 2, device=gaussians.device)
+    for index, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
+        progress(index, len(masks), "lifting masks")
+        # one view's lists at a time, so that memory does not grow with the number of views
+        total += _sums_of_view(view_operator(gaussians, camera, RenderOptions()), mask.to(gaussians.device))
+    progress(len(masks), len(masks), "lifting masks")
+    return _ratio(total[:, 0], total[:, 1])
+
+
+def _sums_of_view(operator: ViewOperator, mask: Float[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
+    """Blending weight inside the mask, and all of it."""
+    return operator.blend_transpose(torch.stack([mask, torch.ones_like(mask)], -1))
+
+
+def _sums(
+    gaussians: Gaussians, operators: Sequence[ViewOperator], masks: Sequence[Tensor]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    parts = [_sums_of_view(op, mask.to(gaussians.device)) for op, mask in zip(operators, masks, strict=True)]
+    inside, seen = torch.stack(parts).sum(0).unbind(1)
+    return inside, seen
+
+
+def _ratio(inside: Float[Tensor, "n"], seen: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    return (inside / seen.clamp_min(_SEEN)).clamp(0, 1).where(seen > _SEEN, 0.0)
+
+
+def _trained(
+    start: Float[Tensor, "n"],
+    operators: Sequence[ViewOperator],
+    masks: Sequence[Tensor],
+    options: LiftOptions,
+    progress: Progress,
+) -> Float[Tensor, "n"]:
+    logits = torch.logit(start, eps=0.01)[:, None].clone().requires_grad_()
+    optimizer = torch.optim.Adam([logits], lr=options.learning_rate, eps=1e-15)
+    targets = [mask.to(start)[..., None] for mask in masks]
+    generator = torch.Generator().manual_seed(options.seed)
+    order: list[int] = []
+    for step in range(options.iterations):
+        if not order:
+            order = torch.randperm(len(targets), generator=generator).tolist()
+        view = order.pop()
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(operators[view].blend(logits), targets[view])
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        if step % 50 == 0:
+            progress(step, options.iterations, f"cross-entropy {loss.item():.4f}")
+    progress(options.iterations, options.iterations, "features trained")
+    return logits.detach()[:, 0].sigmoid()

@@ -1,0 +1,79 @@
+"""Decides which Gaussians are the object, from a number per Gaussian. Knows nothing about masks."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.segmentation.box import Box
+
+Keep = Literal["substantial", "largest", "all"]
+_NEIGHBOURS = 16
+_SUBSTANTIAL = 0.05
+
+
+@dataclass(frozen=True)
+class SelectOptions:
+    """What makes a Gaussian part of the object."""
+
+    threshold: float = 0.75
+    """Least feature (section 3.1 of the paper, after its sigmoid)."""
+    box: Box | None = None
+    """Where centres must lie, world units."""
+    keep: Keep = "substantial"
+    """Which pieces stay: those with at least a twentieth of the largest one's opacity, the largest alone, or all."""
+
+
+def select_object(
+    gaussians: Gaussians, feature: Float[Tensor, "n"], options: SelectOptions = SelectOptions()
+) -> Bool[Tensor, "n"]:
+    """The Gaussians at or above the threshold, inside the box, in the pieces to keep.
+
+    Raises: ValueError where none is left.
+    """
+    chosen = feature >= options.threshold
+    if not chosen.any():
+        raise ValueError(
+            f"object: expected Gaussians with a feature of at least {options.threshold}, found at most "
+            f"{float(feature.max()) if len(feature) else 0:.2f}; do the masks show what the cameras see?"
+        )
+    if options.box is not None:
+        chosen = chosen & options.box.contains(gaussians.means)
+        if not chosen.any():
+            raise ValueError("object: expected some of its Gaussians inside the box, found all outside")
+    if options.keep == "all":
+        return chosen
+    mass = mass_of_piece(gaussians.select(chosen))
+    least = mass.max() * (_SUBSTANTIAL if options.keep == "substantial" else 1)
+    kept = torch.zeros_like(chosen)
+    kept[torch.nonzero(chosen)[:, 0][mass >= least]] = True
+    return kept
+
+
+def mass_of_piece(gaussians: Gaussians) -> Float[Tensor, "n"]:
+    """For each Gaussian the sum of opacities of the connected piece it is in; two touch if their 2-sigma spheres do.
+
+    Only the 16 nearest of each are asked, which is where touching ones are.
+    """
+    n = gaussians.count
+    if n <= 1:
+        return gaussians.opacities.detach()
+    means = gaussians.means.detach().double().cpu().numpy()
+    # the middle scale: a needle reaches far along one axis only
+    radii = 2 * gaussians.scales.detach().double().cpu().numpy().clip(1e-12)
+    radii = np.median(radii, axis=1)
+    distance, neighbour = KDTree(means).query(means, k=min(_NEIGHBOURS + 1, n))
+    neighbour = np.asarray(neighbour)
+    near = distance <= radii[:, None] + radii[neighbour]
+    rows = np.broadcast_to(np.arange(n)[:, None], near.shape)[near]
+    graph = coo_array((np.ones(len(rows), bool), (rows, neighbour[near])), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    mass = np.bincount(label, weights=gaussians.opacities.detach().double().cpu().numpy())
+    return torch.from_numpy(mass[label]).to(gaussians.means)

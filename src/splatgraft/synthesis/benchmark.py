@@ -1,0 +1,267 @@
+"""Nine benchmark scenes with ground truth (paper, Sec. 6), planned as render jobs and gathered as captures.
+
+Six indoor, three outdoor. `<out>/<scene>/` holds `source/` (the object on a stage in its own light), `target/` (the
+scene without it), `ground_truth/` (the scene with it, from the target's cameras), all captures with transforms.json;
+`placement.json`; `probe.npy` and `suns.json`, the true light at the object's place. The object stands at one place in
+both worlds, turned about the vertical by the pose's angle, so that the placement is known exactly. Knows nothing about
+transfers.
+"""
+
+import json
+import math
+import random
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core import images
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.core.similarity import Similarity
+from splatgraft.formats import read_capture, write_capture
+from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
+from splatgraft.synthesis import furniture, objects, views
+from splatgraft.synthesis.jobs import Job, RenderSize, Take
+from splatgraft.synthesis.outdoors import SUPPLIED_MAPS
+from splatgraft.synthesis.pairs import make_scene
+from splatgraft.synthesis.palette import Palette
+from splatgraft.synthesis.scene import Material, Part, Place, Scene, World
+
+POSES_DEG = (0.0, 120.0, 240.0)
+"""P0, P1, P2: the object's turns in the illumination-consistency scenes (paper, Table 2)."""
+
+
+@dataclass(frozen=True)
+class BenchmarkScene:
+    """One scene of the benchmark, by its seeds."""
+
+    name: str
+    kind: str
+    seed: int
+    """Of the scene; none is used for training pairs."""
+    object_seed: int
+    pose_deg: float = 0.0
+    """The object's turn about the vertical between source and target."""
+
+
+SCENES: tuple[BenchmarkScene, ...] = (
+    BenchmarkScene("living_room_a", "living_room", 9_000_001, 11),
+    BenchmarkScene("kitchen", "kitchen", 9_000_002, 12),
+    BenchmarkScene("office", "office", 9_000_003, 13),
+    BenchmarkScene("bathroom", "bathroom", 9_000_004, 14),
+    BenchmarkScene("bedroom", "bedroom", 9_000_005, 15),
+    BenchmarkScene("living_room_b", "living_room", 9_000_006, 16),
+    BenchmarkScene("terrace", "terrace", 9_000_007, 17),
+    BenchmarkScene("garden", "garden", 9_000_008, 18),
+    BenchmarkScene("square", "square", 9_000_009, 19),
+)
+ROTATIONS: tuple[BenchmarkScene, ...] = tuple(
+    replace(scene, name=f"{scene.name}_p{i}", pose_deg=angle)
+    for scene in (SCENES[0], SCENES[3], SCENES[7])
+    for i, angle in enumerate(POSES_DEG)
+)
+
+
+def twins(which: BenchmarkScene) -> tuple[BenchmarkScene, ...]:
+    """The other scenes of the same place and object: they differ in the turn of the object only, and share views."""
+    return tuple(
+        other
+        for other in (*SCENES, *ROTATIONS)
+        if (other.seed, other.object_seed) == (which.seed, which.object_seed) and other != which
+    )
+
+
+@dataclass(frozen=True)
+class BenchmarkSize:
+    """How large the benchmark is rendered."""
+
+    render: RenderSize
+    views: int
+
+    @staticmethod
+    def named(name: str) -> "BenchmarkSize":
+        """`small`: 352x248, 40 views; `paper`: 704x496, 200 views.
+
+        Raises: ValueError where the name is neither.
+        """
+        if name == "small":
+            return BenchmarkSize(RenderSize.small(), 40)
+        if name == "paper":
+            return BenchmarkSize(RenderSize(), 200)
+        raise ValueError(f"benchmark size: expected small or paper, found '{name}'")
+
+
+def stage(seed: int, place: Place) -> Scene:
+    """A pedestal under an environment map with some things around: where the object was captured."""
+    rng = random.Random(f"stage-{seed}")
+    palette = Palette(rng)
+    x, y, z = place.location
+    top = max(0.5, 3.2 * place.radius)
+    cloth = replace(palette.stone(), roughness=0.7, scale=2.0)
+    pedestal = Part("cylinder", (top, top, 0.4), (x, y, z - 0.2), cloth, bevel=0.02)
+    ground = furniture.box((14, 14, 0.1), (x, y, z - 0.45), Material("tiles", (0.3, 0.29, 0.27), (0.2, 0.2, 0.2), 0.7))
+    parts = [pedestal, ground]
+    for i in range(5):
+        angle = 2 * math.pi * (i + rng.random()) / 5
+        made = (
+            furniture.cabinet(rng, palette, 0.8, rng.uniform(0.4, 0.9)) if i % 2 else furniture.plant(rng, palette, 1.0)
+        )
+        parts += furniture.placed(
+            made, (x + 2.6 * math.cos(angle), y + 2.6 * math.sin(angle), z - 0.4), angle - math.pi / 2
+        )
+    world = World("environment", path=rng.choice(SUPPLIED_MAPS[:6]), rotation=rng.uniform(0, 6.283))
+    return Scene(
+        name=f"stage_{seed}",
+        kind="stage",
+        parts=tuple(parts),
+        lamps=(),
+        world=world,
+        places=(place,),
+        bounds=((x - 3, y - 3, z - 0.2), (x + 3, y + 3, z + 3)),
+        obstacles=(((x - top / 2, y - top / 2, z - 0.45), (x + top / 2, y + top / 2, z + 0.12)),),
+        notes={"world": world.path},
+    )
+
+
+def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
+    """The job in the target scene (target, ground truth, light probe) and the job on the stage (source)."""
+    scene = make_scene(which.kind, which.seed)
+    place = scene.places[0]
+    made = objects.make(which.object_seed, place)
+    height = max(part.location[2] + part.size[2] / 2 for part in made)
+    yaw = random.Random(f"yaw-{which.seed}").uniform(0, 6.283)
+    there = objects.standing_at(made, place.location, yaw)
+    turned = objects.standing_at(made, place.location, yaw + math.radians(which.pose_deg))
+    seen: tuple[str, ...] = ("color", "mask", "depth")
+    provenance = {"scene": which.name, "pose_deg": str(which.pose_deg), "licence": "own render"}
+    target = Job(
+        scene=scene,
+        objects={"object": turned},
+        cameras=views.capture(scene, place, height, size.views, which.seed),
+        takes=(
+            Take("target", scene=True, passes=("color", "depth")),
+            Take("ground_truth", scene=True, object="object", passes=seen),
+            Take("light", scene=True, probe=(place.location[0], place.location[1], place.location[2] + height / 2)),
+        ),
+        size=size.render,
+        provenance=provenance,
+    )
+    own = stage(which.object_seed, place)
+    source = Job(
+        scene=own,
+        objects={"object": there},
+        cameras=views.capture(own, place, height, size.views, which.object_seed),
+        takes=(Take("source", scene=True, object="object", passes=seen),),
+        size=size.render,
+        provenance=provenance,
+    )
+    return target, source
+
+
+def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
+    """The cameras of a rendered job: Blender's poses look along -z with y up, ours along +z with y down."""
+    found = json.loads((out / "cameras.json").read_text())
+    poses = torch.tensor(found["poses"], dtype=torch.float64)
+    poses[:, :3, 1:3] *= -1
+    width, height = found["width"], found["height"]
+    focal = [0.5 * width / math.tan(0.5 * angle) for angle in found["field_of_view"]]
+    intrinsics = torch.stack([torch.tensor([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]) for f in focal])
+    sizes = torch.tensor([[width, height]]).repeat(len(names), 1)
+    return Cameras(world_from_camera=poses.float(), intrinsics=intrinsics.float(), sizes=sizes, names=names)
+
+
+def sparse_points(
+    folder: Path, cameras: Cameras, *, count: int = 20_000, noise: float = 0.002, seed: int = 0
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    """Noisy surface points as structure from motion would give: seeded pixels lifted by their depth.
+
+    `noise` is the standard deviation as a share of the depth. Points of the sky are left out.
+    """
+    generator = np.random.default_rng(seed)
+    points, colors = [], []
+    for i in range(len(cameras)):
+        depth = np.load(folder / f"{i:04d}_depth.npy", allow_pickle=False).astype(np.float32)
+        rows, columns = np.nonzero(depth > 0)
+        if not len(rows):
+            continue
+        pick = generator.choice(len(rows), min(count // len(cameras), len(rows)), replace=False)
+        u, v = columns[pick], rows[pick]
+        z = depth[v, u] * (1 + noise * generator.standard_normal(len(pick)).astype(np.float32))
+        k = cameras.intrinsics[i].numpy()
+        in_camera = np.stack([(u + 0.5 - k[0, 2]) / k[0, 0] * z, (v + 0.5 - k[1, 2]) / k[1, 1] * z, z], -1)
+        pose = cameras.world_from_camera[i].numpy()
+        points.append(in_camera @ pose[:3, :3].T + pose[:3, 3])
+        colors.append(images.read_rgb(folder / f"{i:04d}.png").numpy()[v, u])
+    return torch.from_numpy(np.concatenate(points)).float(), torch.from_numpy(np.concatenate(colors)).float()
+
+
+def _gather(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
+    """Lay one take out as a capture: images/, a folder a pass, transforms.json, points.ply."""
+    count = len(json.loads((rendered / "cameras.json").read_text())["poses"])
+    stems = tuple(f"{i:04d}" for i in range(count))
+    for folder, suffix, ending in _PASS_FILES:
+        if folder in passes:
+            (out / folder).mkdir(parents=True, exist_ok=True)
+            for stem in stems:
+                shutil.copyfile(rendered / take / f"{stem}{suffix}", out / folder / f"{stem}{ending}")
+    cameras = rendered_cameras(rendered, tuple(f"{stem}.png" for stem in stems))
+    found, colors = sparse_points(rendered / take, cameras) if points else (torch.zeros(0, 3), torch.zeros(0, 3))
+    image_paths = tuple(out / "images" / f"{stem}.png" for stem in stems)
+    mask_paths = tuple(out / "masks" / f"{stem}.png" for stem in stems) if "masks" in passes else ()
+    write_capture(out, PosedImages(image_paths, cameras, found, colors, mask_paths))
+
+
+_PASS_FILES = (("images", ".png", ".png"), ("masks", "_mask.png", ".png"), ("depth", "_depth.npy", ".npy"))
+
+
+def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out: Path) -> None:
+    """Lay out one rendered scene as captures with its placement and what is known of its light."""
+    _gather(source_render, "source", out / "source", passes=("images", "masks"), points=True)
+    _gather(target_render, "target", out / "target", passes=("images",), points=True)
+    _gather(target_render, "ground_truth", out / "ground_truth", passes=("images", "masks", "depth"), points=False)
+    scene = make_scene(which.kind, which.seed)
+    angle = math.radians(which.pose_deg)
+    c, s = math.cos(angle), math.sin(angle)
+    rotation = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    center = torch.tensor(scene.places[0].location)
+    moved = Similarity(scale=1.0, rotation=rotation, translation=center - rotation @ center)
+    write_placement(out / "placement.json", Placement((ObjectPlacement(moved),)))
+    shutil.copyfile(target_render / "light" / "0000.npy", out / "probe.npy")
+    shutil.copyfile(target_render / "light" / "suns.json", out / "suns.json")
+    record = {"kind": which.kind, "pose_deg": which.pose_deg, "seed": which.seed, **scene.notes}
+    (out / "scene.json").write_text(json.dumps(record, indent=1) + "\n")
+
+
+def fault(folder: Path) -> str | None:
+    """What is wrong with a gathered scene, in a line, or None: missing, broken, black, burnt out, no object in it."""
+    try:
+        truth, target = read_capture(folder / "ground_truth"), read_capture(folder / "target")
+        source = read_capture(folder / "source")
+        for capture, masked in ((truth, True), (target, False), (source, True)):
+            for index in range(len(capture)):
+                wrong = _view_fault(capture, index, masked=masked)
+                if wrong:
+                    return wrong
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def _view_fault(capture: PosedImages, index: int, *, masked: bool) -> str | None:
+    path, image = capture.image_paths[index], capture.image(index)
+    mean, deviation, burnt = float(image.mean()), float(image.std()), float((image > 0.995).float().mean())
+    if mean < 0.02 or deviation < 0.01 or burnt > 0.6:
+        return (
+            f"{path}: expected a lit picture, found mean {mean:.3f}, deviation {deviation:.3f}, {burnt:.0%} burnt out"
+        )
+    mask = capture.mask(index) if masked else None
+    if masked and mask is None:
+        return f"{path}: expected a mask beside it, found none"
+    if mask is not None and not 0.001 <= float(mask.mean()) <= 0.7:
+        return f"{capture.mask_paths[index]}: expected a mask of 0.1% to 70%, found {float(mask.mean()):.2%}"
+    return None

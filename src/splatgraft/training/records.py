@@ -1,0 +1,93 @@
+"""The log of a training: a line of JSON a step, validation pictures, TensorBoard where asked. Knows no training."""
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.images import write_image
+from splatgraft.runtime.atomic_file import atomic_write
+
+LOG_FILE = "log.jsonl"
+VALIDATION_FOLDER = "validation"
+
+
+class Curve:
+    """Open for writing while a training runs."""
+
+    def __init__(self, folder: Path, tensorboard: bool) -> None:
+        """Append to the folder's log.
+
+        Raises: ValueError where TensorBoard is asked for and missing.
+        """
+        self.smooth = float("nan")
+        """The loss, averaged over some 50 steps."""
+        self._folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / VALIDATION_FOLDER).mkdir(exist_ok=True)
+        self._log = (folder / LOG_FILE).open("a")
+        self._board: Any = None
+        if tensorboard:
+            if find_spec("tensorboard") is None:
+                raise ValueError(
+                    "--tensorboard: expected the package tensorboard (pip install tensorboard), found none"
+                )
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._board = SummaryWriter(str(folder / "tensorboard"))
+
+    def add(self, step: int, loss: float, rate: float) -> None:
+        """One step."""
+        self.smooth = loss if self.smooth != self.smooth else self.smooth + (loss - self.smooth) / 50
+        self._write({"step": step, "loss": loss, "rate": rate})
+        if self._board:
+            self._board.add_scalar("loss", loss, step)
+
+    def add_validation(self, step: int, numbers: dict[str, float], sheet: Float[Tensor, "h w 3"]) -> None:
+        """Figures of a validation and its picture."""
+        self._write({"step": step, "validation": numbers})
+        write_image(self._folder / VALIDATION_FOLDER / f"{step:08d}.png", sheet)
+        if self._board:
+            for name, number in numbers.items():
+                self._board.add_scalar(f"validation/{name}", number, step)
+            self._board.add_image("validation", sheet.clamp(0, 1), step, dataformats="HWC")
+
+    def close(self) -> None:
+        """Flush and close."""
+        self._log.close()
+        if self._board:
+            self._board.close()
+
+    def _write(self, entry: dict[str, Any]) -> None:
+        self._log.write(json.dumps(entry) + "\n")
+        self._log.flush()
+
+
+def read_losses(path: Path) -> list[float]:
+    """The loss of each step, in order.
+
+    Raises: ValueError where the log is missing or broken.
+    """
+    try:
+        entries = [json.loads(line) for line in path.read_text().splitlines()]
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: expected the log of a training, found {error}") from error
+    return [entry["loss"] for entry in entries if "loss" in entry]
+
+
+def cut_log(path: Path, step: int) -> None:
+    """Forget what was logged after `step`: it is done again."""
+    if not path.is_file():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line)
+        except (ValueError, KeyError, TypeError):
+            continue  # a line that a kill cut in two
+    with atomic_write(path) as stream:
+        stream.write("".join(f"{line}\n" for line in kept).encode())

@@ -1,0 +1,112 @@
+"""Training Stable Diffusion 2 to take objects out of pictures, with their shadows (paper, Sec. 4.2 and 4.3).
+
+The latents of picture and mask join the noisy latent in the UNet's first layer; v-prediction. Knows no loop.
+"""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
+from splatgraft.harmonization.flux.sampling import noise
+from splatgraft.harmonization.flux.stable_diffusion import NoiseSchedule, ddim
+from splatgraft.harmonization.flux.weights.folder import local_folder, part, read_config
+from splatgraft.harmonization.flux.weights.library import read_tensors, unet_class
+from splatgraft.harmonization.flux.weights.loading import load_autoencoder
+from splatgraft.harmonization.flux.weights.widening import widened
+from splatgraft.training.objective import Latents
+from splatgraft.training.sources.source import Role
+
+CONDITIONS = 2
+_SAMPLING_STEPS = 20
+
+
+class RemovalObjective:
+    """A UNet that is given a picture with an object and where it is, and makes the picture without."""
+
+    roles: tuple[Role, ...] = ("background", "target", "mask")
+    shown: Role = "background"
+
+    def __init__(self, base: str, say: Any, *, checkpointing: bool = True) -> None:
+        """Load Stable Diffusion 2, or a removal network of ours to go on from.
+
+        Raises: ValueError where a folder is of another kind or broken.
+        """
+        folder = local_folder(base, say)
+        config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
+        self._prompt_path = part(PROMPT_FILE, folder)
+        if not self._prompt_path.is_file():
+            raise ValueError(
+                f"{self._prompt_path}: expected the empty prompt's embeddings, found none; `splatgraft train embed "
+                f"{self._prompt_path} --kind stable-diffusion --base {base}` makes them once"
+            )
+        self.tokens = read_tensors(self._prompt_path)["tokens"]
+        self.autoencoder = load_autoencoder(part("vae", folder))
+        self.autoencoder.network.eval().requires_grad_(False)
+        channels = self.autoencoder.channels
+        if config["in_channels"] not in (channels, channels * (CONDITIONS + 1)):
+            raise ValueError(
+                f"{folder}: expected a UNet of {channels} input channels (Stable Diffusion) or "
+                f"{channels * (CONDITIONS + 1)} (object removal), found {config['in_channels']}"
+            )
+        try:
+            self.network = unet_class().from_pretrained(folder / "unet")
+        except (OSError, ValueError, RuntimeError) as error:
+            found = " ".join(str(error).split())[:200]
+            raise ValueError(f"{folder / 'unet'}: expected weights that fit config.json, found {found}") from error
+        if config["in_channels"] == channels:
+            self.network.conv_in = widened(self.network.conv_in, CONDITIONS + 1)
+            self.network.register_to_config(in_channels=self.network.conv_in.in_channels)
+        if checkpointing:
+            self.network.enable_gradient_checkpointing()
+        self._schedule = NoiseSchedule.stable_diffusion()
+
+    def encode(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
+        """Latents of pictures."""
+        return self.autoencoder.encode(pictures)
+
+    def to(self, device: Any) -> None:
+        """Autoencoder and prompt to a device."""
+        self.autoencoder.network.to(device)
+        self.tokens = self.tokens.to(device)
+
+    def loss(self, network: nn.Module, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
+        """Mean square error of the velocity."""
+        clean = latents["background"]
+        steps, eps = [], []
+        for seed in seeds:
+            generator = torch.Generator().manual_seed(seed)
+            steps.append(torch.randint(1000, (), generator=generator))
+            eps.append(torch.randn(clean.shape[1:], generator=generator))
+        step, drawn = torch.stack(steps).to(clean.device), torch.stack(eps).to(clean.device)
+        told = self._told(network, self._schedule.noisy(clean, drawn, step), latents, step)
+        return ((told.float() - self._schedule.velocity(clean, drawn, step)) ** 2).mean()
+
+    def predict(self, network: nn.Module, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
+        """Pictures without the object."""
+        given = latents["target"]
+        start = noise(tuple(given.shape[1:]), seed).to(given.device).expand(given.shape[0], -1, -1, -1)  # pyright: ignore
+
+        def at(z: Tensor, step: int) -> Tensor:
+            return self._told(network, z, latents, torch.full((z.shape[0],), step, device=z.device))
+
+        made = ddim(at, start, self._schedule, steps=_SAMPLING_STEPS, predicts="velocity")
+        return self.autoencoder.decode(made)
+
+    def save(self, state: dict[str, Tensor], folder: Path) -> None:
+        """Write unet/, vae/ and the prompt."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.network.save_pretrained(folder / "unet", state_dict=state)
+        self.autoencoder.network.save_pretrained(folder / "vae")
+        shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
+
+    def _told(
+        self, network: nn.Module, noisy: Float[Tensor, "b c h w"], latents: Latents, step: Tensor
+    ) -> Float[Tensor, "b c h w"]:
+        joined = torch.cat([noisy, latents["target"], latents["mask"]], 1)
+        return network(joined, step, self.tokens.expand(joined.shape[0], -1, -1), return_dict=False)[0]

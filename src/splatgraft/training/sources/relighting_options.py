@@ -1,0 +1,46 @@
+"""How `synth generated` and `synth orida` relight: by whom and under which environment maps. Relights nothing."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from splatgraft.training.sources.generate import Lighting
+from splatgraft.training.sources.relighters import DiffusionRenderer, Relighter, StandIn
+
+
+@dataclass(frozen=True)
+class Relighting:
+    """By whom pictures are relit."""
+
+    lights: Path = Path("lights")
+    """Folder with .hdr environment maps."""
+    each: int = 4
+    """Lights per picture."""
+    relighter: Literal["diffusion-renderer", "stand-in"] = "diffusion-renderer"
+    """The paper's, in your own installation; or ours, simple and without a model, which the manifest says."""
+    renderer: Path | None = None
+    """Folder of DiffusionRenderer's code."""
+    renderer_variant: Literal["svd", "cosmos"] = "svd"
+    """Which of the two."""
+    renderer_python: Path | None = None
+    """The Python that runs it; this one where not given."""
+
+    def open(self, seed: int) -> Lighting:
+        """The relighter, found complete.
+
+        Raises: ValueError where it or the maps are missing.
+        """
+        maps = sorted(self.lights.glob("*.hdr")) if self.lights.is_dir() else []
+        if not maps:
+            raise ValueError(f"{self.lights}: expected a folder with .hdr environment maps (--lights), found none")
+        return Lighting(self._relighter(), maps, self.each, seed)
+
+    def _relighter(self) -> Relighter:
+        if self.relighter == "stand-in":
+            return StandIn()
+        if self.renderer is None:
+            raise ValueError(
+                "--renderer: expected the folder of DiffusionRenderer's code, found none; or --relighter stand-in"
+            )
+        return DiffusionRenderer(self.renderer, self.renderer_python or Path(sys.executable), self.renderer_variant)

@@ -1,0 +1,108 @@
+"""Pairs made of pictures that were relit: generated ones and photographs (paper, Sec. 4.2). Knows no network.
+
+manifest.jsonl                 a line a sample: folder, group, relit (how many), and where all came from
+NAME/target.png  background.png  mask.png  relit_0.png ..  record.json
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.images import read_mask, read_rgb, write_image
+from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.atomic_folder import atomic_folder
+from splatgraft.synthesis.pairs import composite, normalized
+from splatgraft.training.sources.rendered import stamp
+from splatgraft.training.sources.source import Role, TrainingPair
+
+MANIFEST_FILE = "manifest.jsonl"
+RECORD_FILE = "record.json"
+
+
+@dataclass(frozen=True)
+class RelitSample:
+    """One target and what was made for it, before it is written."""
+
+    target: Float[Tensor, "h w 3"]
+    background: Float[Tensor, "h w 3"]
+    mask: Float[Tensor, "h w"]
+    relit: Sequence[Float[Tensor, "h w 3"]]
+    """The whole picture under other light, a picture a light."""
+
+
+def write_sample(folder: Path, sample: RelitSample, record: Mapping[str, Any]) -> None:
+    """Write one sample, whole or not at all; `record` says group, licence and how each picture was made."""
+    with atomic_folder(folder) as new:
+        write_image(new / "target.png", sample.target)
+        write_image(new / "background.png", sample.background)
+        write_image(new / "mask.png", sample.mask)
+        for i, picture in enumerate(sample.relit):
+            write_image(new / f"relit_{i}.png", picture)
+        (new / RECORD_FILE).write_text(json.dumps({**record, "relit": len(sample.relit)}, indent=1) + "\n")
+
+
+def write_manifest(out: Path) -> int:
+    """One line for each whole sample; returns their number."""
+    lines = []
+    for path in sorted(out.glob(f"*/{RECORD_FILE}")):
+        lines.append(json.dumps({"folder": path.parent.name, **json.loads(path.read_text())}))
+    with atomic_write(out / MANIFEST_FILE) as stream:
+        stream.write("".join(f"{line}\n" for line in lines).encode())
+    return len(lines)
+
+
+class RelitPairs:
+    """The samples of one folder, a pair a light."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read the manifest.
+
+        Raises: ValueError where it is missing or broken.
+        """
+        self.name = str(folder)
+        self._pairs: list[tuple[Path, str, int]] = []
+        path = folder / MANIFEST_FILE
+        if not path.is_file():
+            raise ValueError(
+                f"{path}: expected the manifest of generated pairs, found none (splatgraft synth generated)"
+            )
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            try:
+                entry = json.loads(line)
+                for light in range(int(entry["relit"])):
+                    self._pairs.append((folder / entry["folder"], str(entry["group"]), light))
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(
+                    f"{path}, line {number}: expected folder, group and relit, found {line[:80]}"
+                ) from error
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def group(self, index: int) -> str:
+        """The scene, or the prompt's object."""
+        return self._pairs[index][1]
+
+    def key(self, index: int, role: Role) -> str:
+        """Path, size and time of the file for the role."""
+        folder, _, light = self._pairs[index]
+        return stamp(folder / (f"relit_{light}.png" if role == "composite" else f"{role}.png")) + f"|{role}"
+
+    def read(self, index: int) -> TrainingPair:
+        """A pair, its composite made here: the relit object brought to the exposure of the one in the scene.
+
+        Raises: ValueError where a file is missing or broken.
+        """
+        folder, _, light = self._pairs[index]
+        target, background = read_rgb(folder / "target.png"), read_rgb(folder / "background.png")
+        mask, relit = read_mask(folder / "mask.png"), read_rgb(folder / f"relit_{light}.png")
+        for name, picture in (("background", background), ("mask", mask), (f"relit_{light}", relit)):
+            if picture.shape[:2] != target.shape[:2]:
+                wanted, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
+                raise ValueError(f"{folder / name}.png: expected {wanted} pixels as target.png, found {found}")
+        return TrainingPair(composite(normalized(relit, target, mask), background, mask), target, background, mask)

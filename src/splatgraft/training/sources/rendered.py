@@ -1,0 +1,57 @@
+"""Pairs that Blender rendered (`splatgraft synth pairs`; paper, Sec. 4.2). Knows no network."""
+
+from pathlib import Path
+
+from splatgraft.synthesis.pairs import PairSample, load_pair, read_manifest
+from splatgraft.training.sources.source import Role, TrainingPair
+
+
+class RenderedPairs:
+    """The sound pairs of one folder, composites made while reading."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read the manifest.
+
+        Raises: ValueError where it is missing or broken.
+        """
+        self.name = str(folder)
+        self._samples = read_manifest(folder)
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def group(self, index: int) -> str:
+        """The scene."""
+        return self._samples[index].folder.name
+
+    def key(self, index: int, role: Role) -> str:
+        """Path, size and time of the file that is rendered for the role."""
+        return stamp(_file(self._samples[index], role)) + f"|{role}"
+
+    def read(self, index: int) -> TrainingPair:
+        """A pair.
+
+        Raises: ValueError where a file is missing or broken.
+        """
+        pair = load_pair(self._samples[index])
+        return TrainingPair(pair.composite, pair.target, pair.background, pair.mask)
+
+
+def stamp(path: Path) -> str:
+    """What changes when a file does.
+
+    Raises: ValueError where it is missing.
+    """
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise ValueError(f"{path}: expected a picture of a pair, found {error.strerror}") from error
+    return f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}"
+
+
+def _file(sample: PairSample, role: Role) -> Path:
+    if role == "composite":
+        return sample.path(f"{sample.object}_{sample.light}")
+    if role == "background":
+        return sample.path("background")
+    return sample.path(sample.object, "mask" if role == "mask" else "")

@@ -1,0 +1,105 @@
+"""The child process in which the editor does long work: the command `run`, telling a state file how far it is.
+
+Started as `python -m splatgraft.workflow.background_job FOLDER TITLE project.toml STEP [OUT]`; not a command.
+"""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from splatgraft.editor.jobs.jobs import JobState, PlannedStep, hold, write_state
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.progress import Progress
+
+_WRITE_EVERY = 0.2
+"""Seconds."""
+
+
+class JobConsole(Console):
+    """A terminal whose bars are also written into the state of a job."""
+
+    def __init__(self, folder: Path, state: JobState) -> None:
+        """Begin with `state`."""
+        super().__init__()
+        self._folder, self.state = folder, state
+        self._written = 0.0
+
+    @contextmanager
+    def bar(self, name: str) -> Generator[Progress]:
+        """The bar of `Terminal`, told to the state file as well."""
+        now = time.time()
+        self.write(replace(self.state, step=name, done=0, total=0, message="", step_started=now))
+        last: tuple[int, int] | None = None
+        with super().bar(name) as progress:
+
+            def move(done: int, total: int, message: str) -> None:
+                nonlocal last
+                progress(done, total, message)
+                if last is None or done < last[0] or total != last[1]:
+                    # another thing is counted; one that was killed goes on where it was: that part took no time now
+                    since = now if last is None else time.time()
+                    self.state = replace(self.state, begun=done if done > 1 else 0, begun_at=since)
+                last = (done, total)
+                self.state = replace(self.state, done=done, total=total, message=f"{done}/{total} {message}")
+                if time.time() - self._written > _WRITE_EVERY:
+                    self.write(self.state)
+
+            yield move
+        self.state = replace(self.state, took=(*self.state.took, (name, time.time() - now)))
+
+    def write(self, state: JobState) -> None:
+        """Replace the state file."""
+        self.state, self._written = state, time.time()
+        write_state(self._folder, state)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Do the run; its outcome is in the state file and in the exit status."""
+    from splatgraft.workflow.run_steps import run_steps
+
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # a shell starts what it puts in the background deaf to the first of them
+    for asked in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(asked, signal.default_int_handler)
+    folder, title, project, to = Path(arguments[0]), arguments[1], Path(arguments[2]), arguments[3]
+    out = Path(arguments[4]) if len(arguments) > 4 else None
+    shown = ("run", str(project), "--to", to)
+    lock = hold(folder)
+    console = JobConsole(folder, JobState(title, shown, os.getpid(), "running", time.time()))
+    try:
+        console.write(console.state)
+        console.write(replace(console.state, plan=_plan(project, out, to)))
+        run_steps(project, console, out=out, to=to)
+        console.write(replace(console.state, outcome="done"))
+        return 0
+    except KeyboardInterrupt:
+        console.write(replace(console.state, outcome="cancelled"))
+        return 130
+    except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
+        console.write(replace(console.state, outcome="failed", error=" ".join(str(error).split())))
+        return 2
+    finally:
+        lock.release()
+
+
+def _plan(project: Path, out: Path | None, to: str) -> tuple[PlannedStep, ...]:
+    """What the run will do; nothing where that cannot be told yet."""
+    from splatgraft.workflow.flow import read_flow
+    from splatgraft.workflow.staleness import reasons
+    from splatgraft.workflow.time_estimate import estimate_step_times
+
+    try:
+        flow = read_flow(project, out)
+        why = reasons(flow)
+        return estimate_step_times(flow, [name for name in flow.up_to(to) if why[name] is not None])
+    except ValueError:
+        return ()  # the run itself says it, and better
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

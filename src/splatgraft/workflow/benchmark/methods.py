@@ -1,0 +1,248 @@
+"""What can be measured: a light prior, a harmoniser, a way to consolidate, or pictures of another program."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from splatgraft.commands.steps.consolidate import Consolidate
+from splatgraft.commands.steps.harmonize import Harmonize
+from splatgraft.commands.steps.relight import Relight
+from splatgraft.commands.steps.render import Render, view_of
+from splatgraft.consolidation import (
+    ConsolidateOptions,
+    geometric_schedule,
+    iterative_update,
+    linear_schedule,
+)
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.splitting import split_wide_around
+from splatgraft.fitting import l1_dssim
+from splatgraft.fitting.perceptual_losses import lpips_vgg, windowed_fourier
+from splatgraft.folders.composite_folder import placement_files, read_composite
+from splatgraft.folders.selection_file import read_selection
+from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
+from splatgraft.harmonization import HARMONIZERS, HarmonizerOptions, make_harmonizer
+from splatgraft.project.results import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
+from splatgraft.project.step import Context, Device, Inputs, choose_device
+from splatgraft.relighting import SourceScene, relight
+from splatgraft.relighting.light.light import light_to_json
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.lazy_sequence import LazySequence
+from splatgraft.workflow.benchmark.scene import ReadyScene, fresh
+from splatgraft.workflow.benchmark.true_light_file import read_true_light
+
+Prior = Literal["off", "gain", "transfer", "true-light"]
+Loss = Literal["fourier", "l1-dssim", "lpips"]
+Schedule = Literal["once", "linear", "geometric"]
+_NAMES = {"copy-paste": "off", "reinhard": "off+reinhard", "flux": "off+flux"}
+_GRAMMAR = "PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], NAME=FOLDER, or " + ", ".join(_NAMES)
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to move light, as the command line names it."""
+
+    name: str
+    prior: Prior = "off"
+    """The light transfer in 3D: none, exposure alone, the physical one, or the same with the true light given."""
+    harmonizer: str | None = None
+    """The image model; where there is none, the prior is the result."""
+    loss: Loss = "fourier"
+    """Of the consolidation."""
+    schedule: Schedule = "once"
+    """Whether views are harmonised again from the consolidated scene (paper, Iterative Dataset Update)."""
+    pictures: Path | None = None
+    """Folder of another program's results: SCENE/VIEW.png, named as the views of the ground truth."""
+
+    @staticmethod
+    def named(text: str) -> "Method":
+        """The method that a text such as `transfer+compact/l1-dssim@linear` or `lbm=results/lbm` means.
+
+        Raises: ValueError where it means none.
+        """
+        if "=" in text:
+            name, folder = text.split("=", 1)
+            if not name or not Path(folder).is_dir():
+                raise ValueError(f"--methods: expected NAME=FOLDER with an existing folder, found {text}")
+            return Method(name=name, pictures=Path(folder))
+        rest, _, schedule = _NAMES.get(text, text).partition("@")
+        rest, _, loss = rest.partition("/")
+        prior, _, harmonizer = rest.partition("+")
+        loss, schedule = loss or "fourier", schedule or "once"
+        if prior not in get_args(Prior) or loss not in get_args(Loss) or schedule not in get_args(Schedule):
+            raise ValueError(
+                f"--methods: expected {_GRAMMAR} with PRIOR of {', '.join(get_args(Prior))}, LOSS of "
+                f"{', '.join(get_args(Loss))}, SCHEDULE of {', '.join(get_args(Schedule))}; found {text}"
+            )
+        if not harmonizer and (loss, schedule) != ("fourier", "once"):
+            raise ValueError(f"--methods: expected a harmonizer where a loss or a schedule is named, found {text}")
+        return Method(text, prior, harmonizer or None, loss, schedule)  # pyright: ignore[reportArgumentType]
+
+    @property
+    def folder_name(self) -> str:
+        """The name without what a folder's name cannot hold."""
+        return self.name.replace("/", "-")
+
+
+@dataclass(frozen=True)
+class RelightWithTrueLight:
+    """The physical transfer with the true light given instead of an estimate: what a perfect estimate would reach."""
+
+    target: Path
+    """The place, a .ply."""
+    placement: Path
+    """Of the composite."""
+    cameras: Path
+    """The target's."""
+    surroundings: Path
+    """The source without the object."""
+    object_cameras: Path
+    """The source's."""
+    light: Path
+    """light.json."""
+    out: Path
+    """Folder for scene.ply."""
+
+    def inputs(self) -> Inputs:
+        """Everything that is read."""
+        scenes = (self.target, self.surroundings)
+        cameras = (self.cameras, self.object_cameras)
+        return {"scenes": scenes, "placement": placement_files(self.placement), "rest": (*cameras, self.light)}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the relit composite."""
+        source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
+        composite = read_composite(self.target, self.placement)
+        relit = relight(
+            composite,
+            read_cameras(self.cameras),
+            sources=[source],
+            light=read_true_light(self.light),
+        )
+        placed = [one.in_target() for one in composite.objects]
+        write_gaussians(folder / SCENE_FILE, split_wide_around(relit.bake(), relit.is_object, placed)[0])
+        if relit.light is not None:
+            (folder / LIGHT_FILE).write_text(light_to_json(relit.light))
+        for sentence in relit.report:
+            context.console.say(sentence)
+
+
+@dataclass(frozen=True)
+class UpdateIteratively:
+    """Harmonise and consolidate five times, each time from renders of the scene so far.
+
+    The strengths of the schedule are the shares of noise that a diffusion model would start from; a harmoniser without
+    noise sees the renders of the scene so far as its prior, whatever the strength.
+    """
+
+    composite: Path
+    """Folder of the copy-paste result."""
+    prior: Path
+    """The scene to start from, a .ply."""
+    cameras: Path
+    """That methods may see."""
+    out: Path
+    """Folder for scene.ply."""
+    harmonizer: str = "reinhard"
+    loss: Loss = "fourier"
+    schedule: Schedule = "linear"
+    weights: Path | None = None
+    """Folder of LPIPS's weights."""
+    model: str | None = None
+    """The harmoniser's own weights: folder, file or hub id."""
+    device: Device = "auto"
+
+    def inputs(self) -> Inputs:
+        """Scenes and cameras."""
+        return {"scenes": (self.composite / SCENE_FILE, self.prior), "cameras": (self.cameras,)}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the updated scene."""
+        device = choose_device(self.device, context.console)
+        composite, prior = (read_gaussians(path).to(device) for path in (self.composite / SCENE_FILE, self.prior))
+        is_object = read_selection(self.composite / "is_object.npy", composite.count, self.composite / SCENE_FILE).to(
+            device
+        )
+        cameras = read_cameras(self.cameras).to(device)
+        options = HarmonizerOptions(weights=self.model, device=device, say=context.console.say)
+        harmonizer = make_harmonizer(self.harmonizer, options)
+
+        def harmonize_at(scene: Gaussians, strength: float) -> LazySequence:
+            views = [view_of(composite, is_object, prior=scene, camera=camera) for camera in cameras]
+            images = [harmonizer.harmonize(view).image.to(device) for view in views]
+            return LazySequence(len(images), lambda index: images[index])
+
+        loss = {"fourier": windowed_fourier, "l1-dssim": l1_dssim}.get(self.loss)
+        strengths = linear_schedule() if self.schedule == "linear" else geometric_schedule()
+        consolidation = ConsolidateOptions(loss=loss or lpips_vgg(self.weights))
+        scene = iterative_update(prior, cameras, harmonize_at, strengths, consolidation, progress=context.progress)
+        write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
+
+
+def result_of(
+    method: Method,
+    ready: ReadyScene,
+    *,
+    weights: Path | None,
+    model: str | None,
+    device: Device,
+    console: Console,
+) -> tuple[Path, dict[str, float]]:
+    """The method's scene and the seconds that its own steps took; what is fresh is kept, what methods share as well.
+
+    Raises: ValueError where the method cannot run here, with the reason.
+    """
+    seconds: dict[str, float] = {}
+    prior = ready.composite / SCENE_FILE
+    if method.prior != "off":
+        prior, seconds["relight"] = _prior_of(method.prior, ready, console)
+    if method.harmonizer is None:
+        return prior, seconds
+    if method.harmonizer not in HARMONIZERS:
+        expected = ", ".join(sorted(HARMONIZERS))
+        raise ValueError(f"harmonizer: expected one of {expected}, found {method.harmonizer!r}")
+    out = ready.work / "methods" / method.folder_name
+    if method.schedule != "once":
+        step = UpdateIteratively(ready.composite, prior, ready.cameras, out / "result", device=device)
+        chosen = {"harmonizer": method.harmonizer, "loss": method.loss, "schedule": method.schedule}
+        update = type(step)(**{**vars(step), **chosen, "weights": weights, "model": model})
+        seconds["update"] = fresh(update, console)
+        return out / "result" / SCENE_FILE, seconds
+    views = ready.work / "views" / method.prior
+    composite = ready.composite / SCENE_FILE
+    draw = Render(composite, ready.cameras, views, is_object=ready.is_object, prior=prior, device=device)
+    seconds["render"] = fresh(draw, console)
+    harmonized = ready.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
+    seconds["harmonize"] = fresh(Harmonize(views, harmonized, method.harmonizer, weights=model, device=device), console)
+    fit = Consolidate(prior, views, harmonized, out / "result", loss=method.loss, lpips_weights=weights, device=device)
+    seconds["consolidate"] = fresh(fit, console)
+    return out / "result" / SCENE_FILE, seconds
+
+
+def _prior_of(prior: Prior, ready: ReadyScene, console: Console) -> tuple[Path, float]:
+    out = ready.work / "priors" / prior
+    placement = ready.composite / PLACEMENT_FILE
+    if prior == "true-light":
+        if ready.given.light is None:
+            raise ValueError(f"{ready.given.name}: expected a true light, found none")
+        truly = RelightWithTrueLight(
+            ready.target,
+            placement,
+            ready.cameras,
+            light=ready.given.light,
+            out=out,
+            surroundings=ready.surroundings,
+            object_cameras=ready.source_cameras,
+        )
+        return out / SCENE_FILE, fresh(truly, console)
+    kind = "gain" if prior == "gain" else "transfer"
+    step = Relight(
+        ready.target,
+        placement,
+        ready.cameras,
+        out,
+        light=kind,
+        surroundings=ready.surroundings,
+        object_cameras=ready.source_cameras,
+    )
+    return out / SCENE_FILE, fresh(step, console)

@@ -1,0 +1,130 @@
+"""The steps of one project, and which reads which other's folder. Does no work itself and reads no TOML."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splatgraft.commands.steps.adopt import Adopt
+from splatgraft.commands.steps.capture import Capture
+from splatgraft.commands.steps.compose import Compose
+from splatgraft.commands.steps.consolidate import Consolidate
+from splatgraft.commands.steps.evaluate import Evaluate
+from splatgraft.commands.steps.harmonize import Harmonize
+from splatgraft.commands.steps.reconstruct import Reconstruct
+from splatgraft.commands.steps.relight import Relight
+from splatgraft.commands.steps.render import Render
+from splatgraft.commands.steps.segment import Segment
+from splatgraft.project.project_file import ProjectFile, read_project_file
+from splatgraft.project.results import (
+    CAMERAS_FILE,
+    IS_OBJECT_FILE,
+    LIGHT_TEXT_FILE,
+    OBJECT_FILE,
+    PLACEMENT_FILE,
+    PROJECT_FILE,
+    REPORT_FILE,
+    SCENE_FILE,
+    SURROUNDINGS_FILE,
+    Layout,
+    Side,
+)
+from splatgraft.project.step import Step, path_fields
+
+STEPS = (Capture, Reconstruct, Segment, Compose, Relight, Render, Harmonize, Consolidate, Evaluate)
+
+
+@dataclass(frozen=True)
+class Flow:
+    """All steps of a project, each after those it reads from."""
+
+    layout: Layout
+    """Where their results are."""
+    steps: Mapping[str, Step]
+    """By name: the command, with source/ or target/ before it where both captures need it."""
+
+    def __iter__(self) -> Iterator[tuple[str, Step]]:
+        return iter(self.steps.items())
+
+    def before(self, name: str) -> list[str]:
+        """The steps whose results `name` reads."""
+        paths = path_fields(self.steps[name])
+        return [other for other, step in self if any(path.is_relative_to(step.out) for path in paths)]
+
+    def named(self, name: str) -> set[str]:
+        """The steps that `name` means: reconstruct is both source/reconstruct and target/reconstruct.
+
+        Raises: ValueError where there is none.
+        """
+        found = {step for step in self.steps if name in (step, step.split("/")[-1])}
+        if not found:
+            raise ValueError(f"--to, --force: expected a step among {', '.join(self.steps)}; found {name}")
+        return found
+
+    def up_to(self, name: str | None) -> dict[str, Step]:
+        """What must be fresh for `name` to be, itself last; everything where it is None.
+
+        Raises: ValueError where there is no such step.
+        """
+        wanted = set(self.steps) if name is None else self.named(name)
+        for other in reversed(list(self.steps)):
+            wanted |= set(self.before(other)) if other in wanted else set()
+        return {other: step for other, step in self if other in wanted}
+
+    def results(self) -> list[tuple[str, Path]]:
+        """What a person wants to open in the end, by the step that makes it."""
+        return [
+            ("consolidate", self.layout.result / SCENE_FILE),
+            ("evaluate", self.layout.report / REPORT_FILE),
+        ]
+
+
+def read_flow(project: Path, out: Path | None = None) -> Flow:
+    """The steps of the project file (or of the one in the folder) `project`, with results under `out` or beside it.
+
+    Raises: ValueError where the file is missing, or one of its keys or values is not as expected.
+    """
+    path = project / PROJECT_FILE if project.is_dir() else project
+    file = read_project_file(path, tables=tuple(kind.__name__.lower() for kind in STEPS))
+    layout = Layout(path.parent if out is None else out)
+    sides: tuple[Side, ...] = ("source", "target")
+    steps: dict[str, Step] = {}
+    for side in sides:
+        steps[f"{side}/capture"] = file.step(Capture, out=layout.capture(side), side=side)
+        given = {"capture": layout.capture(side)}
+        # a scene that was trained already stands where a reconstruction would
+        trained = file.scene(side)
+        kind, given = (Reconstruct, given) if trained is None else (Adopt, given | {"scene": trained})
+        steps[f"{side}/reconstruct"] = file.step(kind, given, out=layout.scene(side), side=side)
+    return Flow(layout, steps | _joint_steps(file, layout))
+
+
+def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:
+    source, target = (layout.scene(side) / SCENE_FILE for side in ("source", "target"))
+    source_capture, target_capture = layout.capture("source"), layout.capture("target")
+    cameras, source_cameras = (layout.capture(side) / CAMERAS_FILE for side in ("target", "source"))
+    surroundings = layout.object / SURROUNDINGS_FILE
+    composite, relit = layout.composite / SCENE_FILE, layout.relit / SCENE_FILE
+    placement = file.path.parent / PLACEMENT_FILE
+
+    lift = {"scene": source, "capture": source_capture}
+    place = {"target": target, "object": layout.object / OBJECT_FILE, "surroundings": surroundings}
+    place |= {"cameras": cameras, "object_cameras": source_cameras}
+    place |= {"placement": placement} if placement.is_file() else {}
+    light = {"target": target, "placement": layout.composite / PLACEMENT_FILE, "cameras": cameras}
+    light |= {"surroundings": surroundings, "object_cameras": source_cameras, "taken": layout.object / OBJECT_FILE}
+    draw = {"scene": composite, "cameras": cameras, "prior": relit, "is_object": layout.composite / IS_OBJECT_FILE}
+    fit = {"scene": relit, "views": layout.views, "images": layout.harmonized}
+    judge = {"result": layout.result / SCENE_FILE, "composite": layout.composite, "cameras": cameras}
+    judge |= {"target_capture": target_capture, "views": layout.views, "light": layout.relit / LIGHT_TEXT_FILE}
+    judge |= {"project": layout.root}
+    plan: list[tuple[type[Any], dict[str, Path], Path]] = [
+        (Segment, lift, layout.object),
+        (Compose, place, layout.composite),
+        (Relight, light, layout.relit),
+        (Render, draw, layout.views),
+        (Harmonize, {"views": layout.views}, layout.harmonized),
+        (Consolidate, fit, layout.result),
+        (Evaluate, judge, layout.report),
+    ]
+    return {kind.__name__.lower(): file.step(kind, given, out=out) for kind, given, out in plan}

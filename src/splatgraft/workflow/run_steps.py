@@ -1,0 +1,40 @@
+"""Performs the stale steps of a project in order."""
+
+from pathlib import Path
+
+from splatgraft.project.results import clear_leftovers, locked, why_stale
+from splatgraft.project.step import job_of, perform
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.flow import read_flow
+
+
+def run_steps(
+    project: Path, console: Console, *, out: Path | None = None, to: str | None = None, force: tuple[str, ...] = ()
+) -> None:
+    """Perform what is stale up to the step `to`, and print the paths of the results.
+
+    Args:
+        project: The project file, or its folder.
+        console: Takes the progress and, on standard output, the paths.
+        out: Root of the results; the project's folder where None.
+        to: Last step, e.g. "reconstruct" (both captures) or "source/reconstruct"; all where None.
+        force: Steps that are performed even where they are fresh.
+
+    Raises:
+        ValueError: The project file or an input is bad, or another run works on the project.
+    """
+    flow = read_flow(project, out)
+    wanted = flow.up_to(to)
+    forced = {step for name in force for step in flow.named(name)}
+    with locked(flow.layout.root / "project"):
+        for name, step in wanted.items():
+            reason = "asked for" if name in forced else why_stale(job_of(step))
+            console.say(f"{name:<20} {reason or 'up to date'}")
+            if reason:
+                perform(step, console, name=name)
+            else:
+                clear_leftovers(step.out)
+    console.say("results:")
+    for name, path in flow.results():
+        if name in wanted:
+            console.result(path)

@@ -1,0 +1,14 @@
+"""Which steps of a project are stale, and why."""
+
+from splatgraft.project.results import why_stale
+from splatgraft.project.step import job_of
+from splatgraft.workflow.flow import Flow
+
+
+def reasons(flow: Flow) -> dict[str, str | None]:
+    """Why each step is stale, or None; one that waits for a stale one says for which."""
+    found: dict[str, str | None] = {}
+    for name, step in flow:
+        waits = [other for other in flow.before(name) if found[other] is not None]
+        found[name] = f"waits for {waits[0]}" if waits else why_stale(job_of(step))
+    return found

@@ -1,0 +1,120 @@
+"""`evaluate benchmark` on the shipped scene: what is measured is held out, what cannot run is said, the light helps."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from splatgraft.cli import main
+from splatgraft.commands.evaluate_benchmark import EvaluateBenchmark
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.benchmark.methods import Method
+
+SCENES = Path(__file__).parents[2] / "data" / "benchmark"
+QUICK = ReconstructOptions(quality="draft", device="cpu", iterations=300, budget=8000)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """A command that ran once: three of our methods, the truth as another program's, one that cannot."""
+    out = tmp_path_factory.mktemp("benchmark")
+    (out / "theirs").mkdir()
+    shutil.copytree(SCENES / "terrace" / "ground_truth" / "images", out / "theirs" / "terrace")
+    methods = ("copy-paste", "reinhard", "true-light", f"truth={out / 'theirs'}", "off+nosuch")
+    command = EvaluateBenchmark(SCENES, out / "report", methods=methods, options=QUICK)
+    assert command.execute(Console()) == 1
+    return command
+
+
+def rows(command):
+    found = json.loads((command.out / "benchmark.json").read_text())
+    return {row["method"]: row["values"] for row in found["rows"]}, found
+
+
+def test_the_true_light_takes_most_of_the_shadows_error_and_colours_alone_none(measured):
+    values, _ = rows(measured)
+    assert values["true-light"]["shadow_ratio_rmse"] < 0.6 * values["copy-paste"]["shadow_ratio_rmse"]
+    assert values["reinhard"]["shadow_ratio_rmse"] > 0.9 * values["copy-paste"]["shadow_ratio_rmse"]
+
+
+def test_the_truth_as_another_programs_pictures_has_no_error_left(measured):
+    values, _ = rows(measured)
+    assert values["truth"]["ssim_whole"] == pytest.approx(1)
+    assert values["truth"]["disagreement"] == values["truth"]["disagreement_truth"]
+    # an infinite PSNR has no number
+    assert values["truth"]["psnr_whole"] is None
+
+
+def test_measured_views_were_held_out_of_everything(measured):
+    work = measured.out / "scenes" / "terrace"
+    held = {f"{i:04d}" for i in (0, 8, 16)}
+    seen = {
+        Path(f["file_path"]).stem for f in json.loads((work / "target/capture/transforms.json").read_text())["frames"]
+    }
+    assert len(seen) == 21
+    assert not seen & held
+    harmonized = {path.stem for path in (work / "harmonized").glob("*/images/*.png")}
+    assert harmonized
+    assert not harmonized & held
+    for metrics in work.glob("measured/*/metrics.json"):
+        assert set(json.loads(metrics.read_text())["views"]) == held
+
+
+def test_what_could_not_run_or_be_measured_is_said_and_never_filled(measured):
+    _, found = rows(measured)
+    assert any("off+nosuch on terrace not run: harmonizer: expected one of" in line for line in found["not_run"])
+    for metric, key in (("lpips", "lpips_whole"), ("fid and kid", "fid_whole")):
+        if metric in found["not_measured"]:
+            assert found["means"]["copy-paste"][key] is None
+    text = (measured.out / "benchmark.md").read_text()
+    assert "reconstruct target" in text
+    page = (measured.out / "index.html").read_text()
+    assert "terrace 0008" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert "https://" not in page
+
+
+def test_a_second_run_measures_nothing_again(measured):
+    files = sorted(measured.out.glob("scenes/terrace/*/**/metrics.json"))
+    before = {path: path.stat().st_mtime_ns for path in files}
+    again = replace(measured, methods=measured.methods[:3])
+    assert again.execute(Console()) == 0
+    assert {path: path.stat().st_mtime_ns for path in files} == before
+
+
+@pytest.mark.parametrize(
+    ("text", "prior", "harmonizer", "loss", "schedule"),
+    [
+        ("copy-paste", "off", None, "fourier", "once"),
+        ("transfer+reinhard/l1-dssim@linear", "transfer", "reinhard", "l1-dssim", "linear"),
+        ("off+flux@geometric", "off", "flux", "fourier", "geometric"),
+    ],
+)
+def test_a_method_is_named_in_one_word(text, prior, harmonizer, loss, schedule):
+    found = Method.named(text)
+    assert (found.prior, found.harmonizer, found.loss, found.schedule) == (prior, harmonizer, loss, schedule)
+
+
+@pytest.mark.parametrize("text", ["transfre", "transfer/l1-dssim", "off+reinhard/l2", "lbm=nowhere", "=x"])
+def test_a_method_that_means_nothing_is_refused(text):
+    with pytest.raises(ValueError, match="--methods: expected"):
+        Method.named(text)
+
+
+def test_a_folder_without_scenes_is_one_line(tmp_path, capsys):
+    assert main(["evaluate", "benchmark", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert "expected scenes with ground_truth/, found none" in capsys.readouterr().err
+
+
+def test_pictures_that_lack_a_held_out_view_are_named(tmp_path, measured):
+    theirs = tmp_path / "theirs" / "terrace"
+    theirs.mkdir(parents=True)
+    for name in ("0000.png", "0008.png"):
+        shutil.copy(SCENES / "terrace" / "ground_truth" / "images" / name, theirs)
+    command = replace(measured, methods=(f"half={theirs.parent}",))
+    assert command.execute(Console()) == 1
+    _, found = rows(command)
+    assert any("0016.png: expected the method's picture of a held-out view" in line for line in found["not_run"])

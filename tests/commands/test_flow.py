@@ -1,0 +1,210 @@
+"""The whole job on a tiny scene, through the commands: done once, redone only where stale, whole after every kill."""
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_project import ball, photograph, plane, write_project
+
+from splatgraft.cli import main
+from splatgraft.core.images import read_rgb, write_image
+from splatgraft.formats import read_gaussians
+from splatgraft.project.results import FolderCheckpoint
+from splatgraft.project.step import job_of
+from splatgraft.workflow.flow import read_flow
+
+STEPS = ("segment", "compose", "relight", "render", "harmonize", "consolidate", "evaluate")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project that was run from beginning to end; tests copy it."""
+    path = write_project(tmp_path_factory.mktemp("tiny"))
+    assert main(["run", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def project(finished: Path, tmp_path: Path) -> Path:
+    shutil.copytree(finished.parents[1], tmp_path / "copy")
+    return tmp_path / "copy" / "project" / "project.toml"
+
+
+def stale(project: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+    capsys.readouterr()
+    assert main(["status", str(project)]) == 0
+    lines = capsys.readouterr().out.splitlines()[1:]
+    return {line.split()[0]: line.split("stale: ")[1] for line in lines if "stale: " in line}
+
+
+def contents(folder: Path) -> dict[str, str]:
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "step.json"]
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def test_everything_is_made_and_fresh_wherever_the_project_lies(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert stale(project, capsys) == {}
+    layout = read_flow(project).layout
+    composite, result = read_gaussians(layout.composite / "scene.ply"), read_gaussians(layout.result / "scene.ply")
+    assert torch.equal(composite.means, result.means)
+    assert torch.equal(composite.opacity_logits, result.opacity_logits)
+    for name in ("index.html", "before.png", "after.png", "turntable.gif"):
+        assert (layout.report / name).is_file()
+
+
+def test_the_report_is_the_last_line_of_a_run(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert main(["run", str(project)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(project.parent / "report" / "index.html")
+
+
+def test_without_a_harmoniser_the_result_is_the_relit_composite(finished: Path) -> None:
+    layout = read_flow(finished).layout
+    relit, result = read_gaussians(layout.relit / "scene.ply"), read_gaussians(layout.result / "scene.ply")
+    # images of 8 bits are off by at most half a level, which counts as unchanged: every colour is kept bit for bit
+    assert torch.equal(relit.sh, result.sh)
+
+
+def test_a_changed_input_makes_stale_what_depends_on_it_and_nothing_else(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mask = project.parents[1] / "photos" / "source" / "masks" / "view_0000.png"
+    write_image(mask, 1 - read_rgb(mask)[..., 0])
+    reasons = stale(project, capsys)
+    assert set(reasons) == {"source/capture", "source/reconstruct", *STEPS}
+    assert reasons["source/capture"] == "masks: view_0000.png changed"
+    before = contents(project.parent / "source" / "scene")
+    assert main(["run", str(project), "--to", "source/reconstruct"]) == 0
+    # the capture came out as it was, so nothing had to be trained again; only the masks are new to segment
+    assert any(
+        line.split() == ["source/reconstruct", "up", "to", "date"] for line in capsys.readouterr().err.splitlines()
+    )
+    assert contents(project.parent / "source" / "scene") == before
+    assert set(stale(project, capsys)) == set(STEPS)
+
+
+def test_a_changed_option_reruns_its_step_and_identical_results_go_no_further(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project.write_text(project.read_text().replace("frames = 3", "frames = 2"))
+    assert stale(project, capsys) == {"evaluate": "frames is now 2, was 3"}
+    assert main(["run", str(project), "--force", "harmonize"]) == 0
+    ran = [line.split()[0] for line in capsys.readouterr().err.splitlines() if "━" in line]
+    assert ran == ["harmonize", "evaluate"]
+    assert stale(project, capsys) == {}
+
+
+def test_each_step_also_takes_paths_and_makes_the_same(project: Path, tmp_path: Path) -> None:
+    layout = read_flow(project).layout
+    words = ["render", "--scene", str(layout.result / "scene.ply"), "--cameras", str(layout.capture("target"))]
+    assert main([*words, "--out", str(tmp_path / "pictures")]) == 0
+    assert len(list((tmp_path / "pictures" / "images").iterdir())) == 8
+    scene, capture = str(layout.scene("source") / "scene.ply"), str(layout.capture("source"))
+    words = ["segment", "--scene", scene, "--capture", capture, "--threshold", "0.5", "--solidify", "4"]
+    assert main([*words, "--out", str(tmp_path / "object")]) == 0
+    assert contents(tmp_path / "object") == contents(layout.object)
+    words = ["reconstruct", capture, "--iterations", "60", "--budget", "400", "--sh-degree", "1"]
+    assert main([*words, "--out", str(tmp_path / "scene")]) == 0
+    assert contents(tmp_path / "scene") == contents(layout.scene("source"))
+
+
+def test_a_project_that_cannot_be_says_so_in_one_line(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    original = project.read_text()
+    for change, line in (
+        (("[segment]", "[segments]"), "project.toml: expected tables among source, target, capture"),
+        (("passes = 1", "pases = 1"), "project.toml [consolidate]: expected keys among"),
+        (("passes = 1", 'method = "slow"'), "[consolidate] method: expected 'fast' or 'adam', found 'slow'"),
+        (("budget = 400", "budget = 0"), "expected budget of at least 1, found 0"),
+        (("../photos/source", "../photos/gone"), "gone: expected"),
+    ):
+        project.write_text(original.replace(*change))
+        capsys.readouterr()
+        assert main(["run", str(project)]) == 2
+        printed = capsys.readouterr()
+        assert printed.out == ""
+        assert line in printed.err.splitlines()[-1]
+
+
+def test_views_of_a_ground_truth_that_no_step_saw_are_measured_apart(project: Path) -> None:
+    truth = project.parents[1] / "photos" / "truth"
+    photograph(truth, plane((0.5, 0.45, 0.6)), ball())
+    (truth / "points.ply").unlink()
+    options = f'[render]\neval = true\n[evaluate]\nground_truth = "{truth}"\n'
+    project.write_text(project.read_text().replace("[evaluate]\n", options))
+    assert main(["run", str(project)]) == 0
+    assert len(list((project.parent / "harmonized" / "images").iterdir())) == 7
+    metrics = json.loads((project.parent / "report" / "metrics.json").read_text())
+    assert metrics["views"] == "held out"
+    assert metrics["view_count"] == 1
+    assert [row["held_out"] for row in metrics["per_view"]] == [True] + [False] * 7
+
+
+def test_no_masks_and_no_box_names_the_choices(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.rmtree(project.parents[1] / "photos" / "source" / "masks")
+    assert main(["run", str(project), "--to", "segment"]) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    for choice in ("--masks", "--mask-source grabcut", "--box", "--mask-source birefnet"):
+        assert choice in line
+
+
+def test_killed_inside_any_step_earlier_results_stay_whole_and_run_finishes(project: Path) -> None:
+    """Every step is asked for again and shot down at a random moment of its work, then all is brought up to date."""
+    generator = random.Random(0)
+    wanted = {step.out: contents(step.out) for _, step in read_flow(project)}
+    killed = 0
+    for name, step in read_flow(project):
+        words = [sys.executable, "-m", "splatgraft", "run", str(project), "--to", name, "--force", name]
+        run = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=_environment())
+        at_work = step.out.with_name(f".{step.out.name}.new")
+        while run.poll() is None and not at_work.exists():
+            time.sleep(0.001)
+        time.sleep(generator.choice((0.0, 0.01, 0.1, 0.3)))
+        run.send_signal(signal.SIGKILL)
+        killed += run.wait() == -signal.SIGKILL
+        assert {folder: contents(folder) for folder in wanted} == wanted
+    # a step of 60 small iterations can be through before the shot
+    assert killed >= 6
+    shutil.rmtree(project.parent / "source" / "scene")
+    assert main(["run", str(project), "--force", "consolidate"]) == 0
+    # the same seeds give the same files, however often a run was cut
+    assert {folder: contents(folder) for folder in wanted} == wanted
+    assert not list(project.parent.rglob(".*.checkpoint"))
+
+
+def test_a_killed_training_goes_on_from_its_checkpoint(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flow = read_flow(project)
+    folder, wanted = flow.layout.scene("source"), contents(flow.layout.scene("source"))
+    shutil.rmtree(folder)
+    monkeypatch.setattr("splatgraft.fitting.loop._CHECKPOINT_SECONDS", 0.0)
+    saves = 0
+
+    def save(self: FolderCheckpoint, state: dict) -> None:
+        nonlocal saves
+        original(self, state)
+        saves += 1
+        if saves == 2:
+            raise KeyboardInterrupt
+
+    original = FolderCheckpoint.save
+    monkeypatch.setattr(FolderCheckpoint, "save", save)
+    assert main(["run", str(project), "--to", "source/reconstruct"]) == 130
+    state = FolderCheckpoint(job_of(flow.steps["source/reconstruct"])).load()
+    assert state is not None
+    monkeypatch.undo()
+    assert main(["run", str(project), "--to", "source/reconstruct"]) == 0
+    assert contents(folder) == wanted
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2] / "src")}

@@ -1,0 +1,261 @@
+"""The placement helper on a built room: a table under a ceiling, a box to stand on it, floaters in the air."""
+
+import math
+
+import pytest
+import torch
+
+from splatgraft.composition import (
+    PlaceOptions,
+    RestOptions,
+    compose,
+    hidden_fraction,
+    object_base,
+    place_object,
+    rest_on_surface,
+    support_below,
+)
+from splatgraft.composition.facing_direction import facing_yaw_deg
+from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.capture_orientation import estimate_up, focus_point
+from splatgraft.core.gaussians import Gaussians, concatenate, empty, quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.core.similarity import Similarity
+
+UP = torch.tensor([0.0, 0.0, 1.0])
+TABLE = 0.7
+
+
+def sheet(center, u, v, *, spacing=0.06, noise=0.004, seed=0):
+    """Flat Gaussians on the parallelogram center +- u +- v."""
+    g = torch.Generator().manual_seed(seed)
+    center, u, v = (torch.tensor(x, dtype=torch.float32) for x in (center, u, v))
+    nu, nv = (max(2, math.ceil(2 * float(x.norm()) / spacing)) for x in (u, v))
+    a, b = torch.meshgrid(torch.linspace(-1, 1, nu), torch.linspace(-1, 1, nv), indexing="ij")
+    normal = torch.nn.functional.normalize(torch.linalg.cross(u, v), dim=0)
+    means = center + a.reshape(-1, 1) * u + b.reshape(-1, 1) * v
+    means = means + noise * torch.randn(len(means), 1, generator=g) * normal
+    axes = torch.stack([u / u.norm(), torch.linalg.cross(normal, u / u.norm()), normal], -1)
+    n = len(means)
+    return Gaussians(
+        means=means,
+        log_scales=torch.tensor([spacing * 0.7, spacing * 0.7, 0.003]).log().repeat(n, 1),
+        quaternions=quaternion_from_rotation(axes[None]).repeat(n, 1),
+        opacity_logits=torch.full((n,), 4.0),
+        sh=torch.zeros(n, 1, 3),
+    )
+
+
+def box(center, half, spacing=0.03):
+    x, y, z = center
+    a, b, c = half
+    return concatenate(
+        [
+            sheet((x, y, z + c), (a, 0, 0), (0, b, 0), spacing=spacing, seed=1),
+            sheet((x, y, z - c), (a, 0, 0), (0, b, 0), spacing=spacing, seed=2),
+            sheet((x + a, y, z), (0, b, 0), (0, 0, c), spacing=spacing, seed=3),
+            sheet((x - a, y, z), (0, b, 0), (0, 0, c), spacing=spacing, seed=4),
+            sheet((x, y + b, z), (a, 0, 0), (0, 0, c), spacing=spacing, seed=5),
+            sheet((x, y - b, z), (a, 0, 0), (0, 0, c), spacing=spacing, seed=6),
+        ]
+    )
+
+
+def room(ceiling=True, floaters=40):
+    g = torch.Generator().manual_seed(9)
+    parts = [
+        sheet((0, 0, 0), (2, 0, 0), (0, 2, 0)),
+        sheet((0, 0, TABLE), (0.6, 0, 0), (0, 0.4, 0), spacing=0.03),
+        sheet((2, 0, 1.2), (0, 2, 0), (0, 0, 1.2)),
+    ]
+    if ceiling:
+        parts.append(sheet((0, 0, 2.4), (2, 0, 0), (0, 2, 0)))
+    n = floaters
+    parts.append(
+        Gaussians(
+            means=(torch.rand(n, 3, generator=g) - 0.5) * torch.tensor([2.0, 2, 0.8]) + torch.tensor([0, 0, 1.2]),
+            log_scales=torch.full((n, 3), math.log(0.03)),
+            quaternions=torch.randn(n, 4, generator=g),
+            opacity_logits=torch.full((n,), -1.5),
+            sh=torch.zeros(n, 1, 3),
+        )
+    )
+    return concatenate(parts)
+
+
+def ring_of_cameras(center=(0.0, 0, TABLE), count=16, height=0.7, distance=1.6):
+    angle = torch.arange(count) / count * 2 * math.pi
+    g = torch.Generator().manual_seed(2)
+    eyes = torch.stack([angle.cos() * distance, angle.sin() * distance, torch.rand(count, generator=g) * 0.3], -1)
+    eyes = eyes + torch.tensor(center) + torch.tensor([0, 0, height])
+    return pinhole(look_at(eyes, torch.tensor(center), UP), 150.0, width=160, height=120)
+
+
+def moved(similarity: Similarity, cameras: Cameras, gaussians: Gaussians):
+    return similarity.cameras(cameras), similarity.gaussians(gaussians)
+
+
+TURN = Similarity(
+    scale=3.0,
+    rotation=rotation_from_quaternion(torch.tensor([[0.6, -0.4, 0.5, 0.3]]))[0],
+    translation=torch.tensor([4.0, -1, 2]),
+)
+
+
+@pytest.mark.parametrize("move", [Similarity.identity(), TURN])
+def test_up_and_focus_are_found_in_any_frame(move):
+    cameras = move.cameras(ring_of_cameras())
+    # the prior weighs 0.01 beside a spread of 0.5: 2% of the half degree by which the images' mean up is tilted
+    assert torch.allclose(estimate_up(cameras), move.rotation @ UP, atol=5e-4)
+    assert torch.allclose(focus_point(cameras), move.points(torch.tensor([0.0, 0, TABLE])), atol=1e-3)
+
+
+def test_a_few_rolled_photos_do_not_turn_up():
+    cameras = ring_of_cameras()
+    poses = cameras.world_from_camera.clone()
+    roll = rotation_from_quaternion(torch.tensor([[1.0, 0, 0, 1]]))[0]
+    poses[:3, :3, :3] = poses[:3, :3, :3] @ roll
+    rolled = pinhole(poses, 150.0, width=160, height=120)
+    # 3 of 16 photos are upright by 90 degrees of roll; within 2 degrees
+    assert float(estimate_up(rolled) @ UP) > math.cos(math.radians(2))
+
+
+def test_outward_looking_cameras_are_refused():
+    inward = ring_of_cameras()
+    poses = inward.world_from_camera.clone()
+    poses[:, :3, 0] *= -1
+    poses[:, :3, 2] *= -1
+    with pytest.raises(ValueError, match="name the place"):
+        focus_point(pinhole(poses, 150.0, width=160, height=120))
+
+
+@pytest.mark.parametrize("start", [TABLE + 0.3, TABLE + 1.0, TABLE, TABLE + 0.01])
+def test_support_is_the_table_under_a_ceiling_and_through_floaters(start):
+    found = support_below(room(), torch.tensor([0.1, -0.05, start]), up=UP, radius=0.15)
+    # surface noise is 4 mm, floaters have an opacity of 0.18: a centimetre
+    assert abs(float(found.point[2]) - TABLE) < 0.01
+    assert torch.allclose(found.point[:2], torch.tensor([0.1, -0.05]), atol=1e-5)
+    assert float(found.normal @ UP) > math.cos(math.radians(3))
+    assert found.flat_fraction > 0.8
+    assert found.obstructed_fraction < 0.1
+
+
+def test_support_beside_the_table_is_the_floor():
+    found = support_below(room(), torch.tensor([-1.2, 1.0, 1.0]), up=UP, radius=0.15)
+    assert abs(float(found.point[2])) < 0.01
+
+
+def test_nothing_below_is_said():
+    with pytest.raises(ValueError, match="expected a surface below"):
+        support_below(room(), torch.tensor([0.0, 0, -0.5]), up=UP, radius=0.15)
+
+
+def test_a_wall_is_no_support():
+    wall = sheet((0, 0, 0), (0.4, 0, 0.9), (0, 1, 0), spacing=0.04)
+    with pytest.raises(ValueError, match="expected a level surface"):
+        support_below(wall, torch.tensor([0.0, 0, 0.5]), up=UP, radius=0.2)
+
+
+def test_base_comes_from_the_surface_where_the_source_has_one():
+    table = sheet((0, 0, 0), (1, 0, 0), (0, 1, 0))
+    # a hole where the box stood, and 3 cm of the table's top left on the box by its mask
+    hole = (table.means[:, :2].abs().amax(-1)) > 0.1
+    thing = concatenate([box((0, 0, 0.15), (0.1, 0.1, 0.15)), sheet((0, 0, -0.02), (0.1, 0, 0), (0, 0.1, 0))])
+    own = object_base(thing, up=UP)
+    assert own.stands_on == "extent"
+    found = object_base(thing, up=UP, surroundings=table.select(hole))
+    assert found.stands_on == "surface"
+    assert abs(float(found.point[2])) < 0.01
+    # height 0.3; up to a sheet's spread of 2 cm at the rim
+    assert abs(found.height - 0.3) < 0.03
+    # half diagonal 0.141; the 97th percentile of a square's perimeter lies a little within
+    assert 0.1 < found.radius < 0.17
+
+
+@pytest.mark.parametrize("move", [Similarity.identity(), TURN])
+def test_the_box_rests_upright_with_its_foot_on_the_table_in_any_source_frame(move):
+    thing = box((0, 0, 0.15), (0.1, 0.08, 0.15))
+    cameras, turned = moved(move, ring_of_cameras((0.0, 0, 0.15), height=0.5), thing)
+    base = object_base(turned, up=estimate_up(cameras))
+    where = torch.tensor([0.2, 0.1, TABLE + 0.2])
+    found, _ = rest_on_surface(room(), base, point=where, up=UP, options=RestOptions(scale=1 / move.scale))
+    placed = found.gaussians(turned)
+    low, high = placed.means[:, 2].quantile(0.02), placed.means[:, 2].quantile(0.98)
+    # percentiles include each Gaussian's own extent of about 2 cm on the sides
+    assert abs(float(low) - TABLE) < 0.03
+    assert abs(float(high - low) - 0.3) < 0.02
+    middle = (placed.means[:, :2].amin(0) + placed.means[:, :2].amax(0)) / 2
+    assert torch.allclose(middle, where[:2], atol=0.02)
+
+
+def test_yaw_turns_and_offset_shifts():
+    thing = box((0, 0, 0.15), (0.1, 0.04, 0.15))
+    base = object_base(thing, up=UP)
+    where, flat = torch.tensor([0.0, 0, 1.0]), room(floaters=0)
+    plain, _ = rest_on_surface(flat, base, point=where, up=UP)
+    options = RestOptions(yaw_deg=90.0, offset=(0.1, 0.0, 0.0))
+    turned, _ = rest_on_surface(flat, base, point=where, up=UP, options=options)
+    x = torch.tensor([1.0, 0, 0])
+    # the normal is measured, to a fraction of a degree
+    assert torch.allclose(turned.rotation @ x, plain.rotation @ torch.tensor([0.0, 1, 0]), atol=0.02)
+    foot = turned.points(base.point) - plain.points(base.point)
+    assert torch.allclose(foot, torch.tensor([0.1, 0, 0]), atol=1e-5)
+
+
+def test_an_automatic_place_is_on_the_table_in_sight_and_free():
+    thing = box((0, 0, 0.15), (0.1, 0.1, 0.15))
+    cameras = ring_of_cameras()
+    placed = place_object(room(), thing, cameras=(cameras, ring_of_cameras((0.0, 0, 0.15), height=0.5)))
+    assert abs(float(placed.support.point[2]) - TABLE) < 0.015
+    assert placed.support.point[:2].abs().max() < 0.5
+    assert placed.hidden_fraction < 1 / 6  # the share of the underside
+    assert placed.warnings == ()
+    # three tenths of 120 px: at 1.6-1.8 m and a focal length of 150 px that is 0.4 m, for 0.3 m of height
+    assert 0.8 < placed.target_from_object.scale < 1.8
+
+
+def test_a_second_object_finds_another_place():
+    thing = box((0, 0, 0.15), (0.1, 0.1, 0.15))
+    cameras = (ring_of_cameras(), ring_of_cameras((0.0, 0, 0.15), height=0.5))
+    options = PlaceOptions(scale=1.0)
+    first = place_object(room(), thing, cameras=cameras, options=options)
+    both, _ = compose(room(), [thing], target_from_objects=[first.target_from_object]).bake()
+    second = place_object(both, thing, cameras=cameras, options=options)
+    assert abs(float(second.support.point[2]) - TABLE) < 0.02
+    apart = (first.support.point - second.support.point).norm()
+    assert apart > 0.18  # two boxes 0.2 wide
+
+
+def test_an_object_in_the_wall_is_reported():
+    thing, cameras = box((0, 0, 0), (0.1, 0.1, 0.1)), ring_of_cameras()
+    inside_floor = Similarity(scale=1.0, rotation=torch.eye(3), translation=torch.tensor([0.0, -0.7, -0.3]))
+    on_table = Similarity(scale=1.0, rotation=torch.eye(3), translation=torch.tensor([0.0, 0, TABLE + 0.1]))
+    assert hidden_fraction(room(), inside_floor.gaussians(thing), cameras=cameras) > 0.9
+    # the box's own underside is a sixth of its surface
+    assert hidden_fraction(room(), on_table.gaussians(thing), cameras=cameras) < 1 / 6
+    assert hidden_fraction(room(), empty(), cameras=cameras) == 0
+    placed = place_object(
+        room(),
+        thing,
+        cameras=(cameras, cameras),
+        options=PlaceOptions(point=(0.0, 0.0, TABLE + 0.3), offset=(0.0, -0.9, -1.2), scale=1.0),
+    )
+    assert any("hidden from every camera" in warning for warning in placed.warnings)
+
+
+def test_an_empty_object_has_no_base():
+    with pytest.raises(ValueError, match="found an empty one"):
+        object_base(empty(), up=UP)
+
+
+def directions(*degrees):
+    angle = torch.deg2rad(torch.tensor(degrees))
+    return torch.stack([angle.cos(), angle.sin(), torch.full_like(angle, 0.5)], -1)
+
+
+def test_the_photographed_side_is_turned_to_the_cameras():
+    arc, other = directions(0.0, 20.0, 40.0), directions(100.0, 120.0, 140.0)
+    assert facing_yaw_deg(arc, other, up=UP) == pytest.approx(100, abs=10)  # flat optimum, 5 degree steps
+    assert facing_yaw_deg(arc, other, up=-UP) == pytest.approx(-100, abs=10)
+    assert facing_yaw_deg(arc, arc, up=UP) == 0
+    ring = directions(*[15.0 * i for i in range(24)])
+    assert facing_yaw_deg(ring, other, up=UP) == 0

@@ -1,0 +1,187 @@
+"""Packing, padding, sampling, widening, baking, adaptations: exact against references, on tiny models."""
+
+import pytest
+import torch
+
+pytest.importorskip("diffusers")
+
+from tiny_models import CHANNELS, quiet, tiny_prompt, tiny_transformer
+
+from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
+from splatgraft.harmonization.flux.latents import pack, pad_by_reflection, positions, unpack
+from splatgraft.harmonization.flux.network import velocity
+from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
+from splatgraft.harmonization.flux.weights.loading import widen_transformer
+from splatgraft.harmonization.flux.weights.lora import LowRankLinear, add_lora, merge_lora, write_lora
+from splatgraft.harmonization.flux.weights.widening import widened
+
+pytestmark = list(quiet)
+
+
+def random(*size, seed=0):
+    return torch.randn(size, generator=torch.Generator().manual_seed(seed))
+
+
+def test_unpacking_undoes_packing_and_a_token_is_a_block_of_four():
+    latents = random(2, 3, 6, 8)
+    tokens = pack(latents)
+    assert tokens.shape == (2, 12, 12)
+    assert torch.equal(unpack(tokens, 6, 8), latents)
+    assert torch.equal(tokens[0, 5], latents[0, :, 2:4, 2:4].reshape(-1))  # row 1, column 1
+
+
+def test_packing_is_that_of_flux():
+    latents = random(2, 16, 6, 8)
+    # FLUX's order: channel, row, column of the block, which is pixel_unshuffle's
+    assert torch.equal(pack(latents), torch.nn.functional.pixel_unshuffle(latents, 2).flatten(2).mT)
+    assert positions(4, 6, torch.device("cpu")).tolist() == [[0, r, c] for r in range(2) for c in range(3)]
+
+
+def test_joining_then_packing_is_packing_then_joining():
+    parts = [random(1, 16, 4, 6, seed=i) for i in range(3)]
+    joined = pack(torch.cat(parts, 1))
+    assert joined.shape == (1, 6, 192)
+    assert torch.equal(joined, torch.cat([pack(part) for part in parts], 2))
+
+
+@pytest.mark.parametrize(("h", "w"), [(32, 48), (31, 47), (17, 1), (5, 16), (1, 3)])
+def test_padding_reaches_a_multiple_of_16_by_mirroring(h, w):
+    image = random(1, 3, h, w)
+    padded = pad_by_reflection(image)
+    assert padded.shape[2] % 16 == padded.shape[3] % 16 == 0
+    assert torch.equal(padded[..., :h, :w], image)
+    if h % 16 and h > 16:
+        assert torch.equal(padded[..., h, :w], image[..., h - 2, :])
+    if h > 8 and w > 8:
+        reference = torch.nn.functional.pad(image, (0, -w % 16, 0, -h % 16), mode="reflect")
+        assert torch.equal(padded, reference)
+
+
+def test_a_size_that_fits_is_not_touched():
+    image = random(1, 3, 32, 48)
+    assert pad_by_reflection(image) is image
+
+
+def test_sampling_takes_the_steps_of_diffusers_scheduler():
+    from diffusers import FlowMatchEulerDiscreteScheduler
+
+    scheduler = FlowMatchEulerDiscreteScheduler(shift=1.0)
+    scheduler.set_timesteps(sigmas=[1.0, 0.75, 0.5, 0.25])
+    assert schnell_levels() == tuple(scheduler.sigmas.tolist())
+    start = random(2, 4, 4, 4)
+    wanted = start
+    for t in scheduler.timesteps:
+        wanted = scheduler.step(torch.sin(wanted) + t / 1000, t, wanted, return_dict=False)[0]
+    assert torch.equal(sample(lambda z, level: torch.sin(z) + torch.tensor(level), start, schnell_levels()), wanted)
+
+
+def test_the_true_velocity_leads_to_the_clean_latents_in_any_number_of_steps():
+    clean, eps = random(2, 4, 4, 4), random(2, 4, 4, 4, seed=1)
+    for steps in (1, 4, 7):
+        # 7 additions of float32 values below 8: half an ulp of 4.8e-7 each
+        assert torch.allclose(sample(lambda z, level: eps - clean, eps, schnell_levels(steps)), clean, atol=4e-6)
+    assert torch.equal(noisy(clean, eps, torch.tensor([0.0, 1.0])), torch.stack([clean[0], eps[1]]))
+
+
+def test_noise_does_not_depend_on_what_else_is_made():
+    assert torch.equal(noise((4, 4, 6), 7), noise((4, 4, 6), 7))
+    assert not torch.equal(noise((4, 4, 6), 7), noise((4, 4, 6), 8))
+
+
+@pytest.mark.parametrize("init", ["repeat", "zero"])
+@pytest.mark.parametrize("layer", [torch.nn.Linear(64, 8), torch.nn.Conv2d(4, 8, 3, padding=1)], ids=["linear", "conv"])
+def test_a_widened_layer_holds_the_old_weights_bit_for_bit(layer, init):
+    wide = widened(layer, 3, init)
+    old = layer.weight
+    n = old.shape[1]
+    assert wide.weight.shape[1] == 3 * n
+    assert torch.equal(wide.weight[:, :n], old)
+    assert torch.equal(wide.bias, layer.bias)
+    for i in (1, 2):
+        assert torch.equal(wide.weight[:, i * n : (i + 1) * n], old if init == "repeat" else torch.zeros_like(old))
+
+
+def test_a_layer_widened_by_zeros_ignores_its_conditions():
+    network, wide = tiny_transformer(), tiny_transformer()
+    widen_transformer(wide, "zero")
+    latents, prompt = random(1, CHANNELS * 3, 4, 4), tiny_prompt()
+    level = torch.tensor([0.5])
+    before = velocity(network, latents[:, :CHANNELS], level, prompt)
+    # sums over 48 instead of 16 channels are rounded in another order
+    assert torch.allclose(velocity(wide, latents, level, prompt), before, atol=1e-5)
+    assert wide.config.in_channels == CHANNELS * 12
+    assert wide.config.out_channels == CHANNELS * 4
+
+
+def test_baked_and_fused_gives_the_same():
+    stock, baked = tiny_transformer(CHANNELS * 12), tiny_transformer(CHANNELS * 12)
+    prompt, levels = tiny_prompt(), schnell_levels()[:-1]
+    gone = bake(baked, prompt, levels)
+    width = stock.inner_dim
+    modulations = (2 * 6 + 2 * 3 + 2) * (width * width + width)  # one double block, two single, the last norm
+    time_and_text = sum(p.numel() for p in stock.time_text_embed.parameters())
+    assert gone == modulations + time_and_text
+    latents = random(1, CHANNELS * 3, 4, 6)
+    for level in levels:
+        t = torch.tensor([level])
+        with torch.no_grad():
+            assert torch.equal(velocity(baked, latents, t, prompt), velocity(stock, latents, t, prompt))
+    fuse_projections(baked)
+    assert not any(name.endswith(("to_q.weight", "add_k_proj.weight")) for name, _ in baked.named_parameters())
+    with torch.no_grad():
+        t = torch.tensor([0.25])
+        # one product of 96 columns instead of three of 32 may round otherwise
+        assert torch.allclose(velocity(baked, latents, t, prompt), velocity(stock, latents, t, prompt), atol=1e-5)
+
+
+def test_baked_in_bfloat16_and_in_batches_finds_its_rows():
+    baked = tiny_transformer(CHANNELS * 12).to(torch.bfloat16)
+    stock = tiny_transformer(CHANNELS * 12).to(torch.bfloat16)
+    prompt = tiny_prompt().to(torch.device("cpu"), torch.bfloat16)
+    bake(baked, prompt, schnell_levels()[:-1])
+    latents = random(4, CHANNELS * 3, 4, 4).to(torch.bfloat16)
+    t = torch.tensor([1.0, 0.75, 0.5, 0.25])
+    with torch.no_grad():
+        together = velocity(baked, latents, t, prompt)
+        for i in range(4):
+            serialized = velocity(stock, latents[i : i + 1], t[i : i + 1], prompt)
+            # batches round otherwise: a few steps of bfloat16 (2^-8) at values of about one
+            assert torch.allclose(together[i], serialized[0], atol=0.03)
+
+
+def test_the_share_that_baking_saves_is_that_of_the_real_model():
+    from diffusers import FluxTransformer2DModel
+
+    with torch.device("meta"):  # shapes alone
+        real = FluxTransformer2DModel(in_channels=192, out_channels=64)
+    counts = {name: parameter.numel() for name, parameter in real.named_parameters()}
+    gone = sum(n for name, n in counts.items() if ".linear." in name or "time_text_embed" in name)
+    assert round(sum(counts.values()) / 1e9, 2) == 11.89
+    assert round((sum(counts.values()) - gone) / 1e9, 2) == 8.62
+    assert real.x_embedder.weight.shape == (3072, 192)
+
+
+def test_an_adaptation_begins_at_nothing_and_merges_to_what_it_was(tmp_path):
+    stock, adapted = tiny_transformer(CHANNELS * 12), tiny_transformer(CHANNELS * 12)
+    count = add_lora(adapted, 2, seed=5)
+    assert count == (8 + 4) + 2 * (3 + 2)  # a double block's attention and MLPs; two single blocks
+    latents, prompt, t = random(1, CHANNELS * 3, 4, 4), tiny_prompt(), torch.tensor([0.5])
+    with torch.no_grad():
+        assert torch.equal(velocity(adapted, latents, t, prompt), velocity(stock, latents, t, prompt))
+        for module in adapted.modules():
+            if isinstance(module, LowRankLinear):
+                module.lora_B.normal_(0, 0.1, generator=torch.Generator().manual_seed(1))
+        wanted = velocity(adapted, latents, t, prompt)
+    write_lora(tmp_path / "lora.safetensors", adapted.state_dict(), {})
+    assert merge_lora(stock, tmp_path / "lora.safetensors") == count
+    with torch.no_grad():
+        # W x + B A x against (W + B A) x: float32 rounding over three blocks
+        assert torch.allclose(velocity(stock, latents, t, prompt), wanted, atol=1e-4)
+
+
+def test_an_adaptation_of_another_network_is_refused(tmp_path):
+    adapted = tiny_transformer(CHANNELS * 12)
+    add_lora(adapted, 2)
+    write_lora(tmp_path / "lora.safetensors", adapted.state_dict(), {})
+    with pytest.raises(ValueError, match=r"lora.safetensors: expected a network whose x_embedder.weight is \(32, 48\)"):
+        merge_lora(tiny_transformer(), tmp_path / "lora.safetensors")

@@ -1,0 +1,123 @@
+"""The command `harmonize` with a network: killed and gone on with, in batches, split over processes and over Ray."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("diffusers")
+
+from tiny_models import CHANNELS, flux_folder, quiet
+
+from splatgraft.cli import main
+from splatgraft.commands.steps.harmonize import Harmonize
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.images import read_rgb
+from splatgraft.folders.harmonized_views import Part, finished, harmonize_part, picture_folders
+from splatgraft.folders.view_folder import ViewFolder
+from splatgraft.harmonization import HarmonizerInputs
+from splatgraft.project.step import perform
+from splatgraft.runtime.console import Console
+
+pytestmark = list(quiet)
+
+
+@pytest.fixture
+def views(tmp_path) -> Path:
+    names, sizes = ("a", "b", "c", "d"), (32, 32, 16, 32)
+    cameras = Cameras(
+        world_from_camera=torch.eye(4).repeat(4, 1, 1),
+        intrinsics=torch.tensor([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]).repeat(4, 1, 1),
+        sizes=torch.tensor([[32, size] for size in sizes]),
+        names=tuple(f"images/{name}.png" for name in names),
+    )
+    folder = ViewFolder.create(tmp_path / "views", cameras)
+    g = torch.Generator().manual_seed(0)
+    for i, size in enumerate(sizes):
+        composite, mask = torch.rand(size, 32, 3, generator=g), torch.zeros(size, 32)
+        mask[4:12, 4:20] = 1
+        flat = torch.zeros(size, 32, 3)
+        folder.write(i, HarmonizerInputs(composite, composite, mask, torch.ones(size, 32), flat, composite))
+    return tmp_path / "views"
+
+
+@pytest.fixture
+def weights(tmp_path) -> Path:
+    return flux_folder(tmp_path / "image-mask", CHANNELS * 12)
+
+
+def step(views, weights, out="out", **other) -> Harmonize:
+    return Harmonize(views, views.parent / out, method="flux", weights=str(weights), device="cpu", **other)
+
+
+def images(folder) -> list[bytes]:
+    return [path.read_bytes() for path in sorted((folder / "images").iterdir())]
+
+
+def test_one_option_names_the_method_and_its_weights(views, weights, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["harmonize", str(views), "--method", "flux", "--weights", str(weights), "--device", "cpu"]
+    assert main(words) == 0
+    assert [read_rgb(path).shape for path in sorted((tmp_path / "harmonized" / "images").iterdir())][2] == (16, 32, 3)
+    assert "float32 on cpu" in capsys.readouterr().err
+    assert main([*words[:-4], "--weights", str(views)]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert "views/config.json: expected the config of a FluxTransformer2DModel, found none" in lines[-1]
+
+
+def test_batches_and_parts_give_the_views_that_one_by_one_gives(views, weights, tmp_path):
+    whole = perform(step(views, weights), Console())
+    together = perform(step(views, weights, "batch", batch=3), Console())
+    for one, other in zip(sorted((whole / "images").iterdir()), sorted((together / "images").iterdir()), strict=True):
+        # a level of 8 bits: batched products may round otherwise
+        assert (read_rgb(one) - read_rgb(other)).abs().max() <= 1.5 / 255
+    (tmp_path / "kept").mkdir()
+    picture_folders(tmp_path / "kept")
+    for number in range(2):
+        harmonize_part(Part(step(views, weights), tmp_path / "kept", number, 2, device="cpu"))
+        assert finished(tmp_path / "kept", ViewFolder.open(views)) == ({0, 2} if number == 0 else {0, 1, 2, 3})
+    assert images(tmp_path / "kept") == images(whole)
+
+
+def test_a_killed_run_keeps_its_views_and_does_no_more_than_the_rest(views, weights, monkeypatch):
+    done = []
+
+    def killed(part, say, progress):
+        def counting(count, total, name):
+            done.append(name)
+            if len(done) == 2:
+                raise KeyboardInterrupt
+
+        harmonize_part(part, say, counting)
+
+    monkeypatch.setattr("splatgraft.commands.steps.harmonize.harmonize_part", killed)
+    with pytest.raises(KeyboardInterrupt):
+        perform(step(views, weights), Console())
+    perform(step(views, weights), Console())
+    assert done == ["a", "b", "c", "d"]
+
+
+def test_two_processes_by_accelerate_make_the_same_files(views, weights):
+    serialized = perform(step(views, weights), Console())
+    split = perform(step(views, weights, "split", processes=2), Console())
+    assert images(split) == images(serialized)
+    with pytest.raises(ValueError, match=r"config.json: expected the config of a FluxTransformer2DModel, found none"):
+        perform(step(views, views, "broken", processes=2), Console())
+
+
+def test_the_machine_does_not_make_a_result_stale(views, weights):
+    from splatgraft.project.results import why_stale
+    from splatgraft.project.step import job_of
+
+    done = step(views, weights)
+    perform(done, Console())
+    assert why_stale(job_of(replace(done, batch=4, processes=2, ray="local"))) is None
+    assert why_stale(job_of(replace(done, seed=1))) == "seed is now 1, was 0"
+
+
+def test_workers_of_ray_make_the_same_files(views, weights):
+    pytest.importorskip("ray")
+    serialized = perform(step(views, weights), Console())
+    spread = perform(step(views, weights, "spread", processes=2, ray="local"), Console())
+    assert images(spread) == images(serialized)

@@ -1,0 +1,190 @@
+"""Staleness, whole folders, locks and checkpoints: what a killed, repeated or doubled run may and may not do."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from splatgraft.project.results import FolderCheckpoint, Job, Layout, locked, read_record, replacing, why_stale
+from splatgraft.runtime.atomic_folder import atomic_folder
+
+
+def job(folder: Path, files: tuple[Path, ...] = (), **options: object) -> Job:
+    return Job(step="step", folder=folder, inputs={"images": files}, options=options)
+
+
+def finish(wanted: Job, text: str = "result") -> None:
+    with replacing(wanted) as folder:
+        (folder / "scene.ply").write_text(text)
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> Path:
+    path = tmp_path / "a.png"
+    path.write_text("pixels")
+    return path
+
+
+def test_a_finished_result_is_fresh_and_says_how_it_was_made(tmp_path: Path, image: Path) -> None:
+    wanted = job(tmp_path / "scene", (image,), iterations=7, size=(1, 2))
+    assert why_stale(wanted) == "not made yet"
+    finish(wanted)
+    assert why_stale(wanted) is None
+    record = read_record(tmp_path / "scene")
+    assert record is not None
+    assert record.outputs == ("scene.ply",)
+    assert record.options == {"iterations": 7, "size": [1, 2]}
+    assert record.seconds >= 0
+    assert record.peak_memory_bytes > 0
+
+
+def test_only_content_and_options_make_stale(tmp_path: Path, image: Path) -> None:
+    folder = tmp_path / "scene"
+    finish(job(folder, (image,), iterations=7))
+    os.utime(image, (0, 0))
+    assert why_stale(job(folder, (image,), iterations=7)) is None
+    assert why_stale(job(folder, (image,), iterations=8)) == "iterations is now 8, was 7"
+    assert why_stale(job(folder, (), iterations=7)) == "images: 0 files, was 1"
+    image.write_text("other!")
+    assert why_stale(job(folder, (image,), iterations=7)) == "images: a.png changed"
+    (folder / "scene.ply").unlink()
+    assert why_stale(job(folder, (image,), iterations=7)) == "scene.ply was removed"
+
+
+def test_fingerprint_moves_with_inputs_and_options(tmp_path: Path, image: Path) -> None:
+    names = {
+        job(tmp_path, (image,)).fingerprint,
+        job(tmp_path, (image,), a=1).fingerprint,
+        job(tmp_path).fingerprint,
+    }
+    image.write_text("changed")
+    names.add(job(tmp_path, (image,)).fingerprint)
+    assert len(names) == 4
+
+
+def fail_in_the_middle(wanted: Job) -> None:
+    with replacing(wanted) as folder:
+        (folder / "scene.ply").write_text("half")
+        raise RuntimeError("in the middle")
+
+
+def test_a_failed_run_leaves_the_earlier_result_and_nothing_else(tmp_path: Path) -> None:
+    finish(job(tmp_path / "scene"), "earlier")
+    with pytest.raises(RuntimeError, match="in the middle"):
+        fail_in_the_middle(job(tmp_path / "scene"))
+    assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+    assert (tmp_path / "scene" / "scene.ply").read_text() == "earlier"
+
+
+def test_files_that_no_step_wrote_are_never_replaced(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "a.jpg").write_text("dear")
+    with (
+        pytest.raises(ValueError, match=r"photos: expected no folder or one that a step wrote"),
+        replacing(job(photos)),
+    ):
+        pass
+    with pytest.raises(ValueError, match=r"a.jpg: expected a folder for the result"), replacing(job(photos / "a.jpg")):
+        pass
+    assert (photos / "a.jpg").read_text() == "dear"
+
+
+def test_missing_input_and_damaged_record_are_told_by_file(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"gone.png: expected an input file, found No such file"):
+        FolderCheckpoint(job(tmp_path / "scene", (tmp_path / "gone.png",)))
+    finish(job(tmp_path / "scene"))
+    for damaged in ("{", "[]", "{}", '{"inputs": 3}'):
+        (tmp_path / "scene" / "step.json").write_text(damaged)
+        with pytest.raises(ValueError, match=r"step.json: expected the record of a step, found"):
+            why_stale(job(tmp_path / "scene"))
+
+
+# Kills itself at the n-th system call that changes the file system; prints how many there are when it survives.
+KILLED_SWAP = """
+import os, signal, sys
+from pathlib import Path
+from splatgraft.project.results import Job, replacing
+
+fatal, seen = int(sys.argv[2]), 0
+def count(event, arguments):
+    global seen
+    if event in ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "shutil.rmtree", "ctypes.dlsym"):
+        seen += 1
+        if seen == fatal:
+            os.kill(os.getpid(), signal.SIGKILL)
+sys.addaudithook(count)
+with replacing(Job(step="step", folder=Path(sys.argv[1]), inputs={}, options={})) as folder:
+    (folder / "scene.ply").write_text("later")
+    (folder / "points.ply").write_text("later")
+print("survived")
+"""
+
+
+def test_killed_anywhere_the_folder_holds_one_whole_result(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    states = set()
+    for fatal in range(1, 200):
+        finish(job(scene), "earlier")
+        run = subprocess.run(
+            [sys.executable, "-c", KILLED_SWAP, str(scene), str(fatal)], capture_output=True, text=True, check=False
+        )
+        assert run.returncode in (0, -signal.SIGKILL), run.stderr
+        texts = {path.name: path.read_text() for path in scene.glob("*.ply")}
+        assert texts in ({"scene.ply": "earlier"}, {"scene.ply": "later", "points.ply": "later"})
+        assert read_record(scene) is not None
+        states.add((run.returncode, texts["scene.ply"]))
+        finish(job(scene), "after")
+        assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+        if run.returncode == 0:
+            break
+    # the loop ran past the last call, and some kills came before and some after the swap
+    assert states == {(0, "later"), (-signal.SIGKILL, "earlier"), (-signal.SIGKILL, "later")}
+
+
+def test_what_a_kill_between_two_renames_left_is_put_back(tmp_path: Path) -> None:
+    (tmp_path / ".scene.old").mkdir()
+    (tmp_path / ".scene.old" / "scene.ply").write_text("earlier")
+    with pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "scene"):
+        raise KeyboardInterrupt
+    assert (tmp_path / "scene" / "scene.ply").read_text() == "earlier"
+
+
+def test_one_run_at_a_time_and_the_lock_dies_with_its_holder(tmp_path: Path) -> None:
+    script = "import sys, time; from pathlib import Path; from splatgraft.project.results import locked\n"
+    script += "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+    holder = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "scene")], stdout=subprocess.PIPE)
+    try:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(ValueError, match=r"scene: expected no other run at work here"), locked(tmp_path / "scene"):
+            pass
+    finally:
+        holder.kill()
+        holder.communicate()
+    with locked(tmp_path / "scene"):
+        pass
+
+
+def test_checkpoint_lives_for_its_own_job_only(tmp_path: Path) -> None:
+    wanted = job(tmp_path / "scene", iterations=7)
+    assert FolderCheckpoint(wanted).load() is None
+    FolderCheckpoint(wanted).save({"step": 3, "means": torch.arange(3.0), "nested": {"a": [1, 2.5]}})
+    state = FolderCheckpoint(wanted).load()
+    assert state is not None
+    assert state["step"] == 3
+    assert torch.equal(state["means"], torch.arange(3.0))
+    assert FolderCheckpoint(job(tmp_path / "scene", iterations=8)).load() is None
+    assert FolderCheckpoint(wanted).load() is None
+
+
+def test_folders_follow_the_flow() -> None:
+    layout = Layout(Path("p"))
+    assert layout.capture("source") == Path("p/source/capture")
+    assert layout.scene("target") == Path("p/target/scene")
+    assert json.dumps([str(layout.result), str(layout.report)]) == '["p/result", "p/report"]'

@@ -1,0 +1,260 @@
+"""Sources: pairs as the paper composes them, scenes held out, choices balanced, generators that go on; relighters."""
+
+import json
+import stat
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("safetensors")
+
+from tiny_pairs import relit_folder, rendered_folder, shipped_samples
+
+from splatgraft.commands.synth.orida import OridaPairs
+from splatgraft.core.images import read_rgb, write_image
+from splatgraft.runtime.console import Console
+from splatgraft.training.sources.generate import Lighting, Unlit, Wanted, generate
+from splatgraft.training.sources.orida import Photograph, balanced, read_orida
+from splatgraft.training.sources.prompts import ANGLES, ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
+from splatgraft.training.sources.relighters import DiffusionRenderer, Draft, StandIn, inflated_normals
+from splatgraft.training.sources.relit import RelitPairs
+from splatgraft.training.sources.rendered import RenderedPairs
+from splatgraft.training.sources.source import fitted, sample_seed, split_mixture
+
+
+def environment(folder: Path, name: str, bright: str) -> Path:
+    """A map whose light comes from one side."""
+    picture = np.full((16, 32, 3), 0.05, np.float32)
+    left, right = slice(16, 31), slice(1, 16)  # phi from the camera's back over its right
+    picture[4:10, right if bright == "right" else left] = 10.0
+    folder.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(folder / f"{name}.hdr"), picture)
+    return folder / f"{name}.hdr"
+
+
+@pytest.mark.parametrize("make", [lambda f: RelitPairs(relit_folder(f)), lambda f: RenderedPairs(rendered_folder(f))])
+def test_a_composite_is_the_normalised_object_on_the_background(tmp_path, make):
+    source = make(tmp_path / "pairs")
+    pair = source.read(0)
+    inside = pair.mask > 0.5
+    assert torch.equal(pair.composite[~inside], pair.background[~inside])
+    # mean and deviation are those of the object in the scene, but for clamping to [0, 1]
+    assert torch.allclose(pair.composite[inside].mean(0), pair.target[inside].mean(0), atol=0.03)
+    assert torch.allclose(pair.composite[inside].std(0), pair.target[inside].std(0), atol=0.03)
+    assert len({source.key(0, role) for role in ("composite", "target", "background", "mask")}) == 4
+
+
+def test_a_light_changes_the_composite_alone(tmp_path):
+    source = RelitPairs(relit_folder(tmp_path / "pairs", 1))
+    assert len(source) == 2
+    assert source.key(0, "target") == source.key(1, "target")
+    assert source.key(0, "composite") != source.key(1, "composite")
+
+
+def test_scenes_are_held_out_whole_and_draws_follow_the_weights(tmp_path):
+    sources = [RelitPairs(relit_folder(tmp_path / "a", 5)), RenderedPairs(rendered_folder(tmp_path / "b", 5))]
+    train, kept = split_mixture(sources, weights=(3.0, 1.0), held_out=0.2, seed=1)
+    for i, source in enumerate(sources):
+        ours, theirs = ({source.group(j) for j in mixture.indices[i]} for mixture in (train, kept))
+        assert not ours & theirs
+        assert len(theirs) == 1
+        assert len(ours) == 4
+    drawn = [train.draw(i) for i in range(2000)]
+    share = sum(d.source is sources[0] for d in drawn) / len(drawn)
+    # a binomial share of 2000 draws has a deviation of 0.0097: four of them
+    assert abs(share - 0.75) < 0.039
+    assert train.draw(1234) == drawn[1234]
+    assert {d.index for d in drawn if d.source is sources[1]} == set(train.indices[1])
+    assert len(kept.all()) == sum(map(len, kept.indices))
+
+
+def test_bad_mixtures_are_one_line(tmp_path):
+    source = RelitPairs(relit_folder(tmp_path / "a", 1))
+    with pytest.raises(ValueError, match=r"--weights: expected 1 numbers of at least 0, found \[1.0, 2.0\]"):
+        split_mixture([source], weights=(1.0, 2.0), held_out=0.1, seed=0)
+    with pytest.raises(ValueError, match="training data: expected pairs, found none in no source"):
+        split_mixture([], weights=(), held_out=0.1, seed=0)
+    with pytest.raises(ValueError, match=r"manifest.jsonl: expected the manifest of generated pairs"):
+        RelitPairs(tmp_path)
+    (tmp_path / "manifest.jsonl").write_text("{}\n")
+    with pytest.raises(ValueError, match="line 1: expected folder, group and relit"):
+        RelitPairs(tmp_path)
+
+
+def test_seeds_differ_from_place_to_place():
+    assert len({sample_seed(s, i) for s in range(3) for i in range(1000)}) == 3000
+
+
+@pytest.mark.parametrize(("h", "w"), [(20, 40), (40, 20), (16, 32), (100, 100)])
+def test_a_fitted_picture_has_its_size_and_its_middle(h, w):
+    ramp = torch.linspace(0, 1, w).expand(h, w)[..., None]
+    made = fitted(ramp, 32, 16)
+    assert made.shape == (16, 32, 1)
+    # symmetric about the middle, to the rounding of the enlarged size
+    assert abs(float(made.mean()) - 0.5) < 0.02
+
+
+def test_lists_are_long_enough_and_objects_take_turns():
+    assert [len(set(words)) for words in (OBJECTS, ENVIRONMENTS, LIGHTINGS, ANGLES)] >= [60, 20, 12, 8]
+    assert len(set(OBJECTS)) == len(OBJECTS)
+    made = [prompt(0, i) for i in range(3 * len(OBJECTS))]
+    assert set(Counter(p.object for p in made).values()) == {3}
+    assert {p.environment for p in made} == set(ENVIRONMENTS)
+    assert {p.lighting for p in made} == set(LIGHTINGS)
+    assert prompt(0, 5) == made[5]
+    assert prompt(1, 5) != made[5]
+    words = prompt(0, 5)
+    assert words.text.count(words.object) == 2
+    assert "with visible contact shadow, everything in focus." in words.text
+
+
+def test_the_choice_of_photographs_is_balanced():
+    photographs = [
+        Photograph(Path(f"{o}{s}{i}.jpg"), Path("m"), Path("b"), f"o{o}", f"s{s}")
+        for o in range(6)
+        for s in range(5)
+        for i in range(3 + 10 * (o == 0))  # one object has many more
+    ]
+    chosen = balanced(photographs, 60, 0)
+    assert len(set(chosen)) == 60
+    assert max(Counter(p.object for p in chosen).values()) - min(Counter(p.object for p in chosen).values()) <= 1
+    assert max(Counter(p.scene for p in chosen).values()) - min(Counter(p.scene for p in chosen).values()) <= 2
+    assert balanced(photographs, 60, 0) == chosen
+    assert balanced(photographs, 60, 1) != chosen
+    assert len(balanced(photographs, 10_000, 0)) == len(photographs)
+
+
+def test_inflated_normals_point_outwards():
+    y, x = torch.meshgrid(torch.arange(41.0), torch.arange(61.0), indexing="ij")
+    normal = inflated_normals((((x - 30) ** 2 + (y - 20) ** 2) < 15**2).float())
+    assert normal[20, 42, 0] > 0.3
+    assert normal[20, 18, 0] < -0.3
+    assert normal[8, 30, 1] > 0.3
+    assert normal[20, 30, 2] > 0.95
+
+
+def test_the_stand_in_shades_the_side_that_light_comes_from_and_says_what_it_is(tmp_path):
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
+    mask = (((x - 30) ** 2 + (y - 20) ** 2) < 15**2).float()
+    draft = Draft("ball", torch.full((40, 60, 3), 0.5), mask)
+    right, left = StandIn().relight(draft, [environment(tmp_path, side, side) for side in ("right", "left")])
+    assert right[20, 40].mean() > right[20, 20].mean() + 0.1
+    assert left[20, 20].mean() > left[20, 40].mean() + 0.1
+    assert torch.equal(right[mask == 0], draft.image[mask == 0])
+    assert "not DiffusionRenderer" in StandIn().name
+
+
+def test_a_generator_goes_on_where_it_was_killed_and_notes_what_is_unfit(tmp_path):
+    made = []
+    samples = {name: sample for name, sample in shipped_samples(4)}
+
+    def wanted():
+        for name, sample in samples.items():
+
+            def make(name=name, sample=sample):
+                made.append(name)
+                mask = torch.zeros_like(sample.mask) if name.endswith("24") else sample.mask
+                if name.endswith("25") and len(made) == 3:
+                    raise KeyboardInterrupt
+                return Unlit(sample.target, sample.background, mask)
+
+            yield Wanted(name, "scene", make, {"prompt": f"a {name}", "licence": "shipped"})
+
+    lighting = Lighting(StandIn(), [environment(tmp_path / "maps", side, side) for side in ("left", "right")], 2, 0)
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        generate(out, wanted(), lighting, total=3)
+    assert generate(out, wanted(), lighting, total=3) == 3
+    names = list(samples)
+    assert made == [names[0], names[1], names[2], names[2], names[3]]
+    note = json.loads((out / "rejected" / f"{names[1]}.json").read_text())
+    assert note["reason"] == "object covers 0.0% of the picture"
+    lines = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+    assert [line["folder"] for line in lines] == [names[0], names[2], names[3]]
+    assert all("stand-in" in line["relighter"] and line["licence"] == "shipped" for line in lines)
+    assert len(RelitPairs(out)) == 6
+    assert read_rgb(out / "sheet.png").shape == (6 * 240, 3 * 240, 3)
+    before = (out / names[0] / "relit_0.png").stat().st_mtime_ns
+    assert generate(out, wanted(), lighting, total=3) == 3
+    assert (out / names[0] / "relit_0.png").stat().st_mtime_ns == before
+
+
+def orida(root: Path) -> Path:
+    for i, (name, sample) in enumerate(shipped_samples(4)):
+        scene = root / f"object{i % 2}" / f"scene{i // 2}"
+        for part in ("images", "masks"):
+            (scene / part).mkdir(parents=True, exist_ok=True)
+        write_image(scene / "background.png", sample.background)
+        write_image(scene / "images" / f"{name}.jpg", sample.target)
+        write_image(scene / "masks" / f"{name}.png", sample.mask)
+    return root
+
+
+def test_photographs_become_pairs(tmp_path):
+    environment(tmp_path / "maps", "left", "left")
+    step = OridaPairs(tmp_path / "out", orida(tmp_path / "orida"), number=3, size="48x32")
+    step = replace(step, relighting=replace(step.relighting, lights=tmp_path / "maps", each=1, relighter="stand-in"))
+    assert step.execute(Console()) == 0
+    pairs = RelitPairs(tmp_path / "out")
+    assert len(pairs) == 3
+    assert pairs.read(0).target.shape == (32, 48, 3)
+    assert {pairs.group(i) for i in range(3)} == {"scene0", "scene1"}
+
+
+def test_a_dataset_of_another_layout_is_one_line(tmp_path):
+    root = orida(tmp_path / "orida")
+    with pytest.raises(ValueError, match=r"expected index.csv .* or OBJECT/SCENE/images, masks and background"):
+        read_orida(tmp_path / "maps")
+    (root / "index.csv").write_text("image,mask,object,scene\n")
+    with pytest.raises(ValueError, match=r"index.csv: expected the columns .*, found no background"):
+        read_orida(root)
+    (root / "index.csv").write_text("image,mask,background,object,scene\na.jpg,b.png,c.png,o,s\n")
+    with pytest.raises(ValueError, match=r"index.csv, line 2: expected files that are there, found no .*a.jpg"):
+        read_orida(root)
+    (root / "index.csv").unlink()
+    next(root.glob("*/*/masks/*.png")).unlink()
+    with pytest.raises(ValueError, match=r"masks: expected a mask DSC_042\d"):
+        read_orida(root)
+
+
+def installation(folder: Path, fails: bool = False) -> Path:
+    """Programs with the command line of DiffusionRenderer's, which only darken."""
+    folder.mkdir()
+    program = f"""
+import pathlib, shutil, sys
+if {fails}: sys.exit("CUDA is not there")
+words = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
+given, out = pathlib.Path(words["inference_input_dir"]), pathlib.Path(words["inference_save_dir"])
+if "envlight" in words: assert words["envlight"].endswith(".hdr']")
+for path in given.rglob("*.png"):
+    target = out / "picture" / path.name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(path, target)
+"""
+    for name in ("inference_svd_rgbx.py", "inference_svd_xrgb.py"):
+        (folder / name).write_text(program)
+    return folder
+
+
+def test_the_adaptor_calls_an_installation_and_gives_its_pictures(tmp_path):
+    python = tmp_path / "python"  # quick to start, and "import torch" does not load it
+    python.write_text(f'#!/bin/sh\n[ "$1" = -c ] && exit 0\nexec {sys.executable} -S "$@"\n')
+    python.chmod(python.stat().st_mode | stat.S_IXUSR)
+    draft = Draft("a", next(iter(shipped_samples(1)))[1].target, torch.ones(32, 32))
+    light = environment(tmp_path / "maps", "left", "left")
+    relit = DiffusionRenderer(installation(tmp_path / "dr"), python).relight(draft, [light, light])
+    # 8 bits
+    assert [float((picture - draft.image).abs().max()) < 1 / 255 for picture in relit] == [True, True]
+    broken = DiffusionRenderer(installation(tmp_path / "broken", fails=True), python)
+    with pytest.raises(ValueError, match=r"inference_svd_rgbx.py: expected it to succeed, found CUDA is not there"):
+        broken.relight(draft, [light])
+    with pytest.raises(
+        ValueError, match=r"expected an installation of DiffusionRenderer \(cosmos\) with cosmos_predict1"
+    ):
+        DiffusionRenderer(tmp_path / "dr", python, "cosmos")

@@ -1,0 +1,250 @@
+"""Training: overfits, is kept and loaded as it was, goes on after a kill to the bit, says in a line what is wrong."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("diffusers")
+
+from tiny_models import CHANNELS, flux_folder, quiet, removal_folder
+from tiny_pairs import relit_folder, rendered_folder
+
+from splatgraft.core.images import read_rgb
+from splatgraft.harmonization import HarmonizerInputs, HarmonizerOptions, make_harmonizer
+from splatgraft.training.flux_objective import FluxObjective, FluxTraining
+from splatgraft.training.latent_cache import LatentCache
+from splatgraft.training.records import LOG_FILE, read_losses
+from splatgraft.training.removal_objective import RemovalObjective
+from splatgraft.training.settings import Loop
+from splatgraft.training.sources.relit import RelitPairs
+from splatgraft.training.sources.rendered import RenderedPairs
+from splatgraft.training.sources.source import fitted_pair, split_mixture
+from splatgraft.training.trainer import Training, train
+
+pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
+ROLES = RemovalObjective.roles
+QUICK = Loop(steps=6, batch=2, rate=1e-3, precision="no", save_every=2, validate_every=3, validation_pairs=2, cpu=True)
+
+
+def silent(*words):
+    pass
+
+
+def training(tmp_path, name, loop=QUICK, *, pairs=2, progress=silent, say=silent, **flux):
+    base, folder = tmp_path / "base", tmp_path / "pairs"
+    if not base.is_dir():
+        flux_folder(base)
+        relit_folder(folder, pairs)
+    objective = FluxObjective(FluxTraining(str(base), **flux), say)
+    mixture, held_out = split_mixture([RelitPairs(folder)], weights=(), held_out=0.5, seed=loop.seed)
+    cache = LatentCache(tmp_path / "latents", objective.encode, width=32, height=32, autoencoder="tiny")
+    return Training(objective, mixture, held_out, cache, loop, tmp_path / name, say, progress)
+
+
+def killed_at(step):
+    def progress(done, total, message):
+        if done == step:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def inputs(sample):
+    composite, mask = sample.composite, (sample.mask > 0.5).float()
+    flat = torch.zeros_like(mask)
+    return HarmonizerInputs(composite, sample.background, mask, flat, torch.zeros_like(composite), composite)
+
+
+def one_shipped_pair(tmp_path):
+    """The first of the rendered pairs that ship with the repository."""
+    shipped, folder = Path(__file__).parents[2] / "data" / "pairs", tmp_path / "shipped"
+    folder.mkdir()
+    line = (shipped / "manifest.jsonl").read_text().splitlines()[0]
+    (folder / "manifest.jsonl").write_text(line + "\n")
+    (folder / json.loads(line)["folder"]).symlink_to(shipped / json.loads(line)["folder"])
+    return folder
+
+
+def test_it_overfits_and_is_loaded_as_it_was(tmp_path):
+    loop = replace(QUICK, steps=250, batch=8, rate=3e-3, save_every=1000, validate_every=1000)
+    run = training(tmp_path, "out", loop, pairs=1, times="schnell", checkpointing=False)
+    mixture, _ = split_mixture([RenderedPairs(one_shipped_pair(tmp_path))], weights=(), held_out=0.0, seed=0)
+    run = replace(run, mixture=mixture, held_out=None)
+    model = train(run)
+    losses = torch.tensor(read_losses(tmp_path / "out" / LOG_FILE))
+    assert losses[-20:].mean() < losses[:5].mean() / 10
+    sample = run.mixture.draw(0)
+    loaded = run.cache.load(sample, run.objective.roles)
+    shown = run.objective.predict(run.objective.network.eval(), run.cache.finish([loaded], run.objective.roles), 3)
+    harmonizer = make_harmonizer("flux", HarmonizerOptions(weights=str(model), seed=3))
+    image = harmonizer.harmonize(inputs(fitted_pair(sample.source.read(sample.index), 32, 32))).image
+    # kept latents are rounded to bfloat16 (2^-9 of values of about one), fresh ones are not
+    assert (image - shown[0].permute(1, 2, 0)).abs().max() < 0.02
+    stored = json.loads((model / "transformer" / "config.json").read_text())
+    assert stored["in_channels"] == CHANNELS * 12
+    assert json.loads((model / "harmonizer.json").read_text())["variant"] == "image-mask"
+
+
+@pytest.mark.parametrize("options", [{}, {"lora": 2}], ids=["all weights", "lora"])
+def test_a_killed_training_goes_on_to_the_same_curve_and_weights(tmp_path, options):
+    loop = replace(QUICK, ema=0.5, accumulate=2, warm_up=3)
+    model = train(training(tmp_path, "whole", loop, **options))
+    with pytest.raises(KeyboardInterrupt):
+        train(training(tmp_path, "killed", loop, progress=killed_at(5), **options))
+    said = []
+    again = train(training(tmp_path, "killed", loop, say=said.append, **options))
+    assert "goes on from step 4" in said
+    assert read_losses(tmp_path / "killed" / LOG_FILE) == read_losses(tmp_path / "whole" / LOG_FILE)
+    name = "lora.safetensors" if options else "transformer/diffusion_pytorch_model.safetensors"
+    assert (model / name).read_bytes() == (again / name).read_bytes()
+    assert sorted(p.name for p in (tmp_path / "killed" / "states").iterdir()) == ["00000004", "00000006"]
+    if options:
+        state = tmp_path / "killed" / "states" / "00000006" / "model.safetensors"
+        whole = model.parent.parent / "base" / "transformer" / "diffusion_pytorch_model.safetensors"
+        assert state.stat().st_size < whole.stat().st_size
+
+
+def test_a_trained_adaptation_changes_what_the_base_makes(tmp_path):
+    model = train(training(tmp_path, "out", replace(QUICK, rate=0.05), lora=2))
+    options = HarmonizerOptions(weights=str(tmp_path / "base"), lora=model / "lora.safetensors")
+    pair = RelitPairs(tmp_path / "pairs").read(0)
+    image = make_harmonizer("flux", options).harmonize(inputs(pair)).image
+    assert image.shape == pair.target.shape
+    assert json.loads((model / "harmonizer.json").read_text())["variant"] == "image-mask"
+
+
+def test_the_other_condition_is_trained_and_told(tmp_path):
+    run = training(tmp_path, "out", condition="image-background", times="logit-normal", first_layer="zero")
+    assert run.objective.roles == ("target", "composite", "background")
+    harmonizer = make_harmonizer("flux", HarmonizerOptions(weights=str(train(run))))
+    assert harmonizer.network.variant == "image-background"
+    with pytest.raises(ValueError, match=r"model: expected image-mask .--variant., found image-background"):
+        FluxObjective(FluxTraining(str(tmp_path / "out" / "model")), silent)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_on_cuda_in_bf16_losses_are_about_those_of_the_cpu(tmp_path):
+    train(training(tmp_path, "cpu"))
+    train(training(tmp_path, "cuda", replace(QUICK, cpu=False, precision="bf16")))
+    cpu, cuda = (torch.tensor(read_losses(tmp_path / name / LOG_FILE)) for name in ("cpu", "cuda"))
+    # 8 bits of mantissa: percents
+    assert torch.allclose(cpu, cuda, rtol=0.05)
+
+
+def test_the_order_does_not_depend_on_the_number_of_passes(tmp_path):
+    losses = []
+    for passes in (1, 2):
+        train(training(tmp_path, f"passes{passes}", replace(QUICK, accumulate=passes, steps=2)))
+        losses.append(torch.tensor(read_losses(tmp_path / f"passes{passes}" / LOG_FILE)))
+    # the same pairs and the same noise: only sums are rounded in another order
+    assert torch.allclose(*losses, rtol=1e-4)
+
+
+def test_kept_latents_are_the_fresh_ones_and_a_changed_picture_is_encoded_anew(tmp_path):
+    run = training(tmp_path, "out")
+    drawn, roles = run.mixture.draw(0), run.objective.roles
+    fresh = run.cache.finish([run.cache.load(drawn, roles)], roles)
+    loaded = run.cache.load(drawn, roles)
+    assert not loaded.pictures
+    kept = run.cache.finish([loaded], roles)
+    assert all(torch.equal(fresh[role], kept[role]) for role in roles)
+    target = next((tmp_path / "pairs").glob("*/target.png"))
+    for path in (tmp_path / "pairs").glob("*/target.png"):
+        path.write_bytes(target.read_bytes() + b" ")
+    assert set(run.cache.load(drawn, roles).pictures) == {"target"}
+
+
+def test_validation_shows_held_out_pairs(tmp_path):
+    said = []
+    run = training(tmp_path, "out", say=said.append)
+    train(run)
+    assert any("(held out)" in line for line in said)
+    sheet = read_rgb(tmp_path / "out" / "validation" / "00000003.png")
+    assert sheet.shape == (2 * 32, 3 * 32, 3)
+    trained = {run.mixture.sources[0].group(i) for i in run.mixture.indices[0]}
+    shown = {run.held_out.sources[0].group(i) for i in run.held_out.indices[0]}
+    assert not trained & shown
+
+
+def test_another_training_in_the_folder_is_refused(tmp_path):
+    train(training(tmp_path, "out"))
+    with pytest.raises(
+        ValueError, match=r"out: expected the same training to go on with, found rate 0.001 instead of 0.5"
+    ):
+        train(training(tmp_path, "out", replace(QUICK, rate=0.5, steps=8)))
+
+
+def test_a_loss_that_is_no_number_stops_and_keeps_the_last_state(tmp_path):
+    run = training(tmp_path, "out", replace(QUICK, save_every=1))
+
+    def poison(done, total, message):
+        if done == 2:
+            with torch.no_grad():
+                run.objective.network.proj_out.bias.fill_(float("nan"))
+
+    with pytest.raises(ValueError, match="expected a finite loss at step 3, found nan; the last state is kept"):
+        train(replace(run, progress=poison))
+    # the poison came after step 2's weights were reported and before they were saved: step 1 is whole
+    assert "00000001" in {p.name for p in (tmp_path / "out" / "states").iterdir()}
+
+
+def test_too_little_memory_is_one_line(tmp_path, monkeypatch):
+    run = training(tmp_path, "out")
+
+    def full(*arguments, **named):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(run.objective, "loss", full)
+    with pytest.raises(ValueError, match="expected memory for 2 pairs a pass, found too little at step 0"):
+        train(run)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"batch": 3, "accumulate": 2}, r"--batch: expected a multiple of 2 \(1 processes x --accumulate 2\), found 3"),
+        ({"ema": 1.0}, "--ema: expected a decay from 0 to below 1, found 1.0"),
+        ({"steps": 0}, "--steps: expected at least 1, found 0"),
+        ({"optimizer": "adam8bit"}, "--optimizer adam8bit: expected bitsandbytes"),
+        ({"tensorboard": True}, "--tensorboard: expected the package tensorboard"),
+    ],
+)
+def test_bad_options_are_one_line(tmp_path, change, line):
+    with pytest.raises(ValueError, match=line):
+        train(training(tmp_path, "out", replace(QUICK, **change)))
+
+
+def test_object_removal_is_trained_by_the_same_loop(tmp_path):
+    base = removal_folder(tmp_path / "base")
+    loop = replace(QUICK, steps=20, batch=4, rate=8e-3, save_every=18, validate_every=99, validation_pairs=1)
+    source = RenderedPairs(rendered_folder(tmp_path / "pairs", 1))
+
+    def run(name, folder, loop, progress=silent):
+        objective = RemovalObjective(str(folder), silent, checkpointing=False)
+        mixture, held_out = split_mixture([source], weights=(), held_out=0.0, seed=0)
+        cache = LatentCache(tmp_path / "latents", objective.encode, width=32, height=32, autoencoder="tiny")
+        return Training(objective, mixture, held_out, cache, loop, tmp_path / name, silent, progress)
+
+    def error(folder):
+        again, seeds = run("out", folder, loop), range(16)
+        latents = again.cache.finish([again.cache.load(again.mixture.draw(0), again.objective.roles)] * 16, ROLES)
+        with torch.no_grad():
+            return float(again.objective.loss(again.objective.network.eval(), latents, seeds))
+
+    model = train(run("out", base, loop))
+    assert error(model) < 0.7 * error(base)
+    with pytest.raises(KeyboardInterrupt):
+        train(run("killed", base, loop, killed_at(19)))
+    train(run("killed", base, loop))
+    assert read_losses(tmp_path / "killed" / LOG_FILE) == read_losses(tmp_path / "out" / LOG_FILE)
+    trained, again = RemovalObjective(str(model), silent), run("out", base, loop)
+    assert trained.network.config.in_channels == CHANNELS * 3
+    pair = again.cache.load(again.mixture.draw(0), trained.roles)
+    latents = again.cache.finish([pair], trained.roles)
+    with torch.no_grad():
+        image = trained.predict(trained.network.eval(), latents, 0)
+    assert image.shape == (1, 3, 32, 32)
+    assert bool(image.isfinite().all())
