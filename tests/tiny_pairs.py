@@ -10,7 +10,7 @@ import torch
 from splatgraft.core.images import list_images, read_mask, read_rgb, resize, write_image
 from splatgraft.training.sources.relit import RelitSample, write_manifest, write_sample
 
-BANANAS = Path(__file__).parents[1] / "data" / "bananas"
+BANANAS = Path(__file__).parents[1] / "src" / "splatgraft" / "demo_captures" / "bananas"
 
 
 def shipped_samples(count, side=32):

@@ -11,7 +11,7 @@ from splatgraft.harmonization.flux.detail import guided_filter, with_detail, wit
 def photograph(side=128):
     from pathlib import Path
 
-    folder = Path(__file__).parents[2] / "data" / "bananas" / "images"
+    folder = Path(__file__).parents[2] / "src" / "splatgraft" / "demo_captures" / "bananas" / "images"
     return resize(read_rgb(list_images(folder)[0]), side, side).clamp(0.02, 1)
 
 

@@ -1,7 +1,7 @@
 """Result, composite and target as pictures of the same views, with the truth beside them where there is one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -63,6 +63,12 @@ class EvaluatedScenes:
             is_object=is_object.to(device),
             cameras=read_cameras(cameras).to(device),
         )
+
+    def with_width(self, width: int | None) -> "EvaluatedScenes":
+        """The same with pictures `width` pixels wide; unchanged where it is None."""
+        if width is None:
+            return self
+        return replace(self, cameras=self.cameras.resized(width / float(self.cameras.sizes[:, 0].max())))
 
     @property
     def object_center(self) -> Float[Tensor, "3"]:

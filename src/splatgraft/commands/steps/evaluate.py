@@ -54,6 +54,9 @@ class Evaluate:
     """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache where not given."""
     pictured: int = 8
     """How many views the page shows."""
+    width: int | None = None
+    """Width of the pictures, pixels; that of the cameras where not given. Pictures beside a ground truth keep its
+    size."""
     frames: int = 48
     """Frames of the turntable; 0 makes none."""
     device: Device = "auto"
@@ -76,7 +79,7 @@ class Evaluate:
             truth = TrueViews(scenes, self.ground_truth, target_capture=self.target_capture, harmonized=self.views)
             metrics, missing = self._measure(truth, context)
         shown = _spread(len(truth.names if truth else scenes.cameras), self.pictured)
-        pictures = [(truth or scenes).pictures(index) for index in shown]
+        pictures = [(truth or scenes.with_width(self.width)).pictures(index) for index in shown]
         changes = [describe_change(p.result, p.copy_paste, p.mask) for p in pictures]
         best = max(pictures, key=lambda p: float(p.mask.sum()))
         self._write_pictures(folder, best)
