@@ -3,7 +3,7 @@
 import tempfile
 from pathlib import Path
 
-from splatgraft.project.results import why_stale
+from splatgraft.project.record import why_stale
 from splatgraft.project.step import job_of, perform
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.flow import read_flow

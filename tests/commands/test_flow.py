@@ -18,7 +18,7 @@ from tiny_project import ball, photograph, plane, write_project
 from splatgraft.cli import main
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft.formats import read_gaussians
-from splatgraft.project.results import FolderCheckpoint
+from splatgraft.project.checkpoint import FolderCheckpoint
 from splatgraft.project.step import job_of
 from splatgraft.workflow.flow import read_flow
 

@@ -23,7 +23,7 @@ from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.evaluation.pictures import write_animation
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
-from splatgraft.project.results import read_record
+from splatgraft.project.record import read_record
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
 from splatgraft.workflow.flow import read_flow

@@ -107,7 +107,7 @@ def test_two_processes_by_accelerate_make_the_same_files(views, weights):
 
 
 def test_the_machine_does_not_make_a_result_stale(views, weights):
-    from splatgraft.project.results import why_stale
+    from splatgraft.project.record import why_stale
     from splatgraft.project.step import job_of
 
     done = step(views, weights)

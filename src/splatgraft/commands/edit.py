@@ -20,7 +20,8 @@ from splatgraft.editor.session.project_access import ProjectFiles, Triple
 from splatgraft.editor.session.session import EDITOR_FOLDER
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.formats import is_scene
-from splatgraft.project.results import (
+from splatgraft.project.folder_lock import locked
+from splatgraft.project.layout import (
     CAMERAS_FILE,
     LIGHT_FILE,
     PLACEMENT_FILE,
@@ -29,7 +30,6 @@ from splatgraft.project.results import (
     SELECTION_FILE,
     SURROUNDINGS_FILE,
     Side,
-    locked,
 )
 from splatgraft.project.step import Positional
 from splatgraft.runtime.atomic_file import atomic_write

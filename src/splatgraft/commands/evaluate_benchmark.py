@@ -29,7 +29,8 @@ from splatgraft.evaluation.regions import find_regions
 from splatgraft.evaluation.report_page import ViewFiles
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.formats import read_capture
-from splatgraft.project.results import METRICS_FILE, locked
+from splatgraft.project.folder_lock import locked
+from splatgraft.project.layout import METRICS_FILE
 from splatgraft.project.step import Device, Positional
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console

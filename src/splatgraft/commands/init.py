@@ -7,8 +7,8 @@ from pathlib import Path
 
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.formats import is_scene
+from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.project_file import TEMPLATE
-from splatgraft.project.results import PROJECT_FILE
 from splatgraft.project.step import Positional
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatgraft.project.results import Record, read_record
+from splatgraft.project.record import Record, read_record
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.flow import read_flow

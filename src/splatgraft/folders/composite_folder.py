@@ -8,7 +8,7 @@ from splatgraft.core.splitting import split_wide_around
 from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.formats.placement import Placement, read_placement, write_placement
-from splatgraft.project.results import IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
+from splatgraft.project.layout import IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
 
 
 def placement_files(path: Path) -> tuple[Path, ...]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from splatgraft.formats import is_scene
-from splatgraft.project.results import Side
+from splatgraft.project.layout import Side
 from splatgraft.runtime.settings import Table, from_table, read_toml
 
 T = TypeVar("T")

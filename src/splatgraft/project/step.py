@@ -8,7 +8,10 @@ from typing import Annotated, Any, Literal, Protocol, get_args, runtime_checkabl
 import torch
 import tyro
 
-from splatgraft.project.results import FolderCheckpoint, Job, locked, replacing
+from splatgraft.project.checkpoint import FolderCheckpoint
+from splatgraft.project.folder_lock import locked
+from splatgraft.project.job import Job
+from splatgraft.project.replacement import replacing
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.progress import Progress
 

@@ -15,8 +15,7 @@ from splatgraft.commands.steps.reconstruct import Reconstruct
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
 from splatgraft.commands.steps.segment import Segment
-from splatgraft.project.project_file import ProjectFile, read_project_file
-from splatgraft.project.results import (
+from splatgraft.project.layout import (
     CAMERAS_FILE,
     IS_OBJECT_FILE,
     LIGHT_TEXT_FILE,
@@ -29,6 +28,7 @@ from splatgraft.project.results import (
     Layout,
     Side,
 )
+from splatgraft.project.project_file import ProjectFile, read_project_file
 from splatgraft.project.step import Step, path_fields
 
 STEPS = (Capture, Reconstruct, Segment, Compose, Relight, Render, Harmonize, Consolidate, Evaluate)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from splatgraft.project.results import locked
+from splatgraft.project.folder_lock import locked
 from splatgraft.runtime.console import Console
 from splatgraft.training.latent_cache import LatentCache
 from splatgraft.training.prediction import Choice, Size, table, training_bytes

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
-from splatgraft.project.results import clear_leftovers, locked, why_stale
+from splatgraft.project.folder_lock import locked
+from splatgraft.project.record import why_stale
+from splatgraft.project.replacement import clear_leftovers
 from splatgraft.project.step import job_of, perform
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.flow import read_flow

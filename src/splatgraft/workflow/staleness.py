@@ -1,6 +1,6 @@
 """Which steps of a project are stale, and why."""
 
-from splatgraft.project.results import why_stale
+from splatgraft.project.record import why_stale
 from splatgraft.project.step import job_of
 from splatgraft.workflow.flow import Flow
 

@@ -6,7 +6,7 @@ Measures nothing; a guess is marked as one.
 from collections.abc import Iterable
 
 from splatgraft.editor.jobs.jobs import PlannedStep
-from splatgraft.project.results import read_record
+from splatgraft.project.record import read_record
 from splatgraft.project.step import Step
 from splatgraft.workflow.flow import Flow
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatgraft.formats import read_gaussians, write_gaussians
-from splatgraft.project.results import SCENE_FILE
+from splatgraft.project.layout import SCENE_FILE
 from splatgraft.project.step import Context, Inputs, Positional
 
 

@@ -10,7 +10,7 @@ from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import ImageLoss, lpips_vgg, windowed_fourier
 from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.formats import read_gaussians, write_gaussians
-from splatgraft.project.results import SCENE_FILE
+from splatgraft.project.layout import SCENE_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.rendering import RenderOptions
 from splatgraft.runtime.lazy_sequence import LazySequence

@@ -24,7 +24,8 @@ from splatgraft.evaluation import (
 )
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.folders.evaluated_scenes import EvaluatedScenes, Pictures, TrueViews, truth_files
-from splatgraft.project.results import RESULTS_IN_ORDER, SCENE_FILE, read_record
+from splatgraft.project.layout import RESULTS_IN_ORDER, SCENE_FILE
+from splatgraft.project.record import read_record
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 
 

@@ -9,7 +9,7 @@ from splatgraft.core.image_metrics import psnr, ssim
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.folders.capture_files import capture_inputs
 from splatgraft.formats import read_capture, write_gaussians
-from splatgraft.project.results import METRICS_FILE, SCENE_FILE
+from splatgraft.project.layout import METRICS_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Inputs, Positional, choose_device
 from splatgraft.reconstruction import ReconstructOptions, predict_memory, reconstruct
 from splatgraft.rendering import RenderOptions, render

@@ -9,7 +9,7 @@ from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
-from splatgraft.project.results import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_TEXT_FILE, SCENE_FILE
+from splatgraft.project.layout import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_TEXT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Inputs
 from splatgraft.relighting.gain_transfer import relight_by_gain
 from splatgraft.relighting.layers import LayerWeights

@@ -16,7 +16,7 @@ from splatgraft.folders.selection_file import read_selection
 from splatgraft.folders.view_folder import ViewFolder, file_stems
 from splatgraft.formats import read_cameras, read_gaussians, write_capture
 from splatgraft.harmonization import HarmonizerInputs
-from splatgraft.project.results import LIGHT_FILE
+from splatgraft.project.layout import LIGHT_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting.light.confidence import light_confidence
 from splatgraft.relighting.light.light import light_from_json

@@ -15,7 +15,7 @@ from splatgraft.folders.object_masks import MaskSource, cut_masks, network_masks
 from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.formats.corrections import read_corrections
-from splatgraft.project.results import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
+from splatgraft.project.layout import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.lazy_sequence import LazySequence

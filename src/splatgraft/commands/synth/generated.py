@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from splatgraft.project.results import locked
+from splatgraft.project.folder_lock import locked
 from splatgraft.project.step import Device, Positional, choose_device
 from splatgraft.runtime.console import Console
 from splatgraft.training.sources.generate import Unlit, Wanted, generate

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from splatgraft.core.images import read_mask, read_rgb
-from splatgraft.project.results import locked
+from splatgraft.project.folder_lock import locked
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.training.sources.generate import Unlit, Wanted, generate

@@ -10,7 +10,7 @@ import torch
 import tyro
 
 from splatgraft.core.images import read_rgb, resize, write_image
-from splatgraft.project.results import locked
+from splatgraft.project.folder_lock import locked
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task, run_tasks

@@ -6,7 +6,7 @@ from pathlib import Path
 from splatgraft.editor.jobs.orbit_video import write_orbit_video
 from splatgraft.editor.session.project_access import ProjectFiles
 from splatgraft.formats import read_gaussians, write_gaussians
-from splatgraft.project.results import REPORT_FILE
+from splatgraft.project.layout import REPORT_FILE
 from splatgraft.runtime.atomic_file import atomic_write
 
 EXPORTS_FOLDER = "export"

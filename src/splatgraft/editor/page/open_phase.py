@@ -12,7 +12,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.editor.access.uploads import SCENES, SUFFIXES, keep_upload
 from splatgraft.editor.session.project_access import Triple
 from splatgraft.editor.session.session import Session
-from splatgraft.project.results import Side
+from splatgraft.project.layout import Side
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page

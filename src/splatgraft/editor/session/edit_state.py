@@ -15,7 +15,7 @@ from torch import Tensor
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.formats.corrections import read_corrections, write_corrections
 from splatgraft.formats.placement import ObjectPlacement, Placement, read_placement, write_placement
-from splatgraft.project.results import LIGHT_FILE, PLACEMENT_FILE
+from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE
 from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.settings import read_toml

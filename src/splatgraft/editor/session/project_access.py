@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 from splatgraft.composition import PlaceOptions
-from splatgraft.project.results import Side
+from splatgraft.project.layout import Side
 from splatgraft.relighting import RelightOptions
 
 LightBy = Literal["transfer", "gain", "off"]

@@ -25,7 +25,7 @@ from splatgraft.editor.session.project_access import Project, ProjectFiles, Trip
 from splatgraft.editor.session.scene_cache import Scenes
 from splatgraft.editor.session.state_store import StateStore
 from splatgraft.formats.placement import ObjectPlacement, read_placement
-from splatgraft.project.results import Side
+from splatgraft.project.layout import Side
 from splatgraft.segmentation import Box, corrected, with_correction
 
 EDITOR_FOLDER = ".editor"

@@ -19,7 +19,7 @@ from splatgraft.evaluation.benchmark.view_metrics import disagreement, measure_v
 from splatgraft.evaluation.measure import Perceptual
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.formats import read_capture, read_gaussians
-from splatgraft.project.results import METRICS_FILE
+from splatgraft.project.layout import METRICS_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.rendering import render
 from splatgraft.workflow.benchmark.scene import HELD_OUT_EVERY

@@ -22,7 +22,7 @@ from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.harmonization import HARMONIZERS, HarmonizerOptions, make_harmonizer
-from splatgraft.project.results import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
+from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting import SourceScene, relight
 from splatgraft.relighting.light.light import light_to_json

@@ -10,16 +10,15 @@ from splatgraft.commands.steps.segment import Segment
 from splatgraft.core.posed_images import held_out
 from splatgraft.evaluation.benchmark.published import PublishedScene
 from splatgraft.formats import read_capture, write_capture
-from splatgraft.project.results import (
+from splatgraft.project.layout import (
     CAMERAS_FILE,
     IS_OBJECT_FILE,
     OBJECT_FILE,
     PLACEMENT_FILE,
     SCENE_FILE,
     SURROUNDINGS_FILE,
-    read_record,
-    why_stale,
 )
+from splatgraft.project.record import read_record, why_stale
 from splatgraft.project.step import Device, Step, job_of, perform
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console

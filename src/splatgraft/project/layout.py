@@ -1,0 +1,86 @@
+"""Names of the files and folders of a project."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+PROJECT_FILE = "project.toml"
+SCENE_FILE = "scene.ply"
+OBJECT_FILE = "object.ply"
+SURROUNDINGS_FILE = "surroundings.ply"
+LIGHT_FILE = "light.json"
+LIGHT_TEXT_FILE = "light.txt"
+SELECTION_FILE = "selection.npy"
+IS_OBJECT_FILE = "is_object.npy"
+CAMERAS_FILE = "transforms.json"
+PLACEMENT_FILE = "placement.json"
+REPORT_FILE = "index.html"
+METRICS_FILE = "metrics.json"
+
+Side = Literal["source", "target"]
+
+RESULTS_IN_ORDER = (
+    "source/capture",
+    "source/scene",
+    "target/capture",
+    "target/scene",
+    "object",
+    "composite",
+    "relit",
+    "views",
+    "harmonized",
+    "result",
+    "report",
+)
+"""All folders of a project, relative to its root, in the order in which they are made."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The folders of one project, in the order of the flow."""
+
+    root: Path
+    """Where all results go: the folder of project.toml by default."""
+
+    def capture(self, side: Side) -> Path:
+        """Posed images: transforms.json, points.ply."""
+        return self.root / side / "capture"
+
+    def scene(self, side: Side) -> Path:
+        """The reconstruction: scene.ply."""
+        return self.root / side / "scene"
+
+    @property
+    def object(self) -> Path:
+        """The object alone, and which Gaussians of the source it is."""
+        return self.root / "object"
+
+    @property
+    def composite(self) -> Path:
+        """The object placed in the target, with the light of its capture."""
+        return self.root / "composite"
+
+    @property
+    def relit(self) -> Path:
+        """The composite after the light transfer."""
+        return self.root / "relit"
+
+    @property
+    def views(self) -> Path:
+        """The composite from the target's cameras: the input of a harmoniser."""
+        return self.root / "views"
+
+    @property
+    def harmonized(self) -> Path:
+        """One harmonised image per view."""
+        return self.root / "harmonized"
+
+    @property
+    def result(self) -> Path:
+        """The consolidated scene."""
+        return self.root / "result"
+
+    @property
+    def report(self) -> Path:
+        """Figures and pictures: metrics.json, index.html."""
+        return self.root / "report"

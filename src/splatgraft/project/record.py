@@ -1,0 +1,81 @@
+"""step.json: what a result was made of, and whether it is still what the step would make."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from splatgraft.project.job import Entry, Job, input_entries
+from splatgraft.runtime.atomic_file import atomic_write
+
+STEP_FILE = "step.json"
+
+
+@dataclass(frozen=True)
+class Record:
+    """The content of step.json: inputs, options and cost of the run that made a folder."""
+
+    step: str
+    """The command."""
+    version: str
+    """Of splatgraft."""
+    options: Mapping[str, Any]
+    """All options, resolved, as plain JSON."""
+    inputs: Mapping[str, tuple[Entry, ...]]
+    """Files read, by role."""
+    outputs: tuple[str, ...]
+    """Files written, relative to the folder."""
+    seconds: float
+    """Wall time of the run that finished; earlier, killed runs do not count."""
+    peak_memory_bytes: int
+    """Largest resident memory while it ran."""
+
+
+def read_record(folder: Path) -> Record | None:
+    """Read the record of a finished result; None where there is none.
+
+    Raises:
+        ValueError: step.json is damaged.
+    """
+    path = folder / STEP_FILE
+    if not path.is_file():
+        return None
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+        inputs = {role: tuple(tuple(e) for e in files) for role, files in found.pop("inputs").items()}
+        return Record(inputs=inputs, outputs=tuple(found.pop("outputs")), **found)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected the record of a step, found {type(error).__name__}: {error}") from error
+
+
+def why_stale(job: Job) -> str | None:
+    """Say in a few words why the folder's content is not what `job` would make; None where it is.
+
+    Raises:
+        ValueError: An input file is missing or step.json is damaged.
+    """
+    record = read_record(job.folder)
+    if record is None:
+        return "not made yet"
+    if missing := [name for name in record.outputs if not (job.folder / name).is_file()]:
+        return f"{missing[0]} was removed"
+    options = json.loads(json.dumps(job.options))
+    for key in sorted({*options, *record.options}):
+        if options.get(key) != record.options.get(key):
+            return f"{key} is now {options.get(key)}, was {record.options.get(key)}"
+    for role in sorted({*job.inputs, *record.inputs}):
+        before = record.inputs.get(role, ())
+        now = input_entries(job.inputs.get(role, ()), before)
+        if [e[0] for e in now] != [e[0] for e in before]:
+            return f"{role}: {len(now)} files, was {len(before)}" if len(now) != len(before) else f"{role}: other files"
+        if changed := [a[0] for a, b in zip(now, before, strict=True) if a[3] != b[3]]:
+            return f"{role}: {changed[0]} changed" + (f" and {len(changed) - 1} more" if len(changed) > 1 else "")
+    return None
+
+
+def write_record(folder: Path, record: Record) -> None:
+    """Write step.json into `folder`, one field per line."""
+    lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in asdict(record).items())
+    with atomic_write(folder / STEP_FILE) as stream:
+        stream.write(f"{{\n{lines}\n}}\n".encode())
