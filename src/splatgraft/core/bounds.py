@@ -1,4 +1,4 @@
-"""The bounding sphere of Gaussians, robust to stray ones."""
+"""The bounding sphere of an object's Gaussians, from percentiles, so that stray Gaussians do not enlarge it."""
 
 from dataclasses import dataclass
 
@@ -9,23 +9,33 @@ from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
 
+_OPAQUE = 0.1  # opacity above which a Gaussian counts
+_STRAY = 0.01  # share of Gaussians on either side that may lie outside
+_MARGIN = 1.05  # factor on the radius; the three are set by hand
+
 
 @dataclass(frozen=True)
 class BoundingSphere:
-    """Where an object is: the ball that holds all but its stray Gaussians."""
+    """A sphere around an object's Gaussians."""
 
     center: Float[Tensor, "3"]
+    """World units, in the frame of the Gaussians."""
     radius: float
+    """World units."""
 
 
 def bounding_sphere(gaussians: Gaussians) -> BoundingSphere:
-    """The ball around the opacity-weighted middle that holds 99% of the opaque Gaussians and their width."""
-    opaque = gaussians.opacities > 0.1
+    """The sphere that holds 99% of the opaque Gaussians with one standard deviation of their width, plus 5%.
+
+    Its centre is the middle between the 1st and the 99th percentile along each axis. Gaussians below an opacity of 0.1
+    are ignored unless all are.
+    """
+    opaque = gaussians.opacities > _OPAQUE
     means = gaussians.means[opaque] if bool(opaque.any()) else gaussians.means
     scales = (gaussians.scales[opaque] if bool(opaque.any()) else gaussians.scales).max(1).values
-    # parted, not sorted, as quantiles are: this is asked of every object at every move
-    few, most = round(0.01 * (len(means) - 1)), round(0.99 * (len(means) - 1))
-    parted = torch.from_numpy(np.partition(means.numpy(), (few, most), axis=0))
-    center = 0.5 * (parted[few] + parted[most])
+    # a partition is faster than a quantile's sort; the editor computes this after every move
+    low, high = round(_STRAY * (len(means) - 1)), round((1 - _STRAY) * (len(means) - 1))
+    partitioned = torch.from_numpy(np.partition(means.numpy(), (low, high), axis=0))
+    center = 0.5 * (partitioned[low] + partitioned[high])
     reach = (means - center).norm(dim=1) + scales
-    return BoundingSphere(center=center, radius=1.05 * float(np.partition(reach.numpy(), most)[most]))
+    return BoundingSphere(center=center, radius=_MARGIN * float(np.partition(reach.numpy(), high)[high]))

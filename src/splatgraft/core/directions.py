@@ -1,33 +1,58 @@
-"""Even sets of directions, frames that look along them, and spherical-harmonic fits. Knows nothing about scenes."""
+"""Unit vectors: even sets over the sphere, spirals over a cone, perpendicular axes, light frames; harmonic fits."""
 
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
+
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+"""Radians; successive points of a Fibonacci lattice or a Vogel spiral are turned by it."""
 
 
 def even_directions(count: int) -> Float[Tensor, "n 3"]:
     """`count` unit vectors spread evenly over the sphere (Fibonacci lattice)."""
     i = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * i / count
-    azimuth = i * (math.pi * (3 - math.sqrt(5)))
+    azimuth = i * GOLDEN_ANGLE
     ring = (1 - z * z).sqrt()
     return torch.stack([ring * azimuth.cos(), ring * azimuth.sin(), z], -1).float()
 
 
 def even_pairs(count: int) -> Float[Tensor, "n 3"]:
-    """`count` (even) unit vectors; entry i + count / 2 is exactly opposite to entry i, so one is the other's back."""
+    """`count` (even) unit vectors over the sphere; entry i + count / 2 is exactly opposite to entry i."""
     half = even_directions(count)[: count // 2]
     return torch.cat([half, -half])
 
 
-def frames_along(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
-    """Rotations whose rows are right, down and away from the light: x_in_light = frame @ x_in_world.
+def vogel_offsets(
+    axis: Float[Tensor, "3"], radii: Float[Tensor, "n"], index: Float[Tensor, "n"] | Int[Tensor, "n"]
+) -> Float[Tensor, "n 3"]:
+    """Offsets perpendicular to unit `axis`, `radii` long, each turned by `index` golden angles (Vogel 1979)."""
+    right, down, _ = frames_along(axis[None])[0]
+    # not index * GOLDEN_ANGLE: that rounds otherwise in single precision
+    angle = index * math.pi * (3 - math.sqrt(5))
+    return (radii * angle.cos())[:, None] * right + (radii * angle.sin())[:, None] * down
 
-    The depth axis is -direction, so that depth grows away from the light. Continuous except at two poles.
+
+def perpendicular(axis: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """A unit vector perpendicular to unit `axis`: its cross product with the world axis farthest from it."""
+    world_axis = torch.eye(3, dtype=axis.dtype, device=axis.device)[int(axis.abs().argmin())]
+    return torch.nn.functional.normalize(torch.linalg.cross(axis, world_axis), dim=0)
+
+
+def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Tangent and bitangent of unit `normal`: `perpendicular(normal)` and normal x tangent, all three right-handed."""
+    tangent = perpendicular(normal)
+    return tangent, torch.linalg.cross(normal, tangent)
+
+
+def frames_along(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
+    """Rotations of the lights in unit `directions`; rows right, down, away from the light: x_in_light = R @ x_in_world.
+
+    The depth axis is -direction, so that depth grows away from the light. Not continuous where |z| passes 0.9.
     """
     away = -directions
     helper = torch.where(
@@ -40,9 +65,10 @@ def frames_along(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
 def fit_sh(
     directions: Float[Tensor, "n 3"], values: Float[Tensor, "n 3"], weights: Float[Tensor, "n"], *, degree: int = 2
 ) -> Float[Tensor, "k 3"]:
-    """Weighted least-squares expansion of `values`; bands above 0 are held small where nothing was seen.
+    """Spherical-harmonic coefficients of `values` at unit `directions`, by weighted least squares.
 
-    The ridge grows with l(l+1), a smoothness prior: an unseen part continues its surroundings, then fades to the mean.
+    A ridge that grows with l(l+1), a smoothness prior, keeps bands above 0 small where weights are 0: there the
+    expansion continues its surroundings, then fades to the mean.
     """
     basis = spherical_harmonics.basis(directions, degree).double()
     band = torch.tensor([float(math.isqrt(i)) for i in range(basis.shape[1])], dtype=torch.float64)
