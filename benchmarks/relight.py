@@ -14,7 +14,8 @@ from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
-from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting import Light, LightSource, SourceScene, relight
 from splatgraft.relighting.light.estimate import estimate_light

@@ -19,8 +19,9 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
-from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.relighting import Light, LightSource, RelightOptions, relight

@@ -7,8 +7,8 @@ import torch
 
 from splatgraft.capture import upright
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.gaussians import rotation_from_quaternion
-from splatgraft.core.level_plane import dominant_level_plane
+from splatgraft.core.planes import dominant_level_plane
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from splatgraft.composition import compose
-from splatgraft.core.gaussians import Gaussians, empty, rotation_from_quaternion
+from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 
 

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatgraft.core.gaussians import rotation_from_quaternion
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats.placement import ObjectPlacement, Placement, read_placement, write_placement
 

@@ -18,7 +18,8 @@ from splatgraft.composition import (
 from splatgraft.composition.facing_direction import facing_yaw_deg
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.capture_orientation import estimate_up, focus_point
-from splatgraft.core.gaussians import Gaussians, concatenate, empty, quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.core.gaussians import Gaussians, concatenate, empty
+from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 
 UP = torch.tensor([0.0, 0.0, 1.0])

@@ -3,7 +3,8 @@
 import torch
 
 from splatgraft.core import spherical_harmonics as harmonics
-from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 
 

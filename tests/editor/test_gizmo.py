@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatgraft.core.gaussians import rotation_from_quaternion
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.editor.session.gizmo import Gizmo, degrees_of, gizmo_of, similarity_of, wxyz_of
 
 ANGLE = st.floats(-179, 179)

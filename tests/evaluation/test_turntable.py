@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.gaussians import rotation_from_quaternion
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.evaluation.turntable import TurntableOptions, turntable_cameras
 
 CENTER = torch.tensor([0.3, -0.2, 0.5])

@@ -8,8 +8,9 @@ import torch
 
 from splatgraft.composition import compose
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.gaussians import Gaussians, empty, rotation_from_quaternion
+from splatgraft.core.gaussians import Gaussians, empty
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.relighting.gain_transfer import relight_by_gain

@@ -8,8 +8,9 @@ import torch
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.directions import even_directions, frames_along
-from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import srgb_from_linear
+from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.relighting.light.highlight_evidence import find_highlights
 from splatgraft.relighting.light.shadow_evidence import estimate_direction
 from splatgraft.relighting.shading.normals import estimate_normals

@@ -7,8 +7,9 @@ import torch
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.directions import even_directions, even_pairs, fit_sh, frames_along
-from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import srgb_from_linear
+from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.core.splitting import split_along
 from splatgraft.relighting.light.estimate import estimate_light

@@ -9,8 +9,9 @@ import torch
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
-from splatgraft.core.gaussians import Gaussians, concatenate, empty, quaternion_from_rotation
+from splatgraft.core.gaussians import Gaussians, concatenate, empty
 from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.relighting import (

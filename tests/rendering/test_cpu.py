@@ -12,7 +12,8 @@ from scenes import camera, random_scene
 
 from splatgraft import rendering
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians, concatenate, empty, rotation_from_quaternion
+from splatgraft.core.gaussians import Gaussians, concatenate, empty
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.rendering import RenderOptions
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.level_plane import dominant_level_plane
+from splatgraft.core.planes import dominant_level_plane
 from splatgraft.core.similarity import Similarity
 
 

@@ -1,4 +1,4 @@
-"""Objects, their transforms and an erasure become a `Composite`, checked. Knows nothing about how places are found."""
+"""Builds a `Composite` from a target, objects, their transforms and the Gaussians to erase, and checks them."""
 
 from collections.abc import Sequence
 
@@ -18,9 +18,16 @@ def compose(
     target_from_objects: Sequence[Similarity],
     erased: Bool[Tensor, "n"] | None = None,
 ) -> Composite:
-    """Place each of `objects` by its transform; `erased` leaves out Gaussians of the target.
+    """Place each of `objects` in `target` by its transform.
 
-    Raises: ValueError where there is not one transform per object, or `erased` has another length than the target.
+    Args:
+        target: The receiving scene.
+        objects: Each in the frame of its own capture.
+        target_from_objects: One transform per object.
+        erased: True for Gaussians of the target to leave out; None leaves out none.
+
+    Raises:
+        ValueError: Where there is not one transform per object, or `erased` has another length than the target.
     """
     if len(objects) != len(target_from_objects):
         raise ValueError(f"placement: expected {len(objects)} objects, one per .ply, found {len(target_from_objects)}")

@@ -1,34 +1,55 @@
-"""Which side of an object should face the target's cameras: the one that was photographed. Looks at no Gaussian."""
+"""Yaw that turns the photographed sides of an object towards the target's cameras, from camera directions alone."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_SPREAD = math.radians(30)
-_STEP_DEG = 5
+from splatgraft.core.directions import tangents
+
+
+@dataclass(frozen=True)
+class FacingOptions:
+    """How well a photograph covers nearby directions; values set by hand."""
+
+    spread_deg: float = 30.0
+    """Standard deviation of the azimuth around a photograph's."""
+    step_deg: int = 5
+    """Between the yaws tried."""
+    good_share: float = 0.98
+    """Coverage over the best one above which the smallest turn is preferred."""
 
 
 def facing_yaw_deg(
-    seen_from: Float[Tensor, "s 3"], looked_at_from: Float[Tensor, "t 3"], *, up: Float[Tensor, "3"]
+    to_source_cameras: Float[Tensor, "s 3"],
+    to_target_cameras: Float[Tensor, "t 3"],
+    *,
+    up: Float[Tensor, "3"],
+    options: FacingOptions = FacingOptions(),
 ) -> float:
-    """Turn about `up` that brings photographed sides before the cameras, in degrees within [-180, 180).
+    """Rotation about `up` that turns photographed sides towards the target's cameras.
 
-    `seen_from` are directions from the object to the cameras of its capture, `looked_at_from` to those of the target,
-    both in the target's frame. Of equally good turns it is the smallest: 0 where the capture went all round.
+    Args:
+        to_source_cameras: From the object to the cameras of its own capture, in the target's frame.
+        to_target_cameras: From the object to the target's cameras, in the target's frame.
+        up: Unit.
+        options: What counts as covered by a photograph.
+
+    Returns:
+        Degrees in [-180, 180); the smallest of about equally good ones: 0 where the capture goes all round.
     """
-    yaw = torch.arange(-180, 180, _STEP_DEG, dtype=torch.float64)
-    source, target = (_azimuth(x.double(), up.double()) for x in (seen_from, looked_at_from))
+    yaw = torch.arange(-180, 180, options.step_deg, dtype=torch.float64)
+    source, target = (_azimuth(x.double(), up.double()) for x in (to_source_cameras, to_target_cameras))
     miss = target[None, :, None] - source[None, None, :] - torch.deg2rad(yaw)[:, None, None]
     miss = torch.remainder(miss + math.pi, 2 * math.pi) - math.pi
-    # for each camera of the target, how near the nearest photograph was taken
-    covered = torch.exp(-0.5 * (miss / _SPREAD) ** 2).amax(2).mean(1)
-    good = covered >= 0.98 * covered.max()
+    # for each camera of the target, how near in azimuth the nearest photograph was taken
+    covered = torch.exp(-0.5 * (miss / math.radians(options.spread_deg)) ** 2).amax(2).mean(1)
+    good = covered >= options.good_share * covered.max()
     return float(yaw[good][yaw[good].abs().argmin()])
 
 
 def _azimuth(directions: Float[Tensor, "n 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "n"]:
-    helper = torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
-    across = torch.nn.functional.normalize(torch.linalg.cross(up, helper), dim=0)
-    return torch.atan2(directions @ torch.linalg.cross(up, across), directions @ across)
+    tangent, bitangent = tangents(up)
+    return torch.atan2(directions @ bitangent, directions @ tangent)

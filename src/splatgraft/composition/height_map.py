@@ -1,4 +1,4 @@
-"""A scene seen straight from above, everything over a given level cut away. Knows nothing about objects or cameras."""
+"""Height map of a scene around a point: depth rendered from straight above, without what lies over a given level."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import RenderOptions, render
 
-# camera distance over radius: rays are vertical within 2.4 degrees
 _DISTANCE = 24.0
+"""Distance of the camera over the radius: rays are vertical within 2.4 degrees."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class HeightMap:
     heights: Float[Tensor, "s s"]
     """Along `up` above the map's centre, world units."""
     alpha: Float[Tensor, "s s"]
-    """How opaque the scene is there, in [0, 1]."""
+    """Opacity of the scene seen from above, in [0, 1]."""
     offsets: Float[Tensor, "s s 2"]
     """Horizontal position from the map's centre, world units."""
     pixel: float
-    """Distance between neighbours, world units."""
+    """Width of a pixel, world units."""
 
 
 def height_map(
@@ -39,17 +39,27 @@ def height_map(
     top: float,
     size: int = 96,
 ) -> HeightMap:
-    """The square of half width `radius` around `center`; Gaussians centred more than `top` above it are cut."""
+    """The height map of the square of half width `radius` around `center`.
+
+    Args:
+        scene: What is seen from above.
+        center: World units.
+        up: Of any length but zero.
+        radius: World units.
+        top: Gaussians centred more than this above `center` are left out, world units.
+        size: Width and height of the map, pixels.
+    """
     center, up = center.to(scene.means), torch.nn.functional.normalize(up.to(scene.means), dim=0)
     distance = _DISTANCE * radius
     eye = center + (top + distance) * up
-    helper = torch.eye(3).to(up)[int(up.abs().argmin())]
-    pose = look_at(eye[None], center, helper)
+    # any image orientation will do; look_at only needs an axis that is not parallel to the view
+    world_axis = torch.eye(3).to(up)[int(up.abs().argmin())]
+    pose = look_at(eye[None], center, world_axis)
     focal = size / 2 * distance / radius
     camera = pinhole(pose, focal, width=size, height=size)
-    seen = render(scene, camera, outputs=frozenset({"depth"}), options=RenderOptions(near=distance))
-    assert seen.depth is not None
-    depth, alpha = seen.depth[0].detach(), seen.alpha[0].detach()
+    rendered = render(scene, camera, outputs=frozenset({"depth"}), options=RenderOptions(near=distance))
+    assert rendered.depth is not None
+    depth, alpha = rendered.depth[0].detach(), rendered.alpha[0].detach()
     x = (torch.arange(size).to(depth) + 0.5 - size / 2) / focal
     v, u = torch.meshgrid(x, x, indexing="ij")
     in_camera = torch.stack([u * depth, v * depth, depth], -1)

@@ -1,13 +1,13 @@
-"""The placement helper: base, place, size and upright rest in one call. Knows nothing about light or files."""
+"""Automatic placement of an object in a target scene: its base, a place, a scale, an upright pose and a yaw."""
 
 from dataclasses import dataclass, field, replace
 
 import torch
 
-from splatgraft.composition.burial import hidden_fraction
 from splatgraft.composition.facing_direction import facing_yaw_deg
 from splatgraft.composition.object_base import ObjectBase, object_base
-from splatgraft.composition.place_suggestion import size_in_view, suggest_place
+from splatgraft.composition.place_suggestion import scale_in_view, suggest_place
+from splatgraft.composition.point_visibility import hidden_fraction
 from splatgraft.composition.resting_pose import RestOptions, rest_on_surface
 from splatgraft.composition.support_surface import Support
 from splatgraft.core.cameras import Cameras
@@ -18,32 +18,32 @@ from splatgraft.core.similarity import Similarity
 
 @dataclass(frozen=True)
 class PlaceOptions:
-    """What the user decides; the rest is found."""
+    """What the user decides; what is None is found."""
 
     point: tuple[float, float, float] | None = None
-    """The object stands on the surface below this point of the target; None finds a visible, level place."""
+    """The object is placed on the surface below this point of the target; None finds a visible, level place."""
     scale: float | None = None
-    """Size in the target over size in the source; None guesses from the views, for captures have no common unit."""
+    """Size in the target over size in the source; None guesses from the views, as captures have no common unit."""
     yaw_deg: float | None = None
-    """Turn about the vertical, counterclockwise seen from above; None turns photographed sides to the cameras."""
+    """Rotation about up, counterclockwise seen from above; None turns photographed sides towards the cameras."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Added to where it stands, world units of the target."""
+    """Added to the position, world units of the target."""
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Where an object was put, and how well it stands."""
+    """Where an object was placed, and how well."""
 
     target_from_object: Similarity
     """The placement."""
     base: ObjectBase
-    """The object's foot, in its own capture."""
+    """The object's base, in its own capture."""
     support: Support
-    """What it stands on."""
+    """The surface under it."""
     hidden_fraction: float
     """Share of the object that no target camera can see, in [0, 1]."""
     warnings: tuple[str, ...] = field(default=())
-    """What a user should look at, one sentence each."""
+    """Problems that a user should look at, one sentence each."""
 
 
 def place_object(
@@ -54,12 +54,17 @@ def place_object(
     surroundings: Gaussians | None = None,
     options: PlaceOptions = PlaceOptions(),
 ) -> Placed:
-    """Stand `object_` upright in `target`; `cameras` are the target's and the source's, in this order.
+    """Place `object_` upright on a surface of `target`.
 
-    `surroundings` is the source without the object: what it stood on tells where its foot is. For a further object,
-    give as `target` the scene baked with the objects before.
+    Args:
+        target: The receiving scene; for a further object, baked with the objects before.
+        object_: The object in the frame of its capture.
+        cameras: Of the target and of the source, in this order.
+        surroundings: The source without the object, whose ground gives the object's base; None uses its lowest parts.
+        options: What the user decides.
 
-    Raises: ValueError where the object is empty or there is nothing level to stand on.
+    Raises:
+        ValueError: Where the object is empty or no level surface is found.
     """
     target_cameras, source_cameras = cameras
     up = estimate_up(target_cameras)
@@ -69,12 +74,12 @@ def place_object(
         point, scale = found.point, found.scale
     else:
         point = torch.tensor(options.point)
-        scale = options.scale if options.scale is not None else size_in_view(base, point, cameras=target_cameras)
+        scale = options.scale if options.scale is not None else scale_in_view(base, point, cameras=target_cameras)
     rest = RestOptions(scale=scale, yaw_deg=options.yaw_deg or 0.0, offset=options.offset)
     move, support = rest_on_surface(target, base, point=point, up=up, options=rest)
     if options.yaw_deg is None:
-        seen_from = (source_cameras.centers - base.point) @ move.rotation.T
-        yaw = facing_yaw_deg(seen_from, target_cameras.centers - support.point, up=support.normal)
+        to_source_cameras = (source_cameras.centers - base.point) @ move.rotation.T
+        yaw = facing_yaw_deg(to_source_cameras, target_cameras.centers - support.point, up=support.normal)
         move, support = rest_on_surface(target, base, point=point, up=up, options=replace(rest, yaw_deg=yaw))
     hidden = hidden_fraction(target, move.gaussians(object_), cameras=target_cameras)
     return Placed(
@@ -88,7 +93,7 @@ def place_object(
 
 def _warnings(support: Support, hidden: float) -> tuple[str, ...]:
     out = []
-    # an underside on its table is hidden from everyone: a sixth of a cube
+    # the underside is always hidden: a sixth of a cube
     if hidden > 0.25:
         out.append(f"{hidden:.0%} of the object is hidden from every camera: it may stick in a wall or in furniture.")
     if support.flat_fraction < 0.6:

@@ -1,11 +1,14 @@
-"""The value `Cameras`: undistorted pinhole cameras with poses. Knows nothing about images or files."""
+"""The value `Cameras`: undistorted pinhole cameras with poses, and their resizing, cropping and selection."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+Window = tuple[int, int, int, int]
+"""A part of an image: left, top, right, bottom, pixels; right and bottom excluded."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Cameras:
         return len(self.names)
 
     def __getitem__(self, which: int | slice | list[int] | Int[Tensor, "m"] | Bool[Tensor, "v"]) -> "Cameras":
-        """The chosen cameras; one integer gives one camera, still as a batch of 1."""
+        """The chosen cameras; an integer gives a batch of one camera."""
         indices = torch.arange(len(self))[[which] if isinstance(which, int) else which]
         return Cameras(
             world_from_camera=self.world_from_camera[indices],
@@ -84,6 +87,18 @@ class Cameras:
         ratio = (sizes / self.sizes).to(self.intrinsics)
         scale = torch.diag_embed(torch.cat([ratio, torch.ones_like(ratio[:, :1])], 1))
         return replace(self, intrinsics=scale @ self.intrinsics, sizes=sizes)
+
+    def cropped(self, windows: Sequence[Window]) -> "Cameras":
+        """Cameras of images cut to `windows`, one window per camera; names and poses stay."""
+        intrinsics = self.intrinsics.clone()
+        edges = torch.tensor(windows, dtype=torch.int64).reshape(-1, 4)
+        intrinsics[:, :2, 2] -= edges[:, :2].to(intrinsics)
+        sizes = (edges[:, 2:] - edges[:, :2]).to(self.sizes.dtype)
+        return replace(self, intrinsics=intrinsics, sizes=sizes)
+
+    def spread(self, count: int) -> "Cameras":
+        """At most `count` of the cameras, evenly spaced in their order, the first and the last among them."""
+        return self[torch.linspace(0, len(self) - 1, min(count, len(self))).round().long()]
 
     def to(self, device: torch.device | str) -> "Cameras":
         """The same cameras on `device`; sizes stay on the CPU."""

@@ -1,4 +1,4 @@
-"""The value `Distortion`: radial and tangential lens distortion of an image. Knows nothing about files or poses."""
+"""The value `Distortion`: radial and tangential lens distortion of an image (OpenCV's model), and its removal."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class Distortion:
     """Width and height for which `intrinsics` hold, pixels."""
 
     def pinhole(self) -> Float64[np.ndarray, "3 3"]:
-        """The matrix of the pinhole, at `size`, that shows the largest upright rectangle without empty border.
+        """Intrinsics, at `size`, of the pinhole camera with the largest view that has no empty border.
 
         Raises: ValueError where the distortion folds the image over itself.
         """
@@ -48,7 +48,7 @@ class Distortion:
         return np.array([[fx, 0, -x0 * fx], [0, fy, -y0 * fy], [0, 0, 1]])
 
     def _is_monotonic(self, radii: np.ndarray) -> bool:
-        """Whether rays further out land further out, up to the largest of `radii`."""
+        """Whether the distorted radius grows with the undistorted one, up to the largest of `radii`."""
         k1, k2, _, _, k3 = self.coefficients.tolist()
         square = np.linspace(0, radii.max(), 256) ** 2
         return bool((1 + square * (3 * k1 + square * (5 * k2 + square * 7 * k3)) > 0).all())
@@ -56,16 +56,23 @@ class Distortion:
     def undistort(
         self, image: Float[Tensor, "h w *c"], pinhole: Float[Tensor, "3 3"], *, width: int, height: int
     ) -> Float[Tensor, "h w *c"]:
-        """The file's pixels as `pinhole` of a `width` x `height` image sees them, at the file's own resolution."""
+        """`image`, at its own resolution, as a pinhole camera sees it.
+
+        Args:
+            image: Pixels of the file.
+            pinhole: Intrinsics of the pinhole camera, for an image of `width` x `height` pixels.
+            width: Pixels.
+            height: Pixels.
+        """
         h, w = image.shape[:2]
         half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV has pixel centres at whole numbers
         to_file = np.diag([w / self.size[0], h / self.size[1], 1])
-        to_served = np.diag([w / width, h / height, 1])
+        to_pinhole = np.diag([w / width, h / height, 1])
         map_x, map_y = cv2.initUndistortRectifyMap(
             to_file @ self.intrinsics.numpy() - half,
             self.coefficients.numpy(),
             None,
-            to_served @ pinhole.double().cpu().numpy() - half,
+            to_pinhole @ pinhole.double().cpu().numpy() - half,
             (w, h),
             cv2.CV_32FC1,
         )

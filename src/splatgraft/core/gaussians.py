@@ -1,4 +1,4 @@
-"""The value `Gaussians`: a 3DGS scene as raw tensors. Knows nothing about files, cameras or rendering."""
+"""The value `Gaussians`: a 3D Gaussian Splatting scene in the raw parametrisation that its .ply stores."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -8,46 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
-
-
-def rotation_from_quaternion(quaternions: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Rotation matrices of wxyz quaternions of any length but zero."""
-    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, -1).reshape(-1, 3, 3)
-
-
-def quaternion_from_rotation(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
-    """Unit wxyz quaternions of rotation matrices, w >= 0; stable for every rotation."""
-    m = rotations
-    d = torch.diagonal(m, dim1=-2, dim2=-1)
-    x, y, z = d.unbind(-1)
-    squares = torch.stack([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z], -1)
-    a, b, c = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
-    e, f, g = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
-    rows = torch.stack(
-        [
-            torch.stack([squares[:, 0], a, b, c], -1),
-            torch.stack([a, squares[:, 1], e, f], -1),
-            torch.stack([b, e, squares[:, 2], g], -1),
-            torch.stack([c, f, g, squares[:, 3]], -1),
-        ],
-        1,
-    )
-    # of four parallel candidates, the one with the largest component is the best conditioned
-    best = rows[torch.arange(len(m), device=m.device), squares.argmax(-1)]
-    best = torch.nn.functional.normalize(best, dim=-1)
-    return torch.where(best[:, :1] < 0, -best, best)
+from splatgraft.core.rotations import rotation_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -77,7 +38,7 @@ class Gaussians:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors live."""
+        """Device of the tensors."""
         return self.means.device
 
     @property
@@ -102,7 +63,7 @@ class Gaussians:
         return half @ half.transpose(1, 2)
 
     def select(self, which: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> "Gaussians":
-        """The Gaussians that a mask keeps, or an index list names."""
+        """The Gaussians where the mask is true, or those at the given indices, in their order."""
         return self.map(lambda tensor: tensor[which])
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Gaussians":
@@ -126,7 +87,7 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
 
 
 def empty(sh_degree: int = 0) -> Gaussians:
-    """No Gaussians at all."""
+    """A scene of zero Gaussians."""
     return Gaussians(
         means=torch.zeros(0, 3),
         log_scales=torch.zeros(0, 3),

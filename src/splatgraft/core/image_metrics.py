@@ -1,4 +1,4 @@
-"""PSNR and SSIM of images in [0, 1], whole or inside a region; differentiable. Knows nothing about files or weights."""
+"""PSNR and SSIM (Wang 2004) of images in [0, 1], whole or inside a region; differentiable."""
 
 import torch
 import torch.nn.functional as F

@@ -1,4 +1,4 @@
-"""Images as tensors: reading and writing files, sRGB transfer, resampling. Knows nothing about cameras or Gaussians."""
+"""Images as tensors: reading and writing files, the sRGB transfer function, resampling."""
 
 import warnings
 from collections.abc import Iterator
@@ -18,9 +18,9 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", "
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 _ALWAYS_ALLOWED_PIXELS = 1 << 24
 _PIXELS_PER_BYTE = 1 << 14
-"""More than any picture needs: a black 1-bit PNG has 8256. Above 179 million pixels Pillow itself refuses."""
+"""Above every real image: a black 1-bit PNG has 8256. Above 179 million pixels Pillow itself refuses."""
 _GREY_SCALES = {"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I;16N": 65535, "I": 65535, "F": 1}
-"""White in Pillow's modes of more than 8 bits; I is what some versions make of 16-bit PNG."""
+"""White in Pillow's modes of more than 8 bits; some versions read a 16-bit PNG as mode I."""
 
 
 def linear_from_srgb(srgb: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -43,7 +43,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def read_rgb(path: Path) -> Float[Tensor, "h w 3"]:
-    """sRGB in [0, 1] of the picture as a viewer shows it: EXIF rotation applied; what is transparent is black.
+    """sRGB in [0, 1] with the EXIF rotation applied; transparent pixels are black.
 
     Raises: ValueError where the file is no readable image.
     """
@@ -112,7 +112,7 @@ def _rgb(image: Image.Image) -> Float[Tensor, "h w 3"]:
 
 
 def _grey(image: Image.Image) -> Float[Tensor, "h w"]:
-    """Modes that Pillow would clip to 8 bits instead of scaling."""
+    """Modes that Pillow clips to 8 bits where it should scale."""
     values = np.array(image).astype(np.float32) / _GREY_SCALES[image.mode]
     return torch.from_numpy(np.nan_to_num(values)).clamp(0, 1)
 
@@ -125,12 +125,12 @@ def _open(path: Path) -> Image.Image:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """The image, with every way in which Pillow says that a file is broken turned into one."""
+    """The opened image; all of Pillow's errors about a broken file become one ValueError."""
     if not path.is_file():
         raise ValueError(f"{path}: expected an image file, found none")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # odd metadata, and sizes that the next check judges better
+            warnings.simplefilter("ignore")  # odd metadata, and sizes that the next check refuses
             with Image.open(path, formats=_FORMATS) as image:
                 if image.width * image.height > max(_ALWAYS_ALLOWED_PIXELS, _PIXELS_PER_BYTE * path.stat().st_size):
                     raise ValueError(f"{image.width}x{image.height} px claimed by {path.stat().st_size} bytes")
@@ -140,7 +140,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 
 
 def write_image(path: Path, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"]) -> None:
-    """Write 8-bit sRGB or grey; the format follows the suffix. The file appears whole or not at all.
+    """Write 8-bit sRGB or grey; the format follows the suffix. Atomic.
 
     Raises: ValueError where the suffix names no image format.
     """

@@ -1,4 +1,4 @@
-"""The value `PosedImages`: a capture with poses and sparse points. Image files are read when asked for, not before."""
+"""The value `PosedImages`: a capture with poses and sparse points; image files are read on access."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,34 +17,34 @@ class PosedImages:
     """v images with their cameras, and m sparse points from structure from motion."""
 
     image_paths: tuple[Path, ...]
-    """One file per camera, in the cameras' order, as photographed: `image` serves their undistorted pixels."""
+    """One file per camera, in the cameras' order, as photographed; `image` undistorts them."""
     cameras: Cameras
-    """Poses and intrinsics, at the size at which images are served."""
+    """Poses and intrinsics, for the size to which images are resampled."""
     points: Float[Tensor, "m 3"]
     """Sparse surface points, world units; m may be 0."""
     point_colors: Float[Tensor, "m 3"]
     """sRGB in [0, 1]."""
     mask_paths: tuple[Path | None, ...] = ()
-    """Object mask of each image where there is one (the image itself where that is its alpha channel); empty where the
-    capture has none."""
+    """Object mask of each image, or None; the image's own path where its alpha channel is the mask; empty where the
+    capture has no masks."""
     distortions: tuple[Distortion | None, ...] = ()
-    """Lens distortion of each image file, removed when it is read; empty where no file has any."""
+    """Lens distortion of each image file, removed on reading; empty where no file has any."""
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     def image(self, index: int) -> Float[Tensor, "h w 3"]:
         """The image of camera `index`, sRGB, undistorted and resampled to that camera's size."""
-        return self._served(read_stored_rgb(self.image_paths[index]), index)
+        return self._resampled(read_stored_rgb(self.image_paths[index]), index)
 
     def mask(self, index: int) -> Float[Tensor, "h w"] | None:
         """The object mask of camera `index` in [0, 1], or None."""
         path = self.mask_paths[index] if self.mask_paths else None
         if path is None:
             return None
-        return self._served(read_alpha(path) if path == self.image_paths[index] else read_mask(path), index)
+        return self._resampled(read_alpha(path) if path == self.image_paths[index] else read_mask(path), index)
 
-    def _served(self, pixels: Float[Tensor, "h w *c"], index: int) -> Float[Tensor, "j i *c"]:
+    def _resampled(self, pixels: Float[Tensor, "h w *c"], index: int) -> Float[Tensor, "j i *c"]:
         width, height = self.cameras.sizes[index].tolist()
         distortion = self.distortions[index] if self.distortions else None
         if distortion is not None:
@@ -63,7 +63,7 @@ class PosedImages:
         )
 
     def resized(self, factor: float) -> "PosedImages":
-        """The same capture served at `factor` times its size."""
+        """The same capture with images resampled by `factor`."""
         return replace(self, cameras=self.cameras.resized(factor))
 
 

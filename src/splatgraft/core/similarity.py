@@ -1,4 +1,4 @@
-"""The value `Similarity`: uniform scale, rotation, translation, and how it moves Gaussians, cameras and points."""
+"""The value `Similarity`: uniform scale, rotation and translation, applied to Gaussians, cameras and points."""
 
 from dataclasses import dataclass, replace
 
@@ -8,7 +8,8 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.rotations import quaternion_from_rotation
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Similarity:
 
     @staticmethod
     def identity() -> "Similarity":
-        """The transform that moves nothing."""
+        """The identity transform."""
         return Similarity(scale=1.0, rotation=torch.eye(3), translation=torch.zeros(3))
 
     def __matmul__(self, other: "Similarity") -> "Similarity":
@@ -47,7 +48,7 @@ class Similarity:
         return self.scale * points @ self.rotation.to(points).T + self.translation.to(points)
 
     def gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """Gaussians of frame b in frame a; every SH band turns with them."""
+        """Gaussians of frame b in frame a; all SH bands are rotated."""
         if self.is_identity:
             return gaussians
         rotation = self.rotation.to(gaussians.means)
@@ -60,7 +61,7 @@ class Similarity:
         )
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """Cameras of frame b in frame a; a render of the moved scene is unchanged."""
+        """Cameras of frame b in frame a; they see the transformed scene as the original cameras see the original."""
         poses = cameras.world_from_camera.clone()
         poses[:, :3, :3] = self.rotation.to(poses) @ poses[:, :3, :3]
         poses[:, :3, 3] = self.points(poses[:, :3, 3])
@@ -68,7 +69,7 @@ class Similarity:
 
     @property
     def is_identity(self) -> bool:
-        """Whether nothing moves at all, exactly."""
+        """Whether this is exactly the identity."""
         return (
             self.scale == 1.0
             and torch.equal(self.rotation, torch.eye(3).to(self.rotation))

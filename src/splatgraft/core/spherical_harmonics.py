@@ -1,4 +1,4 @@
-"""Real spherical harmonics of degree 0 to 3: basis, colours, rotation. Knows nothing about Gaussians or images.
+"""Real spherical harmonics of degree 0 to 3: basis values, colours of Gaussians, rotation of coefficients.
 
 Sign and order follow the 3DGS convention: band l holds m = -l .. l, band 1 is (-y, z, -x) times a constant.
 """
@@ -11,6 +11,7 @@ from torch import Tensor
 
 MAX_DEGREE = 3
 C0 = 0.28209479177387814
+"""Value of the band-0 basis function, 1 / (2 sqrt(pi))."""
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
 _C3 = (
@@ -82,7 +83,7 @@ def colors(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Floa
 
 
 def dc_from_rgb(rgb: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
-    """Band-0 coefficient of a colour that is the same from all sides."""
+    """Band-0 coefficient of a colour that does not depend on the view."""
     return (rgb - 0.5) / C0
 
 
@@ -102,7 +103,7 @@ def with_degree(sh: Float[Tensor, "n k 3"], degree: int) -> Float[Tensor, "n j 3
 def rotation_matrix(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "k k"]:
     """Matrix D with f'(d) = f(R^T d) when coefficients are c' = D c; block-diagonal by band, float64.
 
-    Solved exactly from the basis at fixed directions, since every band is closed under rotation.
+    Solved from the basis at 64 directions of a Fibonacci lattice; exact, since every band is closed under rotation.
     """
     rotation = rotation.detach().to("cpu", torch.float64)
     i = torch.arange(64, dtype=torch.float64)
@@ -120,6 +121,6 @@ def rotation_matrix(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor
 
 
 def rotate(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
-    """Coefficients of the same radiance after its carrier is turned by `rotation`."""
+    """Coefficients of the same radiance after the object that emits it is rotated by `rotation`."""
     matrix = rotation_matrix(rotation, degree_of(sh.shape[1])).to(sh)
     return torch.einsum("jk,nkc->njc", matrix, sh)

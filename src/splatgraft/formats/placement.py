@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from splatgraft.core.gaussians import rotation_from_quaternion
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.runtime.atomic_file import atomic_write
 

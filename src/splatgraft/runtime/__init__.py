@@ -1,1 +1,1 @@
-"""Infrastructure without domain knowledge: atomic files and folders, worker pools, memoising, settings, console."""
+"""Infrastructure: atomic files and folders, worker pools, child processes, memoising, settings, console."""

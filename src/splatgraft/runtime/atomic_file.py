@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: written beside their place, then renamed. Knows nothing of their content."""
+"""Atomic writing of files: to a partial file in the same folder, renamed when it is complete."""
 
 import os
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
-    """A binary stream that becomes `path` when the block ends well; when it fails, what was there before stays.
+    """A binary stream that replaces `path` when the block succeeds; when it raises, `path` stays as it was.
 
     Raises: ValueError where the folder does not exist or `path` is a folder.
     """
@@ -17,7 +17,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
         raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")
     if path.is_dir():
         raise ValueError(f"{path}: expected a file name to write, found a folder")
-    partial = path.with_name(f".{path.name}.partial")  # one name, so that the next write clears what a kill left
+    partial = path.with_name(f".{path.name}.partial")  # fixed: replaces what a killed write left
     try:
         with partial.open("wb") as stream:
             yield stream

@@ -1,4 +1,4 @@
-"""Folders that appear whole or not at all: written beside their place, then swapped. Knows nothing of their content."""
+"""Atomic writing of folders: into a new folder beside the old one, exchanged when it is complete."""
 
 import ctypes
 import os
@@ -11,9 +11,9 @@ from pathlib import Path
 
 @contextmanager
 def atomic_folder(folder: Path) -> Generator[Path]:
-    """A new folder that takes the place of `folder` when the block ends well; when it fails, what was there stays.
+    """A new folder that replaces `folder` when the block succeeds; when it raises, `folder` stays as it was.
 
-    What a killed run left behind is put right first.
+    Leftovers of a killed run are restored or removed first.
     """
     new, old = (folder.with_name(f".{folder.name}.{kind}") for kind in ("new", "old"))
     if old.exists() and not folder.exists():
@@ -35,7 +35,7 @@ def atomic_folder(folder: Path) -> Generator[Path]:
 
 
 def _exchange(a: Path, b: Path) -> bool:
-    """Swap two folders in one step where the system can: then there is no moment without a result."""
+    """Exchange two folders in one system call; False where the system has none."""
     at_fdcwd, rename_exchange = -100, 2  # linux/fcntl.h, linux/fs.h
     if sys.platform != "linux":
         return False
@@ -44,7 +44,7 @@ def _exchange(a: Path, b: Path) -> bool:
 
 
 def _flush(folder: Path) -> None:
-    """Bring all content to the disk before the folder gets its name, so that a power cut cannot leave hollow files."""
+    """Write all content to the disk before the rename, so that a power failure cannot leave empty files."""
     for path in [*folder.rglob("*"), folder]:
         descriptor = os.open(path, os.O_RDONLY)
         try:

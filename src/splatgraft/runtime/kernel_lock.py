@@ -1,4 +1,4 @@
-"""One parallel kernel at a time in a process. Knows no kernel."""
+"""A lock that lets one parallel numba kernel run at a time in a process."""
 
 import functools
 import threading
@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 KERNEL_LOCK = threading.Lock()
-"""Held while a kernel runs: numba's workqueue threads, which a machine without OpenMP has, end the process where two
-threads start kernels at once."""
+"""Held while a kernel runs: without OpenMP numba uses its workqueue layer, which aborts the process when two threads
+start kernels at the same time."""
 
 
 def serialized(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """`kernel`, called under the lock; it must not be called by what holds it, nor from within another kernel."""
+    """`kernel`, called under the lock; must not be called while the lock is held, nor from another kernel."""
 
     @functools.wraps(kernel)
     def call(*args: Any) -> Any:

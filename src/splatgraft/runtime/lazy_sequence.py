@@ -1,4 +1,4 @@
-"""Things that are read when asked for, so that memory holds one at a time. Knows nothing about what they are."""
+"""Sequences whose items are read on access, so that memory holds one at a time."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -7,10 +7,10 @@ T = TypeVar("T")
 
 
 class LazySequence(Sequence[T]):
-    """`count` things, each made by `read(index)` whenever it is asked for."""
+    """`count` items, each read anew by `read(index)` on every access."""
 
     def __init__(self, count: int, read: Callable[[int], T]) -> None:
-        """Nothing is read yet."""
+        """Read nothing yet."""
         self._count, self._read = count, read
 
     def __len__(self) -> int:

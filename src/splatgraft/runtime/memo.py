@@ -1,40 +1,40 @@
-"""Results by name, each as long as what it was made of stays the same. Knows nothing about what they are."""
+"""A memo of results by name; a result is reused while its inputs are the same objects."""
 
 from collections.abc import Callable
 from typing import Any
 
 
 class Memo:
-    """At most one result per name."""
+    """Holds the latest result per name, with the inputs that it was made from."""
 
     def __init__(self) -> None:
-        """Nothing yet."""
-        self._made: dict[str, tuple[tuple[Any, ...], Any]] = {}
+        """Start empty."""
+        self._entries: dict[str, tuple[tuple[Any, ...], Any]] = {}
 
     def get(self, name: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
-        """The result of that name if it was made of these inputs, else a new one."""
-        made = self._made.get(name)
-        if made is None or not same_inputs(made[0], inputs):
-            made = (inputs, make())
-            self.put(name, *made)
-        return made[1]
+        """The result of that name if it was made from these inputs, otherwise `make()`, which is stored."""
+        entry = self._entries.get(name)
+        if entry is None or not same_inputs(entry[0], inputs):
+            entry = (inputs, make())
+            self.put(name, *entry)
+        return entry[1]
 
     def peek(self, name: str, inputs: tuple[Any, ...]) -> Any | None:
-        """The result of that name if it was made of these inputs, else None."""
-        made = self._made.get(name)
-        return made[1] if made is not None and same_inputs(made[0], inputs) else None
+        """The result of that name if it was made from these inputs, otherwise None."""
+        entry = self._entries.get(name)
+        return entry[1] if entry is not None and same_inputs(entry[0], inputs) else None
 
     def put(self, name: str, inputs: tuple[Any, ...], result: Any) -> None:
-        """Keep `result` in place of what was there."""
-        self._made[name] = (inputs, result)
+        """Store `result`, replacing the one of that name."""
+        self._entries[name] = (inputs, result)
 
     def has(self, name: str) -> bool:
-        """Whether there is one of that name, of whatever inputs."""
-        return name in self._made
+        """Whether a result of that name is stored, from any inputs."""
+        return name in self._entries
 
 
 def same_inputs(a: tuple[Any, ...], b: tuple[Any, ...]) -> bool:
-    """Whether two lists of inputs are the very same objects; numbers, texts and bytes count by value."""
+    """Whether two tuples of inputs hold the same objects; numbers, strings and bytes are compared by value."""
     return len(a) == len(b) and all(
         x is y or (isinstance(x, int | float | str | bytes) and x == y) for x, y in zip(a, b, strict=True)
     )

@@ -1,4 +1,4 @@
-"""The largest resident memory of this process over a stretch of work. Knows nothing about what was done."""
+"""Peak resident memory of this process since the last reset, from /proc on Linux and getrusage elsewhere."""
 
 import resource
 import sys
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def reset_peak_memory() -> None:
-    """Start a new stretch; where the system cannot (not Linux), peaks count from the start of the process."""
+    """Reset the peak; where the system cannot (not Linux), it counts from the start of the process."""
     try:
         Path("/proc/self/clear_refs").write_text("5")  # man proc: 5 resets VmHWM
     except OSError:
@@ -14,7 +14,7 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_bytes() -> int:
-    """Largest resident memory since the last reset."""
+    """Peak resident memory since the last reset."""
     status = Path("/proc/self/status")
     if status.is_file():
         for line in status.read_text().splitlines():

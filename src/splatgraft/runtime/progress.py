@@ -1,4 +1,4 @@
-"""How a long stage says how far it is and saves what it needs to go on. Knows nothing about terminals or files."""
+"""Interfaces by which a long stage reports its progress and saves checkpoints."""
 
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
@@ -8,28 +8,28 @@ Progress = Callable[[int, int, str], None]
 
 
 def silent(done: int, total: int, message: str) -> None:
-    """A `Progress` that tells nobody."""
+    """A `Progress` that reports nothing."""
 
 
 @runtime_checkable
 class Checkpoint(Protocol):
-    """Where a long stage leaves its state (tensors, numbers, nested dicts of them) and finds it again."""
+    """Storage for the state of a long stage: tensors, numbers and nested dicts of them."""
 
     def load(self) -> dict[str, Any] | None:
-        """The last state saved for this very job, or None."""
+        """The state last saved for the same job with the same inputs, or None."""
         ...
 
     def save(self, state: dict[str, Any]) -> None:
-        """Replace the saved state, whole or not at all."""
+        """Replace the saved state atomically."""
         ...
 
 
 class NoCheckpoint:
-    """A `Checkpoint` that keeps nothing."""
+    """A `Checkpoint` that stores nothing."""
 
     def load(self) -> dict[str, Any] | None:
-        """Nothing was ever saved."""
+        """None."""
         return None
 
     def save(self, state: dict[str, Any]) -> None:
-        """Forget."""
+        """Discard `state`."""

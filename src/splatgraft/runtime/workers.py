@@ -1,7 +1,7 @@
-"""Many independent jobs: a few at a time on this machine, or on many machines through Ray. Knows not what a job does.
+"""Independent tasks run in parallel: in threads on this machine, or on many machines through Ray.
 
-A job leaves its result in files and looks first whether they are there: so it may be begun again after a kill, and on
-another machine that sees the same files.
+A task writes its result to files and first checks whether they exist, so that it can be repeated after a kill, also
+on another machine with the same file system.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,17 +12,17 @@ from typing import Any
 from splatgraft.runtime.progress import Progress, silent
 
 _RETRIES = 5
-"""How often Ray begins a job again whose worker died."""
+"""How often Ray repeats a task whose worker died."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One job, safe to repeat."""
+    """One task, safe to repeat."""
 
     name: str
-    """What a failure and the progress call it."""
+    """Shown in failures and in the progress."""
     work: Callable[[], object]
-    """Does it; for Ray, a `functools.partial` of a module's function. A ValueError says that its data is at fault."""
+    """The function to call; for Ray, a `functools.partial` of a module's function. A ValueError reports bad data."""
 
 
 def run_tasks(
@@ -33,14 +33,22 @@ def run_tasks(
     progress: Progress = silent,
     gpus_each: int = 0,
 ) -> list[str]:
-    """Do all tasks; what went wrong, a line a task, in the order of the tasks. One that fails does not stop the rest.
+    """Run all tasks; a task that fails with a ValueError does not stop the others.
 
-    `ray_address` is that of a Ray cluster (`auto`, `host:port`, `ray://host:port`), or `local` for a cluster of this
-    machine's cores that lives as long as the call. All machines must see the same files under the same names.
-    `gpus_each`: GPUs that Ray keeps for a task.
+    Args:
+        tasks: What to run; for Ray, all machines must see the same files under the same names.
+        at_once: Threads, where Ray is not used.
+        ray_address: Address of a Ray cluster (`auto`, `host:port`, `ray://host:port`), or `local` for a cluster of
+            this machine's cores that ends with the call; None runs the tasks in threads.
+        progress: Called after each task.
+        gpus_each: GPUs that Ray reserves for a task.
 
-    Raises: whatever but ValueError a task raises on this machine; ModuleNotFoundError where Ray is asked for and not
-    installed.
+    Returns:
+        One line per failed task, in the order of the tasks.
+
+    Raises:
+        Exception: Any error but a ValueError that a task raises.
+        ModuleNotFoundError: Where Ray is asked for and not installed.
     """
     if ray_address is not None:
         return _through_ray(tasks, ray_address, progress, gpus_each)

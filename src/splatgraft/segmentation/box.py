@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.capture_orientation import estimate_up, focus_point
-from splatgraft.core.level_plane import dominant_level_plane
+from splatgraft.core.planes import dominant_level_plane
 from splatgraft.core.posed_images import PosedImages
 
 

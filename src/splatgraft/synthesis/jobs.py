@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from splatgraft.runtime.child_process import run_logged
 from splatgraft.runtime.workers import Task
 from splatgraft.synthesis.scene import Camera, Part, Scene, Vector, World
 
@@ -117,10 +118,7 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
     description = out / "job.json"
     description.write_text(_description(job, out.resolve()))
     log = out / "render.log"
-    with log.open("ab") as words:
-        code = subprocess.run(
-            [str(blender_python), str(_WORKER), str(description)], stdout=words, stderr=subprocess.STDOUT, check=False
-        ).returncode
+    code = run_logged([str(blender_python), str(_WORKER), str(description)], log)
     if not job.is_done(out):
         tail = log.read_text(errors="replace").strip().splitlines()
         said = next(

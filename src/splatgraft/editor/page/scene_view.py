@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import C0
 from splatgraft.editor.previews.level_of_detail import shown_indices

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.core.gaussians import quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 
 Triple = tuple[float, float, float]

@@ -3,7 +3,6 @@
 A small program of ours runs there and exchanges arrays through files. Not run with the real code where it was written.
 """
 
-import subprocess
 import tempfile
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from torch import Tensor
 from splatgraft.core.images import resize
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
 from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.runtime.child_process import last_line, run_logged
 
 SIDE = 256
 """Pixels: what the network was trained at."""
@@ -59,11 +59,11 @@ class MVCoLight:
             given, out = Path(name) / "input.npy", Path(name) / "output.npy"
             np.save(given, small.numpy())
             command = [str(self._python), "-", str(self._weights), str(given), str(out)]
-            done = subprocess.run(
-                command, input=_PROGRAM, cwd=self._checkout, capture_output=True, text=True, check=False
-            )
-            if done.returncode != 0 or not out.is_file():
-                last = (done.stderr.strip().splitlines() or ["no output"])[-1]
+            log = Path(name) / "log"
+            # standard output stays out of the log, whose last line is to be that of the error
+            code = run_logged(command, log, folder=self._checkout, stdin=_PROGRAM, on_line=lambda _: None)
+            if code != 0 or not out.is_file():
+                last = last_line(log) or "no output"
                 raise ValueError(f"{self._checkout}: expected MV-CoLight to make a picture, found {last[:200]}")
             made = torch.from_numpy(np.load(out)).permute(1, 2, 0).clamp(0, 1)
         ratio = (made + 0.02) / (small[:3].permute(1, 2, 0) + 0.02)

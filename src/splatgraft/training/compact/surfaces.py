@@ -11,8 +11,9 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.directions import frames_along
-from splatgraft.core.gaussians import Gaussians, quaternion_from_rotation
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import read_mask, read_rgb
+from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.spherical_harmonics import C0
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import linear_from_srgb, list_images, read_rgb, resize, srgb_from_linear, write_image
+from splatgraft.runtime.child_process import last_line, run_logged
 
 _PROGRAMS = {
     "svd": ("inference_svd_rgbx.py", "inference_svd_xrgb.py"),
@@ -160,12 +161,13 @@ class DiffusionRenderer:
     def _run(self, arguments: list[str]) -> None:
         inverse = any("rgbx" in word or "Inverse" in word for word in arguments)
         program = _PROGRAMS[self._variant][0 if inverse else 1]
-        done = subprocess.run(
-            [str(self._python), program, *arguments], cwd=self._checkout, capture_output=True, text=True, check=False
-        )
-        if done.returncode != 0:
-            last = (done.stderr.strip().splitlines() or ["no output"])[-1]
-            raise ValueError(f"{self._checkout / program}: expected it to succeed, found {last[:200]}")
+        with tempfile.TemporaryDirectory() as name:
+            log = Path(name) / "log"
+            # standard output stays out of the log, whose last line is to be that of the error
+            command = [str(self._python), program, *arguments]
+            if run_logged(command, log, folder=self._checkout, on_line=lambda _: None) != 0:
+                last = last_line(log) or "no output"
+                raise ValueError(f"{self._checkout / program}: expected it to succeed, found {last[:200]}")
 
 
 def inflated_normals(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:

@@ -1,0 +1,70 @@
+"""Child processes: exit code, working directory, standard input, log, lines as they come, no process left behind."""
+
+import os
+import sys
+
+import pytest
+
+from splatgraft.runtime.child_process import last_line, run_logged
+
+
+def python(program: str) -> list[str]:
+    return [sys.executable, "-c", program]
+
+
+def test_both_streams_are_appended_to_the_log(tmp_path):
+    log = tmp_path / "log"
+    log.write_text("before\n")
+    code = run_logged(python("import os; os.write(1, b'out\\n'); os.write(2, b'err\\n'); raise SystemExit(3)"), log)
+    assert code == 3
+    assert log.read_text().splitlines() == ["before", "out", "err"]
+    assert last_line(log) == "err"
+
+
+def test_lines_of_the_output_are_handed_over_and_stay_out_of_the_log(tmp_path):
+    lines = []
+    program = "import sys; print('one'); print('two', end=''); sys.stderr.write('warning\\n\\n')"
+    assert run_logged(python(program), tmp_path / "log", on_line=lines.append) == 0
+    assert lines == ["one", "two"]
+    assert last_line(tmp_path / "log") == "warning"
+
+
+def test_a_line_arrives_while_the_process_runs(tmp_path):
+    # the process ends only after the file exists that is made when its line arrives
+    program = "import os, sys, time; print(1, flush=True)\nwhile not os.path.exists('seen'): time.sleep(0.01)"
+    code = run_logged(
+        python(program), tmp_path / "log", folder=tmp_path, on_line=lambda line: (tmp_path / "seen").touch()
+    )
+    assert code == 0
+
+
+def test_standard_input_and_folder(tmp_path):
+    text = "line\n" * 100_000  # more than a pipe holds
+    program = "import sys; open('copy', 'w').write(sys.stdin.read())"
+    assert run_logged(python(program), tmp_path / "log", folder=tmp_path, stdin=text) == 0
+    assert (tmp_path / "copy").read_text() == text
+
+
+def test_a_failing_listener_kills_the_process(tmp_path):
+    ids = []
+
+    def fail(line: str) -> None:
+        ids.append(int(line))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_logged(
+            python("import os, time; print(os.getpid(), flush=True); time.sleep(3600)"), tmp_path / "log", on_line=fail
+        )
+    # killed and waited for: the system knows its id no more
+    with pytest.raises(ProcessLookupError):
+        os.kill(ids[0], 0)
+
+
+def test_a_program_that_does_not_exist_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"no-such-program: expected a program that starts, found No such file"):
+        run_logged([str(tmp_path / "no-such-program")], tmp_path / "log")
+
+
+def test_a_log_without_lines(tmp_path):
+    assert last_line(tmp_path / "none") == ""
