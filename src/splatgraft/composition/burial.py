@@ -40,7 +40,6 @@ def visible_points(scene: Gaussians, points: Float[Tensor, "m 3"], *, camera: Ca
     """Bool[m]: which points one camera has in its image, not more than `slack` behind the scene's surface."""
     depth, pixels, inside = project(points, camera)
     seen = render(scene, camera, outputs=frozenset({"depth"}))
-    assert seen.depth is not None
     column, row = pixels.long().unbind(-1)
     column, row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
     surface, alpha = seen.depth[0].detach()[row, column], seen.alpha[0].detach()[row, column]
