@@ -48,7 +48,6 @@ def main() -> None:
     pairs = []
     for i in tested:
         picture = render(gaussians, served.cameras[i]).color
-        assert picture is not None
         pairs.append((picture[0].clamp(0, 1), served.image(i)))
     similarity = sum(float(ssim(a, b)) for a, b in pairs) / len(pairs)
     decibel = sum(float(psnr(a, b)) for a, b in pairs) / len(pairs)

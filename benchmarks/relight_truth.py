@@ -202,10 +202,8 @@ def measure(
     camera = cameras[VIEW]
     before = render(scene, camera)
     # the plane alone is looked at: what the object's own splats cover is measured nowhere
-    after = render(relit.bake().select(~relit.is_object), camera)
+    after = render(relit.shaded().select(~relit.is_object), camera)
     covered = render(thing, camera).alpha[0] > 0.001
-    assert before.color is not None
-    assert after.color is not None
     light_before, light_after = (linear_from_srgb(r.color[0].clamp(0, 1)).mean(-1) for r in (before, after))
     whole = before.alpha[0] > 0.9
     band = (truth < BAND) & ~covered & whole

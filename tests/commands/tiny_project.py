@@ -69,8 +69,6 @@ def photograph(folder: Path, scene: Gaussians, object_: Gaussians | None) -> Non
     cameras = pinhole(poses, 45.0, width=48, height=36)
     whole = scene if object_ is None else concatenate([scene, object_])
     pictures = render(whole, cameras, features=(torch.arange(whole.count) >= scene.count)[:, None].float())
-    assert pictures.color is not None
-    assert pictures.features is not None
     for name in ("images", "masks") if object_ is not None else ("images",):
         (folder / name).mkdir(parents=True)
     for index, name in enumerate(cameras.names):

@@ -35,21 +35,21 @@ MOVE = Similarity(
 
 def test_identity_placement_bakes_the_same_bits():
     target, object_ = random_gaussians(20, 0), random_gaussians(7, 1)
-    baked, is_object = compose(target, [object_], target_from_objects=[Similarity.identity()]).bake()
+    baked, is_object = compose(target, [object_], target_from_objects=[Similarity.identity()]).merged()
     assert same_bits(baked.select(~is_object), target)
     assert same_bits(baked.select(is_object), object_)
 
 
 def test_empty_object_is_the_identity_even_with_more_bands():
     target = random_gaussians(20, 0, k=4)
-    baked, is_object = compose(target, [empty(sh_degree=3)], target_from_objects=[MOVE]).bake()
+    baked, is_object = compose(target, [empty(sh_degree=3)], target_from_objects=[MOVE]).merged()
     assert same_bits(baked, target)
     assert not is_object.any()
 
 
 def test_no_objects_and_nothing_erased_is_the_target():
     target = random_gaussians(5, 0)
-    baked, _ = compose(target, [], target_from_objects=[]).bake()
+    baked, _ = compose(target, [], target_from_objects=[]).merged()
     assert same_bits(baked, target)
 
 
@@ -59,7 +59,7 @@ def test_erased_gaussians_are_gone_and_objects_follow_in_order():
     composite = compose(
         target, [first, empty(), second], target_from_objects=[MOVE, MOVE, Similarity.identity()], erased=erased
     )
-    baked, is_object = composite.bake()
+    baked, is_object = composite.merged()
     index = composite.object_index()
     assert torch.equal(is_object, index >= 0)
     assert same_bits(baked.select(index == -1), target.select(~erased))

@@ -219,7 +219,7 @@ def test_a_second_object_finds_another_place():
     cameras = (ring_of_cameras(), ring_of_cameras((0.0, 0, 0.15), height=0.5))
     options = PlaceOptions(scale=1.0)
     first = place_object(room(), thing, cameras=cameras, options=options)
-    both, _ = compose(room(), [thing], target_from_objects=[first.target_from_object]).bake()
+    both, _ = compose(room(), [thing], target_from_objects=[first.target_from_object]).merged()
     second = place_object(both, thing, cameras=cameras, options=options)
     assert abs(float(second.support.point[2]) - TABLE) < 0.02
     apart = (first.support.point - second.support.point).norm()

@@ -1,9 +1,13 @@
 """Wide Gaussians around an object are split: its foot is seen, the scene looks as it did, what is narrow is kept."""
 
+from dataclasses import fields
+
 import torch
 
 from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.core.splitting import split_wide_around
 from splatgraft.rendering import render
@@ -85,3 +89,16 @@ def test_where_all_is_narrow_or_far_or_no_object_stands_nothing_changes():
     whole = concatenate([far, thing])
     assert split_wide_around(whole, torch.arange(whole.count) >= 1, [thing])[0] is whole
     assert split_wide_around(far, torch.zeros(1, dtype=torch.bool), [])[0] is far
+
+
+def test_a_baked_composite_is_the_merged_one_with_wide_gaussians_split():
+    scene, thing = table(0.15, 0.12), post()
+    move = Similarity(scale=1.2, rotation=torch.eye(3), translation=torch.tensor([0.2, 0.1, 0.0]))
+    nothing = torch.zeros(scene.count, dtype=torch.bool)
+    composite = Composite(scene, (PlacedObject(thing, move),), nothing)
+    merged, of_object = composite.merged()
+    expected, still = split_wide_around(merged, of_object, [move.gaussians(thing)])
+    baked, is_object = composite.bake()
+    assert merged.count == scene.count + thing.count < baked.count
+    assert torch.equal(is_object, still)
+    assert all(torch.equal(getattr(baked, f.name), getattr(expected, f.name)) for f in fields(Gaussians))

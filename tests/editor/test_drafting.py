@@ -36,14 +36,14 @@ def test_each_gaussian_has_the_light_of_the_nearest_that_is_left() -> None:
     composite = compose(target, [object_], target_from_objects=[move], erased=erased)
     parts = [thinned(target.select(~erased), 60), thinned(object_, 20)]
     few = thinned_composite(composite, parts[0], parts[1:])
-    assert few.bake()[0].count == 80
+    assert few.merged()[0].count == 80
     # the same tensors for the same parts: what was made of them stays known
     assert thinned_composite(composite, parts[0], parts[1:]).erased is few.erased
-    baked, is_object = few.bake()
-    plain = unchanged(baked, is_object, report=("said",))
+    baked, is_object = few.merged()
+    plain = unchanged(baked, is_object, objects=(), report=("said",))
     # a light that is a function of the place: its error is what the place of the nearest is off
     lit = carried_over(replace(plain, shadow=0.5 + 0.1 * baked.means), composite, parts)
-    whole, flags = composite.bake()
+    whole, flags = composite.merged()
     assert torch.equal(lit.gaussians.means, whole.means)
     assert torch.equal(lit.is_object, flags)
     off = (lit.shadow - (0.5 + 0.1 * whole.means)).norm(dim=1)
@@ -51,4 +51,4 @@ def test_each_gaussian_has_the_light_of_the_nearest_that_is_left() -> None:
     assert bool((off <= 0.1 * spread + 1e-6).all())  # float32 of numbers up to four
     assert int((spread == 0).sum()) == 80
     assert lit.report == ("said",)
-    assert lit.bake(LayerWeights()).count == whole.count
+    assert lit.shaded(LayerWeights()).count == whole.count

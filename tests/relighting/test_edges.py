@@ -60,7 +60,7 @@ def error(width, options) -> float:
     )
     relit = relight(composite, cameras(), light=light, options=options)
     camera = cameras()[3]
-    before, after = render(plane, camera), render(relit.bake().select(~relit.is_object), camera)
+    before, after = render(plane, camera), render(relit.shaded().select(~relit.is_object), camera)
     ratio = linear_from_srgb(after.color[0]).mean(-1) / linear_from_srgb(before.color[0]).mean(-1).clamp_min(1e-3)
     height, wide = ratio.shape
     v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(wide) + 0.5, indexing="ij")
@@ -121,10 +121,10 @@ def test_an_edge_stands_in_one_place_from_all_sides():
     ground = torch.cat([under, torch.zeros(len(under), 1)], 1)
 
     def disagreement(one) -> float:
-        scene = one.bake().select(~one.is_object)
+        scene = one.shaded().select(~one.is_object)
         return float((seen_from(0, scene, plane, ground) - seen_from(3, scene, plane, ground)).abs().mean())
 
     flat = replace(relit, slope=torch.zeros_like(relit.slope))
-    assert float(seen_from(0, relit.bake().select(~relit.is_object), plane, ground).min()) < 0.5
+    assert float(seen_from(0, relit.shaded().select(~relit.is_object), plane, ground).min()) < 0.5
     # measured 0.031 and 0.054 split, 0.014 and 0.070 whole; an eighth more is allowed
     assert disagreement(relit) < 0.65 * disagreement(flat)

@@ -94,7 +94,7 @@ def shadow_center(relit):
 def test_no_object_no_change():
     composite = placed((empty(), at(0.0, 0.0, 0.3)))
     relit = relight(composite, cameras(), light=sun_from(1, 0, 1))
-    assert torch.equal(relit.bake().sh, composite.target.sh)
+    assert torch.equal(relit.shaded().sh, composite.target.sh)
     assert relit.light is None
     assert "No object" in relit.report[0]
 
@@ -107,7 +107,7 @@ def test_light_from_one_side_casts_to_the_other_and_lights_that_side():
     assert abs(y) < 0.02
     body = relit.is_object
     side = relit.gaussians.means[body][:, 0]
-    brightness = rgb_from_dc(relit.bake().sh[body, 0]).mean(1)
+    brightness = rgb_from_dc(relit.shaded().sh[body, 0]).mean(1)
     assert brightness[side < -0.15].mean() > 1.1 * brightness[side > 0.15].mean()
 
 
@@ -193,7 +193,7 @@ def test_erased_and_far_gaussians_keep_every_bit():
     erased[:10] = True
     relit = relight(replace(composite, erased=erased), cameras(), light=sun_from(-1, 0, 1), options=WHOLE)
     assert int((~relit.is_object).sum()) == scene.count - 10
-    kept = relit.bake().sh[scene.count - 11]
+    kept = relit.shaded().sh[scene.count - 11]
     assert torch.equal(kept[:1], far.sh[0])
     # a scene without bands has one where an edge leans; elsewhere it is empty
     assert bool((kept[1:] == 0).all())
@@ -203,17 +203,17 @@ def test_layers_can_be_taken_out():
     composite = placed((ball(), at(0.0, 0.0, 0.35)))
     relit = relight(composite, cameras(), light=sun_from(-1, 0, 1), options=WHOLE)
     nothing = LayerWeights(shade=0.0, shadow=0.0, bounce=0.0, gloss=0.0)
-    assert torch.equal(relit.bake(nothing).sh, composite.bake()[0].sh)
-    assert not torch.equal(relit.bake().sh, composite.bake()[0].sh)
+    assert torch.equal(relit.shaded(nothing).sh, composite.merged()[0].sh)
+    assert not torch.equal(relit.shaded().sh, composite.merged()[0].sh)
 
 
 def test_splitting_sharpens_and_keeps_count_bounded():
     coarse = floor(count=30)
     composite = placed((ball(), at(0.0, 0.0, 0.35)), target=coarse)
     relit = relight(composite, cameras(), light=sun_from(-1, 0, 1), options=RelightOptions(most_added=0.5))
-    added = relit.gaussians.count - composite.bake()[0].count
+    added = relit.gaussians.count - composite.merged()[0].count
     assert 0 < added <= 40_000  # as many as any scene may have, though half of this one is fewer
-    assert torch.equal(relit.origin.unique(), torch.arange(composite.bake()[0].count))
+    assert torch.equal(relit.origin.unique(), torch.arange(composite.merged()[0].count))
 
 
 def test_cache_gives_what_a_fresh_transfer_gives():
@@ -249,7 +249,7 @@ def test_bad_places_give_copy_paste_and_a_plain_reason():
     for composite, word in ((nothing, "empty"), (inside, "inside"), (black, "no light")):
         relit = relight(composite, cameras())
         assert word in relit.report[0]
-        assert torch.equal(relit.bake().sh, composite.bake()[0].sh)
+        assert torch.equal(relit.shaded().sh, composite.merged()[0].sh)
 
 
 def test_one_source_per_object_is_asked_for():
@@ -279,7 +279,7 @@ def test_the_old_place_loses_the_shadow_that_was_there():
     normals = even_directions(3000)
     side = light.irradiance(normals) / light.irradiance(torch.tensor([[0.0, 0.0, 1.0]]))
     body = apply_gain(ball(), side)  # a ball that was photographed in that light
-    shaded = relight(placed((body, at(0.0, 0.0, 0.35)), target=scene), cameras(), light=light, options=WHOLE).bake()
+    shaded = relight(placed((body, at(0.0, 0.0, 0.35)), target=scene), cameras(), light=light, options=WHOLE).shaded()
     around = even_directions(4000)
     sky = surfels(20 * around, -around, width=0.7, rgb=(0.7, 0.7, 0.7))
     source = SourceScene(concatenate([shaded.select(torch.arange(scene.count)), sky]), cameras())

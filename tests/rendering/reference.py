@@ -83,12 +83,14 @@ def render(
     visible = torch.zeros(gaussians.count, dtype=torch.bool)
     visible[order] = (weight > 0).any(0).any(0)
     return Render(
-        color=(weight @ colors[order] + (1 - alpha)[..., None] * background)[None],
         alpha=alpha[None],
-        depth=torch.where(alpha > 0, blended_depth / torch.where(alpha > 0, alpha, 1), 0)[None],
-        normal=torch.nn.functional.normalize(blended_normal, dim=-1)[None],
-        features=(weight @ features[order])[None],
         visible=visible[None],
+        pictures={
+            "color": (weight @ colors[order] + (1 - alpha)[..., None] * background)[None],
+            "depth": torch.where(alpha > 0, blended_depth / torch.where(alpha > 0, alpha, 1), 0)[None],
+            "normal": torch.nn.functional.normalize(blended_normal, dim=-1)[None],
+            "features": (weight @ features[order])[None],
+        },
     )
 
 

@@ -90,7 +90,6 @@ def _tried(scene: Gaussians, stand: CameraPosition, up: Float[Tensor, "3"]) -> t
     pose = look_at(stand.eye[None], stand.target, up)
     small = pinhole(pose, 24 / math.tan(HALF_FOV), width=48, height=36)
     seen = render(scene, small, outputs=frozenset({"depth"}))
-    assert seen.depth is not None
     depth, alpha = seen.depth[0], seen.alpha[0]
     close = float((alpha * (depth < stand.clear_at_edges)).mean())
     hidden = float((alpha * (depth < stand.clear))[12:24, 16:32].mean())

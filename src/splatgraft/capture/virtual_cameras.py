@@ -96,7 +96,6 @@ def photographed(
     """Hand a picture of `scene` from every viewpoint to `write`, by the camera's name."""
     for index, camera in enumerate(found.cameras):
         color = render(scene, camera).color
-        assert color is not None
         write(camera.names[0], color[0].clamp(0, 1))
         progress(index + 1, len(found.cameras), "pictures of the scene")
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 
-from splatgraft.project.results import PROJECT_FILE
+from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.step import Positional
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console

@@ -58,7 +58,6 @@ def height_map(
     focal = size / 2 * distance / radius
     camera = pinhole(pose, focal, width=size, height=size)
     rendered = render(scene, camera, outputs=frozenset({"depth"}), options=RenderOptions(near=distance))
-    assert rendered.depth is not None
     depth, alpha = rendered.depth[0].detach(), rendered.alpha[0].detach()
     x = (torch.arange(size).to(depth) + 0.5 - size / 2) / focal
     v, u = torch.meshgrid(x, x, indexing="ij")

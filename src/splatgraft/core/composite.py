@@ -1,4 +1,4 @@
-"""The value `Composite`: a target scene with objects placed in it. Knows nothing about files, light or rendering."""
+"""The value `Composite`: a target scene with objects placed in it, and its conversion to one plain scene."""
 
 from dataclasses import dataclass, replace
 
@@ -8,11 +8,12 @@ from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.similarity import Similarity
+from splatgraft.core.splitting import split_wide_around
 
 
 @dataclass(frozen=True)
 class PlacedObject:
-    """An object's Gaussians and where they stand in the target scene."""
+    """An object's Gaussians and their place in the target scene."""
 
     gaussians: Gaussians
     """In the frame of the capture that the object comes from."""
@@ -31,17 +32,24 @@ class Composite:
     target: Gaussians
     """The scene that receives the objects, n Gaussians."""
     objects: tuple[PlacedObject, ...]
-    """In the order in which they are baked."""
+    """In the order in which they follow the target in a merged or baked scene."""
     erased: Bool[Tensor, "n"]
     """True where a Gaussian of the target is left out."""
 
-    def bake(self) -> tuple[Gaussians, Bool[Tensor, "m"]]:
-        """One plain scene, kept target first, then the objects in order; and which Gaussians belong to an object."""
-        gaussians = self._baked_gaussians()
+    def bake(self) -> tuple[Gaussians, Bool[Tensor, "b"]]:
+        """The scene to write or to draw, and which of its Gaussians belong to an object.
+
+        Wide Gaussians of the target around the objects are split, so that they do not cover the objects' edges.
+        """
+        return split_wide_around(*self.merged(), [placed.in_target() for placed in self.objects])
+
+    def merged(self) -> tuple[Gaussians, Bool[Tensor, "m"]]:
+        """The target's kept Gaussians, then the objects' in order, none split; and which belong to an object."""
+        gaussians = self._merged_gaussians()
         return gaussians, torch.arange(gaussians.count, device=gaussians.device) >= self.kept_count
 
     def object_index(self) -> Int[Tensor, "m"]:
-        """For every Gaussian of the baked scene the position of its object in `objects`, or -1 for the target."""
+        """For every Gaussian of the merged scene the position of its object in `objects`, or -1 for the target."""
         counts = [self.kept_count] + [placed.gaussians.count for placed in self.objects]
         return torch.repeat_interleave(torch.arange(-1, len(self.objects)), torch.tensor(counts))
 
@@ -51,11 +59,11 @@ class Composite:
         return int((~self.erased).sum())
 
     def with_object_colors(self, recolored: tuple[Gaussians, ...]) -> "Composite":
-        """The same placement of objects whose Gaussians are exchanged for `recolored`, in the objects' own frames."""
+        """The composite with `recolored`, in the objects' own frames, in place of the objects' Gaussians."""
         pairs = zip(self.objects, recolored, strict=True)
         return replace(self, objects=tuple(replace(placed, gaussians=gaussians) for placed, gaussians in pairs))
 
-    def _baked_gaussians(self) -> Gaussians:
+    def _merged_gaussians(self) -> Gaussians:
         kept = self.target.select(~self.erased) if bool(self.erased.any()) else self.target
         # an empty object must not even widen the harmonics: it is the identity
         parts = [placed.in_target() for placed in self.objects if placed.gaussians.count]

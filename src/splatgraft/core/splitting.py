@@ -1,11 +1,11 @@
-"""Splits Gaussians that are too wide into five along an axis, so that the picture stays: for shadows' edges, for order.
+"""Splitting of wide Gaussians into five narrower ones along one axis, with almost the same render.
 
-Knows nothing about light: which to split, and along which axis, is asked for.
+Used for Gaussians of the target around an object (`split_wide_around`) and for those on which a shadow's edge falls.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,7 +15,7 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 
 PIECES = 5
 PIECE_WIDTH = 0.55
-"""Width of a piece along the split axis, as a share of the whole's."""
+"""Width of a piece along the split axis, over the width of the whole."""
 
 # Five Gaussians of 0.55 sigma along the axis whose blended alpha in the plane is nearest to that of one of sigma 1, by
 # opacity of the whole (least squares of alpha; rms error up to 0.008, largest 0.05, both for the most opaque). In
@@ -36,14 +36,22 @@ _TABLE = (
 
 
 def split_along(gaussians: Gaussians, axis: Int[Tensor, "n"]) -> tuple[Gaussians, Int[Tensor, "m"]]:
-    """Each Gaussian as five along its own axis `axis` (0, 1 or 2), m = 5 n, and which one each piece is of."""
+    """Split each Gaussian into five along one of its own axes.
+
+    Args:
+        gaussians: n Gaussians.
+        axis: Own axis (0, 1 or 2) along which each is split.
+
+    Returns:
+        The m = 5 n pieces, and the index of the Gaussian that each piece is of.
+    """
     n = gaussians.count
-    columns = _interpolated(gaussians.opacities.clamp_max(0.99))
+    columns = _pieces_by_opacity(gaussians.opacities.clamp_max(0.99))
     opacities = columns[:, [2, 1, 0, 1, 2]].clamp(1e-6, 0.9999)
     places = torch.stack(
         [-columns[:, 4], -columns[:, 3], torch.zeros_like(columns[:, 3]), columns[:, 3], columns[:, 4]], 1
     )
-    rows = torch.arange(n)
+    rows = torch.arange(n, device=gaussians.device)
     along = gaussians.rotations[rows, :, axis] * gaussians.scales[rows, axis][:, None]
     log_scales = gaussians.log_scales + columns[:, 5:].log()
     log_scales[rows, axis] = gaussians.log_scales[rows, axis] + math.log(PIECE_WIDTH)
@@ -57,7 +65,8 @@ def split_along(gaussians: Gaussians, axis: Int[Tensor, "n"]) -> tuple[Gaussians
     return pieces, origin
 
 
-def _interpolated(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 6"]:
+def _pieces_by_opacity(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 6"]:
+    """Columns 2 to 7 of the table, interpolated linearly."""
     table = torch.tensor(_TABLE).to(opacities)
     above = torch.searchsorted(table[:, 0].contiguous(), opacities.contiguous()).clamp(1, len(table) - 1)
     low, high = table[above - 1], table[above]
@@ -65,35 +74,62 @@ def _interpolated(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 6"]:
     return (low + share[:, None] * (high - low))[:, 1:]
 
 
-_WIDE = 0.25  # object radii
-_REACH = 1.5
-_ROUNDS = 6
-_MOST = 4000  # pieces' wholes per round and object: a scene of a million small Gaussians has none
+@dataclass(frozen=True)
+class SplitOptions:
+    """Which Gaussians around an object are split; all values were set by hand on the benchmark scenes."""
+
+    least_width: float = 0.25
+    """Least standard deviation along the widest axis, object radii."""
+    least_opacity: float = 0.02
+    """Fainter Gaussians are not split."""
+    reach: float = 1.5
+    """Largest distance of a centre from the object's, object radii; two standard deviations are added to it."""
+    farthest: float = 6.0
+    """Largest distance of a centre in any case, object radii."""
+    rounds: int = 6
+    """How many times the pieces that are still too wide are split again, at most."""
+    most_per_round: int = 4000
+    """Most Gaussians split per round and object; a scene of a million small Gaussians has none that wide."""
 
 
 def split_wide_around(
-    gaussians: Gaussians, is_object: Bool[Tensor, "n"], objects: Sequence[Gaussians]
+    gaussians: Gaussians,
+    is_object: Bool[Tensor, "n"],
+    objects: Sequence[Gaussians],
+    *,
+    options: SplitOptions = SplitOptions(),
 ) -> tuple[Gaussians, Bool[Tensor, "m"]]:
-    """A baked composite whose wide Gaussians around each of `objects` (as placed) are split, the rest bit for bit.
+    """Split the wide Gaussians of a composite's target that lie around its objects.
 
-    Renderers blend in the order of centres. A plain table is made of Gaussians wider than what stands on it, and one
-    whose centre is nearer than the object hides its foot, though it lies beneath. Objects' Gaussians stay as they are,
-    after the scene's.
+    Renderers blend Gaussians in the order of their centres. A plain table is reconstructed with Gaussians wider than
+    the objects on it, and one of them whose centre is nearer to the camera than the object covers the object's foot,
+    though it lies below. Gaussians of objects, and all that are not split, keep every bit and their order.
+
+    Args:
+        gaussians: n Gaussians of the composite: the target's, then the objects'.
+        is_object: Which of them belong to an object.
+        objects: The placed objects, in the frame of `gaussians`.
+        options: What counts as wide and as near.
+
+    Returns:
+        The m Gaussians after splitting, pieces in the place of their whole, and which of them belong to an object.
     """
     for one in objects:
         if not one.count:
             continue
         middle = 0.5 * (one.means.quantile(0.01, dim=0) + one.means.quantile(0.99, dim=0))
         radius = float((one.means - middle).norm(dim=1).quantile(0.99))
-        for _ in range(_ROUNDS):
+        farthest = torch.tensor(options.farthest * radius, device=gaussians.device)
+        for _ in range(options.rounds):
             widest, axis = gaussians.scales.max(1)
             away = (gaussians.means - middle).norm(dim=1)
-            near = away < torch.minimum(_REACH * radius + 2 * widest, torch.tensor(4 * _REACH * radius))
-            score = widest * (~is_object & near & (widest > _WIDE * radius) & (gaussians.opacities > 0.02))
+            near = away < torch.minimum(options.reach * radius + 2 * widest, farthest)
+            wide = (widest > options.least_width * radius) & (gaussians.opacities > options.least_opacity)
+            score = widest * (~is_object & near & wide)
             if not bool((score > 0).any()):
                 break
-            chosen = score.argsort(descending=True)[: min(_MOST, int((score > 0).sum()))]
-            keep = torch.ones(gaussians.count, dtype=torch.bool)
+            chosen = score.argsort(descending=True)[: min(options.most_per_round, int((score > 0).sum()))]
+            keep = torch.ones_like(is_object)
             keep[chosen] = False
             pieces, parent = split_along(gaussians.select(chosen), axis[chosen])
             origin = torch.cat([keep.nonzero()[:, 0], chosen[parent]])

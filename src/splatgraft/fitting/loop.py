@@ -142,7 +142,6 @@ def fit(
         camera, image = views.at(_view_of(state.iteration, len(views), options.seed), done)
         leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
         drawn = render(replace(state.gaussians, **leaves), camera, options=options.rendering)
-        assert drawn.color is not None
         loss = options.loss(drawn.color[0], image)
         value = float(loss.detach())
         if not math.isfinite(value):

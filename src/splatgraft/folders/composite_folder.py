@@ -4,7 +4,6 @@ from pathlib import Path
 
 from splatgraft.composition import Composite, compose
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.splitting import split_wide_around
 from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.formats.placement import Placement, read_placement, write_placement
@@ -46,7 +45,7 @@ def assemble(target: Gaussians, objects: list[Gaussians], placement: Placement) 
 
 def write_composite(folder: Path, composite: Composite, placement: Placement) -> None:
     """Write the three files; `placement` names every object."""
-    gaussians, is_object = split_wide_around(*composite.bake(), [placed.in_target() for placed in composite.objects])
+    gaussians, is_object = composite.bake()
     write_gaussians(folder / SCENE_FILE, gaussians)
     write_selection(folder / IS_OBJECT_FILE, is_object)
     write_placement(folder / PLACEMENT_FILE, placement)

@@ -79,7 +79,6 @@ class EvaluatedScenes:
     def picture(self, scene: Gaussians, camera: Cameras) -> Float[Tensor, "h w 3"]:
         """One view of one scene, on the CPU."""
         color = render(scene, camera).color
-        assert color is not None
         return color[0].cpu().clamp(0, 1)
 
     def pictures(self, index: int) -> Pictures:
@@ -89,7 +88,6 @@ class EvaluatedScenes:
     def pictures_from(self, camera: Cameras) -> Pictures:
         """One view from any camera."""
         coverage = render(self.composite, camera, features=self.is_object[:, None].float()).features
-        assert coverage is not None
         return Pictures(
             name=camera.names[0],
             before=self.picture(self.composite.select(~self.is_object), camera),

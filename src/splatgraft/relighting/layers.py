@@ -12,6 +12,7 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.core.splitting import split_wide_around
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.shading.gain import apply_gain
 
@@ -41,7 +42,7 @@ class Relit:
     is_object: Bool[Tensor, "m"]
     """Which Gaussians belong to an object."""
     origin: Int[Tensor, "m"]
-    """Position in `Composite.bake()` of the Gaussian that each one is, or is a piece of."""
+    """Position in `Composite.merged()` of the Gaussian that each one is, or is a piece of."""
     shade: Float[Tensor, "m 3"]
     """Factor on linear rgb; 1 off the objects."""
     shadow: Float[Tensor, "m 3"]
@@ -52,13 +53,25 @@ class Relit:
     """Its product with the unit vector from the camera is added to shadow and bounce; world axes, 0 away from edges."""
     gloss: Float[Tensor, "m k 3"]
     """Added to the harmonics after shading."""
+    objects: tuple[Gaussians, ...]
+    """The placed objects, target's frame."""
     light: Light | None
     """The light at the object's place that was used; None where there was no transfer."""
     report: tuple[str, ...]
     """Plain sentences: what was found, how sure, and what was not done and why."""
 
-    def bake(self, weights: LayerWeights = LayerWeights()) -> Gaussians:
-        """A plain 3DGS scene; Gaussians that no layer touches keep every bit."""
+    def bake(self, weights: LayerWeights = LayerWeights()) -> tuple[Gaussians, Bool[Tensor, "b"]]:
+        """The scene to write or to draw, and which of its Gaussians belong to an object.
+
+        Wide Gaussians of the target around the objects are split, as in `Composite.bake`.
+
+        Args:
+            weights: How much of each layer is applied.
+        """
+        return split_wide_around(self.shaded(weights), self.is_object, self.objects)
+
+    def shaded(self, weights: LayerWeights = LayerWeights()) -> Gaussians:
+        """The m Gaussians under the layers, in the order of `gaussians`; those that no layer changes keep every bit."""
         ratio = self.ratio(weights)
         leaning = (weights.shadow * self.slope != 0).any(1).nonzero()[:, 0]
         sh = spherical_harmonics.with_degree(self.gaussians.sh, max(self.gaussians.sh_degree, int(len(leaning) > 0)))
@@ -94,7 +107,9 @@ def _seen_change(
     return (slope / height)[:, :, None] * (0.5 * (top - bottom))[:, None]
 
 
-def unchanged(gaussians: Gaussians, is_object: Bool[Tensor, "m"], *, report: tuple[str, ...]) -> Relit:
+def unchanged(
+    gaussians: Gaussians, is_object: Bool[Tensor, "m"], *, objects: tuple[Gaussians, ...], report: tuple[str, ...]
+) -> Relit:
     """The copy-paste result, with the sentences that say why."""
     ones = torch.ones(gaussians.count, 3)
     return Relit(
@@ -106,6 +121,7 @@ def unchanged(gaussians: Gaussians, is_object: Bool[Tensor, "m"], *, report: tup
         bounce=torch.zeros_like(ones),
         slope=torch.zeros_like(ones),
         gloss=torch.zeros_like(gaussians.sh),
+        objects=objects,
         light=None,
         report=report,
     )

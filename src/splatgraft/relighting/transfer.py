@@ -70,16 +70,17 @@ def relight(
     """
     if len(sources) not in (0, len(composite.objects)):
         raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")
-    baked, is_object = composite.bake()
+    baked, is_object = composite.merged()
     placed = [(p, s) for p, s in zip_longest(composite.objects, sources) if p.gaussians.count]
     if not placed:
-        return unchanged(baked, is_object, report=("No object is placed: nothing to light.",))
+        return unchanged(baked, is_object, objects=(), report=("No object is placed: nothing to light.",))
     cache = cache or Memo()
     scene = cache.get("scene", (composite.target, composite.erased), lambda: composite.target.select(~composite.erased))
     balls = [bounding_sphere(p.in_target()) for p, _ in placed]
     stage, problem = prepare_scene(scene, cameras, balls=balls, reach=options.reach, light=light, cache=cache)
     if stage is None:
-        return unchanged(baked, is_object, report=(f"{problem} The object is pasted as it is.",))
+        objects = tuple(p.in_target() for p, _ in placed)
+        return unchanged(baked, is_object, objects=objects, report=(f"{problem} The object is pasted as it is.",))
     beams = sample_light(stage.light)
     report = [stage.light.describe(estimate_up(cameras)) + (", as given." if light is not None else ".")]
     actors, shades = [], []
@@ -142,6 +143,7 @@ def _assembled(  # noqa: PLR0913
         bounce=torch.cat([zeros, ratio.bounce, *[r.bounce for r in on_objects]])[order],
         slope=torch.cat([zeros, ratio.slope, *[r.slope for r in on_objects]])[order],
         gloss=torch.cat([torch.zeros_like(gaussians.sh[:count]), *glosses])[order],
+        objects=tuple(actor.body.gaussians for actor in actors),
         light=stage.light,
         report=tuple(report),
     )

@@ -26,14 +26,16 @@ def pictures(
     for name, width in WIDTHS.items():
         if name in outputs:
             planes[name], at = image[:, at : at + width], at + width
-    return Render(
-        color=_over(planes["color"], alpha, options.background) if "color" in outputs else None,
-        alpha=alpha,
-        depth=_per_hit(planes["depth"][:, 0], alpha) if "depth" in outputs else None,
-        normal=_unit(planes["normal"].permute(0, 2, 3, 1)) if "normal" in outputs else None,
-        features=image[:, at:].permute(0, 2, 3, 1) if has_features else None,
-        visible=visible,
-    )
+    made: dict[str, Tensor] = {}
+    if "color" in outputs:
+        made["color"] = _over(planes["color"], alpha, options.background)
+    if "depth" in outputs:
+        made["depth"] = _per_hit(planes["depth"][:, 0], alpha)
+    if "normal" in outputs:
+        made["normal"] = _unit(planes["normal"].permute(0, 2, 3, 1))
+    if has_features:
+        made["features"] = image[:, at:].permute(0, 2, 3, 1)
+    return Render(alpha=alpha, visible=visible, pictures=made)
 
 
 def _over(planes: Tensor, alpha: Tensor, background: tuple[float, float, float]) -> Tensor:

@@ -1,5 +1,6 @@
 """What rendering takes and gives, and the choice of the device's implementation. Holds no arithmetic of its own."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
@@ -28,20 +29,40 @@ class RenderOptions:
 
 @dataclass(frozen=True)
 class Render:
-    """Pictures of one scene from v cameras of one size."""
+    """Pictures of one scene from v cameras of one size; reading one that was not asked for raises a ValueError."""
 
-    color: Float[Tensor, "v h w 3"] | None
-    """sRGB over the background, not clamped above; None where not asked for."""
     alpha: Float[Tensor, "v h w"]
     """Accumulated opacity in [0, 1]."""
-    depth: Float[Tensor, "v h w"] | None
-    """Expected distance along the optical axis given a hit, world units; 0 where alpha is 0."""
-    normal: Float[Tensor, "v h w 3"] | None
-    """World-frame unit normal towards the camera (shortest axes, blended, normalised); 0 where alpha is 0."""
-    features: Float[Tensor, "v h w f"] | None
-    """Blended per-Gaussian features, not divided by alpha."""
     visible: Bool[Tensor, "v n"]
     """Which Gaussians reach at least one pixel's tile list of that view."""
+    pictures: Mapping[str, Float[Tensor, "v h w ..."]]
+    """By name: the outputs asked for, and "features" where features were given."""
+
+    @property
+    def color(self) -> Float[Tensor, "v h w 3"]:
+        """sRGB over the background, not clamped above."""
+        return self._asked("color")
+
+    @property
+    def depth(self) -> Float[Tensor, "v h w"]:
+        """Expected distance along the optical axis given a hit, world units; 0 where alpha is 0."""
+        return self._asked("depth")
+
+    @property
+    def normal(self) -> Float[Tensor, "v h w 3"]:
+        """World-frame unit normal towards the camera (shortest axes, blended, normalised); 0 where alpha is 0."""
+        return self._asked("normal")
+
+    @property
+    def features(self) -> Float[Tensor, "v h w f"]:
+        """Blended per-Gaussian features, not divided by alpha."""
+        return self._asked("features")
+
+    def _asked(self, name: str) -> Tensor:
+        if name not in self.pictures:
+            found = ", ".join(self.pictures) or "none"
+            raise ValueError(f"render: expected {name} among what was asked for, found {found}")
+        return self.pictures[name]
 
 
 @runtime_checkable

@@ -95,7 +95,6 @@ def solidify_object(
         background = torch.rand(3, generator=generator)
         fitted = replace(chosen, **leaves, sh=torch.cat([base, higher], 1))
         drawn = render(fitted, sight.camera, options=RenderOptions(background=tuple(background.tolist()))).color
-        assert drawn is not None
         wanted = sight.mask * sight.image + (1 - sight.mask) * background.to(sight.image)
         loss = (sight.weight * (drawn[0] - wanted).abs()).mean()
         optimizer.zero_grad(set_to_none=True)
@@ -122,8 +121,6 @@ def _sight(
     chosen = scene.select(selection)
     serialized = render(chosen, camera, outputs=frozenset({"depth"}))
     rest = render(scene.select(~selection), camera, outputs=frozenset({"depth"}))
-    assert serialized.depth is not None
-    assert rest.depth is not None
     extent = float((chosen.means.quantile(0.95, dim=0) - chosen.means.quantile(0.05, dim=0)).norm())
     before = (rest.depth[0] < serialized.depth[0] - 0.25 * extent) & (rest.alpha[0] > 0.5)
     hidden = before & (serialized.alpha[0] > 0.5) & (mask.to(before.device) < 0.5)

@@ -56,7 +56,6 @@ def _held_out_metrics(scene: Gaussians, capture: PosedImages, options: Reconstru
     values: list[tuple[float, float]] = []
     for index, camera in enumerate(views.cameras.to(scene.device)):
         picture = render(scene, camera, options=RenderOptions(background=options.background)).color
-        assert picture is not None
         image, truth = picture[0].cpu().clamp(0, 1), views.image(index)
         values.append((float(psnr(image, truth)), float(ssim(image, truth))))
     means = [sum(column) / len(values) for column in zip(*values, strict=True)]

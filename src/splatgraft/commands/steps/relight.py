@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from splatgraft.core.splitting import split_wide_around
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
@@ -66,9 +65,7 @@ class Relight:
             cameras, sources = read_cameras(self.cameras), self._sources()
             relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
             found = relit.light
-            gaussians, is_object, sentences = relit.bake(self.weights), relit.is_object, relit.report
-        placed = [one.in_target() for one in composite.objects]
-        gaussians, is_object = split_wide_around(gaussians, is_object, placed)
+            (gaussians, is_object), sentences = relit.bake(self.weights), relit.report
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_selection(folder / IS_OBJECT_FILE, is_object)
         (folder / LIGHT_TEXT_FILE).write_text("\n".join(sentences) + "\n")

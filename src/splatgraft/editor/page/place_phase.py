@@ -200,7 +200,7 @@ class PlacePhase:
         item = session.scenes.placeable(ObjectPlacement(Similarity.identity(), path))
         cameras = session.scenes.cameras(session.files.target_cameras)
         # what is placed already counts as a part of the scene
-        scene = session.scenes.composite(session.placed_state()).bake()[0]
+        scene = session.scenes.composite(session.placed_state()).merged()[0]
         move = placing.suggested(scene, item, cameras)
         objects = (*session.objects(), ObjectPlacement(move, path))
         session.change(replace(session.state, objects=objects))

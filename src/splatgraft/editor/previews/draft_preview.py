@@ -64,7 +64,7 @@ def carried_over(relit: Relit, composite: Composite, parts: Sequence[Thinned]) -
     assert relit.gaussians.count == sum(counts)
     starts = torch.tensor([0, *counts[:-1]]).cumsum(0).tolist()
     row = torch.cat([part.nearest + start for part, start in zip(parts, starts, strict=True)])
-    gaussians, is_object = composite.bake()
+    gaussians, is_object = composite.merged()
     return Relit(
         gaussians=gaussians,
         is_object=is_object,
@@ -74,6 +74,7 @@ def carried_over(relit: Relit, composite: Composite, parts: Sequence[Thinned]) -
         bounce=relit.bounce[row],
         slope=torch.zeros_like(relit.slope[row]),  # holds for the width of the thinned only
         gloss=relit.gloss[row],
+        objects=tuple(placed.in_target() for placed in composite.objects),
         light=relit.light,
         report=relit.report,
     )

@@ -93,14 +93,12 @@ class Preview:
         if kind == "Shadow layer":
             return self._shadow(state, camera, draft=draft)
         color = render(self._scene(kind, state, draft=draft), camera).color
-        assert color is not None
         return _bytes(color[0])
 
     def source_picture(self, which: Bool[Tensor, "n"] | None, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         """The source scene, or those of its Gaussians that `which` names."""
         scene = self._scenes.gaussians(self._scenes.files.source_scene)
         color = render(scene if which is None else scene.select(which), camera).color
-        assert color is not None
         return _bytes(color[0])
 
     def _scene(self, kind: Kind, state: EditState, *, draft: bool) -> Gaussians:
@@ -120,14 +118,12 @@ class Preview:
         composite = self._transfers.composite(state)
         gaussians, is_object = self._transfers.pasted(composite)
         features = render(gaussians, camera, outputs=frozenset(), features=is_object[:, None].float()).features
-        assert features is not None
         return _bytes(features[0].expand(-1, -1, 3))
 
     def _depth(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         composite = self._transfers.composite(state)
         gaussians, _ = self._transfers.pasted(composite)
         depth = render(gaussians, camera, outputs=frozenset({"depth"})).depth
-        assert depth is not None
         near = depth[0][depth[0] > 0]
         if not len(near):
             return _bytes(torch.zeros(*depth[0].shape, 3))
@@ -146,7 +142,6 @@ class Preview:
         layers = self._kept.get("layers", (relit, state.weights), lambda: relit.ratio(state.weights))
         # half grey is unchanged, so that both what is darkened and what is brightened can be seen
         seen = render(relit.gaussians, camera, outputs=frozenset(), features=(0.5 * layers).clamp(0, 1))
-        assert seen.features is not None
         return _bytes(seen.features[0] + 0.5 * (1 - seen.alpha[0])[..., None])
 
     def _photograph(self, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:

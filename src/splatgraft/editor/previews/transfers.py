@@ -13,7 +13,6 @@ from torch import Tensor
 
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.splitting import split_wide_around
 from splatgraft.editor.previews.draft_preview import (
     OBJECT_BUDGET,
     TARGET_BUDGET,
@@ -79,22 +78,16 @@ class Transfers:
         Raises: ValueError where a file is missing.
         """
         composite, light_by = self.composite(state), self._scenes.files.light_by
-        placed = [one.in_target() for one in composite.objects]
         if light_by == "off":
             return self.pasted(composite)[0]
         if light_by == "gain":
             return self._kept.get("gained", (composite,), lambda: self._gained(composite, state))
         relit = self.soonest(state) if draft else self.relit(state)
-
-        def make() -> Gaussians:
-            return split_wide_around(relit.bake(state.weights), relit.is_object, placed)[0]
-
-        return self._kept.get("scene", (relit, state.weights), make)
+        return self._kept.get("scene", (relit, state.weights), lambda: relit.bake(state.weights)[0])
 
     def pasted(self, composite: Composite) -> tuple[Gaussians, Bool[Tensor, "n"]]:
         """What the step `compose` would write."""
-        placed = [one.in_target() for one in composite.objects]
-        return self._kept.get("pasted", (composite,), lambda: split_wide_around(*composite.bake(), placed))
+        return self._kept.get("pasted", (composite,), composite.bake)
 
     def note(self) -> str:
         """What `Light transfer` shows where project.toml asks for less than the physical one."""
@@ -107,7 +100,7 @@ class Transfers:
     def _gained(self, composite: Composite, state: EditState) -> Gaussians:
         cameras, sources = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.source_scenes(state)
         adjusted, _ = relight_by_gain(composite, cameras, sources=sources)
-        return split_wide_around(*adjusted.bake(), [one.in_target() for one in composite.objects])[0]
+        return adjusted.bake()[0]
 
     def _made_alone(self, name: str, state: EditState, make: Callable[[EditState], Relit]) -> Relit:
         inputs = self._inputs(state)

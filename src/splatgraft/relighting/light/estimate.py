@@ -128,7 +128,6 @@ def _through_windows(light: Light, scene: Gaussians, ball: BoundingSphere) -> Li
         helper = torch.tensor([0.0, 0.0, 1.0]) if abs(source.direction[2]) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
         pose = look_at(ball.center[None], ball.center + direction, helper)
         seen = render(scene, pinhole(pose, 32.0, width=16, height=16), outputs=frozenset({"depth"}))
-        assert seen.depth is not None
         there = (seen.alpha > 0.5) & (seen.depth > ball.radius)
         distance = float(seen.depth[there].quantile(0.25)) if bool(there.any()) else math.inf
         sources.append(replace(source, blockers_within=0.7 * distance))
@@ -140,7 +139,6 @@ def panorama_at(scene: Gaussians, ball: BoundingSphere) -> tuple[Panorama | None
     if scene.count == 0:
         return None, "The scene is empty."
     depth = render(scene, cube_cameras(ball.center, 24), outputs=frozenset({"depth"}))
-    assert depth.depth is not None
     close = (depth.alpha > 0.5) & (depth.depth < 0.4 * ball.radius)
     if float(close.float().mean()) > _ENCLOSED:
         return None, "The object is inside a wall or another thing: there is no light to be found there."

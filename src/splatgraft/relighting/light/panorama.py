@@ -77,7 +77,6 @@ def render_panorama(scene: Gaussians, center: Float[Tensor, "3"], *, size: int =
     # the plane of each face only has to keep out what is behind it: distance was taken care of above
     near = max(nearest / math.sqrt(3), 1e-6)
     seen = render(scene.select(far_enough), cube_cameras(center, size), options=RenderOptions(near=near))
-    assert seen.color is not None
     alpha = seen.alpha.detach().clamp(0, 1)
     # Gaussians are blended in sRGB: the colour of what is there comes first, its linear light second
     color = seen.color.detach().clamp_min(0) / alpha.clamp_min(_FAINTEST)[..., None]

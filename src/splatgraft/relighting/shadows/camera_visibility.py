@@ -26,7 +26,6 @@ def seen_from(gaussians: Gaussians, camera: Cameras, *, among: Gaussians) -> Boo
     """Whether one `camera` sees each Gaussian's centre, or only what of `among` is in front of it."""
     small = camera.resized(_WIDTH / int(camera.sizes[0, 0]))
     seen = render(among, small, outputs=frozenset({"depth"}))
-    assert seen.depth is not None
     surface = torch.where(seen.alpha[0] > 0.5, seen.depth[0], torch.inf).numpy()
     pose, intrinsics = small.camera_from_world[0].numpy(), small.intrinsics[0].numpy()
     out = np.zeros(gaussians.count, np.bool_)

@@ -129,7 +129,6 @@ def _mean(values: list[float | None]) -> float | None:
 
 def _picture(scene: Gaussians, truth: PosedImages, index: int) -> Float[Tensor, "h w 3"]:
     color = render(scene, truth.cameras[index].to(scene.device)).color
-    assert color is not None
     return color[0].cpu().clamp(0, 1)
 
 

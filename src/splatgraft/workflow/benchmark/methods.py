@@ -15,7 +15,6 @@ from splatgraft.consolidation import (
     linear_schedule,
 )
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.splitting import split_wide_around
 from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import lpips_vgg, windowed_fourier
 from splatgraft.folders.composite_folder import placement_files, read_composite
@@ -119,8 +118,7 @@ class RelightWithTrueLight:
             sources=[source],
             light=read_true_light(self.light),
         )
-        placed = [one.in_target() for one in composite.objects]
-        write_gaussians(folder / SCENE_FILE, split_wide_around(relit.bake(), relit.is_object, placed)[0])
+        write_gaussians(folder / SCENE_FILE, relit.bake()[0])
         if relit.light is not None:
             (folder / LIGHT_FILE).write_text(light_to_json(relit.light))
         for sentence in relit.report:
