@@ -1,44 +1,64 @@
-# make install: the environment in .venv; make demo: the whole job on shipped data; make test: all checks;
+# make install: the package in .venv; make demo: a whole transfer on shipped captures;
+# make dev: also what the checks need; make test: all checks; make test-fast: those that take a minute;
 # make blender: Blender as a Python module in .venv-blender, for `splatgraft synth --blender-python`;
 # make browser: Chromium, for the editor's tests.
 SHELL := /bin/bash
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 STAMP := .venv/.installed
+DEV_STAMP := .venv/.installed-dev
 # threads of torch and numba that spin while they wait take the cores from each other
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: install demo test blender browser clean
+.PHONY: install dev demo test test-fast blender browser clean
 .DEFAULT_GOAL := install
 
+# the package alone: what `make demo` needs
 install: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "make: expected Python 3.11 or newer, found " + sys.version.split()[0] + "; name one with PYTHON=...")'
+	@echo "installing splatgraft into .venv: about 1.3 GB on disk with PyTorch for the CPU, usually 1 to 2 minutes"
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	@touch $@
+
+# what the checks need besides: linters, Ray, diffusers, ONNX, pycolmap, a driver for Chromium
+dev: $(DEV_STAMP)
+
+$(DEV_STAMP): $(STAMP)
+	@echo "installing what the checks need into .venv: about 1.4 GB more on disk, usually 2 minutes"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
 
 demo: install
-	$(BIN)/splatgraft run data/demo/project.toml --out demo
+	$(BIN)/splatgraft demo demo
 
-# Blender's wheel is for Python 3.11 alone and 1 GiB large: an environment of its own
+# Blender's wheel is for Python 3.11 alone: an environment of its own
 BLENDER_PYTHON ?= $(shell command -v python3.11)
 blender: .venv-blender/.installed
 
 .venv-blender/.installed: constraints.txt
 	@test -n "$(BLENDER_PYTHON)" || { echo "make: expected Python 3.11 for bpy, found none; name one with BLENDER_PYTHON=..."; exit 1; }
+	@echo "installing Blender as a Python module into .venv-blender: a download of 334 MB, 1 GB on disk"
 	$(BLENDER_PYTHON) -m venv .venv-blender
 	.venv-blender/bin/python -m pip install --quiet --disable-pip-version-check 'bpy==4.2.23' numpy==2.4.6
 	@touch $@
 
-# Debian's Chromium with software OpenGL, for the stories of the editor
+# Debian's Chromium with software OpenGL, for the stories of the editor; apt is used by root alone
 browser:
-	@command -v chromium >/dev/null || { apt-get update -qq && \
-	  apt-get install -y -qq --no-install-recommends chromium libgl1-mesa-dri libegl1 >/dev/null; }
+	@command -v chromium >/dev/null && exit 0; \
+	if [ "$$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then \
+	  echo "no chromium found: install the packages chromium libgl1-mesa-dri libegl1 (about 400 MB on disk) for the browser tests"; exit 1; fi; \
+	echo "installing Chromium by apt-get for the browser tests: a download of about 130 MB, 400 MB on disk"; \
+	apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium libgl1-mesa-dri libegl1 >/dev/null
 
 test:
 	.ci/run
+
+# the inner loop: no browser, no training
+test-fast: dev
+	$(BIN)/python -m pytest -q -m "not browser and not slow"
 
 clean:
 	rm -rf demo build .pytest_cache .ruff_cache .hypothesis

@@ -61,7 +61,6 @@ def visible_points(scene: Gaussians, points: Float[Tensor, "m 3"], *, camera: Ca
     """Bool[m]: points inside the camera's image and at most `slack`, world units, behind the scene's surface."""
     depth, pixels, inside = project(points, camera)
     rendered = render(scene, camera, outputs=frozenset({"depth"}))
-    assert rendered.depth is not None
     column, row = pixels.long().unbind(-1)
     column, row = column.clamp(0, camera.width - 1), row.clamp(0, camera.height - 1)
     surface, alpha = rendered.depth[0].detach()[row, column], rendered.alpha[0].detach()[row, column]
