@@ -47,7 +47,7 @@ def from_table(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
 
 
 def _keys(kind: type) -> set[str]:
-    hints = _hints(kind)
+    hints = field_types(kind)
     nested = [name for name, hint in hints.items() if is_dataclass(hint)]
     return (set(hints) - set(nested)).union(*(_keys(hints[name]) for name in nested))
 
@@ -55,7 +55,7 @@ def _keys(kind: type) -> set[str]:
 def _build(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
     values: dict[str, Any] = {}
     for field in fields(kind):  # pyright: ignore[reportArgumentType]
-        hint = _hints(kind)[field.name]
+        hint = field_types(kind)[field.name]
         if field.name in given:
             values[field.name] = given[field.name]
         elif is_dataclass(hint):
@@ -70,8 +70,8 @@ def _build(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
     return kind(**values)
 
 
-def _hints(kind: type) -> dict[str, Any]:
-    """Annotations of a dataclass, without what tyro reads."""
+def field_types(kind: type) -> dict[str, Any]:
+    """The type of each field of a dataclass, without the annotations that tyro reads."""
     hints = get_type_hints(kind, include_extras=True)
     return {
         field.name: get_args(hint)[0] if get_origin(hint) is Annotated else hint

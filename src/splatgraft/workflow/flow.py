@@ -1,4 +1,4 @@
-"""The steps of one project, and which reads which other's folder. Does no work itself and reads no TOML."""
+"""The steps of a project as a graph: which step reads the folder of which other."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -100,31 +100,40 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
 
 
 def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:
+    placement = file.path.parent / PLACEMENT_FILE
+    given = default_paths(layout)
+    if placement.is_file():
+        given[Compose] = given[Compose] | {"placement": placement}
+    folders = (layout.object, layout.composite, layout.relit, layout.views)
+    folders += (layout.harmonized, layout.result, layout.report)
+    plan = zip(given.items(), folders, strict=True)
+    return {kind.__name__.lower(): file.step(kind, paths, out=out) for (kind, paths), out in plan}
+
+
+def default_paths(layout: Layout) -> dict[type[Any], dict[str, Path]]:
+    """The paths that a project hands to each step after the reconstructions, in the order of the flow."""
     source, target = (layout.scene(side) / SCENE_FILE for side in ("source", "target"))
     source_capture, target_capture = layout.capture("source"), layout.capture("target")
     cameras, source_cameras = (layout.capture(side) / CAMERAS_FILE for side in ("target", "source"))
     surroundings = layout.object / SURROUNDINGS_FILE
     composite, relit = layout.composite / SCENE_FILE, layout.relit / SCENE_FILE
-    placement = file.path.parent / PLACEMENT_FILE
 
-    lift = {"scene": source, "capture": source_capture}
-    place = {"target": target, "object": layout.object / OBJECT_FILE, "surroundings": surroundings}
-    place |= {"cameras": cameras, "object_cameras": source_cameras}
-    place |= {"placement": placement} if placement.is_file() else {}
-    light = {"target": target, "placement": layout.composite / PLACEMENT_FILE, "cameras": cameras}
-    light |= {"surroundings": surroundings, "object_cameras": source_cameras, "taken": layout.object / OBJECT_FILE}
-    draw = {"scene": composite, "cameras": cameras, "prior": relit, "is_object": layout.composite / IS_OBJECT_FILE}
-    fit = {"scene": relit, "views": layout.views, "images": layout.harmonized}
-    judge = {"result": layout.result / SCENE_FILE, "composite": layout.composite, "cameras": cameras}
-    judge |= {"target_capture": target_capture, "views": layout.views, "light": layout.relit / LIGHT_TEXT_FILE}
-    judge |= {"project": layout.root}
-    plan: list[tuple[type[Any], dict[str, Path], Path]] = [
-        (Segment, lift, layout.object),
-        (Compose, place, layout.composite),
-        (Relight, light, layout.relit),
-        (Render, draw, layout.views),
-        (Harmonize, {"views": layout.views}, layout.harmonized),
-        (Consolidate, fit, layout.result),
-        (Evaluate, judge, layout.report),
-    ]
-    return {kind.__name__.lower(): file.step(kind, given, out=out) for kind, given, out in plan}
+    segment = {"scene": source, "capture": source_capture}
+    compose = {"target": target, "object": layout.object / OBJECT_FILE, "surroundings": surroundings}
+    compose |= {"cameras": cameras, "object_cameras": source_cameras}
+    relight = {"target": target, "placement": layout.composite / PLACEMENT_FILE, "cameras": cameras}
+    relight |= {"surroundings": surroundings, "object_cameras": source_cameras, "taken": layout.object / OBJECT_FILE}
+    render = {"scene": composite, "cameras": cameras, "prior": relit, "is_object": layout.composite / IS_OBJECT_FILE}
+    consolidate = {"scene": relit, "views": layout.views, "images": layout.harmonized}
+    evaluate = {"result": layout.result / SCENE_FILE, "composite": layout.composite, "cameras": cameras}
+    evaluate |= {"target_capture": target_capture, "views": layout.views, "light": layout.relit / LIGHT_TEXT_FILE}
+    evaluate |= {"project": layout.root}
+    return {
+        Segment: segment,
+        Compose: compose,
+        Relight: relight,
+        Render: render,
+        Harmonize: {"views": layout.views},
+        Consolidate: consolidate,
+        Evaluate: evaluate,
+    }
