@@ -19,6 +19,7 @@ from splatgraft.project.project_file import ProjectFile, read_project_file
 from splatgraft.project.results import (
     CAMERAS_FILE,
     IS_OBJECT_FILE,
+    LIGHT_FILE,
     LIGHT_TEXT_FILE,
     OBJECT_FILE,
     PLACEMENT_FILE,
@@ -113,7 +114,8 @@ def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:
     place |= {"placement": placement} if placement.is_file() else {}
     light = {"target": target, "placement": layout.composite / PLACEMENT_FILE, "cameras": cameras}
     light |= {"surroundings": surroundings, "object_cameras": source_cameras, "taken": layout.object / OBJECT_FILE}
-    draw = {"scene": composite, "cameras": cameras, "prior": relit, "is_object": layout.composite / IS_OBJECT_FILE}
+    draw = {"scene": composite, "cameras": cameras, "is_object": layout.composite / IS_OBJECT_FILE}
+    draw |= {"prior": relit, "light": layout.relit / LIGHT_FILE}
     fit = {"scene": relit, "views": layout.views, "images": layout.harmonized}
     judge = {"result": layout.result / SCENE_FILE, "composite": layout.composite, "cameras": cameras}
     judge |= {"target_capture": target_capture, "views": layout.views, "light": layout.relit / LIGHT_TEXT_FILE}
