@@ -1,6 +1,12 @@
-"""The folder of a composite: scene.ply, is_object.npy, placement.json that names its objects. Knows no algorithm."""
+"""The folder of a composite: placement.json, and the scene that it describes as scene.ply with is_object.npy.
 
+placement.json and the target's scene.ply are what `relight` reads: it needs the objects apart and no Gaussian split.
+scene.ply is the baked composite, for `render`, `evaluate` and other programs; changing it changes no light transfer.
+"""
+
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from splatgraft.composition import Composite, compose
 from splatgraft.core.gaussians import Gaussians
@@ -26,25 +32,33 @@ def read_composite(target: Path, placement: Path) -> Composite:
     Raises: ValueError where a file is missing or broken, or an object is not named.
     """
     found = read_placement(placement)
-    objects: list[Gaussians] = []
-    read: dict[Path, Gaussians] = {}
     for index, item in enumerate(found.objects):
         if item.object_path is None:
             raise ValueError(f'{placement}: expected objects[{index}] to name its "object", found none')
+    return composite_of(read_gaussians(target), found)
+
+
+def composite_of(
+    target: Gaussians, placement: Placement, *, known: Mapping[Path, Gaussians] = MappingProxyType({})
+) -> Composite:
+    """The composite of a target scene and the objects that `placement` names, each file read once.
+
+    `known` holds scenes that were read before, by path.
+
+    Raises: ValueError where an object's file is missing or broken, or what is erased belongs to another target.
+    """
+    read = dict(known)
+    for item in placement.objects:
+        assert item.object_path is not None
         if item.object_path not in read:
             read[item.object_path] = read_gaussians(item.object_path)
-        objects.append(read[item.object_path])
-    return assemble(read_gaussians(target), objects, found)
-
-
-def assemble(target: Gaussians, objects: list[Gaussians], placement: Placement) -> Composite:
-    """The composite of scenes that are already read."""
+    objects = [read[item.object_path] for item in placement.objects if item.object_path is not None]
     moves = [item.target_from_object for item in placement.objects]
     return compose(target, objects, target_from_objects=moves, erased=placement.erased)
 
 
 def write_composite(folder: Path, composite: Composite, placement: Placement) -> None:
-    """Write the three files; `placement` names every object."""
+    """Write the three files; `placement` describes `composite` and names every object's file."""
     gaussians, is_object = composite.bake()
     write_gaussians(folder / SCENE_FILE, gaussians)
     write_selection(folder / IS_OBJECT_FILE, is_object)

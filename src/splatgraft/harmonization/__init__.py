@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from splatgraft.harmonization.compact.factory import make_compact
 from splatgraft.harmonization.flux.factory import make_flux
+from splatgraft.harmonization.inputs import render_views
 from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
 from splatgraft.harmonization.keep_prior import KeepPrior
 from splatgraft.harmonization.options import HarmonizerOptions
@@ -18,6 +19,7 @@ __all__ = [
     "HarmonizerInputs",
     "HarmonizerOptions",
     "make_harmonizer",
+    "render_views",
 ]
 
 HARMONIZERS: dict[str, Callable[[HarmonizerOptions], Harmonizer]] = {

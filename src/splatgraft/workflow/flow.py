@@ -18,6 +18,7 @@ from splatgraft.commands.steps.segment import Segment
 from splatgraft.project.layout import (
     CAMERAS_FILE,
     IS_OBJECT_FILE,
+    LIGHT_FILE,
     LIGHT_TEXT_FILE,
     OBJECT_FILE,
     PLACEMENT_FILE,
@@ -123,7 +124,8 @@ def default_paths(layout: Layout) -> dict[type[Any], dict[str, Path]]:
     compose |= {"cameras": cameras, "object_cameras": source_cameras}
     relight = {"target": target, "placement": layout.composite / PLACEMENT_FILE, "cameras": cameras}
     relight |= {"surroundings": surroundings, "object_cameras": source_cameras, "taken": layout.object / OBJECT_FILE}
-    render = {"scene": composite, "cameras": cameras, "prior": relit, "is_object": layout.composite / IS_OBJECT_FILE}
+    render = {"scene": composite, "cameras": cameras, "is_object": layout.composite / IS_OBJECT_FILE}
+    render |= {"prior": relit, "light": layout.relit / LIGHT_FILE}
     consolidate = {"scene": relit, "views": layout.views, "images": layout.harmonized}
     evaluate = {"result": layout.result / SCENE_FILE, "composite": layout.composite, "cameras": cameras}
     evaluate |= {"target_capture": target_capture, "views": layout.views, "light": layout.relit / LIGHT_TEXT_FILE}

@@ -1,11 +1,11 @@
-"""The command `compose`: an object and a target scene become a composite, by a placement or where the object fits."""
+"""The command `compose`: place an object in a target scene, by a placement or where the object fits."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatgraft.composition import PlaceOptions, place_object
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.folders.composite_folder import assemble, placement_files, write_composite
+from splatgraft.folders.composite_folder import composite_of, placement_files, write_composite
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.formats.placement import ObjectPlacement, Placement, read_placement
 from splatgraft.project.step import Context, Inputs
@@ -20,15 +20,15 @@ class Compose:
     object: Path
     """The object's Gaussians, a .ply; a placement may name others beside it."""
     out: Path = Path("composite")
-    """Folder for scene.ply, is_object.npy and placement.json."""
+    """Folder for placement.json, which `relight` reads beside the target, and the same as scene.ply, is_object.npy."""
     placement: Path | None = None
     """placement.json; without it the object is rested on a surface, for which both captures' cameras are needed."""
     cameras: Path | None = None
-    """The target's cameras, a transforms.json: they tell what is up and what is in view."""
+    """The target's cameras, a transforms.json: from them follow the up direction and what is in view."""
     object_cameras: Path | None = None
     """The source's cameras."""
     surroundings: Path | None = None
-    """The source without the object, a .ply: what the object stood on tells where its foot is."""
+    """The source without the object, a .ply: the surface that the object stood on gives the object's base."""
     options: PlaceOptions = field(default_factory=PlaceOptions)
 
     def inputs(self) -> Inputs:
@@ -40,17 +40,15 @@ class Compose:
         return scenes | {"cameras": tuple(path for path in optional if path is not None)}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make the composite."""
+        """Compose and write the scene."""
         target, object_ = read_gaussians(self.target), read_gaussians(self.object)
         placement = self._found(target, object_, context) if self.placement is None else read_placement(self.placement)
-        paths = [item.object_path or self.object for item in placement.objects]
-        objects = [object_ if path == self.object else read_gaussians(path) for path in paths]
-        named = [replace(item, object_path=path) for item, path in zip(placement.objects, paths, strict=True)]
-        placement = replace(placement, objects=tuple(named))
-        write_composite(folder, assemble(target, objects, placement), placement)
+        named = tuple(replace(item, object_path=item.object_path or self.object) for item in placement.objects)
+        placement = replace(placement, objects=named)
+        write_composite(folder, composite_of(target, placement, known={self.object: object_}), placement)
 
     def _found(self, target: Gaussians, object_: Gaussians, context: Context) -> Placement:
-        """A placement on a surface of the target."""
+        """The placement on a level surface of the target."""
         if self.cameras is None or self.object_cameras is None:
             raise ValueError(
                 "compose: expected --placement, or --cameras and --object-cameras to find a place, found neither"

@@ -1,4 +1,4 @@
-"""The command `relight`: a composite becomes one whose object has the light of its new place."""
+"""The command `relight`: light the objects of a composite by the target scene, and add their shadows to it."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,28 +18,28 @@ from splatgraft.relighting.transfer import RelightOptions, SourceScene, relight
 
 @dataclass(frozen=True)
 class Relight:
-    """Give the object the light of its new place, and the place its shadow; no training, no views."""
+    """Light the object by its new place and add its shadow to the place; no training, no images."""
 
     target: Path
     """The scene that receives the object, a .ply."""
     placement: Path
-    """placement.json that names the objects: the one in the composite's folder."""
+    """placement.json in the composite's folder: it names the objects. The composite's scene.ply is not read."""
     cameras: Path
-    """The target's cameras, a transforms.json: they tell what is up."""
+    """The target's cameras, a transforms.json: from them follows the up direction."""
     out: Path = Path("relit")
-    """Folder for scene.ply, is_object.npy, light.json and the same in words, light.txt."""
+    """Folder for scene.ply, is_object.npy, light.json, and light.txt, which describes the light in words."""
     surroundings: Path | None = None
-    """The source without the object that was taken from it, a .ply: the light that is to be taken off. Objects of other
-    files, and all of them without it, keep their mean brightness."""
+    """The source without its object, a .ply: from it the light on the object at capture is estimated and divided out.
+    Objects of other files, and all of them without it, keep their mean brightness."""
     object_cameras: Path | None = None
     """The source's cameras, a transforms.json."""
     taken: Path | None = None
-    """That object's file, as the placement names it; the first object's where not given."""
+    """File of the object that was taken from the source, as the placement names it; the first where not given."""
     light: Literal["transfer", "gain", "off"] = "transfer"
     """transfer: shading and shadows; gain: exposure and white balance of the object alone; off: the object as it was
     captured (the paper's configuration)."""
     given_light: Path | None = None
-    """A light.json, as an earlier run wrote it and you may have changed it; it takes the place of the estimate."""
+    """A light.json that replaces the estimate: one that an earlier run wrote, changed or not."""
     options: RelightOptions = field(default_factory=RelightOptions)
     weights: LayerWeights = field(default_factory=LayerWeights)
 
@@ -52,7 +52,7 @@ class Relight:
         return scenes | {"cameras": (self.cameras,), "source": source, "light": light}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make the relit composite, and say in words what was found."""
+        """Relight, write the scene and the light, and print the report."""
         composite = read_composite(self.target, self.placement)
         found: Light | None = None
         if self.light == "off":
@@ -91,7 +91,7 @@ class Relight:
         taken = self.taken or (paths[0] if paths else None)
         if taken is None:
             return [None] * len(paths)
-        # copies of one object have one origin; of others none is known, and the report says so
+        # all copies of the object have this source; objects of other files have none, as the report says
         return [source if path is not None and path.resolve() == taken.resolve() else None for path in paths]
 
 

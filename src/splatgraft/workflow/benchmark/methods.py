@@ -7,7 +7,7 @@ from typing import Literal, get_args
 from splatgraft.commands.steps.consolidate import Consolidate
 from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.commands.steps.relight import Relight
-from splatgraft.commands.steps.render import Render, view_of
+from splatgraft.commands.steps.render import Render
 from splatgraft.consolidation import (
     ConsolidateOptions,
     geometric_schedule,
@@ -20,7 +20,7 @@ from splatgraft.fitting.perceptual_losses import lpips_vgg, windowed_fourier
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
-from splatgraft.harmonization import HARMONIZERS, HarmonizerOptions, make_harmonizer
+from splatgraft.harmonization import HARMONIZERS, HarmonizerOptions, make_harmonizer, render_views
 from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting import SourceScene, relight
@@ -166,7 +166,7 @@ class UpdateIteratively:
         harmonizer = make_harmonizer(self.harmonizer, options)
 
         def harmonize_at(scene: Gaussians, strength: float) -> LazySequence:
-            views = [view_of(composite, is_object, prior=scene, camera=camera) for camera in cameras]
+            views = render_views(composite, is_object, cameras, prior=scene)
             images = [harmonizer.harmonize(view).image.to(device) for view in views]
             return LazySequence(len(images), lambda index: images[index])
 
@@ -208,7 +208,9 @@ def result_of(
         return out / "result" / SCENE_FILE, seconds
     views = ready.work / "views" / method.prior
     composite = ready.composite / SCENE_FILE
-    draw = Render(composite, ready.cameras, views, is_object=ready.is_object, prior=prior, device=device)
+    # a prior without a transfer has no light, and a failed transfer found none
+    light = path if (path := prior.parent / LIGHT_FILE).is_file() else None
+    draw = Render(composite, ready.cameras, views, is_object=ready.is_object, prior=prior, light=light, device=device)
     seconds["render"] = fresh(draw, console)
     harmonized = ready.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
     seconds["harmonize"] = fresh(Harmonize(views, harmonized, method.harmonizer, weights=model, device=device), console)
