@@ -43,7 +43,7 @@ class Problem:
     judge_images: list[Tensor]
 
     def pictures(self, scene: Gaussians) -> list[Tensor]:
-        """Renders from the judging cameras."""
+        """Renders from the test_views cameras."""
         with torch.no_grad():
             return [render(scene, camera).color[0].clamp(0, 1) for camera in self.judge_cameras]
 
@@ -107,20 +107,20 @@ def _spoil_view(image: Tensor, warp_px: float, cell_px: float, seed: int) -> Ten
 
 
 def problem_of(capture: PosedImages, scene: Gaussians) -> Problem:
-    judges = held_out(len(capture))
-    fitted, judging = capture.select(~judges), capture.select(judges)
+    is_held_out = held_out(len(capture))
+    fitted, test_views = capture.select(~is_held_out), capture.select(is_held_out)
     return Problem(
         composite=spoilt(scene),
         cameras=fitted.cameras,
         images=[fitted.image(i) for i in range(len(fitted))],
-        judge_cameras=judging.cameras,
-        judge_images=[judging.image(i) for i in range(len(judging))],
+        judge_cameras=test_views.cameras,
+        judge_images=[test_views.image(i) for i in range(len(test_views))],
     )
 
 
 def compare_roads(problem: Problem, loss: ImageLoss, iterations: int) -> str:
     """Both roads on photographs that agree."""
-    options = ConsolidateOptions(loss=loss, nuisance=None)
+    options = ConsolidateOptions(loss=loss, view_error=None)
     consolidate(problem.composite, problem.cameras[:2], problem.images[:2], options)  # compiles the kernels
     runs = {
         "fast": options,
@@ -156,9 +156,9 @@ def compare_losses(problem: Problem, passes: int) -> None:
         print(f"without LPIPS: {error}")
     settings = {"A: 0.8 px": (0.8, 44.0), "B: 1.5 px": (1.5, 44.0), "C: fine jitter": (0.8, 8.0)}
     polish = ConsolidateOptions().polish
-    rows = [("equations alone", ConsolidateOptions(polish_passes=0, nuisance=None))]
+    rows = [("equations alone", ConsolidateOptions(polish_passes=0, view_error=None))]
     rows += [
-        (name, ConsolidateOptions(loss=loss, nuisance=None, polish_passes=passes, polish=polish))
+        (name, ConsolidateOptions(loss=loss, view_error=None, polish_passes=passes, polish=polish))
         for name, loss in losses.items()
     ]
     rows += [("per-view tint and flow, equations alone", ConsolidateOptions(polish_passes=0))]

@@ -13,7 +13,7 @@ from splatgraft.fitting.perceptual_losses import l1
 from splatgraft.rendering import render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
-PLAIN = ConsolidateOptions(nuisance=None)
+PLAIN = ConsolidateOptions(view_error=None)
 ADAM = ConsolidateOptions(method="adam", loss=l1, reference=DescentOptions(iterations=24, save_every=8))
 
 

@@ -3,12 +3,12 @@ from dataclasses import replace
 import torch
 from conftest import ball, ring
 
-from splatgraft.consolidation.changed_region import reset_bands
-from splatgraft.consolidation.corrected_targets import Corrections
+from splatgraft.consolidation.changed_region import drop_higher_bands
+from splatgraft.consolidation.corrected_targets import CorrectedTargets
 from splatgraft.consolidation.frozen_views import Views
-from splatgraft.consolidation.normal_equations import _choose, _set_up, solve
+from splatgraft.consolidation.normal_equations import _build_equations, _select_ridge, solve
 from splatgraft.consolidation.options import SolveOptions
-from splatgraft.consolidation.view_errors import NuisanceOptions
+from splatgraft.consolidation.view_errors import ViewErrorOptions
 from splatgraft.rendering import RenderOptions, render
 
 
@@ -27,7 +27,7 @@ def test_equals_dense_ridge_regression():
     options = SolveOptions(rounds=1, steps=120, prior_px=0.5, band_ridges=(0.1,))
     prior = scene.sh.clone()
     views = views_of(scene, cameras, images, weights)
-    found = solve(prior, Corrections(views, None), options)
+    found = solve(prior, CorrectedTargets(views, None), options)
 
     rows, right, seen = [], [], torch.zeros(40, dtype=torch.float64)
     for index in range(5):
@@ -54,7 +54,7 @@ def test_an_unseen_gaussian_keeps_its_prior():
     cameras = ring(4, 32)
     images = list(0.5 * render(scene, cameras).color)
     prior = scene.sh.clone()
-    found = solve(prior, Corrections(views_of(scene, cameras, images), None), SolveOptions())
+    found = solve(prior, CorrectedTargets(views_of(scene, cameras, images), None), SolveOptions())
     assert torch.equal(found[50:], prior[50:])
     assert not torch.equal(found[:50], prior[:50])
 
@@ -62,13 +62,13 @@ def test_an_unseen_gaussian_keeps_its_prior():
 def test_the_ridge_follows_how_much_the_views_disagree():
     scene, cameras = ball(200, degree=2, seed=6), ring(12)
     images = render(scene, cameras).color
-    prior = reset_bands(scene.sh)
+    prior = drop_higher_bands(scene.sh)
     options = SolveOptions(band_ridges=(0.001, 0.1, 10.0))
 
     def chosen(pictures) -> float:
-        corrections = Corrections(views_of(scene, cameras, list(pictures)), None)
-        equations = _set_up(prior, corrections.views, 0.1, options.prior_px)
-        return _choose(prior, corrections, equations, options)
+        targets = CorrectedTargets(views_of(scene, cameras, list(pictures)), None)
+        equations = _build_equations(prior, targets.views, 0.1, options.prior_px)
+        return _select_ridge(prior, targets, equations, options)
 
     # the scene has higher bands, and views that agree show them; a gain of 40% per view drowns them
     gains = torch.exp(0.4 * torch.randn(12, 1, 1, 3, generator=torch.Generator().manual_seed(7)))
@@ -80,11 +80,11 @@ def test_tints_are_taken_off_before_the_colours_are_fitted():
     images = render(scene, cameras).color
     gains = torch.exp(0.1 * torch.randn(12, 1, 1, 3, generator=torch.Generator().manual_seed(10)))
     gains /= gains.log().mean(0, keepdim=True).exp()  # the mean gain is the scene's
-    prior = reset_bands(scene.sh)
+    prior = drop_higher_bands(scene.sh)
 
-    def error(nuisance) -> float:
-        corrections = Corrections(views_of(scene, cameras, list(images * gains)), nuisance)
-        found = replace(scene, sh=solve(prior, corrections, SolveOptions()))
+    def error(view_error) -> float:
+        targets = CorrectedTargets(views_of(scene, cameras, list(images * gains)), view_error)
+        found = replace(scene, sh=solve(prior, targets, SolveOptions()))
         return float((render(found, cameras).color - images).square().mean().sqrt())
 
-    assert error(NuisanceOptions()) < error(None)
+    assert error(ViewErrorOptions()) < error(None)

@@ -25,7 +25,7 @@ def test_each_update_harmonises_renders_of_the_one_before(relit):
         seen.append((scene, strength))
         return relit.images
 
-    options = ConsolidateOptions(nuisance=None, polish_passes=1)
+    options = ConsolidateOptions(view_error=None, polish_passes=1)
     out = iterative_update(relit.composite, relit.cameras, harmonize_at, (1.0, 0.5), options)
     assert [strength for _, strength in seen] == [1.0, 0.5]
     assert seen[0][0] is relit.composite

@@ -1,4 +1,4 @@
-"""Consolidation of harmonised views into one scene. Knows nothing about files or harmonisers."""
+"""Consolidation: fit the colours of a composite to independently harmonised views (paper, Multi-View Consolidation)."""
 
 from splatgraft.consolidation.consolidate import consolidate
 from splatgraft.consolidation.options import (
@@ -8,14 +8,14 @@ from splatgraft.consolidation.options import (
     SolveOptions,
 )
 from splatgraft.consolidation.schedules import geometric_schedule, iterative_update, linear_schedule
-from splatgraft.consolidation.view_errors import NuisanceOptions
+from splatgraft.consolidation.view_errors import ViewErrorOptions
 
 __all__ = [
     "ConsolidateOptions",
     "DescentOptions",
     "ImageSequence",
-    "NuisanceOptions",
     "SolveOptions",
+    "ViewErrorOptions",
     "consolidate",
     "geometric_schedule",
     "iterative_update",

@@ -1,10 +1,14 @@
-"""Consolidation: independently harmonised views become one scene again, by colours alone. Knows no paths."""
+"""Consolidation: fits the SH colours of a composite to independently harmonised views; geometry and opacity stay.
+
+Two methods: the paper's gradient descent (section Multi-View Consolidation), and least squares by normal equations,
+followed by a short descent.
+"""
 
 from dataclasses import replace
 
-from splatgraft.consolidation.changed_region import narrow, reset_bands
-from splatgraft.consolidation.corrected_targets import Corrections
-from splatgraft.consolidation.descent import descend
+from splatgraft.consolidation.changed_region import drop_higher_bands, restrict_to_changes
+from splatgraft.consolidation.color_optimization import optimize_colors
+from splatgraft.consolidation.corrected_targets import CorrectedTargets
 from splatgraft.consolidation.frozen_views import Views
 from splatgraft.consolidation.normal_equations import solve
 from splatgraft.consolidation.options import ConsolidateOptions, ImageSequence
@@ -23,16 +27,25 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
-    """The composite with the colours (all SH bands) that explain the harmonised images; geometry and opacity stay.
+    """The composite with SH colours of all bands fitted to the harmonised images; higher bands start from zero.
 
-    Paper: section Multi-View Consolidation. Higher bands start from zero. `images` and `weights` (confidence per pixel,
-    (h, w) in [0, 1]) are read one at a time. Memory above the inputs, for n Gaussians with k coefficients:
-    4 n (k^2 + 50 k) bytes for `fast`, 4 n 24 k for `adam`, plus `options.cache_bytes`, plus what the tile lists of two
-    views and a few images take; it does not grow with the number of views. With `fast`, Gaussians that no changed
-    pixel sees keep all their colours, exactly. The same inputs and seed give the same result.
+    Memory above the inputs, for n Gaussians with k coefficients: 4 n (k^2 + 50 k) bytes for `fast`, 4 n 24 k for
+    `adam`, plus `options.cache_bytes`, plus the tile lists of two views and a few images; it does not grow with the
+    number of views. With `fast`, Gaussians on no changed pixel keep their colours exactly. The same inputs and seed
+    give the same result.
 
-    Raises: ValueError where there is no camera, not one image per camera, or one has another size than its camera or
-    numbers that are not finite.
+    Args:
+        composite: The scene before harmonisation.
+        cameras: Of the harmonised views.
+        images: One per camera, (h, w, 3), sRGB; read one at a time.
+        options: Method and its parameters.
+        weights: Confidence of each pixel per view, (h, w) in [0, 1]; read one at a time. None: all are 1.
+        progress: Called after each round or iteration.
+        checkpoint: Where `adam` saves its state.
+
+    Raises:
+        ValueError: Where there is no camera, not one image per camera, or an image does not have its camera's size or
+            has numbers that are not finite.
     """
     _check_counts(cameras, images, weights)
     views = Views(
@@ -44,9 +57,9 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
         cache_bytes=options.cache_bytes,
     )
     if options.method == "adam":
-        sh = descend(
-            reset_bands(composite.sh),
-            Corrections(views, None),
+        sh = optimize_colors(
+            drop_higher_bands(composite.sh),
+            CorrectedTargets(views, None),
             options.reference,
             loss=options.loss,
             seed=options.seed,
@@ -54,21 +67,21 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
             checkpoint=checkpoint,
         )
         return replace(composite, sh=sh)
-    return _fast(composite, narrow(views, options.unchanged_below), options, progress)
+    return _consolidate_fast(composite, restrict_to_changes(views, options.unchanged_below), options, progress)
 
 
-def _fast(composite: Gaussians, views: Views, options: ConsolidateOptions, progress: Progress) -> Gaussians:
+def _consolidate_fast(composite: Gaussians, views: Views, options: ConsolidateOptions, progress: Progress) -> Gaussians:
     if len(views) == 0:
         return composite
-    moving = slice(None) if views.moving is None else views.moving
-    corrections = Corrections(views, options.nuisance)
-    prior = reset_bands(composite.sh)[moving]
-    sh = solve(prior, corrections, options.solve, progress=progress)
+    active = slice(None) if views.active is None else views.active
+    targets = CorrectedTargets(views, options.view_error)
+    prior = drop_higher_bands(composite.sh)[active]
+    sh = solve(prior, targets, options.solve, progress=progress)
     if options.polish_passes:
         polish = replace(options.polish, iterations=options.polish_passes * len(views))
-        sh = descend(sh, corrections, polish, loss=options.loss, seed=options.seed, progress=progress)
+        sh = optimize_colors(sh, targets, polish, loss=options.loss, seed=options.seed, progress=progress)
     colors = composite.sh.clone()
-    colors[moving] = sh
+    colors[active] = sh
     return replace(composite, sh=colors)
 
 

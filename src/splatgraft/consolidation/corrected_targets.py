@@ -1,4 +1,4 @@
-"""The targets of all views, each without its own error. Knows nothing about how colours are fitted."""
+"""Target images of all views with each view's estimated error (tint and flow) removed."""
 
 from dataclasses import replace
 
@@ -7,32 +7,32 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.consolidation.frozen_views import Views
-from splatgraft.consolidation.view_errors import Nuisance, NuisanceOptions, no_nuisance, refine
+from splatgraft.consolidation.view_errors import ViewError, ViewErrorOptions, no_view_error, refine
 
 
-class Corrections:
-    """One `Nuisance` per view (a few kB each), refined against renders while the colours are fitted."""
+class CorrectedTargets:
+    """The views' targets, each corrected by its `ViewError` (a few kB), which is refined while colours are fitted."""
 
-    def __init__(self, views: Views, options: NuisanceOptions | None) -> None:
-        """No error known yet; None: none is ever looked for."""
+    def __init__(self, views: Views, options: ViewErrorOptions | None) -> None:
+        """Start without errors; with `options` None none are estimated."""
         self.views, self.options = views, options
-        self._of_view: list[Nuisance | None] = [None] * len(views)
+        self._of_view: list[ViewError | None] = [None] * len(views)
 
     def target(self, index: int) -> Float[Tensor, "h w 3"]:
-        """The view's image without its error, as far as known."""
-        image, nuisance = self.views.target(index), self._of_view[index]
-        return image if nuisance is None else nuisance.correct(image)
+        """The view's image, corrected by its error as estimated so far."""
+        image, view_error = self.views.target(index), self._of_view[index]
+        return image if view_error is None else view_error.correct(image)
 
     def refine(self, index: int, render: Float[Tensor, "h w 3"]) -> None:
-        """Solve the view's error again, against what the scene looks like now."""
+        """Refine the view's error against a render of the current scene."""
         if self.options is None:
             return
         image = self.views.target(index)
-        known = self._of_view[index] or no_nuisance(image, self.options)
+        known = self._of_view[index] or no_view_error(image, self.options)
         self._of_view[index] = refine(known, image, render.detach(), self.views.weight(index), self.options)
 
     def center(self) -> None:
-        """Take the mean gain of all views, which belongs to the scene, out of their errors."""
+        """Subtract the mean gain of all views from their errors, since it belongs to the scene."""
         gains = [n.log_gain.mean((0, 1)) for n in self._of_view if n is not None]
         if gains:
             mean = torch.stack(gains).mean(0)

@@ -1,10 +1,11 @@
-"""The views that a consolidation works on: frozen operators, kept within a byte budget, and lazily read targets.
+"""Views of a composite with frozen geometry: the linear map from colours to pixels, cached within a byte budget.
 
-Knows which Gaussians move and which part of each view they touch. Knows nothing about losses or solvers.
+The active Gaussians may change colour; the others are blended once into a constant image per view. Target images are
+read lazily.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,59 +14,56 @@ from torch import Tensor
 
 from splatgraft.consolidation.options import ImageSequence
 from splatgraft.core import spherical_harmonics
-from splatgraft.core.cameras import Cameras
+from splatgraft.core.cameras import Cameras, Window
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import RenderOptions, ViewOperator, view_operator
-
-Window = tuple[int, int, int, int]
-"""Left, top, right, bottom, pixels; right and bottom excluded."""
 
 
 @dataclass(frozen=True)
 class View:
-    """The affine map from the colours of m moving Gaussians to the pixels of one view."""
+    """The affine map from the colours of m active Gaussians to the pixels of one view."""
 
     operator: ViewOperator
     """From the values of all n Gaussians to pixels."""
     basis: Float[Tensor, "m k"]
-    """Spherical harmonics towards each moving Gaussian."""
-    still: Float[Tensor, "h w 3"] | None
-    """What the other Gaussians and the background give; None where they give nothing."""
-    moving: Int[Tensor, "m"] | None
-    """Indices of the moving Gaussians; None where all n move."""
+    """Spherical harmonics towards each active Gaussian."""
+    static: Float[Tensor, "h w 3"] | None
+    """Image of the other Gaussians and the background; None where that is zero."""
+    active: Int[Tensor, "m"] | None
+    """Indices of the active Gaussians; None where all n are active."""
 
     @property
     def visible(self) -> Bool[Tensor, "m"]:
-        """Which moving Gaussians the view sees."""
-        return self.operator.visible if self.moving is None else self.operator.visible[self.moving]
+        """Which active Gaussians have weight in the view."""
+        return self.operator.visible if self.active is None else self.operator.visible[self.active]
 
     def colors(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
         """The expansion towards this view, plus one half, not clamped."""
         return torch.einsum("mk,mkc->mc", self.basis, sh) + 0.5
 
     def blend(self, colors: Float[Tensor, "m c"]) -> Float[Tensor, "h w c"]:
-        """The linear part: moving Gaussians over black."""
-        if self.moving is None:
+        """The linear part: active Gaussians over black."""
+        if self.active is None:
             return self.operator.blend(colors)
         values = colors.new_zeros(len(self.operator.visible), colors.shape[1])
-        return self.operator.blend(values.index_copy(0, self.moving, colors))
+        return self.operator.blend(values.index_copy(0, self.active, colors))
 
     def render(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "h w 3"]:
-        """The picture, with colours clamped at zero as every 3DGS renderer does; differentiable."""
+        """The image, with colours clamped at zero as every 3DGS renderer does; differentiable."""
         picture = self.blend(self.colors(sh).clamp_min(0))
-        return picture if self.still is None else picture + self.still
+        return picture if self.static is None else picture + self.static
 
-    def gather(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "m c"]:
+    def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "m c"]:
         """The transpose of `blend`."""
         values = self.operator.blend_transpose(image)
-        return values if self.moving is None else values[self.moving]
+        return values if self.active is None else values[self.active]
 
 
 class Views:
-    """v views of one composite, of which `moving` Gaussians may change colour.
+    """v views of one composite, whose `active` Gaussians may change colour.
 
-    Keeps the first views whose operators fit `cache_bytes`; the others are made anew each time, which costs a
-    projection and a sort. Images and weights are read one at a time.
+    The first views whose operators fit `cache_bytes` are cached; the others are projected and sorted on each access.
+    Images and weights are read one at a time.
     """
 
     def __init__(
@@ -78,58 +76,58 @@ class Views:
         rendering: RenderOptions,
         cache_bytes: int,
     ) -> None:
-        """All Gaussians move and all pixels count, until `narrowed`."""
+        """All Gaussians are active and all pixels count."""
         self.composite, self.cameras, self.images, self.weights = composite, cameras, images, weights
         self.rendering, self.cache_bytes = rendering, cache_bytes
-        self.moving: Tensor | None = None
-        self._kept: dict[int, View] = {}
-        self._kept_bytes = 0
+        self.active: Tensor | None = None
+        self._cached: dict[int, View] = {}
+        self._cached_bytes = 0
 
     def __len__(self) -> int:
         """How many there are."""
         return len(self.cameras)
 
-    def narrowed(self, moving: Bool[Tensor, "n"], windows: Sequence[Window | None]) -> "Views":
-        """Only some Gaussians move; views are cut to their windows, and dropped where that is None."""
+    def restricted(self, active: Bool[Tensor, "n"], windows: Sequence[Window | None]) -> "Views":
+        """The same views with some Gaussians active, cropped to `windows`, and without those whose window is None."""
         chosen = [i for i, window in enumerate(windows) if window is not None]
         kept = [window for window in windows if window is not None]
-        narrowed = Views(
+        restricted = Views(
             self.composite,
-            cropped(self.cameras[chosen], kept),
+            self.cameras[chosen].cropped(kept),
             _Cropped(self.images, chosen, kept),
             weights=None if self.weights is None else _Cropped(self.weights, chosen, kept),
             rendering=self.rendering,
             cache_bytes=self.cache_bytes,
         )
-        narrowed.moving = None if bool(moving.all()) else torch.nonzero(moving).flatten()
-        return narrowed
+        restricted.active = None if bool(active.all()) else torch.nonzero(active).flatten()
+        return restricted
 
     def __getitem__(self, index: int) -> View:
-        """The view's map, from the budget's keep or made anew."""
-        if index in self._kept:
-            return self._kept[index]
-        view = self._make(index)
-        size = held_bytes(view)
-        if self._kept_bytes + size <= self.cache_bytes:
-            self._kept[index] = view
-            self._kept_bytes += size
+        """The view's map, from the cache or built anew."""
+        if index in self._cached:
+            return self._cached[index]
+        view = self._build(index)
+        size = memory_bytes(view)
+        if self._cached_bytes + size <= self.cache_bytes:
+            self._cached[index] = view
+            self._cached_bytes += size
         return view
 
-    def _make(self, index: int) -> View:
+    def _build(self, index: int) -> View:
         scene, camera = self.composite, self.cameras[index]
         operator = view_operator(scene, camera, self.rendering)
         directions = torch.nn.functional.normalize(scene.means - camera.centers, dim=-1)
-        still = None
+        static = None
         if any(self.rendering.background):
-            still = (1 - operator.alpha)[..., None] * operator.alpha.new_tensor(self.rendering.background)
-        if self.moving is not None:
+            static = (1 - operator.alpha)[..., None] * operator.alpha.new_tensor(self.rendering.background)
+        if self.active is not None:
             colors = spherical_harmonics.colors(scene.sh, directions)
-            colors[self.moving] = 0
+            colors[self.active] = 0
             others = operator.blend(colors)
-            still = others if still is None else still + others
-            directions = directions[self.moving]
+            static = others if static is None else static + others
+            directions = directions[self.active]
         basis = spherical_harmonics.basis(directions, scene.sh_degree)
-        return View(operator=operator, basis=basis, still=still, moving=self.moving)
+        return View(operator=operator, basis=basis, static=static, active=self.active)
 
     def target(self, index: int) -> Float[Tensor, "h w 3"]:
         """The harmonised image of a view.
@@ -157,7 +155,7 @@ class Views:
 
 @dataclass(frozen=True)
 class _Cropped:
-    """Some images of a sequence, cut."""
+    """Chosen images of a sequence, cropped."""
 
     whole: ImageSequence
     chosen: list[int]
@@ -168,28 +166,19 @@ class _Cropped:
         return len(self.chosen)
 
     def __getitem__(self, index: int, /) -> Tensor:
-        """The image, cut."""
+        """The cropped image."""
         left, top, right, bottom = self.windows[index]
         return self.whole[self.chosen[index]][top:bottom, left:right]
 
 
-def cropped(cameras: Cameras, windows: Sequence[Window]) -> Cameras:
-    """The cameras of images cut to `windows`."""
-    intrinsics = cameras.intrinsics.clone()
-    edges = torch.tensor(windows, dtype=torch.int64).reshape(-1, 4)
-    intrinsics[:, :2, 2] -= edges[:, :2].to(intrinsics)
-    sizes = (edges[:, 2:] - edges[:, :2]).to(cameras.sizes.dtype)
-    return replace(cameras, intrinsics=intrinsics, sizes=sizes)
-
-
-def held_bytes(value: object) -> int:
-    """Bytes of all tensors and arrays that a value holds, directly or in its fields."""
+def memory_bytes(value: object) -> int:
+    """Bytes of all tensors and arrays in a value, its items and its fields."""
     if isinstance(value, Tensor):
         return value.numel() * value.element_size()
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, dict):
-        return sum(held_bytes(part) for part in value.values())
+        return sum(memory_bytes(part) for part in value.values())
     if isinstance(value, list | tuple):
-        return sum(held_bytes(part) for part in value)
-    return sum(held_bytes(part) for part in vars(value).values()) if hasattr(value, "__dict__") else 0
+        return sum(memory_bytes(part) for part in value)
+    return sum(memory_bytes(part) for part in vars(value).values()) if hasattr(value, "__dict__") else 0

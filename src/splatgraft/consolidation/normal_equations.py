@@ -2,7 +2,7 @@
 
 With geometry frozen a pixel is a fixed weighted sum of colours, and a colour a fixed weighted sum of SH coefficients:
 sum_v |W_v B_v x - image_v|^2 + ridge |x - prior|^2 is quadratic (after "Instant Colorization of Gaussian Splats",
-2026). Renderers clamp colours at zero; the equations do not, and leave that to the descent. Knows nothing about losses.
+2026). Renderers clamp colours at zero; the equations do not, and leave that to the descent that follows.
 """
 
 from collections.abc import Sequence
@@ -12,33 +12,34 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.consolidation.corrected_targets import Corrections
+from splatgraft.consolidation.corrected_targets import CorrectedTargets
 from splatgraft.consolidation.frozen_views import Views
 from splatgraft.consolidation.options import SolveOptions
 from splatgraft.runtime.progress import Progress, silent
 
 _FACTORED_AT_ONCE = 2**14
-# views left out while ridges are tried: every 5th
-_JUDGE_EVERY = 5
+"""Gaussians per batch of Cholesky factorisations, which bounds the memory."""
+_HOLD_OUT_EVERY = 5
+"""Every how many views one is left out while ridges are compared."""
 
 
 @dataclass(frozen=True)
 class _Equations:
-    """The quadratic over some of the views, up to the images."""
+    """The quadratic form over some of the views, without the images."""
 
     views: Views
     """All views."""
     which: Sequence[int]
-    """Those that count."""
+    """Indices of the views that count."""
     seen: Float[Tensor, "m 1"]
-    """Pixels that each Gaussian makes up, summed over all views."""
+    """Pixels that each Gaussian makes up, summed over all views (row sums of W^T W)."""
     factor: Float[Tensor, "m k k"]
-    """Cholesky factors of the preconditioner: each Gaussian alone, with the others moving along."""
+    """Cholesky factors of the preconditioner, one block per Gaussian, with the row sums of W^T W on its diagonal."""
     ridge: Float[Tensor, "m k"]
     """Weight of the prior, pixels."""
 
     def with_ridge(self, band_ridge: float, prior_px: float) -> "_Equations":
-        """The same with another weight of zero for the higher bands."""
+        """The same with another ridge for the higher bands."""
         return replace(self, ridge=_ridge(self.seen, self.ridge.shape[1], band_ridge, prior_px))
 
     def apply(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m k 3"]:
@@ -49,33 +50,37 @@ class _Equations:
             picture = view.blend(torch.einsum("mk,mkc->mc", view.basis, sh))
             if weight is not None:
                 picture = picture * weight[..., None]
-            out += view.basis[:, :, None] * view.gather(picture)[:, None, :]
+            out += view.basis[:, :, None] * view.blend_transpose(picture)[:, None, :]
         return out
 
 
 @torch.no_grad()
 def solve(
     prior: Float[Tensor, "m k 3"],
-    corrections: Corrections,
+    targets: CorrectedTargets,
     options: SolveOptions,
     *,
     progress: Progress = silent,
 ) -> Float[Tensor, "m k 3"]:
-    """The colours that explain all views best, from and towards `prior`.
+    """The colours with the least squared error over all views, with a ridge towards `prior`.
 
-    The weight of zero for the higher bands is the one of `options.band_ridges` that predicts views left out best.
+    Args:
+        prior: Coefficients of the active Gaussians, from which the solution starts.
+        targets: Views and their corrected images, refined between rounds.
+        options: Rounds, steps and ridges; the ridge of the higher bands is chosen by cross-validation.
+        progress: Called after each round.
     """
-    trials = len(options.band_ridges) if len(corrections.views) >= 2 * _JUDGE_EVERY else 0
+    trials = len(options.band_ridges) if len(targets.views) >= 2 * _HOLD_OUT_EVERY else 0
     total = options.rounds + trials + 1
     progress(0, total, "setting up the equations")
-    # the strongest first: colours that hardly turn with the view cannot take a view's own error for a highlight
-    equations = _set_up(prior, corrections.views, max(options.band_ridges), options.prior_px)
+    # the strongest ridge first: colours that hardly depend on the view cannot fit a view's own error as a highlight
+    equations = _build_equations(prior, targets.views, max(options.band_ridges), options.prior_px)
     sh, error = prior, 0.0
     for turn in range(options.rounds):
-        residual, error = _residual(sh, corrections, equations.which, refine=turn > 0)
-        corrections.center()
+        residual, error = _residual(sh, targets, equations.which, refine=turn > 0)
+        targets.center()
         if turn == 1 and trials > 1:
-            chosen = _choose(prior, corrections, equations, options)
+            chosen = _select_ridge(prior, targets, equations, options)
             equations = equations.with_ridge(chosen, options.prior_px)
         residual -= equations.ridge[..., None] * (sh - prior)
         sh = sh + _conjugate_gradient(residual, equations, options.steps)
@@ -84,29 +89,29 @@ def solve(
     return sh
 
 
-def _choose(
-    prior: Float[Tensor, "m k 3"], corrections: Corrections, equations: _Equations, options: SolveOptions
+def _select_ridge(
+    prior: Float[Tensor, "m k 3"], targets: CorrectedTargets, equations: _Equations, options: SolveOptions
 ) -> float:
-    """The ridge whose short solution without every 5th view comes closest to those views, corrected."""
-    judges = range(_JUDGE_EVERY // 2, len(corrections.views), _JUDGE_EVERY)
-    fitted = [index for index in equations.which if index not in judges]
-    residual, _ = _residual(prior, corrections, fitted, refine=False)
+    """The ridge whose short solution without every 5th view predicts those views best (cross-validation)."""
+    held_out = range(_HOLD_OUT_EVERY // 2, len(targets.views), _HOLD_OUT_EVERY)
+    fitted = [index for index in equations.which if index not in held_out]
+    residual, _ = _residual(prior, targets, fitted, refine=False)
     errors = {}
     for band_ridge in options.band_ridges:
         trial = replace(equations, which=fitted).with_ridge(band_ridge, options.prior_px)
         sh = prior + _conjugate_gradient(residual, trial, options.steps)
-        errors[band_ridge] = _error(sh, corrections, judges)
+        errors[band_ridge] = _error(sh, targets, held_out)
     return min(errors, key=errors.__getitem__)
 
 
-def _set_up(prior: Float[Tensor, "m k 3"], views: Views, band_ridge: float, prior_px: float) -> _Equations:
+def _build_equations(prior: Float[Tensor, "m k 3"], views: Views, band_ridge: float, prior_px: float) -> _Equations:
     """Blocks sum_v (W^T W 1) b b^T: W is non-negative, so these row sums bound what neighbours add to a Gaussian."""
     m, k = prior.shape[:2]
     blocks, seen = prior.new_zeros(m, k, k), prior.new_zeros(m, 1)
     for index in range(len(views)):
         view, weight = views[index], views.weight(index)
         share = view.blend(prior.new_ones(m, 1))
-        share = view.gather(share if weight is None else share * weight[..., None])
+        share = view.blend_transpose(share if weight is None else share * weight[..., None])
         blocks.baddbmm_((share * view.basis)[:, :, None], view.basis[:, None, :])
         seen += share
     ridge = _ridge(seen, k, band_ridge, prior_px)
@@ -122,29 +127,29 @@ def _ridge(seen: Float[Tensor, "m 1"], k: int, band_ridge: float, prior_px: floa
 
 
 def _residual(
-    sh: Float[Tensor, "m k 3"], corrections: Corrections, which: Sequence[int], *, refine: bool
+    sh: Float[Tensor, "m k 3"], targets: CorrectedTargets, which: Sequence[int], *, refine: bool
 ) -> tuple[Float[Tensor, "m k 3"], float]:
-    """What the images still ask for, and the root mean square error over their pixels."""
-    views, out, squares, count = corrections.views, torch.zeros_like(sh), 0.0, 0
+    """Right-hand side left over at `sh`, and the root mean square error over the views' pixels."""
+    views, out, squares, count = targets.views, torch.zeros_like(sh), 0.0, 0
     for index in which:
         view = views[index]
         picture = view.render(sh)
         if refine:
-            corrections.refine(index, picture)
-        difference = _difference(corrections, index, picture)
-        out += view.basis[:, :, None] * view.gather(difference)[:, None, :]
+            targets.refine(index, picture)
+        difference = _difference(targets, index, picture)
+        out += view.basis[:, :, None] * view.blend_transpose(difference)[:, None, :]
         squares += float((difference**2).sum())
         count += difference.numel()
     return out, (squares / count) ** 0.5
 
 
-def _error(sh: Float[Tensor, "m k 3"], corrections: Corrections, which: Sequence[int]) -> float:
-    views = corrections.views
-    return sum(float(_difference(corrections, i, views[i].render(sh)).square().mean()) for i in which)
+def _error(sh: Float[Tensor, "m k 3"], targets: CorrectedTargets, which: Sequence[int]) -> float:
+    views = targets.views
+    return sum(float(_difference(targets, i, views[i].render(sh)).square().mean()) for i in which)
 
 
-def _difference(corrections: Corrections, index: int, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    difference, weight = corrections.target(index) - picture, corrections.views.weight(index)
+def _difference(targets: CorrectedTargets, index: int, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    difference, weight = targets.target(index) - picture, targets.views.weight(index)
     return difference if weight is None else difference * weight[..., None]
 
 

@@ -1,21 +1,21 @@
-"""The choices of a consolidation. Holds no arithmetic."""
+"""Options of a consolidation: method, least squares, gradient descent, and what is cached."""
 
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from splatgraft.consolidation.view_errors import NuisanceOptions
+from splatgraft.consolidation.view_errors import ViewErrorOptions
 from splatgraft.fitting.perceptual_losses import ImageLoss, windowed_fourier
 from splatgraft.rendering import RenderOptions
 
 
 @runtime_checkable
 class ImageSequence(Protocol):
-    """Images by index, read when asked for; a list of tensors is one."""
+    """Images by index, read on access; a list of tensors is one."""
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of images."""
         ...
 
     def __getitem__(self, index: int, /) -> Tensor:
@@ -25,26 +25,26 @@ class ImageSequence(Protocol):
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """The linear part of the fast road: colours by conjugate gradient on the normal equations."""
+    """The linear part of `fast`: colours by conjugate gradient on the normal equations."""
 
     rounds: int = 3
-    """How often the images are corrected and the equations solved again, from the last solution; at least 2."""
+    """Times that targets are corrected and the equations solved, each from the last solution; at least 2."""
     steps: int = 6
-    """Steps of conjugate gradient per round; each blends and gathers every view once."""
+    """Steps of conjugate gradient per round; each blends every view once and applies the transpose once."""
     prior_px: float = 0.1
-    """Weight of the composite's colour in every Gaussian, pixels: decides only what no view sees."""
+    """Ridge towards the composite's colour, pixels: it decides only Gaussians that no view sees."""
     band_ridges: tuple[float, ...] = (0.003, 0.02, 0.1)
-    """Weights of zero for the higher bands to choose from, as shares of the pixels that the Gaussian is seen in.
+    """Ridges of the higher bands to choose from, as shares of the pixels that the Gaussian makes up.
 
-    What predicts views left out best depends on how much the views disagree. Fewer than ten views: the largest."""
+    Which one predicts held-out views best depends on how much the views disagree. Below ten views: the largest."""
 
 
 @dataclass(frozen=True)
 class DescentOptions:
-    """Adam on the colours under an image loss, one view per iteration."""
+    """Adam on the colours under an image loss."""
 
     iterations: int = 10_000
-    """One view each."""
+    """Steps, one view each."""
     rate: float = 0.0025
     """Learning rate of band 0 (3DGS: feature_lr)."""
     rest_ratio: float = 0.05
@@ -57,14 +57,14 @@ class DescentOptions:
 
 @dataclass(frozen=True)
 class ConsolidateOptions:
-    """How harmonised views become one scene."""
+    """How colours are fitted to harmonised views."""
 
     method: Literal["fast", "adam"] = "fast"
-    """`adam`: the paper's reference, `reference` alone. `fast`: normal equations, then a short descent."""
+    """`adam`: the paper's descent (`reference`). `fast`: normal equations, then a short descent (`polish`)."""
     loss: ImageLoss = windowed_fourier
-    """What the descent minimises."""
-    nuisance: NuisanceOptions | None = field(default_factory=NuisanceOptions)
-    """Solve a tint and a flow per view beside the colours; None: take every view at its word. `fast` only."""
+    """Loss of the descent."""
+    view_error: ViewErrorOptions | None = field(default_factory=ViewErrorOptions)
+    """How a tint and a flow per view are estimated beside the colours; None: they are not. `fast` only."""
     solve: SolveOptions = field(default_factory=SolveOptions)
     """The linear part of `fast`."""
     polish_passes: int = 12
@@ -76,8 +76,8 @@ class ConsolidateOptions:
     unchanged_below: float = 2.0 / 255
     """Pixels that differ less than this from the composite's render are unchanged; 0: all count as changed. `fast`."""
     cache_bytes: int = 256 * 2**20
-    """Tile lists and bases kept between passes; what does not fit is computed again in each pass."""
+    """Bytes of tile lists and bases cached between passes; the rest is computed again in each pass."""
     rendering: RenderOptions = field(default_factory=RenderOptions)
-    """How the scene is drawn."""
+    """How the scene is rendered."""
     seed: int = 0
     """Order of the views."""

@@ -1,4 +1,4 @@
-"""Iterative dataset update: harmonise and consolidate in turn, from full noise to little. Knows no harmoniser.
+"""Iterative dataset update: harmonise and consolidate in turn, with decreasing noise.
 
 Paper: ablation Iterative Dataset Update (after Haque 2023, Instruct-NeRF2NeRF); five updates from 1.0 to 0.1.
 """
@@ -12,16 +12,16 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.runtime.progress import Progress, silent
 
 HarmonizeAt = Callable[[Gaussians, float], ImageSequence]
-"""From the scene so far and the share of noise to start from, in (0, 1], to one harmonised image per camera."""
+"""From the current scene and a noise strength in (0, 1] to one harmonised image per camera."""
 
 
 def linear_schedule(updates: int = 5, first: float = 1.0, last: float = 0.1) -> tuple[float, ...]:
-    """Noise strengths at even distances."""
+    """Noise strengths from `first` to `last` with equal differences."""
     return tuple(first + (last - first) * _share(i, updates) for i in range(updates))
 
 
 def geometric_schedule(updates: int = 5, first: float = 1.0, last: float = 0.1) -> tuple[float, ...]:
-    """Noise strengths at even ratios."""
+    """Noise strengths from `first` to `last` with equal ratios."""
     return tuple(first * (last / first) ** _share(i, updates) for i in range(updates))
 
 
@@ -40,10 +40,17 @@ def iterative_update(
 ) -> Gaussians:
     """The scene after one consolidation per strength, each on images harmonised from renders of the one before.
 
-    The composite stays the start of each consolidation; `harmonize_at` conditions on it, and begins from renders of the
-    scene that it is given, as the paper found sharper.
+    Args:
+        composite: The start of each consolidation.
+        cameras: Of the views.
+        harmonize_at: Conditions on the composite and adds noise to renders of the scene that it is given, which the
+            paper found sharper.
+        strengths: Noise strengths in (0, 1], one per update.
+        options: Of each consolidation.
+        progress: Of each consolidation.
 
-    Raises: ValueError where a strength is outside (0, 1].
+    Raises:
+        ValueError: Where a strength is outside (0, 1].
     """
     if any(not 0 < strength <= 1 for strength in strengths):
         raise ValueError(f"iterative update: expected strengths in (0, 1], found {tuple(strengths)}")

@@ -1,8 +1,8 @@
-"""What one view gets wrong by itself: a low-frequency tint and a small flow, solved against a render and thrown away.
+"""Per-view errors of a harmoniser: a low-frequency tint and a small flow, estimated against a render of the scene.
 
 A harmoniser that works view by view shifts edges by a pixel and drifts in colour. Both are smooth over the image, so a
-coarse grid per view describes them; taking them off the view's image before the colours are fitted keeps the scene
-sharp. Closed form: one robust Gauss-Newton step per call. Knows nothing about Gaussians.
+coarse grid per view describes them; removing them from the view's image before the colours are fitted keeps the scene
+sharp. Each call takes one robust Gauss-Newton step in closed form.
 """
 
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class NuisanceOptions:
-    """How coarse and how free the per-view corrections are."""
+class ViewErrorOptions:
+    """Resolution and strength of the per-view errors; values set by hand."""
 
     flow_cell_px: float = 32.0
     """Distance between the knots of the flow, pixels."""
@@ -26,49 +26,61 @@ class NuisanceOptions:
     tint_sigma: float = 0.1
     """Expected size of the logarithm of the gain."""
     residual_sigma: float = 0.05
-    """Expected size of what neither explains; larger residuals count less (Geman-McClure weights)."""
+    """Expected size of the remaining residual; larger ones count less (Geman-McClure weights)."""
+    correlated_px: float = 16.0
+    """Pixels over which a residual (a misplaced edge, a wrong shade) stays alike and counts as one observation."""
+    most_flow: float = 4.0
+    """Bound on the flow, over `flow_sigma_px`."""
 
 
 @dataclass(frozen=True)
-class Nuisance:
-    """One view's own error on coarse grids: image(p + flow) * exp(log_gain) is what the scene should look like."""
+class ViewError:
+    """One view's error on coarse grids: image(p + flow) * exp(log_gain) is the corrected image."""
 
     flow: Float[Tensor, "a b 2"]
-    """Where the image holds what belongs at a knot: shift in x and y, pixels."""
+    """Shift in x and y at each knot, pixels."""
     log_gain: Float[Tensor, "c d 3"]
-    """Natural logarithm of the factor on each channel."""
+    """Natural logarithm of the factor on each channel at each knot."""
 
     def correct(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        """The image without this error."""
+        """The image with this error removed."""
         h, w = image.shape[:2]
-        return _warp(image, _spread(self.flow, h, w)) * _spread(self.log_gain, h, w).exp()
+        return _warp(image, _upsample(self.flow, h, w)) * _upsample(self.log_gain, h, w).exp()
 
 
-def no_nuisance(image: Float[Tensor, "h w 3"], options: NuisanceOptions) -> Nuisance:
-    """No error at all, on the grids of an image of that size."""
+def no_view_error(image: Float[Tensor, "h w 3"], options: ViewErrorOptions) -> ViewError:
+    """A zero error, on the grids for an image of that size."""
     (a, b), (c, d) = (
         [_knots(n, cell) for n in image.shape[:2]] for cell in (options.flow_cell_px, options.tint_cell_px)
     )
-    return Nuisance(flow=image.new_zeros(a, b, 2), log_gain=image.new_zeros(c, d, 3))
+    return ViewError(flow=image.new_zeros(a, b, 2), log_gain=image.new_zeros(c, d, 3))
 
 
 @torch.no_grad()
 def refine(
-    nuisance: Nuisance,
+    view_error: ViewError,
     image: Float[Tensor, "h w 3"],
     render: Float[Tensor, "h w 3"],
     weight: Float[Tensor, "h w"] | None,
-    options: NuisanceOptions,
-) -> Nuisance:
-    """One Gauss-Newton step of tint, then flow, towards the least robust error between corrected image and render."""
+    options: ViewErrorOptions,
+) -> ViewError:
+    """The view's error after one Gauss-Newton step on the tint, then one on the flow.
+
+    Args:
+        view_error: Estimate so far.
+        image: The view's harmonised image, sRGB.
+        render: The current scene from the same camera, sRGB.
+        weight: Confidence of each pixel in [0, 1]; None: all are 1.
+        options: Grids and priors.
+    """
     h, w = image.shape[:2]
     confidence = image.new_ones(h, w) if weight is None else weight
-    warped = _warp(image, _spread(nuisance.flow, h, w))
-    tinted = warped * _spread(nuisance.log_gain, h, w).exp()
-    log_gain = _refine_tint(nuisance.log_gain, tinted, render, confidence, options)
-    tinted = warped * _spread(log_gain, h, w).exp()
-    return Nuisance(
-        flow=_refine_flow(nuisance.flow, tinted, render, confidence, options),
+    warped = _warp(image, _upsample(view_error.flow, h, w))
+    tinted = warped * _upsample(view_error.log_gain, h, w).exp()
+    log_gain = _refine_tint(view_error.log_gain, tinted, render, confidence, options)
+    tinted = warped * _upsample(log_gain, h, w).exp()
+    return ViewError(
+        flow=_refine_flow(view_error.flow, tinted, render, confidence, options),
         log_gain=log_gain,
     )
 
@@ -78,17 +90,21 @@ def _refine_tint(
     tinted: Float[Tensor, "h w 3"],
     render: Float[Tensor, "h w 3"],
     confidence: Float[Tensor, "h w"],
-    options: NuisanceOptions,
+    options: ViewErrorOptions,
 ) -> Float[Tensor, "c d 3"]:
     rows, columns = _grid_bases(log_gain, tinted)
     residual = render - tinted
-    trust = _trust(residual, confidence, options)
+    robust = _robust_weights(residual, confidence, options)
     channels = []
     for channel in range(3):
         slope, knots = tinted[..., channel], log_gain[..., channel]
-        ridge = (options.residual_sigma / options.tint_sigma) ** 2 * _support(trust, slope.numel(), knots.numel())
-        normal = _normal_matrix(trust * slope**2, rows, columns) + ridge * torch.eye(knots.numel(), device=knots.device)
-        right = rows.T @ (trust * slope * residual[..., channel]) @ columns
+        ridge = (options.residual_sigma / options.tint_sigma) ** 2 * _observations_per_knot(
+            robust, slope.numel(), knots.numel(), options
+        )
+        normal = _normal_matrix(robust * slope**2, rows, columns) + ridge * torch.eye(
+            knots.numel(), device=knots.device
+        )
+        right = rows.T @ (robust * slope * residual[..., channel]) @ columns
         step = torch.linalg.solve(normal, right.flatten() - ridge * knots.flatten())
         channels.append(knots + step.reshape(knots.shape))
     return torch.stack(channels, -1)
@@ -99,16 +115,16 @@ def _refine_flow(
     tinted: Float[Tensor, "h w 3"],
     render: Float[Tensor, "h w 3"],
     confidence: Float[Tensor, "h w"],
-    options: NuisanceOptions,
+    options: ViewErrorOptions,
 ) -> Float[Tensor, "a b 2"]:
     rows, columns = _grid_bases(flow, tinted)
     # a slight blur widens the basin of the linearisation to about 1.5 px and keeps noise out of the slopes
     smooth_image, smooth_render = _blur(tinted), _blur(render)
     residual = smooth_render - smooth_image
-    trust = _trust(residual, confidence, options)
+    robust = _robust_weights(residual, confidence, options)
     dx, dy = _slopes(0.5 * (smooth_image + smooth_render))
-    xx, xy, yy = ((a * b).sum(-1) * trust for a, b in ((dx, dx), (dx, dy), (dy, dy)))
-    right = torch.stack([rows.T @ (trust * (d * residual).sum(-1)) @ columns for d in (dx, dy)])
+    xx, xy, yy = ((a * b).sum(-1) * robust for a, b in ((dx, dx), (dx, dy), (dy, dy)))
+    right = torch.stack([rows.T @ (robust * (d * residual).sum(-1)) @ columns for d in (dx, dy)])
     cross = _normal_matrix(xy, rows, columns)
     normal = torch.cat(
         [
@@ -117,28 +133,27 @@ def _refine_flow(
         ]
     )
     knots = flow.permute(2, 0, 1).flatten()
-    ridge = (options.residual_sigma / options.flow_sigma_px) ** 2 * _support(trust, xx.numel(), len(knots) // 2)
+    ridge = (options.residual_sigma / options.flow_sigma_px) ** 2 * _observations_per_knot(
+        robust, xx.numel(), len(knots) // 2, options
+    )
     step = torch.linalg.solve(
         normal + ridge * torch.eye(len(knots), device=knots.device), right.flatten() - ridge * knots
     )
     moved = (knots + step).reshape(2, *flow.shape[:2]).permute(1, 2, 0)
-    return moved.clamp(-4 * options.flow_sigma_px, 4 * options.flow_sigma_px)
+    return moved.clamp(-options.most_flow * options.flow_sigma_px, options.most_flow * options.flow_sigma_px)
 
 
-def _trust(
-    residual: Float[Tensor, "h w 3"], confidence: Float[Tensor, "h w"], options: NuisanceOptions
+def _robust_weights(
+    residual: Float[Tensor, "h w 3"], confidence: Float[Tensor, "h w"], options: ViewErrorOptions
 ) -> Float[Tensor, "h w"]:
+    """Confidence times Geman-McClure weights of the residual."""
     squares = (residual**2).mean(-1) / options.residual_sigma**2
     return confidence / (1 + squares) ** 2
 
 
-def _support(trust: Float[Tensor, "h w"], pixels: int, knots: int) -> float:
-    """Trusted pixels per knot, at least one: neighbouring residuals are correlated, so a knot counts as one sample."""
-    return max(float(trust.sum()) / pixels, 1e-3) * pixels / knots / _CORRELATED_PX
-
-
-# pixels over which a residual (a misplaced edge, a wrong shade) stays alike, so that they count as one observation
-_CORRELATED_PX = 16.0
+def _observations_per_knot(robust: Float[Tensor, "h w"], pixels: int, knots: int, options: ViewErrorOptions) -> float:
+    """Independent observations per knot: weighted pixels over `correlated_px`, as neighbours are correlated."""
+    return max(float(robust.sum()) / pixels, 1e-3) * pixels / knots / options.correlated_px
 
 
 def _normal_matrix(
@@ -158,17 +173,19 @@ def _knots(length: int, cell_px: float) -> int:
 def _grid_bases(
     grid: Float[Tensor, "a b c"], image: Float[Tensor, "h w 3"]
 ) -> tuple[Float[Tensor, "h a"], Float[Tensor, "w b"]]:
-    return _tents(image.shape[0], grid.shape[0], like=grid), _tents(image.shape[1], grid.shape[1], like=grid)
+    return _linear_weights(image.shape[0], grid.shape[0], like=grid), _linear_weights(
+        image.shape[1], grid.shape[1], like=grid
+    )
 
 
-def _tents(length: int, knots: int, *, like: Tensor) -> Float[Tensor, "length knots"]:
-    """Linear interpolation from knots at the two ends and evenly between to pixel centres."""
+def _linear_weights(length: int, knots: int, *, like: Tensor) -> Float[Tensor, "length knots"]:
+    """Linear interpolation weights from evenly spaced knots, the outer ones at the image's ends, to pixel centres."""
     position = (torch.arange(length, dtype=like.dtype, device=like.device) + 0.5) / length * (knots - 1)
     return (1 - (position[:, None] - torch.arange(knots, device=like.device)).abs()).clamp_min(0)
 
 
-def _spread(grid: Float[Tensor, "a b c"], height: int, width: int) -> Float[Tensor, "h w c"]:
-    rows, columns = _tents(height, grid.shape[0], like=grid), _tents(width, grid.shape[1], like=grid)
+def _upsample(grid: Float[Tensor, "a b c"], height: int, width: int) -> Float[Tensor, "h w c"]:
+    rows, columns = _linear_weights(height, grid.shape[0], like=grid), _linear_weights(width, grid.shape[1], like=grid)
     return torch.stack([rows @ channel @ columns.T for channel in grid.unbind(-1)], -1)
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from splatgraft.consolidation import ConsolidateOptions, NuisanceOptions, consolidate
+from splatgraft.consolidation import ConsolidateOptions, ViewErrorOptions, consolidate
 from splatgraft.core.images import read_mask, read_rgb
 from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import ImageLoss, lpips_vgg, windowed_fourier
@@ -75,7 +75,7 @@ class Consolidate:
             standard,
             method=self.method,
             loss=self._loss(),
-            nuisance=NuisanceOptions() if self.nuisance == "tint-flow" else None,
+            view_error=ViewErrorOptions() if self.nuisance == "tint-flow" else None,
             polish_passes=self.passes,
             reference=replace(standard.reference, iterations=self.iterations),
             rendering=RenderOptions(low_pass=self.low_pass),

@@ -1,7 +1,7 @@
 import torch
 from conftest import ball, ring
 
-from splatgraft.consolidation.changed_region import narrow, reset_bands
+from splatgraft.consolidation.changed_region import drop_higher_bands, restrict_to_changes
 from splatgraft.consolidation.frozen_views import Views
 from splatgraft.core.gaussians import concatenate
 from splatgraft.rendering import RenderOptions, render
@@ -20,20 +20,20 @@ def scene_with_a_satellite():
 
 def test_nothing_moves_where_nothing_changed():
     scene, cameras = scene_with_a_satellite(), ring(4)
-    views = narrow(views_of(scene, cameras, list(render(scene, cameras).color)), 2 / 255)
+    views = restrict_to_changes(views_of(scene, cameras, list(render(scene, cameras).color)), 2 / 255)
     assert len(views) == 0
 
 
 def test_only_what_changed_pixels_see_moves():
     scene, cameras = scene_with_a_satellite(), ring(4)
     darker = type(scene)(**{**vars(scene), "sh": torch.cat([scene.sh[:150], scene.sh[150:] - 1.0])})
-    views = narrow(views_of(scene, cameras, list(render(darker, cameras).color)), 2 / 255)
-    assert views.moving is not None
-    moving = torch.zeros(170, dtype=torch.bool)
-    moving[views.moving] = True
+    views = restrict_to_changes(views_of(scene, cameras, list(render(darker, cameras).color)), 2 / 255)
+    assert views.active is not None
+    active = torch.zeros(170, dtype=torch.bool)
+    active[views.active] = True
     visible = render(scene, cameras).visible.any(0)
-    assert bool(moving[150:][visible[150:]].float().mean() > 0.9)
-    assert float(moving[:150].float().mean()) < 0.5
+    assert bool(active[150:][visible[150:]].float().mean() > 0.9)
+    assert float(active[:150].float().mean()) < 0.5
     # windows hold the satellite, not the whole picture
     assert bool((views.cameras.sizes.prod(1) < 48 * 48).all())
 
@@ -41,10 +41,10 @@ def test_only_what_changed_pixels_see_moves():
 def test_zero_switches_it_off():
     scene, cameras = scene_with_a_satellite(), ring(2)
     views = views_of(scene, cameras, list(render(scene, cameras).color))
-    assert narrow(views, 0.0) is views
+    assert restrict_to_changes(views, 0.0) is views
 
 
 def test_reset_keeps_band_zero_alone():
     sh = ball(5, degree=3, seed=0).sh
-    assert torch.equal(reset_bands(sh)[:, :1], sh[:, :1])
-    assert not reset_bands(sh)[:, 1:].any()
+    assert torch.equal(drop_higher_bands(sh)[:, :1], sh[:, :1])
+    assert not drop_higher_bands(sh)[:, 1:].any()

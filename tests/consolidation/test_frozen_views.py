@@ -3,7 +3,7 @@ from conftest import ball, ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatgraft.consolidation.frozen_views import Views, cropped, held_bytes
+from splatgraft.consolidation.frozen_views import Views, memory_bytes
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
@@ -19,23 +19,23 @@ def test_render_equals_the_renderer_with_and_without_a_subset():
     rendering = RenderOptions(background=(0.2, 0.4, 0.6))
     wanted = render(scene, cameras, options=rendering).color
     views = views_of(scene, cameras, rendering=rendering)
-    moving = torch.arange(200) % 3 == 0
-    part = views.narrowed(moving, [(0, 0, 40, 40)] * 3)
+    active = torch.arange(200) % 3 == 0
+    part = views.restricted(active, [(0, 0, 40, 40)] * 3)
     for index in range(3):
         # sums of at most some 50 float32 terms of size 1 in another order
         assert torch.allclose(views[index].render(scene.sh), wanted[index], atol=1e-5)
-        assert torch.allclose(part[index].render(scene.sh[moving]), wanted[index], atol=1e-5)
+        assert torch.allclose(part[index].render(scene.sh[active]), wanted[index], atol=1e-5)
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**16))
 def test_gather_is_the_transpose_of_blend(seed):
     scene, cameras = ball(100, degree=1, seed=seed), ring(2, 40)
-    moving = torch.arange(100) % 2 == 0
-    view = views_of(scene, cameras).narrowed(moving, [(0, 0, 40, 40)] * 2)[1]
+    active = torch.arange(100) % 2 == 0
+    view = views_of(scene, cameras).restricted(active, [(0, 0, 40, 40)] * 2)[1]
     generator = torch.Generator().manual_seed(seed)
     colors, image = torch.rand(50, 3, generator=generator), torch.rand(40, 40, 3, generator=generator)
-    left, right = (view.blend(colors) * image).sum(), (colors * view.gather(image)).sum()
+    left, right = (view.blend(colors) * image).sum(), (colors * view.blend_transpose(image)).sum()
     # about 5000 positive float32 products summed in two orders
     assert torch.allclose(left, right, rtol=1e-4)
 
@@ -44,7 +44,7 @@ def test_a_cropped_camera_sees_a_cut_of_the_picture():
     scene, cameras = ball(200, degree=1, seed=2), ring(2, 40)
     whole = render(scene, cameras).color
     windows = [(3, 5, 30, 36), (0, 10, 17, 40)]
-    cut = cropped(cameras, windows)
+    cut = cameras.cropped(windows)
     for index, (left, top, right, bottom) in enumerate(windows):
         # positions shift by whole pixels; float32 rounding of coordinates near 40 px over splats of 1 px and more,
         # and the renderer's own cut-offs at alpha 1/255
@@ -55,7 +55,7 @@ def test_a_cropped_camera_sees_a_cut_of_the_picture():
 
 def test_the_budget_bounds_what_is_kept():
     scene, cameras = ball(300, degree=2, seed=3), ring(6, 40)
-    one = held_bytes(views_of(scene, cameras)[0])
+    one = memory_bytes(views_of(scene, cameras)[0])
     assert one > 300 * 9 * 4
     views = views_of(scene, cameras, cache_bytes=int(2.5 * one))
     kept = [views[index] is views[index] for index in range(6)]

@@ -2,7 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from splatgraft.consolidation.view_errors import Nuisance, NuisanceOptions, no_nuisance, refine
+from splatgraft.consolidation.view_errors import ViewError, ViewErrorOptions, no_view_error, refine
 
 
 def texture(height: int = 96, width: int = 128, seed: int = 0) -> torch.Tensor:
@@ -11,26 +11,26 @@ def texture(height: int = 96, width: int = 128, seed: int = 0) -> torch.Tensor:
     return 0.2 + 0.6 * F.interpolate(noise, (height, width), mode="bicubic")[0].permute(1, 2, 0).clamp(0, 1)
 
 
-def spoilt_by(nuisance: Nuisance, image: torch.Tensor) -> torch.Tensor:
-    """An image whose correction by `nuisance` is about `image`: small flows are nearly their own inverse, negated."""
-    return Nuisance(flow=-nuisance.flow, log_gain=-nuisance.log_gain).correct(image)
+def spoilt_by(view_error: ViewError, image: torch.Tensor) -> torch.Tensor:
+    """An image whose correction by `view_error` is about `image`: small flows are nearly their own inverse, negated."""
+    return ViewError(flow=-view_error.flow, log_gain=-view_error.log_gain).correct(image)
 
 
 def test_nothing_is_found_where_nothing_is_wrong():
-    image, options = texture(), NuisanceOptions()
-    found = refine(no_nuisance(image, options), image, image, None, options)
+    image, options = texture(), ViewErrorOptions()
+    found = refine(no_view_error(image, options), image, image, None, options)
     assert not found.flow.any()
     assert not found.log_gain.any()
 
 
 def test_a_known_tint_and_flow_are_found():
-    image, options = texture(), NuisanceOptions()
+    image, options = texture(), ViewErrorOptions()
     generator = torch.Generator().manual_seed(1)
-    clean = no_nuisance(image, options)
+    clean = no_view_error(image, options)
     # constant over the picture, plus a little that varies
     flow = torch.tensor([0.6, -0.4]) + 0.1 * torch.randn(clean.flow.shape, generator=generator)
     gain = torch.tensor([0.06, -0.04, 0.0]) + 0.01 * torch.randn(clean.log_gain.shape, generator=generator)
-    true = Nuisance(flow=flow, log_gain=gain)
+    true = ViewError(flow=flow, log_gain=gain)
     spoilt = spoilt_by(true, image)
     found = clean
     for _ in range(4):
@@ -43,10 +43,10 @@ def test_a_known_tint_and_flow_are_found():
 
 
 def test_untrusted_pixels_do_not_pull():
-    image, options = texture(), NuisanceOptions()
+    image, options = texture(), ViewErrorOptions()
     spoilt, weight = image.clone(), torch.ones(96, 128)
     spoilt[:, 64:], weight[:, 64:] = 0.9, 0.0
-    found = refine(no_nuisance(image, options), spoilt, image, weight, options)
+    found = refine(no_view_error(image, options), spoilt, image, weight, options)
     # right of column 64 the picture is ruined; knots that share no cell with it see no difference, but for the coupling
     # of neighbours through their overlaps, which falls by about 4 from knot to knot: 2 px / 4^3 at most
     assert float(found.flow[:, 0].abs().max()) < 2 / 4**3
@@ -54,8 +54,8 @@ def test_untrusted_pixels_do_not_pull():
 
 @pytest.mark.parametrize(("height", "width"), [(11, 17), (16, 200), (5, 5)])
 def test_small_images_have_grids_too(height, width):
-    options = NuisanceOptions()
+    options = ViewErrorOptions()
     image = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(2))
-    found = refine(no_nuisance(image, options), image, image.flip(0), None, options)
+    found = refine(no_view_error(image, options), image, image.flip(0), None, options)
     assert found.correct(image).shape == image.shape
     assert bool(torch.isfinite(found.correct(image)).all())

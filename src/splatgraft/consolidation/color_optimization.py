@@ -1,6 +1,6 @@
-"""Adam on the colours under an image loss, one view per iteration: the paper's reference, and the polish of `fast`.
+"""Optimises SH colours with Adam under an image loss, one view per iteration; geometry and opacity are frozen.
 
-Geometry and opacity are frozen in the views' operators. Knows nothing about the normal equations.
+The paper's method (section Multi-View Consolidation), and the last part of the method `fast`.
 """
 
 import math
@@ -9,16 +9,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.consolidation.corrected_targets import Corrections
+from splatgraft.consolidation.corrected_targets import CorrectedTargets
 from splatgraft.consolidation.options import DescentOptions
 from splatgraft.fitting import adam
 from splatgraft.fitting.perceptual_losses import ImageLoss
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 
-def descend(  # noqa: PLR0913 - the last two are the services of every long stage
+def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
     sh: Float[Tensor, "m k 3"],
-    corrections: Corrections,
+    targets: CorrectedTargets,
     options: DescentOptions,
     *,
     loss: ImageLoss,
@@ -26,13 +26,21 @@ def descend(  # noqa: PLR0913 - the last two are the services of every long stag
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Float[Tensor, "m k 3"]:
-    """Colours after `options.iterations` steps of Adam over views in shuffled order, from `sh`.
+    """Colours after `options.iterations` steps of Adam over views in shuffled order; only visible Gaussians change.
 
-    Gaussians move when the view sees them.
+    Args:
+        sh: Initial coefficients of the active Gaussians.
+        targets: Views and their corrected images.
+        options: Rates and number of iterations.
+        loss: Distance from the render to the target.
+        seed: Of the order of views.
+        progress: Called after each iteration.
+        checkpoint: Where the state is saved every `options.save_every` iterations.
 
-    Raises: ValueError where a gradient is not finite, which a loss that divides can cause.
+    Raises:
+        ValueError: Where a gradient is not finite, which a loss that divides can cause.
     """
-    views, start = corrections.views, 0
+    views, start = targets.views, 0
     sh = sh.clone().contiguous()
     moments = adam.no_moments({"sh": sh}, len(sh))
     saved = checkpoint.load()
@@ -45,7 +53,7 @@ def descend(  # noqa: PLR0913 - the last two are the services of every long stag
         index = _view_of(iteration, len(views), seed)
         view, leaf = views[index], sh.detach().requires_grad_()
         picture = view.render(leaf)
-        picture, target = _confident(picture, corrections.target(index), views.weight(index))
+        picture, target = _weighted_pair(picture, targets.target(index), views.weight(index))
         value = loss(picture, target)
         (gradient,) = torch.autograd.grad(value, leaf)
         rates = options.rate * _decay(iteration / options.iterations, options.final_ratio) * shares
@@ -67,19 +75,20 @@ def descend(  # noqa: PLR0913 - the last two are the services of every long stag
 
 
 def _view_of(iteration: int, count: int, seed: int) -> int:
-    """The view of an iteration: each pass visits all in an order that depends on seed and pass alone."""
+    """The view of an iteration: each pass visits all views in an order that depends on seed and pass only."""
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + iteration // count))
     return int(order[iteration % count])
 
 
 def _decay(done: float, final_ratio: float) -> float:
+    """Factor on the learning rate after the share `done` of all iterations: half a cosine from 1 to `final_ratio`."""
     return final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * done))
 
 
-def _confident(
+def _weighted_pair(
     picture: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], weight: Float[Tensor, "h w"] | None
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]]:
-    """Both images with the render, taken as a constant, in place of what is not trusted: serves every loss."""
+    """Both images blended by confidence with the detached render, so that any loss ignores pixels of weight 0."""
     if weight is None:
         return picture, target
     share, constant = weight[..., None], picture.detach()
