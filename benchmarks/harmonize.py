@@ -20,12 +20,12 @@ import torch
 
 from splatgraft.harmonization import HarmonizerInputs
 from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
-from splatgraft.harmonization.flux.empty_prompt import Prompt
+from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
 from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer, FluxSettings
 from splatgraft.harmonization.flux.latents import pad_by_reflection
 from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork, velocity
 from splatgraft.harmonization.flux.sampling import noise, sample, schnell_levels
-from splatgraft.harmonization.flux.weights.library import autoencoder_class, flux_transformer_class
+from splatgraft.harmonization.flux.weights.diffusers_library import autoencoder_class, flux_transformer_class
 
 REAL = {"in_channels": 192, "out_channels": 64}
 TINY = {
@@ -138,7 +138,7 @@ def main() -> None:
     transformer = random_network(flux_transformer_class(), TINY if asked.tiny else REAL, device, dtype)
     settings = TINY_AUTOENCODER if asked.tiny else AUTOENCODER
     autoencoder = Autoencoder(random_network(autoencoder_class(), settings, device, dtype))
-    prompt = Prompt(torch.randn(TOKENS, 4096), torch.randn(768)).to(device, dtype)
+    prompt = PromptEmbedding(torch.randn(TOKENS, 4096), torch.randn(768)).to(device, dtype)
     network = FluxNetwork(transformer, autoencoder, prompt, "image-mask", device, dtype)
     rows: dict[str, dict[str, float]] = {}
 

@@ -44,6 +44,7 @@ def kitchen() -> Scene:
 
 
 def main() -> None:
+    """Render the capture and write it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--blender-python", type=Path, required=True)

@@ -48,10 +48,10 @@ def tiny_autoencoder(seed=1, channels=CHANNELS):
 
 
 def tiny_prompt(seed=2):
-    from splatgraft.harmonization.flux.empty_prompt import Prompt
+    from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
 
     g = torch.Generator().manual_seed(seed)
-    return Prompt(torch.randn(3, TEXT, generator=g), torch.randn(POOLED, generator=g))
+    return PromptEmbedding(torch.randn(3, TEXT, generator=g), torch.randn(POOLED, generator=g))
 
 
 def flux_folder(folder: Path, in_channels=CHANNELS * 4, variant=None, seed=0) -> Path:
@@ -70,7 +70,7 @@ def removal_folder(folder: Path) -> Path:
     """Stable Diffusion 2's layout (unet/, vae/), tiny."""
     from diffusers import UNet2DConditionModel
 
-    from splatgraft.harmonization.flux.weights.library import write_tensors
+    from splatgraft.harmonization.flux.weights.tensor_file import write_tensors
 
     torch.manual_seed(3)
     UNet2DConditionModel(

@@ -7,7 +7,7 @@ import torch
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.evaluation.benchmark.published import DOT3D, SYNCOM, download, method_pictures, scenes_of
+from splatgraft.evaluation.benchmark.published_datasets import DOT3D, SYNCOM, download, find_scenes, method_pictures
 from splatgraft.formats import write_capture
 
 
@@ -28,7 +28,7 @@ def test_scenes_of_all_parts_are_found_with_truth_or_without(tmp_path):
     ):
         for role in roles:
             write_small_capture(tmp_path / part / name / role)
-    found = {scene.name: scene for scene in scenes_of(DOT3D, tmp_path)}
+    found = {scene.name: scene for scene in find_scenes(DOT3D, tmp_path)}
     assert set(found) == {"kitchen", "desk", "hall"}
     assert found["desk"].truth is None
     assert found["hall"].truth == tmp_path / "data_rotation" / "hall" / "gt"
@@ -36,15 +36,15 @@ def test_scenes_of_all_parts_are_found_with_truth_or_without(tmp_path):
 
 def test_a_folder_of_another_kind_is_refused_with_what_was_looked_for(tmp_path):
     with pytest.raises(ValueError, match=r"expected nviolante/dot3d with data_3d/synthetic/insertions/SCENE/"):
-        scenes_of(DOT3D, tmp_path)
+        find_scenes(DOT3D, tmp_path)
     with pytest.raises(ValueError, match=r"expected yGaoJiany/SynCom with"):
-        scenes_of(SYNCOM, tmp_path)
+        find_scenes(SYNCOM, tmp_path)
 
 
 def test_a_scene_without_a_target_is_named(tmp_path):
     write_small_capture(tmp_path / "data_rotation" / "hall" / "source")
     with pytest.raises(ValueError, match=r"hall: expected the target in a folder named target, background"):
-        scenes_of(DOT3D, tmp_path)
+        find_scenes(DOT3D, tmp_path)
 
 
 def test_published_results_are_one_folder_a_method(tmp_path):

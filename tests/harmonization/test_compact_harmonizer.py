@@ -1,4 +1,4 @@
-"""The compact harmoniser's network and composition: identity at the start, texture multiplied, weights kept."""
+"""The compact harmoniser: identity before training, texture only scaled, weights written and read back."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import torch
 
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.harmonization import HarmonizerInputs, HarmonizerOptions, make_harmonizer
-from splatgraft.harmonization.compact.features import composed, view_of
+from splatgraft.harmonization.compact.features import apply_output, compact_input
 from splatgraft.harmonization.compact.harmonizer import Compact
 from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
 from splatgraft.harmonization.compact.weights import read_weights, write_weights
@@ -64,13 +64,13 @@ def test_without_an_object_the_prior_is_kept_to_the_bit():
 
 
 def test_texture_off_the_object_is_multiplied_and_never_made_up():
-    view = view_of(example())
-    answer = moved(CompactNetwork(TINY))(view.resized(48, 64).channels())
-    plain = replace(answer, scene_added=torch.zeros_like(answer.scene_added))
-    lit = composed(view, plain)
+    view = compact_input(example())
+    output = moved(CompactNetwork(TINY))(view.resized(48, 64).channels())
+    plain = replace(output, scene_added=torch.zeros_like(output.scene_added))
+    lit = apply_output(view, plain)
     # light is never below zero
     off = (view.mask == 0).expand(-1, 3, -1, -1) & (lit > 0)
-    brighter = composed(replace(view, composite=2 * view.composite + 0.004), plain)
+    brighter = apply_output(replace(view, composite=2 * view.composite + 0.004), plain)
     # (2c + e) + e = 2 (c + e): the factor is the same, whatever the pixel's own light
     torch.testing.assert_close((brighter + 0.004)[off], (2 * (lit + 0.004))[off], rtol=1e-4, atol=1e-5)
 
@@ -89,14 +89,16 @@ def test_normals_are_turned_into_the_cameras_frame():
     angle = torch.tensor(0.7)
     turn = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1.0]])
     in_camera = replace(view, normal=view.normal @ turn.T)
-    torch.testing.assert_close(view_of(replace(view, camera_from_world=turn)).normal, view_of(in_camera).normal)
+    torch.testing.assert_close(
+        compact_input(replace(view, camera_from_world=turn)).normal, compact_input(in_camera).normal
+    )
 
 
 def test_weights_are_kept_as_halves_and_read_back(tmp_path):
     network = moved(CompactNetwork(TINY))
     path = tmp_path / "compact.safetensors"
     write_weights(path, network.size, network.state_dict(), {"steps": "0"})
-    channels = view_of(example()).resized(48, 64).channels()
+    channels = compact_input(example()).resized(48, 64).channels()
     first, again = network(channels), read_weights(path)(channels)
     # float16 keeps 11 bits of every weight
     torch.testing.assert_close(again.scene_gain, first.scene_gain, rtol=0.02, atol=2e-3)
@@ -122,6 +124,6 @@ def test_other_weights_are_refused_in_a_line(tmp_path):
 
 def test_linear_light_is_what_is_multiplied():
     view = example()
-    batch = view_of(view)
+    batch = compact_input(view)
     torch.testing.assert_close(batch.composite[0].permute(1, 2, 0), linear_from_srgb(view.composite))
     torch.testing.assert_close(srgb_from_linear(batch.prior()[0]).permute(1, 2, 0), view.prior, atol=2e-4, rtol=0)

@@ -5,7 +5,7 @@ import torch
 
 from splatgraft.core.image_metrics import psnr
 from splatgraft.core.images import linear_from_srgb, list_images, read_rgb, resize, srgb_from_linear
-from splatgraft.harmonization.flux.detail import guided_filter, with_detail, with_material_held
+from splatgraft.harmonization.flux.detail import guided_filter, limit_material_change, restore_detail
 
 
 def photograph(side=128):
@@ -35,9 +35,9 @@ def test_what_an_autoencoder_blurs_comes_back_and_the_light_stays():
     composite = photograph()
     truth = relit(composite, shading())
     seen = blurred(truth)  # stands for what the autoencoder makes of the right answer
-    cured = with_detail(seen, composite, amount=1.0)
+    cured = restore_detail(seen, composite, amount=1.0)
     assert psnr(cured, truth) > psnr(seen, truth) + 10
-    half = with_detail(seen, composite, amount=0.5)
+    half = restore_detail(seen, composite, amount=0.5)
     assert psnr(seen, truth) < psnr(half, truth) < psnr(cured, truth)
 
 
@@ -46,7 +46,7 @@ def test_a_cast_shadow_s_edge_survives_about():
     shadow = torch.ones(128, 128, 1)
     shadow[:, 64:] = 0.4
     truth = relit(composite, shadow.expand(-1, -1, 3))
-    cured = with_detail(truth, composite, amount=1.0)
+    cured = restore_detail(truth, composite, amount=1.0)
     far = torch.ones(128, 128, dtype=torch.bool)
     far[:, 64 - 20 : 64 + 20] = False  # two windows of 8 px either way
     assert psnr(cured, truth, far) > 35
@@ -56,11 +56,11 @@ def test_off_is_off_and_a_model_that_changes_nothing_changes_nothing():
     composite = photograph(64)
     model = relit(composite, shading(64))
     mask = torch.ones(64, 64)
-    assert with_detail(model, composite, amount=0.0) is model
-    assert with_material_held(model, composite, mask, strength=1.0) is model
+    assert restore_detail(model, composite, amount=0.0) is model
+    assert limit_material_change(model, composite, mask, strength=1.0) is model
     # ratios of exactly one, through two transfer functions in float32
-    assert torch.allclose(with_detail(composite, composite, amount=1.0), composite, atol=1e-5)
-    assert torch.allclose(with_material_held(composite, composite, mask, strength=0.0), composite, atol=1e-5)
+    assert torch.allclose(restore_detail(composite, composite, amount=1.0), composite, atol=1e-5)
+    assert torch.allclose(limit_material_change(composite, composite, mask, strength=0.0), composite, atol=1e-5)
 
 
 def test_a_changed_material_is_held_and_a_changed_light_is_not():
@@ -72,11 +72,11 @@ def test_a_changed_material_is_held_and_a_changed_light_is_not():
     changed = torch.lerp(lit, stripes.expand(128, 128, 3) * torch.tensor([0.2, 0.9, 0.4]), 0.4)
     model = torch.where(mask[..., None] > 0, changed, lit)
     errors = [
-        float(((with_material_held(model, composite, mask, strength=s) - lit) ** 2).mean()) for s in (1.0, 0.5, 0.0)
+        float(((limit_material_change(model, composite, mask, strength=s) - lit) ** 2).mean()) for s in (1.0, 0.5, 0.0)
     ]
     assert errors[2] < errors[1] < errors[0]
     assert errors[2] < errors[0] / 3
-    assert torch.equal(with_material_held(model, composite, mask, strength=0.0)[mask == 0], model[mask == 0])
+    assert torch.equal(limit_material_change(model, composite, mask, strength=0.0)[mask == 0], model[mask == 0])
 
 
 def test_the_filter_keeps_edges_of_its_guide_and_means_of_its_signal():
@@ -94,4 +94,4 @@ def test_the_filter_keeps_edges_of_its_guide_and_means_of_its_signal():
 @pytest.mark.parametrize("size", [(5, 7), (1, 40)])
 def test_pictures_smaller_than_the_window_work(size):
     image = torch.rand(*size, 3, generator=torch.Generator().manual_seed(0))
-    assert bool(with_detail(image, image * 0.5 + 0.1, amount=1.0).isfinite().all())
+    assert bool(restore_detail(image, image * 0.5 + 0.1, amount=1.0).isfinite().all())

@@ -11,7 +11,7 @@ pytest.importorskip("diffusers")
 from tiny_models import CHANNELS, flux_folder, quiet, tiny_transformer
 
 from splatgraft.harmonization import HarmonizerInputs, HarmonizerOptions, make_harmonizer
-from splatgraft.harmonization.flux.detail import with_detail, with_material_held
+from splatgraft.harmonization.flux.detail import limit_material_change, restore_detail
 from splatgraft.harmonization.flux.weights.folder import FluxFolder
 from splatgraft.harmonization.flux.weights.loading import FluxWeights, load_flux, widen_transformer
 from splatgraft.harmonization.flux.weights.lora import add_lora, write_lora
@@ -65,9 +65,9 @@ def test_a_padded_view_is_cropped_from_the_whole_and_a_legal_size_is_not_padded(
 def test_views_at_once_are_those_one_by_one(tmp_path):
     folder = flux_folder(tmp_path / "image-mask", WIDE)
     views = [view(seed=i) for i in range(3)]
-    serialized = [make_harmonizer("flux", options(folder)).harmonize(v).image for v in views]
+    alone = [make_harmonizer("flux", options(folder)).harmonize(v).image for v in views]
     together = make_harmonizer("flux", options(folder, batch=3)).harmonize_all(views)
-    for one, other in zip(serialized, together, strict=True):
+    for one, other in zip(alone, together, strict=True):
         # batched products round otherwise; four steps and a decoder of a tiny model amplify that little
         assert torch.allclose(one, other.image, atol=1e-4)
 
@@ -209,16 +209,16 @@ def test_numbers_that_are_none_and_memory_that_does_not_do_are_said(tmp_path, mo
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr("splatgraft.harmonization.flux.harmonizer.velocity", full)
-    with pytest.raises(ValueError, match="expected memory for 1 views at once, found too little; views that are done"):
+    with pytest.raises(ValueError, match="expected memory for 1 views at once, found too little; finished views"):
         harmonizer.harmonize(view())
 
 
 def test_detail_and_strength_are_laid_on_what_the_network_makes(tmp_path):
     folder, shown = flux_folder(tmp_path / "image-mask", WIDE), view()
     plain = make_harmonizer("flux", options(folder)).harmonize(shown).image
-    held = with_material_held(plain, shown.composite, shown.mask, strength=0.3)
+    held = limit_material_change(plain, shown.composite, shown.mask, strength=0.3)
     image = make_harmonizer("flux", options(folder, detail=0.7, strength=0.3)).harmonize(shown).image
-    assert torch.equal(image, with_detail(held, shown.composite, amount=0.7))
+    assert torch.equal(image, restore_detail(held, shown.composite, amount=0.7))
     for name in ("detail", "strength"):
         with pytest.raises(ValueError, match=f"--{name}: expected a number from 0 to 1, found 2.0"):
             make_harmonizer("flux", options(folder, **{name: 2.0}))

@@ -3,11 +3,17 @@
 import pytest
 import torch
 
-from splatgraft.harmonization.flux.empty_prompt import Prompt
+from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
 from splatgraft.harmonization.flux.network import velocity
-from splatgraft.harmonization.flux.weights.memory import activation_bytes as tokens_bytes
-from splatgraft.harmonization.flux.weights.memory import choose_placement, decoder_bytes
-from splatgraft.training.prediction import Choice, Size, activation_bytes, table, training_bytes
+from splatgraft.harmonization.flux.weights.placement import activation_bytes as tokens_bytes
+from splatgraft.harmonization.flux.weights.placement import choose_placement, decoder_bytes
+from splatgraft.training.memory_estimate import (
+    MemoryOptions,
+    TransformerSize,
+    activation_bytes,
+    memory_table,
+    training_bytes,
+)
 
 GB = 10**9
 FLUX = {"parameters": 8_640_000_000, "others": 84_000_000}
@@ -58,7 +64,7 @@ def test_the_activations_predicted_are_those_that_are_kept(checkpointing):
     )  # fmt: skip
     if checkpointing:
         network.enable_gradient_checkpointing()
-    prompt = Prompt(torch.randn(16, 32), torch.randn(16))
+    prompt = PromptEmbedding(torch.randn(16, 32), torch.randn(16))
     weights = {p.untyped_storage().data_ptr() for p in network.parameters()}
     sides = (16, 32)
     for side in sides:
@@ -77,8 +83,8 @@ def test_the_activations_predicted_are_those_that_are_kept(checkpointing):
         kept.append(sum(found.values()))
     # two sizes, so that copies of weights, which do not grow, fall out
     tokens = (sides[1] ** 2 - sides[0] ** 2) // 4
-    size = Size(parameters=0, blocks=blocks, width=width, tokens=tokens)
-    predicted = activation_bytes(size, Choice(1, checkpointing=checkpointing))
+    size = TransformerSize(parameters=0, blocks=blocks, width=width, tokens=tokens)
+    predicted = activation_bytes(size, MemoryOptions(1, checkpointing=checkpointing))
     # a block that is computed again is not among what is kept through the forward pass
     predicted -= 54 * tokens * width if checkpointing else 0
     # ends of the network and odds of a block: some 7 bytes a token and channel with 6 blocks
@@ -87,14 +93,18 @@ def test_the_activations_predicted_are_those_that_are_kept(checkpointing):
 
 def test_training_flux_takes_the_paper_s_four_cards():
     width = 3072
-    size = Size(parameters=11_890_000_000, blocks=57, width=width, tokens=1876, adapted=width * (36 * 19 + 20 * 38))
-    one = training_bytes(size, Choice(pairs=1))
+    size = TransformerSize(
+        parameters=11_890_000_000, blocks=57, width=width, tokens=1876, adapted=width * (36 * 19 + 20 * 38)
+    )
+    one = training_bytes(size, MemoryOptions(pairs=1))
     # 12 billion weights, gradients and two moments in float32 and a copy in 16 bits: 18 bytes each
     assert 214 * GB < one < 218 * GB
-    assert training_bytes(size, Choice(pairs=1, shards=4)) < 80 * GB
-    assert training_bytes(size, Choice(pairs=1, adam8bit=True)) < one - 60 * GB
-    assert training_bytes(size, Choice(pairs=1, lora=64)) < 40 * GB
-    assert training_bytes(size, Choice(pairs=1, ema=True)) > one
-    assert training_bytes(size, Choice(pairs=4, checkpointing=False)) > training_bytes(size, Choice(pairs=4))
-    lines = table(size, Choice(pairs=1, lora=16))
+    assert training_bytes(size, MemoryOptions(pairs=1, shards=4)) < 80 * GB
+    assert training_bytes(size, MemoryOptions(pairs=1, adam8bit=True)) < one - 60 * GB
+    assert training_bytes(size, MemoryOptions(pairs=1, lora=64)) < 40 * GB
+    assert training_bytes(size, MemoryOptions(pairs=1, ema=True)) > one
+    assert training_bytes(size, MemoryOptions(pairs=4, checkpointing=False)) > training_bytes(
+        size, MemoryOptions(pairs=4)
+    )
+    lines = memory_table(size, MemoryOptions(pairs=1, lora=16))
     assert [line.startswith("* ") for line in lines] == [False, False, True]

@@ -13,7 +13,7 @@ from splatgraft.harmonization.flux.network import velocity
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
 from splatgraft.harmonization.flux.weights.loading import widen_transformer
 from splatgraft.harmonization.flux.weights.lora import LowRankLinear, add_lora, merge_lora, write_lora
-from splatgraft.harmonization.flux.weights.widening import widened
+from splatgraft.harmonization.flux.weights.widening import widen_layer
 
 pytestmark = list(quiet)
 
@@ -91,7 +91,7 @@ def test_noise_does_not_depend_on_what_else_is_made():
 @pytest.mark.parametrize("init", ["repeat", "zero"])
 @pytest.mark.parametrize("layer", [torch.nn.Linear(64, 8), torch.nn.Conv2d(4, 8, 3, padding=1)], ids=["linear", "conv"])
 def test_a_widened_layer_holds_the_old_weights_bit_for_bit(layer, init):
-    wide = widened(layer, 3, init)
+    wide = widen_layer(layer, 3, init)
     old = layer.weight
     n = old.shape[1]
     assert wide.weight.shape[1] == 3 * n
@@ -144,9 +144,9 @@ def test_baked_in_bfloat16_and_in_batches_finds_its_rows():
     with torch.no_grad():
         together = velocity(baked, latents, t, prompt)
         for i in range(4):
-            serialized = velocity(stock, latents[i : i + 1], t[i : i + 1], prompt)
+            alone = velocity(stock, latents[i : i + 1], t[i : i + 1], prompt)
             # batches round otherwise: a few steps of bfloat16 (2^-8) at values of about one
-            assert torch.allclose(together[i], serialized[0], atol=0.03)
+            assert torch.allclose(together[i], alone[0], atol=0.03)
 
 
 def test_the_share_that_baking_saves_is_that_of_the_real_model():

@@ -99,9 +99,9 @@ def test_a_killed_run_keeps_its_views_and_does_no_more_than_the_rest(views, weig
 
 
 def test_two_processes_by_accelerate_make_the_same_files(views, weights):
-    serialized = perform(step(views, weights), Console())
+    alone = perform(step(views, weights), Console())
     split = perform(step(views, weights, "split", processes=2), Console())
-    assert images(split) == images(serialized)
+    assert images(split) == images(alone)
     with pytest.raises(ValueError, match=r"config.json: expected the config of a FluxTransformer2DModel, found none"):
         perform(step(views, views, "broken", processes=2), Console())
 
@@ -118,6 +118,6 @@ def test_the_machine_does_not_make_a_result_stale(views, weights):
 
 def test_workers_of_ray_make_the_same_files(views, weights):
     pytest.importorskip("ray")
-    serialized = perform(step(views, weights), Console())
+    alone = perform(step(views, weights), Console())
     spread = perform(step(views, weights, "spread", processes=2, ray="local"), Console())
-    assert images(spread) == images(serialized)
+    assert images(spread) == images(alone)

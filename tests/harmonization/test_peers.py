@@ -134,7 +134,7 @@ def test_ic_light_adds_its_difference_to_the_base(tmp_path):
     pytest.importorskip("diffusers")
     from tiny_models import removal_folder
 
-    from splatgraft.harmonization.flux.weights.library import read_tensors, write_tensors
+    from splatgraft.harmonization.flux.weights.tensor_file import read_tensors, write_tensors
 
     base = removal_folder(tmp_path / "base")
     weights = read_tensors(base / "unet" / "diffusion_pytorch_model.safetensors")

@@ -63,7 +63,7 @@ def pair_folder(tmp_path_factory):
     """Scene 0 of the training pairs: five cameras, one object, one light."""
     out = tmp_path_factory.mktemp("pairs")
     job = pairs.plan(pairs.PairPlan(objects=1, lights=1, size=TINY), 0)
-    return rendered(job, out / pairs.folder_of(job))
+    return rendered(job, out / pairs.job_folder_name(job))
 
 
 def test_the_interpreter_is_told_by_its_version_and_another_is_refused():
@@ -78,7 +78,7 @@ def test_a_rendered_composite_is_equation_2_to_the_bit(pair_folder):
         relit = read_rgb(sample.path("object0_light0"))
         background = read_rgb(sample.path("background"))
         mask = read_rgb(sample.path("object0", "mask"))[..., :1]
-        wanted = mask * pairs.normalized(relit, pair.target, mask[..., 0]) + (1 - mask) * background
+        wanted = mask * pairs.match_statistics(relit, pair.target, mask[..., 0]) + (1 - mask) * background
         assert torch.equal(pair.composite, wanted)
         assert torch.equal(pair.composite[mask[..., 0] == 0], background[mask[..., 0] == 0])
 
@@ -86,7 +86,7 @@ def test_a_rendered_composite_is_equation_2_to_the_bit(pair_folder):
 def test_rendered_pairs_are_sound_and_show_the_same_scene_with_and_without_the_object(pair_folder):
     samples = pairs.samples_in(pair_folder)
     assert len(samples) == 5
-    assert [pairs.fault(sample) for sample in samples] == [None] * 5
+    assert [pairs.find_defect(sample) for sample in samples] == [None] * 5
 
 
 @pytest.mark.parametrize("damage", ["truncated", "black", "another scene"])
@@ -101,7 +101,7 @@ def test_a_spoilt_render_is_caught_and_named(pair_folder, damage):
             cv2.imwrite(str(path), np.zeros((TINY.height, TINY.width, 3), np.uint8))
         else:
             cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
-        fault = pairs.fault(sample)
+        fault = pairs.find_defect(sample)
         assert fault is not None
         assert str(pair_folder) in fault
         assert "expected" in fault
@@ -198,7 +198,7 @@ def test_a_benchmark_scene_is_laid_out_sound_with_its_true_light(tmp_path):
         render_job(job, folder, PYTHON)
     out = tmp_path / which.name
     benchmark.gather(which, *folders, out)
-    assert benchmark.fault(out) is None
+    assert benchmark.find_defect(out) is None
     truth, place = read_capture(out / "ground_truth"), pairs.make_scene(which.kind, which.seed).places[0]
     assert truth.cameras.names == read_capture(out / "target").cameras.names
     # sparse points are where surfaces are: the support under the object among them, within noise (0.2% of 3 m)

@@ -44,7 +44,7 @@ def test_normalised_object_has_the_targets_mean_and_deviation():
     relit = 0.2 + 0.1 * torch.randn(64, 64, 3, generator=generator)
     mask = torch.zeros(64, 64)
     mask[10:50, 8:40] = 1
-    made = pairs.normalized(relit, target, mask)[mask > 0]
+    made = pairs.match_statistics(relit, target, mask)[mask > 0]
     wanted = target[mask > 0]
     # nothing clips at eight deviations from 0 and 1, so only float32 sums over 1280 pixels err
     assert torch.allclose(made.mean(0), wanted.mean(0), atol=1e-5)
@@ -94,7 +94,7 @@ def damage_dark_object(sample):
 )
 def test_bad_renders_are_caught_and_named(tmp_path, damage):
     sample = write_sample(tmp_path / "a")
-    assert pairs.fault(sample) is None
+    assert pairs.find_defect(sample) is None
     damage(sample)
     count, faults = pairs.write_manifest(tmp_path, [tmp_path / "a"])
     assert count == 0

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from splatgraft.synthesis import benchmark, objects, pairs, views
-from splatgraft.synthesis.jobs import RenderSize, take_over
+from splatgraft.synthesis import benchmark, cameras, objects, pairs
+from splatgraft.synthesis.jobs import RenderSize, copy_shared_takes
 
 
 @pytest.mark.parametrize("kind", pairs.KINDS)
@@ -25,7 +25,7 @@ def test_cameras_stay_inside_and_out_of_furniture(kind):
     for seed in range(3):
         scene = pairs.make_scene(kind, seed)
         low, high = scene.bounds
-        for camera in views.arc(scene, scene.places[0], 0.3, seed):
+        for camera in cameras.camera_arc(scene, scene.places[0], 0.3, seed):
             assert all(low[i] <= camera.location[i] <= high[i] for i in range(3))
             for a, b in scene.obstacles:
                 assert not all(a[i] < camera.location[i] < b[i] for i in range(3))
@@ -57,7 +57,7 @@ def test_plan_renders_each_background_once_and_is_plain_data():
     options = pairs.PairPlan(scenes=2, objects=2, lights=3, size=RenderSize(64, 48, 2))
     for job in (pairs.plan(options, number) for number in range(2)):
         assert [take.name for take in job.takes].count("background") == 1
-        assert len(job.cameras) == views.ARC_LENGTH
+        assert len(job.cameras) == cameras.ARC_LENGTH
         assert len([take for take in job.takes if "_light" in take.name and take.is_pictures]) == 6
         json.loads(job.scene.to_json())
 
@@ -87,16 +87,16 @@ def rendered_in_name(job, out):
 def test_turns_of_one_object_share_what_does_not_show_it(tmp_path):
     size = benchmark.BenchmarkSize(RenderSize(64, 48, 2), 8)
     first, other = benchmark.ROTATIONS[0], benchmark.ROTATIONS[1]
-    assert other in benchmark.twins(first)
-    assert benchmark.SCENES[0] in benchmark.twins(first)
+    assert other in benchmark.scenes_with_shared_renders(first)
+    assert benchmark.SCENES[0] in benchmark.scenes_with_shared_renders(first)
     (target, source), (turned, same) = benchmark.plan(first, size), benchmark.plan(other, size)
     rendered_in_name(target, tmp_path / "target")
     rendered_in_name(source, tmp_path / "source")
-    take_over(turned, tmp_path / "turned", target, tmp_path / "target")
+    copy_shared_takes(turned, tmp_path / "turned", target, tmp_path / "target")
     assert sorted(path.name for path in (tmp_path / "turned").iterdir() if path.is_dir()) == ["light", "target"]
     assert (tmp_path / "turned" / "target" / "0003.png").read_text() == "target 0003"
     assert not turned.is_done(tmp_path / "turned")
-    take_over(same, tmp_path / "same", source, tmp_path / "source")
+    copy_shared_takes(same, tmp_path / "same", source, tmp_path / "source")
     assert same.is_done(tmp_path / "same")
 
 
@@ -105,8 +105,8 @@ def test_half_a_take_and_another_scenes_are_not_taken_over(tmp_path):
     target, turned = (benchmark.plan(which, size)[0] for which in benchmark.ROTATIONS[:2])
     stranger = benchmark.plan(benchmark.SCENES[1], size)[0]
     rendered_in_name(target, tmp_path / "target")
-    take_over(stranger, tmp_path / "stranger", target, tmp_path / "target")
+    copy_shared_takes(stranger, tmp_path / "stranger", target, tmp_path / "target")
     assert not (tmp_path / "stranger").exists()
     (tmp_path / "target" / "target" / "0003.done").unlink()
-    take_over(turned, tmp_path / "turned", target, tmp_path / "target")
+    copy_shared_takes(turned, tmp_path / "turned", target, tmp_path / "target")
     assert not (tmp_path / "turned").exists()

@@ -87,7 +87,7 @@ def _pictures(pose, now, others):
     def on_ground(ball):
         return torch.where(ground_there[..., None], shaded(ground, up, GROUND, now, ball=ball), sky)
 
-    def serialized(light):
+    def alone(light):
         picture = srgb_from_linear(shaded(body, facing, BODY, light, ball=False))
         return torch.cat([picture, inside[..., None].float()], -1)
 
@@ -101,8 +101,8 @@ def _pictures(pose, now, others):
         "object0 depth": depth,
         "object0 normal": torch.where(on, facing, up) * 0.5 + 0.5,
         "object0 albedo": srgb_from_linear(torch.where(on, BODY, GROUND)),
-        "object0_light0": serialized(others[0]),
-        "object0_light1": serialized(others[1]),
+        "object0_light0": alone(others[0]),
+        "object0_light1": alone(others[1]),
     }
 
 

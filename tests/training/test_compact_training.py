@@ -12,21 +12,23 @@ from ball_pairs import write_ball_pairs
 
 from splatgraft.cli import main
 from splatgraft.harmonization.compact.factory import SHIPPED
-from splatgraft.harmonization.compact.features import composed
+from splatgraft.harmonization.compact.features import apply_output
 from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
 from splatgraft.harmonization.compact.weights import read_weights
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
 from splatgraft.synthesis.pairs import write_manifest
 from splatgraft.training.compact import priors
-from splatgraft.training.compact.augment import augmented
-from splatgraft.training.compact.loop import CompactLoop, CompactTraining, train_compact
-from splatgraft.training.compact.loss import errors_of, loss_of
-from splatgraft.training.compact.pairs import CompactPairs, HeldOut
-from splatgraft.training.compact.wrong_light import wrong
+from splatgraft.training.compact.augmentation import augment
+from splatgraft.training.compact.light_perturbation import perturb_light
+from splatgraft.training.compact.loop import CompactLoopOptions, CompactTraining, train_compact
+from splatgraft.training.compact.loss import compact_loss, region_errors
+from splatgraft.training.compact.pairs import CompactPairs, HeldOutOptions
 
 TINY = CompactSize(widths=(8, 8, 16, 16), blocks=(1, 1, 1, 1), heads=2)
-QUICK = CompactLoop(steps=6, batch=2, size=(32, 48), save_every=2, validate_every=3, validation_pairs=2, network=TINY)
-NOTHING = HeldOut(materials=(), lights=(), every=0)
+QUICK = CompactLoopOptions(
+    steps=6, batch=2, size=(32, 48), save_every=2, validate_every=3, validation_pairs=2, network=TINY
+)
+NOTHING = HeldOutOptions(materials=(), lights=(), every=0)
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +52,13 @@ def silent(*words):
 
 
 def test_under_the_true_light_the_prior_removes_most_of_the_error(rendered, tmp_path, monkeypatch):
-    monkeypatch.setattr(priors, "wrong", lambda light, rng: light)
+    monkeypatch.setattr(priors, "perturb_light", lambda light, rng: light)
     priors.write_priors([rendered / "ball_0"], tmp_path / "priors", seed=0)
     pairs = CompactPairs(rendered, [tmp_path / "priors"], NOTHING)
     assert len(pairs.entries) == 4
     for index in range(4):
         view, truth = pairs.read(index)
-        pasted, prior = errors_of(view.composite, truth, view), errors_of(view.prior(), truth, view)
+        pasted, prior = region_errors(view.composite, truth, view), region_errors(view.prior(), truth, view)
         # what is left: normals spoilt by 12 degrees on purpose, edges of a shadow a few pixels wide, and the light that
         # the ball throws back, which the closed form leaves out
         assert prior.object < 0.4 * pasted.object
@@ -65,7 +67,7 @@ def test_under_the_true_light_the_prior_removes_most_of_the_error(rendered, tmp_
 
 def test_wrong_lights_stay_within_their_bounds_and_differ():
     light = Light((LightSource((0.6, 0.0, 0.8), (3.0, 2.0, 1.0), name="sun"),), fit_ambient(torch.ones(3)))
-    found = [wrong(light, random.Random(i)) for i in range(400)]
+    found = [perturb_light(light, random.Random(i)) for i in range(400)]
     kept = [one.sources[0] for one in found if one.sources]
     assert 350 < len(kept) < 400
     angles = [math.degrees(math.acos(min(1.0, 0.6 * s.direction[0] + 0.8 * s.direction[2]))) for s in kept]
@@ -75,7 +77,7 @@ def test_wrong_lights_stay_within_their_bounds_and_differ():
     ratios = [s.irradiance[0] / 3.0 for s in kept]
     assert max(ratios) < 4 * math.exp(1.4) * 1.3
     assert max(ratios) > 2
-    # doubt is honest: where more is said, more is wrong
+    # doubt is honest: where more is said, more is perturb_light
     doubts = np.array([s.uncertainty_deg for s in kept])
     assert np.mean(np.array(angles)[doubts > 12]) > 2 * np.mean(np.array(angles)[doubts < 8])
 
@@ -88,18 +90,18 @@ def test_priors_that_are_there_are_kept(rendered):
 
 
 def test_families_held_out_are_never_trained_on(rendered):
-    by_material = pairs_of(rendered, HeldOut(materials=("brick",), lights=(), every=0))
+    by_material = pairs_of(rendered, HeldOutOptions(materials=("brick",), lights=(), every=0))
     assert {by_material.entries[i].folder for i in by_material.training} == {"ball_0"}
     assert {by_material.entries[i].folder for i in by_material.validation} == {"ball_1"}
-    by_light = pairs_of(rendered, HeldOut(materials=(), lights=("map1.exr",), every=0))
+    by_light = pairs_of(rendered, HeldOutOptions(materials=(), lights=("map1.exr",), every=0))
     assert {by_light.entries[i].light for i in by_light.training} == {"light0"}
 
 
 def test_a_cut_keeps_the_object_whole_and_a_seed_makes_the_same(rendered):
     view, truth = pairs_of(rendered).read(0)
     for seed in range(12):
-        cut, wanted = augmented(view, truth, (48, 72), str(seed))
-        again, _ = augmented(view, truth, (48, 72), str(seed))
+        cut, wanted = augment(view, truth, (48, 72), str(seed))
+        again, _ = augment(view, truth, (48, 72), str(seed))
         assert torch.equal(cut.composite, again.composite)
         assert wanted.shape[-2:] == (48, 72)
         edges = torch.cat([cut.mask[0, 0, 0], cut.mask[0, 0, -1], cut.mask[0, 0, :, 0], cut.mask[0, 0, :, -1]])
@@ -137,11 +139,11 @@ def test_it_learns_what_it_is_shown(rendered, tmp_path):
     network.load_state_dict(state)
     before = after = 0.0
     for index in range(len(pairs.entries)):
-        view, truth = augmented(*pairs.read(index), loop.size, f"test-{index}")
+        view, truth = augment(*pairs.read(index), loop.size, f"test-{index}")
         with torch.no_grad():
-            answer = network(view.channels())
-            _, found, prior = loss_of(view, answer, truth)
-        assert composed(view, answer).min() >= 0
+            output = network(view.channels())
+            _, found, prior = compact_loss(view, output, truth)
+        assert apply_output(view, output).min() >= 0
         before, after = before + float(prior.object), after + float(found.object)
     # cuts and exposures are others than those trained on; a third of the error is far beyond chance
     assert after < 0.65 * before
@@ -187,10 +189,10 @@ def test_the_shipped_weights_are_those_of_a_training(tmp_path):
     for index in range(10):
         view, truth = pairs.read(index)
         with torch.no_grad():
-            made = composed(view, network(view.resized(160, 240).channels()))
+            made = apply_output(view, network(view.resized(160, 240).channels()))
         assert made.isfinite().all()
-        before += float(errors_of(view.prior(), truth, view).object)
-        after += float(errors_of(made, truth, view).object)
+        before += float(region_errors(view.prior(), truth, view).object)
+        after += float(region_errors(made, truth, view).object)
     assert after < 0.9 * before
 
 

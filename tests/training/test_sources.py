@@ -19,13 +19,18 @@ from tiny_pairs import relit_folder, rendered_folder, shipped_samples
 from splatgraft.commands.synth.orida import OridaPairs
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft.runtime.console import Console
-from splatgraft.training.sources.generate import Lighting, Unlit, Wanted, generate
-from splatgraft.training.sources.orida import Photograph, balanced, read_orida
+from splatgraft.training.sources.generate import Lighting, SamplePlan, UnrelitSample, generate
+from splatgraft.training.sources.orida import Photograph, choose_balanced, read_orida
+from splatgraft.training.sources.pair_source import crop_to_size, sample_seed, split_mixture
 from splatgraft.training.sources.prompts import ANGLES, ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
-from splatgraft.training.sources.relighters import DiffusionRenderer, Draft, StandIn, inflated_normals
-from splatgraft.training.sources.relit import RelitPairs
-from splatgraft.training.sources.rendered import RenderedPairs
-from splatgraft.training.sources.source import fitted, sample_seed, split_mixture
+from splatgraft.training.sources.relighters import (
+    DiffusionRenderer,
+    RelightingInput,
+    SilhouetteRelighter,
+    inflated_normals,
+)
+from splatgraft.training.sources.relit_pairs import RelitPairs
+from splatgraft.training.sources.rendered_pairs import RenderedPairs
 
 
 def environment(folder: Path, name: str, bright: str) -> Path:
@@ -94,7 +99,7 @@ def test_seeds_differ_from_place_to_place():
 @pytest.mark.parametrize(("h", "w"), [(20, 40), (40, 20), (16, 32), (100, 100)])
 def test_a_fitted_picture_has_its_size_and_its_middle(h, w):
     ramp = torch.linspace(0, 1, w).expand(h, w)[..., None]
-    made = fitted(ramp, 32, 16)
+    made = crop_to_size(ramp, 32, 16)
     assert made.shape == (16, 32, 1)
     # symmetric about the middle, to the rounding of the enlarged size
     assert abs(float(made.mean()) - 0.5) < 0.02
@@ -121,13 +126,13 @@ def test_the_choice_of_photographs_is_balanced():
         for s in range(5)
         for i in range(3 + 10 * (o == 0))  # one object has many more
     ]
-    chosen = balanced(photographs, 60, 0)
+    chosen = choose_balanced(photographs, 60, 0)
     assert len(set(chosen)) == 60
     assert max(Counter(p.object for p in chosen).values()) - min(Counter(p.object for p in chosen).values()) <= 1
     assert max(Counter(p.scene for p in chosen).values()) - min(Counter(p.scene for p in chosen).values()) <= 2
-    assert balanced(photographs, 60, 0) == chosen
-    assert balanced(photographs, 60, 1) != chosen
-    assert len(balanced(photographs, 10_000, 0)) == len(photographs)
+    assert choose_balanced(photographs, 60, 0) == chosen
+    assert choose_balanced(photographs, 60, 1) != chosen
+    assert len(choose_balanced(photographs, 10_000, 0)) == len(photographs)
 
 
 def test_inflated_normals_point_outwards():
@@ -142,12 +147,14 @@ def test_inflated_normals_point_outwards():
 def test_the_stand_in_shades_the_side_that_light_comes_from_and_says_what_it_is(tmp_path):
     y, x = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
     mask = (((x - 30) ** 2 + (y - 20) ** 2) < 15**2).float()
-    draft = Draft("ball", torch.full((40, 60, 3), 0.5), mask)
-    right, left = StandIn().relight(draft, [environment(tmp_path, side, side) for side in ("right", "left")])
+    draft = RelightingInput("ball", torch.full((40, 60, 3), 0.5), mask)
+    right, left = SilhouetteRelighter().relight(
+        draft, [environment(tmp_path, side, side) for side in ("right", "left")]
+    )
     assert right[20, 40].mean() > right[20, 20].mean() + 0.1
     assert left[20, 20].mean() > left[20, 40].mean() + 0.1
     assert torch.equal(right[mask == 0], draft.image[mask == 0])
-    assert "not DiffusionRenderer" in StandIn().name
+    assert "not DiffusionRenderer" in SilhouetteRelighter().name
 
 
 def test_a_generator_goes_on_where_it_was_killed_and_notes_what_is_unfit(tmp_path):
@@ -162,11 +169,13 @@ def test_a_generator_goes_on_where_it_was_killed_and_notes_what_is_unfit(tmp_pat
                 mask = torch.zeros_like(sample.mask) if name.endswith("24") else sample.mask
                 if name.endswith("25") and len(made) == 3:
                     raise KeyboardInterrupt
-                return Unlit(sample.target, sample.background, mask)
+                return UnrelitSample(sample.target, sample.background, mask)
 
-            yield Wanted(name, "scene", make, {"prompt": f"a {name}", "licence": "shipped"})
+            yield SamplePlan(name, "scene", make, {"prompt": f"a {name}", "licence": "shipped"})
 
-    lighting = Lighting(StandIn(), [environment(tmp_path / "maps", side, side) for side in ("left", "right")], 2, 0)
+    lighting = Lighting(
+        SilhouetteRelighter(), [environment(tmp_path / "maps", side, side) for side in ("left", "right")], 2, 0
+    )
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         generate(out, wanted(), lighting, total=3)
@@ -246,7 +255,7 @@ def test_the_adaptor_calls_an_installation_and_gives_its_pictures(tmp_path):
     python = tmp_path / "python"  # quick to start, and "import torch" does not load it
     python.write_text(f'#!/bin/sh\n[ "$1" = -c ] && exit 0\nexec {sys.executable} -S "$@"\n')
     python.chmod(python.stat().st_mode | stat.S_IXUSR)
-    draft = Draft("a", next(iter(shipped_samples(1)))[1].target, torch.ones(32, 32))
+    draft = RelightingInput("a", next(iter(shipped_samples(1)))[1].target, torch.ones(32, 32))
     light = environment(tmp_path / "maps", "left", "left")
     relit = DiffusionRenderer(installation(tmp_path / "dr"), python).relight(draft, [light, light])
     # 8 bits

@@ -16,8 +16,8 @@ from tiny_models import flux_folder, quiet, removal_folder
 from tiny_pairs import relit_folder, rendered_folder, shipped_samples
 
 from splatgraft.cli import main
-from splatgraft.training.records import read_losses
-from splatgraft.training.sources.relit import RelitPairs
+from splatgraft.training.sources.relit_pairs import RelitPairs
+from splatgraft.training.training_log import read_losses
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 SMALL = ["--size", "32x32", "--batch", "2", "--precision", "no", "--cpu", "--steps", "3", "--validation-pairs", "1"]
@@ -99,7 +99,8 @@ def test_painted_pictures_become_pairs(tmp_path, monkeypatch, capsys):
             return torch.nn.functional.pad(torch.ones(16, 16), (8, 8, 8, 8))
 
     monkeypatch.setattr(
-        "splatgraft.harmonization.flux.weights.library.text_to_image_pipeline", lambda base, **settings: Pipeline()
+        "splatgraft.harmonization.flux.weights.diffusers_library.text_to_image_pipeline",
+        lambda base, **settings: Pipeline(),
     )
     monkeypatch.setattr("splatgraft.segmentation.birefnet.load_birefnet", lambda weights: Masks())
     base = removal_folder(tmp_path / "base")

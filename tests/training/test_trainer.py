@@ -1,4 +1,4 @@
-"""Training: overfits, is kept and loaded as it was, goes on after a kill to the bit, says in a line what is wrong."""
+"""Training overfits, its model loads unchanged, a killed run resumes bit for bit, and errors are one line."""
 
 import json
 from dataclasses import replace
@@ -16,17 +16,19 @@ from splatgraft.core.images import read_rgb
 from splatgraft.harmonization import HarmonizerInputs, HarmonizerOptions, make_harmonizer
 from splatgraft.training.flux_objective import FluxObjective, FluxTraining
 from splatgraft.training.latent_cache import LatentCache
-from splatgraft.training.records import LOG_FILE, read_losses
+from splatgraft.training.loop_options import LoopOptions
 from splatgraft.training.removal_objective import RemovalObjective
-from splatgraft.training.settings import Loop
-from splatgraft.training.sources.relit import RelitPairs
-from splatgraft.training.sources.rendered import RenderedPairs
-from splatgraft.training.sources.source import fitted_pair, split_mixture
-from splatgraft.training.trainer import Training, train
+from splatgraft.training.sources.pair_source import crop_pair_to_size, split_mixture
+from splatgraft.training.sources.relit_pairs import RelitPairs
+from splatgraft.training.sources.rendered_pairs import RenderedPairs
+from splatgraft.training.trainer import TrainingRun, train
+from splatgraft.training.training_log import LOG_FILE, read_losses
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 ROLES = RemovalObjective.roles
-QUICK = Loop(steps=6, batch=2, rate=1e-3, precision="no", save_every=2, validate_every=3, validation_pairs=2, cpu=True)
+QUICK = LoopOptions(
+    steps=6, batch=2, rate=1e-3, precision="no", save_every=2, validate_every=3, validation_pairs=2, cpu=True
+)
 
 
 def silent(*words):
@@ -41,7 +43,7 @@ def training(tmp_path, name, loop=QUICK, *, pairs=2, progress=silent, say=silent
     objective = FluxObjective(FluxTraining(str(base), **flux), say)
     mixture, held_out = split_mixture([RelitPairs(folder)], weights=(), held_out=0.5, seed=loop.seed)
     cache = LatentCache(tmp_path / "latents", objective.encode, width=32, height=32, autoencoder="tiny")
-    return Training(objective, mixture, held_out, cache, loop, tmp_path / name, say, progress)
+    return TrainingRun(objective, mixture, held_out, cache, loop, tmp_path / name, say, progress)
 
 
 def killed_at(step):
@@ -78,9 +80,11 @@ def test_it_overfits_and_is_loaded_as_it_was(tmp_path):
     assert losses[-20:].mean() < losses[:5].mean() / 10
     sample = run.mixture.draw(0)
     loaded = run.cache.load(sample, run.objective.roles)
-    shown = run.objective.predict(run.objective.network.eval(), run.cache.finish([loaded], run.objective.roles), 3)
+    shown = run.objective.predict(
+        run.objective.network.eval(), run.cache.encode_missing([loaded], run.objective.roles), 3
+    )
     harmonizer = make_harmonizer("flux", HarmonizerOptions(weights=str(model), seed=3))
-    image = harmonizer.harmonize(inputs(fitted_pair(sample.source.read(sample.index), 32, 32))).image
+    image = harmonizer.harmonize(inputs(crop_pair_to_size(sample.source.read(sample.index), 32, 32))).image
     # kept latents are rounded to bfloat16 (2^-9 of values of about one), fresh ones are not
     assert (image - shown[0].permute(1, 2, 0)).abs().max() < 0.02
     stored = json.loads((model / "transformer" / "config.json").read_text())
@@ -146,10 +150,10 @@ def test_the_order_does_not_depend_on_the_number_of_passes(tmp_path):
 def test_kept_latents_are_the_fresh_ones_and_a_changed_picture_is_encoded_anew(tmp_path):
     run = training(tmp_path, "out")
     drawn, roles = run.mixture.draw(0), run.objective.roles
-    fresh = run.cache.finish([run.cache.load(drawn, roles)], roles)
+    fresh = run.cache.encode_missing([run.cache.load(drawn, roles)], roles)
     loaded = run.cache.load(drawn, roles)
     assert not loaded.pictures
-    kept = run.cache.finish([loaded], roles)
+    kept = run.cache.encode_missing([loaded], roles)
     assert all(torch.equal(fresh[role], kept[role]) for role in roles)
     target = next((tmp_path / "pairs").glob("*/target.png"))
     for path in (tmp_path / "pairs").glob("*/target.png"):
@@ -226,11 +230,13 @@ def test_object_removal_is_trained_by_the_same_loop(tmp_path):
         objective = RemovalObjective(str(folder), silent, checkpointing=False)
         mixture, held_out = split_mixture([source], weights=(), held_out=0.0, seed=0)
         cache = LatentCache(tmp_path / "latents", objective.encode, width=32, height=32, autoencoder="tiny")
-        return Training(objective, mixture, held_out, cache, loop, tmp_path / name, silent, progress)
+        return TrainingRun(objective, mixture, held_out, cache, loop, tmp_path / name, silent, progress)
 
     def error(folder):
         again, seeds = run("out", folder, loop), range(16)
-        latents = again.cache.finish([again.cache.load(again.mixture.draw(0), again.objective.roles)] * 16, ROLES)
+        latents = again.cache.encode_missing(
+            [again.cache.load(again.mixture.draw(0), again.objective.roles)] * 16, ROLES
+        )
         with torch.no_grad():
             return float(again.objective.loss(again.objective.network.eval(), latents, seeds))
 
@@ -243,7 +249,7 @@ def test_object_removal_is_trained_by_the_same_loop(tmp_path):
     trained, again = RemovalObjective(str(model), silent), run("out", base, loop)
     assert trained.network.config.in_channels == CHANNELS * 3
     pair = again.cache.load(again.mixture.draw(0), trained.roles)
-    latents = again.cache.finish([pair], trained.roles)
+    latents = again.cache.encode_missing([pair], trained.roles)
     with torch.no_grad():
         image = trained.predict(trained.network.eval(), latents, 0)
     assert image.shape == (1, 3, 32, 32)

@@ -22,7 +22,7 @@ from splatgraft.evaluation.benchmark.image_features import (
     kernel_distance,
 )
 from splatgraft.evaluation.benchmark.page import benchmark_html
-from splatgraft.evaluation.benchmark.published import PUBLISHED, download, scenes_of
+from splatgraft.evaluation.benchmark.published_datasets import PUBLISHED, download, find_scenes
 from splatgraft.evaluation.benchmark.table import Benchmark, Row, as_json, markdown
 from splatgraft.evaluation.benchmark.view_metrics import REGIONS, only_region
 from splatgraft.evaluation.regions import find_regions
@@ -106,7 +106,7 @@ class EvaluateBenchmark:
             layout = PUBLISHED[self.published]
             if self.download:
                 download(layout, self.scenes)
-            found = [GivenScene.of_published(scene) for scene in scenes_of(layout, self.scenes)]
+            found = [GivenScene.of_published(scene) for scene in find_scenes(layout, self.scenes)]
         else:
             found = [GivenScene.of(path.parent) for path in sorted(self.scenes.glob("*/ground_truth"))]
         if not found:

@@ -88,10 +88,10 @@ def page_html(report: "Report", views: Sequence[ViewFiles], *, turntable: str | 
         _steps(report.steps, report.machine),
         _list("What to know before trusting this", report.limits),
     ]
-    return framed(report.title, report.subtitle, "".join(sections), views=views)
+    return html_page(report.title, report.subtitle, "".join(sections), views=views)
 
 
-def framed(title: str, subtitle: str, sections: str, *, views: Sequence[ViewFiles]) -> str:
+def html_page(title: str, subtitle: str, sections: str, *, views: Sequence[ViewFiles]) -> str:
     """A page around HTML `sections`, with looks and behaviour inside; `views` is what a `viewer` on it shows."""
     here = files("splatgraft.evaluation")
     data = json.dumps([{**asdict(view), "files": dict(view.files)} for view in views]).replace("<", "\\u003c")

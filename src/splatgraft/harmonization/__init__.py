@@ -1,12 +1,12 @@
-"""Harmonize: one view at a time, an image model makes the light agree. Knows nothing about scenes or other views."""
+"""Harmonization of rendered views: an image model corrects the light on an inserted object, one view at a time."""
 
 from collections.abc import Callable
 
 from splatgraft.harmonization.compact.factory import make_compact
 from splatgraft.harmonization.flux.factory import make_flux
 from splatgraft.harmonization.inputs import render_views
+from splatgraft.harmonization.identity import IdentityHarmonizer
 from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
-from splatgraft.harmonization.keep_prior import KeepPrior
 from splatgraft.harmonization.options import HarmonizerOptions
 from splatgraft.harmonization.peers.factory import make_ic_light, make_image_editing, make_lbm, make_mv_colight
 from splatgraft.harmonization.reinhard import Reinhard
@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 HARMONIZERS: dict[str, Callable[[HarmonizerOptions], Harmonizer]] = {
-    "none": lambda options: KeepPrior(),
+    "none": lambda options: IdentityHarmonizer(),
     "reinhard": lambda options: Reinhard(),
     "compact": make_compact,
     "flux": make_flux,
@@ -32,7 +32,7 @@ HARMONIZERS: dict[str, Callable[[HarmonizerOptions], Harmonizer]] = {
     "mv-colight": make_mv_colight,
     "image-editing": make_image_editing,
 }
-"""Name to maker; a maker imports what is heavy only when called."""
+"""Name to factory function; a factory imports its heavy libraries only when it is called."""
 
 
 def make_harmonizer(name: str, options: HarmonizerOptions | None = None) -> Harmonizer:

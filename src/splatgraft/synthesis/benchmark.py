@@ -25,7 +25,8 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats import read_capture, write_capture
 from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
-from splatgraft.synthesis import furniture, objects, views
+from splatgraft.synthesis import furniture, objects
+from splatgraft.synthesis.cameras import capture_cameras
 from splatgraft.synthesis.jobs import Job, RenderSize, Take
 from splatgraft.synthesis.outdoors import SUPPLIED_MAPS
 from splatgraft.synthesis.pairs import make_scene
@@ -67,7 +68,7 @@ ROTATIONS: tuple[BenchmarkScene, ...] = tuple(
 )
 
 
-def twins(which: BenchmarkScene) -> tuple[BenchmarkScene, ...]:
+def scenes_with_shared_renders(which: BenchmarkScene) -> tuple[BenchmarkScene, ...]:
     """The other scenes of the same place and object: they differ in the turn of the object only, and share views."""
     return tuple(
         other
@@ -96,7 +97,7 @@ class BenchmarkSize:
         raise ValueError(f"benchmark size: expected small or paper, found '{name}'")
 
 
-def stage(seed: int, place: Place) -> Scene:
+def pedestal_scene(seed: int, place: Place) -> Scene:
     """A pedestal under an environment map with some things around: where the object was captured."""
     rng = random.Random(f"stage-{seed}")
     palette = Palette(rng)
@@ -142,7 +143,7 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
     target = Job(
         scene=scene,
         objects={"object": turned},
-        cameras=views.capture(scene, place, height, size.views, which.seed),
+        cameras=capture_cameras(scene, place, height, size.views, which.seed),
         takes=(
             Take("target", scene=True, passes=("color", "depth")),
             Take("ground_truth", scene=True, object="object", passes=seen),
@@ -151,11 +152,11 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
         size=size.render,
         provenance=provenance,
     )
-    own = stage(which.object_seed, place)
+    own = pedestal_scene(which.object_seed, place)
     source = Job(
         scene=own,
         objects={"object": there},
-        cameras=views.capture(own, place, height, size.views, which.object_seed),
+        cameras=capture_cameras(own, place, height, size.views, which.object_seed),
         takes=(Take("source", scene=True, object="object", passes=seen),),
         size=size.render,
         provenance=provenance,
@@ -237,14 +238,14 @@ def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out:
     (out / "scene.json").write_text(json.dumps(record, indent=1) + "\n")
 
 
-def fault(folder: Path) -> str | None:
+def find_defect(folder: Path) -> str | None:
     """What is wrong with a gathered scene, in a line, or None: missing, broken, black, burnt out, no object in it."""
     try:
         truth, target = read_capture(folder / "ground_truth"), read_capture(folder / "target")
         source = read_capture(folder / "source")
         for capture, masked in ((truth, True), (target, False), (source, True)):
             for index in range(len(capture)):
-                wrong = _view_fault(capture, index, masked=masked)
+                wrong = _find_view_defect(capture, index, masked=masked)
                 if wrong:
                     return wrong
     except ValueError as error:
@@ -252,7 +253,7 @@ def fault(folder: Path) -> str | None:
     return None
 
 
-def _view_fault(capture: PosedImages, index: int, *, masked: bool) -> str | None:
+def _find_view_defect(capture: PosedImages, index: int, *, masked: bool) -> str | None:
     path, image = capture.image_paths[index], capture.image(index)
     mean, deviation, burnt = float(image.mean()), float(image.std()), float((image > 0.995).float().mean())
     if mean < 0.02 or deviation < 0.01 or burnt > 0.6:

@@ -27,7 +27,8 @@ def box(size: Vector, location: Vector, material: Material, bevel: Number = 0.00
     return Part(shape="box", size=size, location=location, material=material, bevel=bevel)
 
 
-def _legs(width: Number, depth: Number, height: Number, thick: Number, material: Material) -> Parts:
+def legs(width: Number, depth: Number, height: Number, thick: Number, material: Material) -> Parts:
+    """Four square legs under the corners of a rectangle, metres."""
     x, y = width / 2 - thick, depth / 2 - thick
     return tuple(
         box((thick, thick, height), (sx * x, sy * y, height / 2), material) for sx in (-1, 1) for sy in (-1, 1)
@@ -46,10 +47,10 @@ def table(rng: random.Random, palette: Palette, width: Number, depth: Number, he
             Part("cylinder", (0.07, 0.07, height - thick), (0, 0, (height - thick) / 2), foot),
             Part("cylinder", (side * 0.5, side * 0.5, 0.02), (0, 0, 0.01), foot, bevel=0.005),
         )
-    legs = _legs(
+    table_legs = legs(
         width - 0.06, depth - 0.06, height - thick, rng.uniform(0.035, 0.07), rng.choice([top, palette.wood()])
     )
-    return (box((width, depth, thick), (0, 0, height - thick / 2), top, 0.008), *legs)
+    return (box((width, depth, thick), (0, 0, height - thick / 2), top, 0.008), *table_legs)
 
 
 def sofa(rng: random.Random, palette: Palette, width: Number = 1.9) -> Parts:
@@ -61,7 +62,7 @@ def sofa(rng: random.Random, palette: Palette, width: Number = 1.9) -> Parts:
         box((width, 0.2, 0.5), (0, depth / 2 - 0.1, 0.56), cloth, 0.06),
     ]
     parts += [box((0.18, depth, 0.36), (s * (width / 2 - 0.09), 0, 0.4), cloth, 0.05) for s in (-1, 1)]
-    parts += list(_legs(width - 0.1, depth - 0.1, 0.09, 0.05, wood))
+    parts += list(legs(width - 0.1, depth - 0.1, 0.09, 0.05, wood))
     count = 2 if width < 2.0 else 3
     each = (width - 0.36) / count
     for i in range(count):
@@ -82,7 +83,7 @@ def chair(rng: random.Random, palette: Palette) -> Parts:
     back = [box((0.035, 0.03, 0.45), (s * 0.19, 0.2, 0.68), frame) for s in (-1, 1)]
     rails = [box((0.36, 0.02, 0.06), (0, 0.2, 0.6 + 0.13 * i), frame) for i in range(3)]
     seat = [box((0.44, 0.44, 0.03), (0, 0, 0.44), frame, 0.01), Part("cushion", (0.41, 0.41, 0.06), (0, 0, 0.475), pad)]
-    return (*_legs(0.44, 0.44, 0.43, 0.035, frame), *back, *rails, *seat)
+    return (*legs(0.44, 0.44, 0.43, 0.035, frame), *back, *rails, *seat)
 
 
 def shelf(rng: random.Random, palette: Palette, width: Number = 0.9, height: Number = 1.8) -> Parts:

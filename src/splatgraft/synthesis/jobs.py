@@ -32,7 +32,7 @@ class RenderSize:
 
 
 @dataclass(frozen=True)
-class Sampling:
+class SurfaceSampling:
     """Points on surfaces, evenly by area, within a ball."""
 
     count: int
@@ -63,7 +63,7 @@ class Take:
 
     The panorama is linear light, scaled as the pictures are: row 0 is straight up, the middle column +x, and columns
     run to the right seen from inside; small suns are left out of it and listed by themselves."""
-    surface: Sampling | None = None
+    surface: SurfaceSampling | None = None
     """Instead of pictures: points on the object, or on the scene where none is named, `0000.npy` (n, 6): position and
     outward normal, world axes."""
 
@@ -127,7 +127,7 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
         raise ValueError(f"{log}: expected Blender to render every picture, found exit code {code}: {said}")
 
 
-def take_over(job: Job, out: Path, elder: Job, elder_out: Path) -> None:
+def copy_shared_takes(job: Job, out: Path, elder: Job, elder_out: Path) -> None:
     """Copy from `elder_out` the whole takes that `job` would render just the same; what `out` has stays.
 
     The first take decides the exposure, so where that is not shared, nothing is.

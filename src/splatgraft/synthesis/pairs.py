@@ -26,8 +26,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import read_rgb
-from splatgraft.synthesis import objects, views
-from splatgraft.synthesis.jobs import Job, RenderSize, Sampling, Take
+from splatgraft.synthesis import objects
+from splatgraft.synthesis.cameras import camera_arc
+from splatgraft.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take
 from splatgraft.synthesis.outdoors import OUTDOORS, SUPPLIED_MAPS, outdoor
 from splatgraft.synthesis.rooms import INTERIORS, interior
 from splatgraft.synthesis.scene import Scene, World
@@ -92,15 +93,17 @@ def plan(options: PairPlan, number: int) -> Job:
             alone = f"{name}_light{light}"
             takes.append(Take(alone, scene=False, object=name, world=world, exposure_group=alone))
             takes.append(Take(f"{alone}_probe", scene=False, world=world, exposure_group=alone, probe=middle))
-        takes.append(Take(f"{name}_surface", scene=False, object=name, surface=Sampling(_OBJECT_POINTS, middle, _NEAR)))
+        takes.append(
+            Take(f"{name}_surface", scene=False, object=name, surface=SurfaceSampling(_OBJECT_POINTS, middle, _NEAR))
+        )
     takes.append(Take("place_probe", scene=True, probe=middle))
-    takes.append(Take("scene_surface", scene=True, surface=Sampling(_SCENE_POINTS, middle, _NEAR)))
-    cameras = views.arc(scene, place, max(heights), number)
+    takes.append(Take("scene_surface", scene=True, surface=SurfaceSampling(_SCENE_POINTS, middle, _NEAR)))
+    cameras = camera_arc(scene, place, max(heights), number)
     provenance = {"kind": kind, "seed": str(options.seed), "number": str(number), "licence": "own render"}
     return Job(scene, things, cameras, tuple(takes), options.size, number, provenance)
 
 
-def folder_of(job: Job) -> str:
+def job_folder_name(job: Job) -> str:
     """The job's folder name."""
     return f"{job.scene.name}_{job.seed:05d}"
 
@@ -137,7 +140,7 @@ class Pair:
     albedo: Float[Tensor, "h w 3"]
 
 
-def normalized(
+def match_statistics(
     relit: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
     """The relit object with the mean and standard deviation, per channel, of the object in the scene (Sec. 4.2)."""
@@ -173,7 +176,7 @@ def load_pair(sample: PairSample) -> Pair:
         raise ValueError(f"{depth_path}: expected a float16 array, found {error}") from error
     normal = read_rgb(sample.path(sample.object, "normal")) * 2 - 1
     return Pair(
-        composite=composite(normalized(relit, target, mask), background, mask),
+        composite=composite(match_statistics(relit, target, mask), background, mask),
         target=target,
         background=background,
         mask=mask,
@@ -198,7 +201,7 @@ def samples_in(folder: Path) -> list[PairSample]:
     return [PairSample(folder, i, name, light) for i in range(cameras) for name, light in alone]
 
 
-def fault(sample: PairSample) -> str | None:
+def find_defect(sample: PairSample) -> str | None:
     """What is wrong with a pair, in a line, or None: missing, broken, empty, black, burnt out or unrelated."""
     try:
         pair = load_pair(sample)
@@ -230,7 +233,7 @@ def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
     for folder in folders:
         provenance = json.loads((folder / "job.json").read_text()).get("provenance", {})
         for sample in samples_in(folder):
-            wrong = fault(sample)
+            wrong = find_defect(sample)
             if wrong:
                 faults.append(wrong)
                 continue

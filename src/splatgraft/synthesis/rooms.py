@@ -101,7 +101,7 @@ def _centre(rng: random.Random, palette: Palette, kind: Interior) -> tuple[Parts
     if kind == "bathroom":
         stool = (
             Part("cylinder", (0.42, 0.42, 0.04), (0, 0, 0.43), palette.wood(), bevel=0.008),
-            *furniture._legs(0.3, 0.3, 0.41, 0.035, palette.wood()),
+            *furniture.legs(0.3, 0.3, 0.41, 0.035, palette.wood()),
         )
         return stool, Place((0, 0, 0.45), 0.16, 1.2), (0.5, 0.5)
     sizes = {

@@ -13,12 +13,12 @@ from torch import Tensor, nn
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE, read_prompt
 from splatgraft.harmonization.flux.network import velocity
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
-from splatgraft.harmonization.flux.weights.folder import FluxFolder, Variant, local_folder, part, write_about
+from splatgraft.harmonization.flux.weights.folder import FluxFolder, Variant, find_part, local_folder, write_description
 from splatgraft.harmonization.flux.weights.loading import load_autoencoder, load_transformer, widen_transformer
 from splatgraft.harmonization.flux.weights.lora import add_lora, write_lora
 from splatgraft.harmonization.flux.weights.widening import FirstLayer
 from splatgraft.training.objective import Latents
-from splatgraft.training.sources.source import Role
+from splatgraft.training.sources.pair_source import Role
 
 Times = Literal["uniform", "logit-normal", "schnell"]
 
@@ -55,13 +55,13 @@ class FluxObjective:
         checked = FluxFolder.open(folder)
         self._wanted, self._folder = wanted, folder
         config = checked.config
-        self._prompt_path = part(PROMPT_FILE, folder)
+        self._prompt_path = find_part(PROMPT_FILE, folder)
         self.prompt = read_prompt(
             self._prompt_path,
             tokens_width=config.get("joint_attention_dim", 4096),
             pooled_width=config.get("pooled_projection_dim", 768),
         )
-        self.autoencoder = load_autoencoder(part("vae", folder))
+        self.autoencoder = load_autoencoder(find_part("vae", folder))
         self.autoencoder.network.eval().requires_grad_(False)
         dtype = torch.bfloat16 if wanted.half and wanted.lora else torch.float32
         self.network = load_transformer(checked, dtype=dtype)
@@ -116,7 +116,7 @@ class FluxObjective:
         """Write a folder that `harmonize --method flux --weights` takes, or lora.safetensors that its --lora takes."""
         folder.mkdir(parents=True, exist_ok=True)
         about = {"variant": self._wanted.condition, "base": self._wanted.base, "first_layer": self._wanted.first_layer}
-        write_about(folder, about)
+        write_description(folder, about)
         if self._wanted.lora:
             write_lora(folder / "lora.safetensors", state, {"rank": str(self._wanted.lora), "base": self._wanted.base})
             return

@@ -10,15 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.harmonization.flux.weights.library import read_tensors, write_tensors
-from splatgraft.training.sources.source import Drawn, Role, fitted_pair
+from splatgraft.harmonization.flux.weights.tensor_file import read_tensors, write_tensors
+from splatgraft.training.sources.pair_source import PairReference, Role, crop_pair_to_size
 
 Encode = Callable[[Tensor], Tensor]
 """Pictures (b 3 h w) in [0, 1] to latents."""
 
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedPair:
     """What of one pair was read: latents where they were kept, else pictures."""
 
     latents: dict[str, Tensor]
@@ -34,7 +34,7 @@ class LatentCache:
         self._folder, self._encode = folder, encode
         self._size, self._job = (width, height), f"{autoencoder}|{width}x{height}"
 
-    def load(self, drawn: Drawn, roles: Sequence[Role]) -> Loaded:
+    def load(self, drawn: PairReference, roles: Sequence[Role]) -> LoadedPair:
         """What is kept of a pair's pictures, and the pictures of what is not.
 
         Raises: ValueError where a file is missing or broken.
@@ -44,11 +44,13 @@ class LatentCache:
         missing = [role for role in roles if role not in latents]
         pictures: dict[str, Tensor] = {}
         if missing:
-            pair = fitted_pair(drawn.source.read(drawn.index), *self._size)
+            pair = crop_pair_to_size(drawn.source.read(drawn.index), *self._size)
             pictures = {role: pair.picture(role).permute(2, 0, 1) for role in missing}
-        return Loaded(latents, pictures, paths)
+        return LoadedPair(latents, pictures, paths)
 
-    def finish(self, loaded: Sequence[Loaded], roles: Sequence[Role]) -> dict[str, Float[Tensor, "b c h w"]]:
+    def encode_missing(
+        self, loaded: Sequence[LoadedPair], roles: Sequence[Role]
+    ) -> dict[str, Float[Tensor, "b c h w"]]:
         """Latents of several pairs by role; what was missing is encoded and kept."""
         batch: dict[str, list[Tensor]] = {role: [] for role in roles}
         for item in loaded:

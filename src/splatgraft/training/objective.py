@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from splatgraft.training.sources.source import Role
+from splatgraft.training.sources.pair_source import Role
 
 Latents = Mapping[str, Tensor]
 """By role, (b c h w) each."""

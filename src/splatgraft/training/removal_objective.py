@@ -12,15 +12,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from splatgraft.harmonization.flux.ddim import NoiseSchedule, ddim
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
 from splatgraft.harmonization.flux.sampling import noise
-from splatgraft.harmonization.flux.stable_diffusion import NoiseSchedule, ddim
-from splatgraft.harmonization.flux.weights.folder import local_folder, part, read_config
-from splatgraft.harmonization.flux.weights.library import read_tensors, unet_class
+from splatgraft.harmonization.flux.weights.diffusers_library import unet_class
+from splatgraft.harmonization.flux.weights.folder import find_part, local_folder, read_config
 from splatgraft.harmonization.flux.weights.loading import load_autoencoder
-from splatgraft.harmonization.flux.weights.widening import widened
+from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
+from splatgraft.harmonization.flux.weights.widening import widen_layer
 from splatgraft.training.objective import Latents
-from splatgraft.training.sources.source import Role
+from splatgraft.training.sources.pair_source import Role
 
 CONDITIONS = 2
 _SAMPLING_STEPS = 20
@@ -39,14 +40,14 @@ class RemovalObjective:
         """
         folder = local_folder(base, say)
         config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
-        self._prompt_path = part(PROMPT_FILE, folder)
+        self._prompt_path = find_part(PROMPT_FILE, folder)
         if not self._prompt_path.is_file():
             raise ValueError(
                 f"{self._prompt_path}: expected the empty prompt's embeddings, found none; `splatgraft train embed "
                 f"{self._prompt_path} --kind stable-diffusion --base {base}` makes them once"
             )
         self.tokens = read_tensors(self._prompt_path)["tokens"]
-        self.autoencoder = load_autoencoder(part("vae", folder))
+        self.autoencoder = load_autoencoder(find_part("vae", folder))
         self.autoencoder.network.eval().requires_grad_(False)
         channels = self.autoencoder.channels
         if config["in_channels"] not in (channels, channels * (CONDITIONS + 1)):
@@ -60,7 +61,7 @@ class RemovalObjective:
             found = " ".join(str(error).split())[:200]
             raise ValueError(f"{folder / 'unet'}: expected weights that fit config.json, found {found}") from error
         if config["in_channels"] == channels:
-            self.network.conv_in = widened(self.network.conv_in, CONDITIONS + 1)
+            self.network.conv_in = widen_layer(self.network.conv_in, CONDITIONS + 1)
             self.network.register_to_config(in_channels=self.network.conv_in.in_channels)
         if checkpointing:
             self.network.enable_gradient_checkpointing()

@@ -18,14 +18,14 @@ from torch import Tensor
 
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.progress import Progress
-from splatgraft.training.averaging import Average
-from splatgraft.training.latent_cache import LatentCache, Loaded
+from splatgraft.training.latent_cache import LatentCache, LoadedPair
+from splatgraft.training.loop_options import LoopOptions
+from splatgraft.training.moving_average import MovingAverage
 from splatgraft.training.objective import Objective
 from splatgraft.training.optimizers import make_optimizer
-from splatgraft.training.records import LOG_FILE, Curve, cut_log
-from splatgraft.training.settings import Loop
-from splatgraft.training.sources.source import Mixture, sample_seed
-from splatgraft.training.validation import Validation, validate
+from splatgraft.training.sources.pair_source import Mixture, sample_seed
+from splatgraft.training.training_log import LOG_FILE, TrainingLog, truncate_log
+from splatgraft.training.validation import ValidationRun, validate
 
 MODEL_FOLDER = "model"
 _STATES = "states"
@@ -34,7 +34,7 @@ _KEPT_STATES = 2
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingRun:
     """All that one run is given."""
 
     objective: Objective
@@ -42,7 +42,7 @@ class Training:
     held_out: Mixture | None
     """Pairs to validate on; none where there is one scene."""
     cache: LatentCache
-    loop: Loop
+    loop: LoopOptions
     folder: Path
     """Gets states/, model/, validation/, log.jsonl."""
     say: Callable[[str], None]
@@ -58,7 +58,7 @@ class Training:
         return self.mixture.sources, self.mixture.indices
 
 
-def train(run: Training) -> Path:
+def train(run: TrainingRun) -> Path:
     """Train to the last step; returns the folder of the model.
 
     Raises: ValueError where the loss is no number, memory does not do, or an earlier run was another one.
@@ -77,7 +77,7 @@ def train(run: Training) -> Path:
 class _Loop:
     """What lives while a run runs."""
 
-    def __init__(self, run: Training, readers: ThreadPoolExecutor) -> None:
+    def __init__(self, run: TrainingRun, readers: ThreadPoolExecutor) -> None:
         from accelerate import Accelerator
 
         self._training, self._readers, loop = run, readers, run.loop
@@ -95,7 +95,7 @@ class _Loop:
         self._learning = {name for name, p in network.named_parameters() if p.requires_grad}
         optimizer = make_optimizer(loop.optimizer, [p for p in network.parameters() if p.requires_grad], loop.rate)
         run.objective.to(self._accelerator.device)
-        self._average = Average(network, loop.ema) if loop.ema else None
+        self._average = MovingAverage(network, loop.ema) if loop.ema else None
         self._network, self._optimizer = self._accelerator.prepare(network, optimizer)
         if self._average:
             self._accelerator.register_for_checkpointing(self._average)
@@ -107,7 +107,7 @@ class _Loop:
         """All steps that are left."""
         run, loop = self._training, self._training.loop
         self._resume()
-        curve = Curve(run.folder, loop.tensorboard) if self._accelerator.is_main_process else None
+        log = TrainingLog(run.folder, loop.tensorboard) if self._accelerator.is_main_process else None
         ahead = self._begin_reading(self.step)
         began, first = time.monotonic(), self.step
         for step in range(self.step, loop.steps):
@@ -115,25 +115,25 @@ class _Loop:
             batches, ahead = ahead, self._begin_reading(step + 1) if step + 1 < loop.steps else []
             loss = self._one_step(step, [[future.result() for future in part] for part in batches])
             self.step = step + 1
-            if curve:
-                curve.add(self.step, loss, loop.rate_at(step))
+            if log:
+                log.add(self.step, loss, loop.rate_at(step))
                 speed = (self.step - first) * loop.batch / max(time.monotonic() - began, 1e-9)
-                run.progress(self.step, loop.steps, f"loss {curve.smooth:.4f}, {speed:.2f} pairs/s")
+                run.progress(self.step, loop.steps, f"loss {log.smooth:.4f}, {speed:.2f} pairs/s")
             if self.step % loop.save_every == 0 or self.step == loop.steps:
                 self._save()
             if self.step % loop.validate_every == 0 or self.step == loop.steps:
-                self._validate(curve)
-        if curve:
-            curve.close()
+                self._validate(log)
+        if log:
+            log.close()
         return self._finish()
 
-    def _one_step(self, step: int, parts: list[list[Loaded]]) -> float:
+    def _one_step(self, step: int, parts: list[list[LoadedPair]]) -> float:
         run, loop, accelerator = self._training, self._training.loop, self._accelerator
         total = torch.zeros((), device=accelerator.device)
         for group in self._optimizer.param_groups:
             group["lr"] = loop.rate_at(step)
         for part, loaded in enumerate(parts):
-            latents = run.cache.finish(loaded, run.objective.roles)
+            latents = run.cache.encode_missing(loaded, run.objective.roles)
             latents = {role: tensor.to(accelerator.device) for role, tensor in latents.items()}
             seeds = [sample_seed(loop.seed, position) for position in self._positions(step, part)]
             with accelerator.accumulate(self._network):
@@ -162,7 +162,7 @@ class _Loop:
     def _begin_reading(self, step: int) -> list[list[Any]]:
         run = self._training
 
-        def read(position: int) -> Loaded:
+        def read(position: int) -> LoadedPair:
             return run.cache.load(run.mixture.draw(position), run.objective.roles)
 
         parts = range(run.loop.accumulate)
@@ -189,7 +189,7 @@ class _Loop:
     def _resume(self) -> None:
         run, states = self._training, _states(self._training.folder)
         if self._accelerator.is_main_process:
-            cut_log(run.folder / LOG_FILE, int(states[-1].name) if states else 0)
+            truncate_log(run.folder / LOG_FILE, int(states[-1].name) if states else 0)
         if not states:
             return
         path = states[-1] / _JOB_FILE
@@ -207,10 +207,10 @@ class _Loop:
         self.step = int(states[-1].name)
         run.say(f"goes on from step {self.step}")
 
-    def _validate(self, curve: Curve | None) -> None:
+    def _validate(self, log: TrainingLog | None) -> None:
         run = self._training
         mixture = run.held_out or run.mixture
-        asked = Validation(
+        asked = ValidationRun(
             run.objective,
             mixture.all()[: run.loop.validation_pairs],
             run.cache,
@@ -226,10 +226,10 @@ class _Loop:
         else:
             found, sheet = validate(asked, self._network)
         self._network.train()
-        if curve:
+        if log:
             label = "held out" if run.held_out else "trained on: no scene is held out"
             run.say(f"step {self.step}: {found.sentence} ({label})")
-            curve.add_validation(self.step, found.numbers, sheet)
+            log.add_validation(self.step, found.numbers, sheet)
 
     def _finish(self) -> Path:
         run, folder = self._training, self._training.folder / MODEL_FOLDER
@@ -252,7 +252,7 @@ class _Loop:
             weights[i] = {name: tensor for name, tensor in state.items() if name in self._learning}
 
     def _load_what_learns(self, models: list[Any], folder: str) -> None:
-        from splatgraft.harmonization.flux.weights.library import read_tensors
+        from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
 
         while models:
             network = self._accelerator.unwrap_model(models.pop())
@@ -264,7 +264,7 @@ def _states(folder: Path) -> list[Path]:
     return sorted(path for path in (folder / _STATES).glob("[0-9]*") if (path / _JOB_FILE).is_file())
 
 
-def launched(*, cpu: bool) -> tuple[int, int]:
+def process_counts(*, cpu: bool) -> tuple[int, int]:
     """Processes that accelerate runs, and how many of them share one copy of the weights."""
     from accelerate import PartialState
 

@@ -10,22 +10,22 @@ from torch import Tensor, nn
 from splatgraft.core.image_metrics import psnr, ssim
 from splatgraft.training.latent_cache import LatentCache
 from splatgraft.training.objective import Objective
-from splatgraft.training.sources.source import Drawn, TrainingPair, fitted_pair
+from splatgraft.training.sources.pair_source import PairReference, TrainingPair, crop_pair_to_size
 
 
 @dataclass(frozen=True)
-class Validation:
+class ValidationRun:
     """What is asked."""
 
     objective: Objective
-    pairs: Sequence[Drawn]
+    pairs: Sequence[PairReference]
     cache: LatentCache
     device: torch.device
     seed: int
 
 
 @dataclass(frozen=True)
-class Found:
+class ValidationResult:
     """Means over the pairs."""
 
     numbers: dict[str, float]
@@ -40,16 +40,16 @@ class Found:
 
 
 @torch.no_grad()
-def validate(asked: Validation, network: nn.Module) -> tuple[Found, Float[Tensor, "h w 3"]]:
+def validate(asked: ValidationRun, network: nn.Module) -> tuple[ValidationResult, Float[Tensor, "h w 3"]]:
     """Figures and a sheet: per pair its input, what the network made, what it should be."""
     rows, totals = [], {"psnr": 0.0, "ssim": 0.0, "psnr_object": 0.0, "psnr_input": 0.0}
     objective = asked.objective
     for drawn in asked.pairs:
         loaded = asked.cache.load(drawn, objective.roles)
-        latents = asked.cache.finish([loaded], objective.roles)
+        latents = asked.cache.encode_missing([loaded], objective.roles)
         latents = {role: tensor.to(asked.device) for role, tensor in latents.items()}
         made = objective.predict(network, latents, asked.seed)[0].permute(1, 2, 0).float().cpu()
-        pair = fitted_pair(drawn.source.read(drawn.index), made.shape[1], made.shape[0])
+        pair = crop_pair_to_size(drawn.source.read(drawn.index), made.shape[1], made.shape[0])
         wanted, given = pair.picture(objective.shown), _input(pair, objective)
         inside = pair.mask > 0.5
         totals["psnr"] += float(psnr(made, wanted))
@@ -58,7 +58,7 @@ def validate(asked: Validation, network: nn.Module) -> tuple[Found, Float[Tensor
         totals["psnr_input"] += float(psnr(given, wanted))
         rows.append(torch.cat([given, made, wanted], 1))
     numbers = {name: round(total / len(asked.pairs), 4) for name, total in totals.items()}
-    return Found(numbers), torch.cat(rows, 0)
+    return ValidationResult(numbers), torch.cat(rows, 0)
 
 
 def _input(pair: TrainingPair, objective: Objective) -> Float[Tensor, "h w 3"]:

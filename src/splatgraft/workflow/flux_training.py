@@ -10,12 +10,12 @@ import torch
 from splatgraft.project.folder_lock import locked
 from splatgraft.runtime.console import Console
 from splatgraft.training.latent_cache import LatentCache
-from splatgraft.training.prediction import Choice, Size, table, training_bytes
-from splatgraft.training.settings import Loop
-from splatgraft.training.sources.relit import RelitPairs
-from splatgraft.training.sources.rendered import RenderedPairs
-from splatgraft.training.sources.source import split_mixture
-from splatgraft.training.trainer import Training, is_first_process, launched, train
+from splatgraft.training.loop_options import LoopOptions
+from splatgraft.training.memory_estimate import MemoryOptions, TransformerSize, memory_table, training_bytes
+from splatgraft.training.sources.pair_source import split_mixture
+from splatgraft.training.sources.relit_pairs import RelitPairs
+from splatgraft.training.sources.rendered_pairs import RenderedPairs
+from splatgraft.training.trainer import TrainingRun, is_first_process, process_counts, train
 from splatgraft.workflow.training_data import DataOptions
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def train_flux(asked: "TrainFlux", console: Console) -> int:
     width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
     doubles, singles = config.get("num_layers", 19), config.get("num_single_layers", 38)
     pixels = math.prod(_pixels(asked.data))
-    size = Size(
+    size = TransformerSize(
         # with the modulations that inference bakes: 6 a stream of a double block, 3 a single one
         parameters=width**2 * (36 * doubles + 15 * singles),
         blocks=doubles + singles,
@@ -87,7 +87,7 @@ def _train(objective: Any, asked: "TrainFlux | TrainRemoval", base: str, console
     name = f"{vae.resolve()}|{vae.stat().st_size if vae.is_file() else 0}"
     cache = LatentCache(asked.out / "latents", objective.encode, width=width, height=height, autoencoder=name)
     with console.bar("train") as progress:
-        run = Training(objective, mixture, held_out, cache, asked.loop, asked.out, say, progress)
+        run = TrainingRun(objective, mixture, held_out, cache, asked.loop, asked.out, say, progress)
         # of several processes the first holds the folder; the others write nothing but latents, whole files each
         with locked(asked.out) if first else nullcontext():
             model = train(run)
@@ -103,10 +103,10 @@ def _pixels(data: DataOptions) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
-def _say_memory(size: Size, asked: "TrainFlux", console: Console) -> None:
-    loop: Loop = asked.loop
-    processes, shards = launched(cpu=loop.cpu)
-    choice = Choice(
+def _say_memory(size: TransformerSize, asked: "TrainFlux", console: Console) -> None:
+    loop: LoopOptions = asked.loop
+    processes, shards = process_counts(cpu=loop.cpu)
+    options = MemoryOptions(
         pairs=max(1, loop.batch // (processes * loop.accumulate)),
         lora=asked.lora,
         adam8bit=loop.optimizer == "adam8bit",
@@ -115,10 +115,10 @@ def _say_memory(size: Size, asked: "TrainFlux", console: Console) -> None:
         shards=shards,
         half=loop.precision != "no",
     )
-    for line in table(size, choice):
+    for line in memory_table(size, options):
         console.say(f"memory: {line}")
     if torch.cuda.is_available() and not loop.cpu:
-        free, need = torch.cuda.mem_get_info()[0], training_bytes(size, choice)
+        free, need = torch.cuda.mem_get_info()[0], training_bytes(size, options)
         if need > free and not asked.force:
             raise ValueError(
                 f"GPU memory: expected {need / 1e9:.0f} GB free, found {free / 1e9:.0f}; choose --lora, --optimizer "

@@ -9,10 +9,10 @@ from splatgraft.core.images import read_mask, read_rgb
 from splatgraft.project.folder_lock import locked
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
-from splatgraft.training.sources.generate import Unlit, Wanted, generate
-from splatgraft.training.sources.orida import LICENCE, Photograph, balanced, read_orida
-from splatgraft.training.sources.relighting_options import Relighting
-from splatgraft.training.sources.source import fitted
+from splatgraft.training.sources.generate import SamplePlan, UnrelitSample, generate
+from splatgraft.training.sources.orida import LICENCE, Photograph, choose_balanced, read_orida
+from splatgraft.training.sources.pair_source import crop_to_size
+from splatgraft.training.sources.relighting_options import RelightingOptions
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class OridaPairs:
     """Folder for one folder a photograph, manifest.jsonl and sheet.png to look at."""
     orida: Path
     """A folder with index.csv (image, mask, background, object, scene), or OBJECT/SCENE/images, masks, background.*."""
-    relighting: Relighting = field(default_factory=Relighting)
+    relighting: RelightingOptions = field(default_factory=RelightingOptions)
     number: int = 2000
     """Photographs to choose."""
     size: str = "704x496"
@@ -37,7 +37,7 @@ class OridaPairs:
         if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
             raise ValueError(f"--size: expected WIDTHxHEIGHT, found {self.size}")
         there = read_orida(self.orida)
-        chosen = balanced(there, self.number, self.seed)
+        chosen = choose_balanced(there, self.number, self.seed)
         objects, scenes = len({p.object for p in chosen}), len({p.scene for p in chosen})
         console.say(f"{len(chosen)} of {len(there)} photographs, {objects} objects in {scenes} scenes")
         lighting = self.relighting.open(self.seed)
@@ -49,22 +49,22 @@ class OridaPairs:
         return 0
 
 
-def _wanted(chosen: list[Photograph], width: int, height: int, seed: int) -> Iterator[Wanted]:
+def _wanted(chosen: list[Photograph], width: int, height: int, seed: int) -> Iterator[SamplePlan]:
     for photograph in chosen:
         record = {"image": photograph.image.name, "object": photograph.object, "scene": photograph.scene}
         record |= {"licence": LICENCE, "chosen_by": f"balanced, seed {seed}"}
-        yield Wanted(photograph.name, photograph.scene, partial(_read, photograph, width, height), record)
+        yield SamplePlan(photograph.name, photograph.scene, partial(_read, photograph, width, height), record)
 
 
-def _read(photograph: Photograph, width: int, height: int) -> Unlit:
+def _read(photograph: Photograph, width: int, height: int) -> UnrelitSample:
     target, background = read_rgb(photograph.image), read_rgb(photograph.background)
     mask = read_mask(photograph.mask)
     for path, picture in ((photograph.background, background), (photograph.mask, mask)):
         if picture.shape[:2] != target.shape[:2]:
             wanted, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
             raise ValueError(f"{path}: expected {wanted} pixels as {photograph.image.name}, found {found}")
-    images = (fitted(image, width, height).clamp(0, 1) for image in (target, background, mask))
-    return Unlit(*images)
+    images = (crop_to_size(image, width, height).clamp(0, 1) for image in (target, background, mask))
+    return UnrelitSample(*images)
 
 
 COMMAND = OridaPairs

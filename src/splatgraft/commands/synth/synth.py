@@ -15,7 +15,7 @@ from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task, run_tasks
 from splatgraft.synthesis import benchmark, pairs
-from splatgraft.synthesis.jobs import Job, RenderSize, check_blender, render_job, take_over
+from splatgraft.synthesis.jobs import Job, RenderSize, check_blender, copy_shared_takes, render_job
 from splatgraft.synthesis.outdoors import SUPPLIED_MAPS
 from splatgraft.workflow.benchmark.true_light_file import write_true_light
 
@@ -96,7 +96,7 @@ class Pairs:
                 except ValueError as error:
                     failures.append(f"scene {number}: {error}")
                     continue
-                folders.append(self.out / pairs.folder_of(job))
+                folders.append(self.out / pairs.job_folder_name(job))
                 tasks.append(Task(folders[-1].name, partial(render_job, job, folders[-1], python)))
             failures += self.workers.run(tasks, self.out, console)
             return _check_pairs(self.out, failures, console)
@@ -129,7 +129,11 @@ class Benchmark:
         with locked(self.out):
             failures = []
             # what several turns of one object share is rendered once: with the first of them
-            first = [which for i, which in enumerate(chosen) if not set(chosen[:i]) & set(benchmark.twins(which))]
+            first = [
+                which
+                for i, which in enumerate(chosen)
+                if not set(chosen[:i]) & set(benchmark.scenes_with_shared_renders(which))
+            ]
             for wave in (first, [which for which in chosen if which not in first]):
                 tasks = []
                 for which in wave:
@@ -145,18 +149,18 @@ class Benchmark:
         return 1 if failures else 0
 
     def _take_over(self, which: benchmark.BenchmarkScene, size: benchmark.BenchmarkSize) -> None:
-        for twin in benchmark.twins(which):
+        for twin in benchmark.scenes_with_shared_renders(which):
             ours, theirs = benchmark.plan(which, size), benchmark.plan(twin, size)
             for job, folder, elder, there in zip(ours, self._folders(which), theirs, self._folders(twin), strict=True):
                 if not job.is_done(folder):
-                    take_over(job, folder, elder, there)
+                    copy_shared_takes(job, folder, elder, there)
 
     def _gather(self, which: benchmark.BenchmarkScene, console: Console) -> list[str]:
         out = self.out / which.name
         if not (out / "true_light.json").is_file():
             benchmark.gather(which, *self._folders(which), out)
             write_true_light(out)
-        wrong = benchmark.fault(out)
+        wrong = benchmark.find_defect(out)
         if wrong is None:
             console.result(out)
         return [wrong] if wrong else []
@@ -190,7 +194,7 @@ class Check:
         scenes = sorted(path.parent for path in self.out.glob("*/scene.json"))
         if not scenes:
             return _check_pairs(self.out, [], console)
-        faults = [wrong for wrong in map(benchmark.fault, scenes) if wrong]
+        faults = [wrong for wrong in map(benchmark.find_defect, scenes) if wrong]
         console.say(f"{len(scenes) - len(faults)} of {len(scenes)} scenes are sound")
         _write_failures(self.out, faults, console)
         return 1 if faults else 0

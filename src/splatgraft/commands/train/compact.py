@@ -7,8 +7,8 @@ from pathlib import Path
 from splatgraft.project.step import Device, Positional, choose_device
 from splatgraft.runtime.console import Console
 from splatgraft.synthesis.pairs import read_manifest
-from splatgraft.training.compact.loop import CompactLoop, CompactTraining, train_compact
-from splatgraft.training.compact.pairs import CompactPairs, HeldOut
+from splatgraft.training.compact.loop import CompactLoopOptions, CompactTraining, train_compact
+from splatgraft.training.compact.pairs import CompactPairs, HeldOutOptions
 from splatgraft.training.compact.priors import write_priors
 
 
@@ -20,8 +20,8 @@ class TrainCompact:
     """Folder for compact.safetensors, priors/, state, log and validation pictures."""
     pairs: Path
     """Folder that `splatgraft synth pairs` rendered."""
-    loop: CompactLoop = field(default_factory=CompactLoop)
-    held_out: HeldOut = field(default_factory=HeldOut)
+    loop: CompactLoopOptions = field(default_factory=CompactLoopOptions)
+    held_out: HeldOutOptions = field(default_factory=HeldOutOptions)
     variants: int = 1
     """Wrong lights per pair; each more adds 0.25 MB a pair at 240x160."""
     start: Path | None = None

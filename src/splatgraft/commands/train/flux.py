@@ -5,7 +5,7 @@ from typing import Literal
 
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
-from splatgraft.training.settings import Loop
+from splatgraft.training.loop_options import LoopOptions
 from splatgraft.workflow.training_data import DataOptions
 
 
@@ -18,7 +18,7 @@ class TrainFlux:
     base: str = "black-forest-labs/FLUX.1-schnell"
     """Folder or hub id with transformer/ and vae/; a harmoniser's folder goes on training that one."""
     data: DataOptions = field(default_factory=DataOptions)
-    loop: Loop = field(default_factory=Loop)
+    loop: LoopOptions = field(default_factory=LoopOptions)
     condition: Literal["image-mask", "image-background"] = "image-mask"
     """What joins the composite: the object's mask (the paper) or the scene without it."""
     first_layer: Literal["repeat", "zero"] = "repeat"

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
-from splatgraft.training.settings import Loop
+from splatgraft.training.loop_options import LoopOptions
 from splatgraft.workflow.training_data import DataOptions
 
 
@@ -17,7 +17,7 @@ class TrainRemoval:
     base: str = "stabilityai/stable-diffusion-2"
     """Folder or hub id with unet/ and vae/."""
     data: DataOptions = field(default_factory=DataOptions)
-    loop: Loop = field(default_factory=lambda: Loop(steps=260_000, batch=8, rate=1e-5))
+    loop: LoopOptions = field(default_factory=lambda: LoopOptions(steps=260_000, batch=8, rate=1e-5))
     no_checkpointing: bool = False
     """Keep activations instead of computing them twice: faster, several times the memory."""
     force: bool = False

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from html import escape
 
 from splatgraft.evaluation.benchmark.table import Benchmark, Table, tables
-from splatgraft.evaluation.report_page import ViewFiles, framed, viewer
+from splatgraft.evaluation.report_page import ViewFiles, html_page, viewer
 
 
 def benchmark_html(benchmark: Benchmark, views: Sequence[ViewFiles]) -> str:
@@ -20,7 +20,7 @@ def benchmark_html(benchmark: Benchmark, views: Sequence[ViewFiles]) -> str:
     scenes = len(benchmark.scenes)
     count = f"{len(benchmark.methods)} methods on {scenes} scene{'s' if scenes != 1 else ''}"
     subtitle = f"{count}; means over held-out views, then over scenes, with 95% bootstrap intervals over scenes."
-    return framed("Benchmark of object transfer", subtitle, "".join(sections), views=views)
+    return html_page("Benchmark of object transfer", subtitle, "".join(sections), views=views)
 
 
 def _section(table: Table) -> str:

@@ -1,6 +1,7 @@
-"""What the compact network is shown of a view, and how its answer becomes a picture. Knows no network.
+"""The compact network's input channels, and how its output is applied to a view.
 
-Every factor is laid onto the composite's own pixels at full resolution: texture is multiplied, never made up.
+All output is gain, matrix or offset on the composite's own pixels at full resolution, so the network adds no texture
+of its own.
 """
 
 from dataclasses import dataclass
@@ -17,117 +18,145 @@ from splatgraft.harmonization.interface import HarmonizerInputs
 CHANNELS = 16
 SH_COUNT = 9
 GRID_BINS = 4
-_LIFT = 0.004
-"""Linear light below which a ratio says nothing: 1/255 of white."""
-_MOST = 3.0
-"""Largest log ratio of the prior."""
-_PICTURES = ("composite", "background", "mask", "log_ratio", "depth", "normal")
+_IMAGES = ("composite", "background", "mask", "log_ratio", "depth", "normal")
 
 
 @dataclass(frozen=True)
-class View:
-    """A batch of views in linear light, channels first, at any one size."""
+class CompactEncoding:
+    """How views are encoded for the network; set by hand, and fixed by the weights that were trained with it."""
+
+    ratio_offset: float = 0.004
+    """Linear light added to both sides of a ratio: 1/255 of white, below which a ratio carries no information."""
+    max_log_ratio: float = 3.0
+    """Bound of the prior's log ratio, either sign."""
+    max_log_gain: float = 4.0
+    """Bound of the total log gain that is applied, either sign."""
+    max_log_depth: float = 2.0
+    """Bound of the relative log depth, either sign; also the value where nothing is hit."""
+    log_offset: float = 1 / 64
+    """Linear light added before the logarithm of a colour channel."""
+    luma_gamma: float = 2.2
+    """Brightness axis of the bilateral grid: mean linear light to the power of its inverse."""
+
+
+ENCODING = CompactEncoding()
+
+
+@dataclass(frozen=True)
+class CompactInput:
+    """A batch of views in linear light, channels first, all of one size."""
 
     composite: Float[Tensor, "b 3 h w"]
-    """Linear, as pasted."""
+    """Linear light, before light transfer."""
     background: Float[Tensor, "b 3 h w"]
-    """Linear, without the object."""
+    """Linear light, without the object."""
     mask: Float[Tensor, "b 1 h w"]
     log_ratio: Float[Tensor, "b 3 h w"]
-    """Of the prior over the composite, see `log_ratio_of`; 0 where there is no prior."""
+    """Of the prior over the composite, see `log_light_ratio`; 0 where there is no prior."""
     depth: Float[Tensor, "b 1 h w"]
-    """Log of depth over the object's median depth, clamped to [-2, 2]; 2 where nothing is."""
+    """Log of depth over the object's median depth, clamped to [-2, 2]; 2 where nothing is hit."""
     normal: Float[Tensor, "b 3 h w"]
-    """Unit, in the camera's frame: right, down, away; 0 where nothing is."""
+    """Unit, in the camera's frame (OpenCV axes); 0 where nothing is hit."""
     prior_confidence: Float[Tensor, "b"]
-    """In the prior, in [0, 1]."""
+    """Confidence in the prior, in [0, 1]."""
 
     def channels(self) -> Float[Tensor, "b 16 h w"]:
-        """What the network sees."""
+        """The network's input channels."""
         b, _, h, w = self.mask.shape
         prior_confidence = self.prior_confidence[:, None, None, None].expand(b, 1, h, w)
-        there = (self.normal.abs().sum(1, keepdim=True) > 0).to(self.mask)
-        lights = [_compressed(self.composite), _compressed(self.background), self.log_ratio]
-        return torch.cat([*lights, 2 * self.mask - 1, self.depth, there, self.normal, prior_confidence], 1)
+        hit = (self.normal.abs().sum(1, keepdim=True) > 0).to(self.mask)
+        colors = [_log_encoded(self.composite), _log_encoded(self.background), self.log_ratio]
+        return torch.cat([*colors, 2 * self.mask - 1, self.depth, hit, self.normal, prior_confidence], 1)
 
     def prior(self) -> Float[Tensor, "b 3 h w"]:
-        """What the light transfer made, linear."""
-        return ((self.composite + _LIFT) * self.log_ratio.exp() - _LIFT).clamp_min(0)
+        """The view after light transfer, linear light."""
+        offset = ENCODING.ratio_offset
+        return ((self.composite + offset) * self.log_ratio.exp() - offset).clamp_min(0)
 
-    def to(self, device: torch.device) -> "View":
-        """The same on a device."""
-        return View(**{name: getattr(self, name).to(device) for name in (*_PICTURES, "prior_confidence")})
+    def to(self, device: torch.device) -> "CompactInput":
+        """Move all tensors to a device."""
+        return CompactInput(**{name: getattr(self, name).to(device) for name in (*_IMAGES, "prior_confidence")})
 
-    def resized(self, height: int, width: int) -> "View":
-        """The same at another size; averaged where it gets smaller."""
+    def resized(self, height: int, width: int) -> "CompactInput":
+        """Resize all images bilinearly, with antialiasing where the size decreases."""
 
-        def to(x: Tensor) -> Tensor:
+        def resize(x: Tensor) -> Tensor:
             return F.interpolate(x, size=(height, width), mode="bilinear", antialias=True, align_corners=False)
 
-        return View(**{name: to(getattr(self, name)) for name in _PICTURES}, prior_confidence=self.prior_confidence)
+        images = {name: resize(getattr(self, name)) for name in _IMAGES}
+        return CompactInput(**images, prior_confidence=self.prior_confidence)
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What the network says of a view; at its own, lower resolution."""
+class CompactOutput:
+    """The network's prediction for a batch of views, at a lower resolution."""
 
-    object_follow: Float[Tensor, "b 1 i j"]
-    """By how much the prior's log ratio is believed above 1, on the object."""
+    object_prior_scale: Float[Tensor, "b 1 i j"]
+    """Factor on the prior's log ratio on the object, as a difference from 1."""
     object_gain: Float[Tensor, "b 3 i j"]
     """Log gain on the object."""
     object_sh: Float[Tensor, "b 9 3"]
-    """Log gain on the object by its normal, in spherical harmonics of degree 2."""
+    """Log gain on the object as a function of the normal, spherical harmonics of degree 2."""
     object_grid: Float[Tensor, "b 12 l p q"]
-    """Bilateral grid (Chen et al. 2007) of affine colour maps, as a change: 3 rows of 3 factors and an offset."""
-    scene_follow: Float[Tensor, "b 1 i j"]
-    """As `object_follow`, off the object."""
+    """Bilateral grid (Chen et al. 2007) of affine colour maps, as a difference: 3 rows of 3 factors and an offset."""
+    scene_prior_scale: Float[Tensor, "b 1 i j"]
+    """As `object_prior_scale`, off the object."""
     scene_gain: Float[Tensor, "b 3 i j"]
     """Log gain off the object: shadow and bounce."""
     scene_added: Float[Tensor, "b 3 i j"]
     """Linear light added off the object: reflections."""
     log_error: Float[Tensor, "b 1 i j"]
-    """Log of the error that the network expects of itself, sRGB."""
+    """Log of the expected absolute error, sRGB."""
 
-    def whole(self) -> "Answer":
-        """The same in float32."""
-        return Answer(**{name: tensor.float() for name, tensor in vars(self).items()})
-
-
-def log_ratio_of(prior: Float[Tensor, "*n"], composite: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Log of prior over composite, both linear; safe in the dark."""
-    return ((prior + _LIFT) / (composite + _LIFT)).log().clamp(-_MOST, _MOST)
+    def float(self) -> "CompactOutput":
+        """Convert all tensors to float32."""
+        return CompactOutput(**{name: tensor.float() for name, tensor in vars(self).items()})
 
 
-def composed(view: View, answer: Answer) -> Float[Tensor, "b 3 h w"]:
-    """The harmonised view, linear, at the size of `view`. With an answer of zeros it is the prior."""
+def log_light_ratio(prior: Float[Tensor, "*n"], composite: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Clamped logarithm of prior over composite, both linear light with a small offset."""
+    offset, bound = ENCODING.ratio_offset, ENCODING.max_log_ratio
+    return ((prior + offset) / (composite + offset)).log().clamp(-bound, bound)
+
+
+def apply_output(view: CompactInput, output: CompactOutput) -> Float[Tensor, "b 3 h w"]:
+    """Apply the network's output to a view.
+
+    Args:
+        view: inputs at any size.
+        output: the network's prediction; zeros give the prior.
+
+    Returns:
+        Linear light at the size of `view`, at least 0.
+    """
     size = view.mask.shape[-2:]
 
     def up(x: Tensor) -> Tensor:
         return F.interpolate(x, size=size, mode="bilinear", align_corners=False)
 
     mask = view.mask
-    by_normal = torch.einsum("bkhw,bkc->bchw", _harmonics(view.normal), answer.object_sh)
-    on_object = (1 + up(answer.object_follow)) * view.log_ratio + up(answer.object_gain) + by_normal
-    on_scene = (1 + up(answer.scene_follow)) * view.log_ratio + up(answer.scene_gain)
-    total = mask * on_object + (1 - mask) * on_scene
-    lit = (view.composite + _LIFT) * total.clamp(-4, 4).exp() - _LIFT
-    lit = lit + mask * _affine(lit, answer.object_grid) + (1 - mask) * up(answer.scene_added)
+    by_normal = torch.einsum("bkhw,bkc->bchw", _harmonics(view.normal), output.object_sh)
+    on_object = (1 + up(output.object_prior_scale)) * view.log_ratio + up(output.object_gain) + by_normal
+    on_scene = (1 + up(output.scene_prior_scale)) * view.log_ratio + up(output.scene_gain)
+    log_gain = (mask * on_object + (1 - mask) * on_scene).clamp(-ENCODING.max_log_gain, ENCODING.max_log_gain)
+    lit = (view.composite + ENCODING.ratio_offset) * log_gain.exp() - ENCODING.ratio_offset
+    lit = lit + mask * _affine(lit, output.object_grid) + (1 - mask) * up(output.scene_added)
     return lit.clamp_min(0)
 
 
-def view_of(inputs: HarmonizerInputs) -> View:
-    """One view as a batch of one."""
-    lights = [
-        linear_from_srgb(picture.clamp(0, 1)).permute(2, 0, 1)[None]
-        for picture in (inputs.composite, inputs.background, inputs.prior)
+def compact_input(inputs: HarmonizerInputs) -> CompactInput:
+    """Convert one view to a batch of one in linear light."""
+    composite, background, prior = [
+        linear_from_srgb(image.clamp(0, 1)).permute(2, 0, 1)[None]
+        for image in (inputs.composite, inputs.background, inputs.prior)
     ]
-    turn = inputs.camera_from_world
-    normal = inputs.normal if turn is None else inputs.normal @ turn.T
-    return View(
-        composite=lights[0],
-        background=lights[1],
+    rotation = inputs.camera_from_world
+    normal = inputs.normal if rotation is None else inputs.normal @ rotation.T
+    return CompactInput(
+        composite=composite,
+        background=background,
         mask=inputs.mask.clamp(0, 1)[None, None],
-        log_ratio=log_ratio_of(lights[2], lights[0]),
+        log_ratio=log_light_ratio(prior, composite),
         depth=relative_depth(inputs.depth, inputs.mask)[None, None],
         normal=normal.permute(2, 0, 1)[None],
         prior_confidence=torch.tensor([inputs.prior_confidence]),
@@ -135,17 +164,17 @@ def view_of(inputs: HarmonizerInputs) -> View:
 
 
 def relative_depth(depth: Float[Tensor, "h w"], mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Log of depth over the object's median, clamped to [-2, 2]; 2 where nothing is."""
-    there = depth > 0
-    inside = there & (mask > 0.5)
-    known = depth[inside] if bool(inside.any()) else depth[there]
-    middle = known.median() if known.numel() else depth.new_ones(())
-    return torch.where(there, (depth.clamp_min(1e-6) / middle).log().clamp(-2, 2), 2.0)
+    """Log of depth over the object's median depth, clamped to [-2, 2]; 2 where nothing is hit."""
+    hit, bound = depth > 0, ENCODING.max_log_depth
+    inside = hit & (mask > 0.5)
+    known = depth[inside] if bool(inside.any()) else depth[hit]
+    median = known.median() if known.numel() else depth.new_ones(())
+    return torch.where(hit, (depth.clamp_min(1e-6) / median).log().clamp(-bound, bound), bound)
 
 
-def _compressed(linear: Tensor) -> Tensor:
-    """Log light, about [-1, 1]: a stop is the same step everywhere."""
-    return (linear + 1 / 64).log() / 2 + 1
+def _log_encoded(linear: Tensor) -> Tensor:
+    """Logarithm of light, scaled to about [-1, 1]."""
+    return (linear + ENCODING.log_offset).log() / 2 + 1
 
 
 def _harmonics(normal: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 9 h w"]:
@@ -155,12 +184,12 @@ def _harmonics(normal: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 9 h w"]:
 
 
 def _affine(lit: Float[Tensor, "b 3 h w"], grid: Float[Tensor, "b 12 l p q"]) -> Float[Tensor, "b 3 h w"]:
-    """The change that the grid makes to colours: cells by place and by brightness, interpolated."""
+    """Difference of colours by the bilateral grid, sliced by pixel position and brightness."""
     b, _, h, w = lit.shape
-    luma = lit.mean(1).clamp(0, 1) ** (1 / 2.2) * 2 - 1
+    luma = lit.mean(1).clamp(0, 1) ** (1 / ENCODING.luma_gamma) * 2 - 1
     y = (torch.arange(h, device=lit.device) + 0.5) / h * 2 - 1
     x = (torch.arange(w, device=lit.device) + 0.5) / w * 2 - 1
-    where = torch.stack([x.expand(b, h, w), y[:, None].expand(b, h, w), luma], -1)[:, None]
-    sliced = F.grid_sample(grid, where, padding_mode="border", align_corners=False)[:, :, 0]
+    coordinates = torch.stack([x.expand(b, h, w), y[:, None].expand(b, h, w), luma], -1)[:, None]
+    sliced = F.grid_sample(grid, coordinates, padding_mode="border", align_corners=False)[:, :, 0]
     rows = sliced.reshape(b, 3, 4, h, w)
     return (rows[:, :, :3] * lit[:, None]).sum(2) + rows[:, :, 3]

@@ -1,38 +1,52 @@
-"""The harmoniser `compact`: the network asked at a low resolution, its answer laid on the whole picture."""
+"""The harmoniser `compact`: the network runs at a low resolution, its output is applied at full resolution."""
+
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 
 from splatgraft.core.images import srgb_from_linear
-from splatgraft.harmonization.compact.features import composed, view_of
+from splatgraft.harmonization.compact.features import apply_output, compact_input
 from splatgraft.harmonization.compact.network import CompactNetwork
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
 
-_LONG_SIDE = 256
 _STRIDE = 16
-_USUAL_ERROR = 0.05
-"""sRGB; an expected error of this size halves the confidence."""
+"""The network halves the image four times."""
+
+
+@dataclass(frozen=True)
+class CompactInference:
+    """Numbers of the inference, set by hand."""
+
+    long_side: int = 256
+    """Pixels of the longer side of the network's input; smaller views are not enlarged."""
+    half_confidence_error: float = 0.05
+    """sRGB; the expected error at which the confidence is one half."""
+
+
+INFERENCE = CompactInference()
 
 
 class Compact:
-    """Gives the prior a small network's corrections; one step, no noise, the same every time."""
+    """Corrects the prior by a small network, in one deterministic step."""
 
     def __init__(self, network: CompactNetwork, *, device: torch.device, strength: float = 1.0) -> None:
-        """`strength`: how much of the correction is made, in [0, 1]."""
+        """Move `network` to `device`; `strength` in [0, 1] scales the correction (0 returns the prior)."""
         self._network, self._device, self._strength = network.to(device), device, strength
 
     @torch.no_grad()
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """The corrected prior, and how sure the network is of it; the prior itself where there is no object."""
+        """Correct the prior and estimate the confidence; return the prior itself where no object is visible."""
         if float(view.mask.max()) < 0.5:
             return Harmonized(image=view.prior)
-        whole = view_of(view).to(self._device)
+        full_size = compact_input(view).to(self._device)
         h, w = view.mask.shape
-        factor = min(1.0, _LONG_SIDE / max(h, w))
-        small = whole.resized(*(max(_STRIDE, round(side * factor / _STRIDE) * _STRIDE) for side in (h, w)))
-        answer = self._network(small.channels())
-        made = srgb_from_linear(composed(whole, answer)[0].clamp(0, 1)).permute(1, 2, 0).cpu()
-        error = F.interpolate(answer.log_error, size=(h, w), mode="bilinear", align_corners=False)[0, 0].exp().cpu()
+        factor = min(1.0, INFERENCE.long_side / max(h, w))
+        small = full_size.resized(*(max(_STRIDE, round(side * factor / _STRIDE) * _STRIDE) for side in (h, w)))
+        output = self._network(small.channels())
+        image = srgb_from_linear(apply_output(full_size, output)[0].clamp(0, 1)).permute(1, 2, 0).cpu()
+        error = F.interpolate(output.log_error, size=(h, w), mode="bilinear", align_corners=False)[0, 0].exp().cpu()
         return Harmonized(
-            image=torch.lerp(view.prior, made, self._strength), confidence=1 / (1 + (error / _USUAL_ERROR) ** 2)
+            image=torch.lerp(view.prior, image, self._strength),
+            confidence=1 / (1 + (error / INFERENCE.half_confidence_error) ** 2),
         )

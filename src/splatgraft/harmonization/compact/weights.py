@@ -1,4 +1,4 @@
-"""Weights of the compact network as one safetensors file: float16, its sizes in the header. Knows no pictures."""
+"""Reads and writes the compact network's weights: one safetensors file in float16, with the sizes in the header."""
 
 from pathlib import Path
 
@@ -14,16 +14,24 @@ FORMAT = "splatgraft compact 1"
 
 
 def write_weights(path: Path, size: CompactSize, state: dict[str, Tensor], notes: dict[str, str]) -> None:
-    """Write a network; `notes` say how it was trained."""
+    """Write a network.
+
+    Args:
+        path: the .safetensors file.
+        size: the network's widths and depths.
+        state: the network's state_dict; stored as float16.
+        notes: how it was trained, for the header.
+    """
     halves = {name: tensor.detach().cpu().to(torch.float16).contiguous() for name, tensor in state.items()}
     with atomic_write(path) as stream:
         stream.write(save(halves, {"format": FORMAT, **size.to_text(), **notes}))
 
 
 def read_weights(path: Path) -> CompactNetwork:
-    """The network, ready to be asked.
+    """Read a network in evaluation mode, with gradients off.
 
-    Raises: ValueError where the file is missing, broken or of something else.
+    Raises:
+        ValueError: the file is missing, broken or holds something else.
     """
     try:
         with safe_open(str(path), "pt") as file:

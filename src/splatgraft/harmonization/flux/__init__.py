@@ -1,1 +1,1 @@
-"""The paper's harmoniser: FLUX.1-schnell given the composite and the mask. Knows nothing about scenes."""
+"""The paper's harmoniser (Sec. 4): FLUX.1-schnell conditioned on the composite and the object's mask."""

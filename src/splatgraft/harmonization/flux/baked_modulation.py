@@ -1,7 +1,7 @@
-"""adaLN modulations as a table: with one prompt and fixed noise levels they are constants. Changes no arithmetic.
+"""Precomputed adaLN modulations: with one prompt and fixed noise levels they are constants, kept in a table.
 
-FLUX spends 3.27 of its 11.89 billion parameters on layers that turn (prompt, noise level) into scales and shifts; four
-rows of a table say the same (8.62 billion parameters remain).
+FLUX uses 3.27 of its 11.89 billion parameters in layers that map (prompt, noise level) to scales and shifts. A table
+with one row per noise level replaces them (8.62 billion parameters remain) with bit-identical results.
 """
 
 from typing import Any, no_type_check
@@ -10,39 +10,45 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from splatgraft.harmonization.flux.empty_prompt import Prompt
+from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
 
 
 class BakedLevels(nn.Module):
-    """In the place of the time and text embedding: says in which row of the tables a noise level stands."""
+    """Replaces the time and text embedding: maps a noise level to its row in the tables."""
 
     levels: Tensor
 
     def __init__(self, levels: tuple[float, ...], device: torch.device) -> None:
-        """`levels` in [0, 1], as the network is called with."""
+        """Store the noise `levels` in [0, 1] that the network will be called with."""
         super().__init__()
         self.register_buffer("levels", torch.tensor(levels, device=device) * 1000, persistent=False)
 
     @no_type_check  # the tests' shape checks cannot be traced by torch.compile
     def forward(self, timestep: Float[Tensor, " b"], pooled: Float[Tensor, "b p"]) -> Int[Tensor, " b"]:
-        """Row of each sample; the nearest, since bfloat16 rounds 750 to 752."""
+        """Row of each sample: the nearest level, since bfloat16 rounds 750 to 752."""
         return (timestep.float()[:, None] - self.levels).abs().argmin(1)
 
 
 class BakedModulation(nn.Module):
-    """In the place of a modulated norm with a linear layer: the norm and the table of what that layer gave."""
+    """Replaces a modulated norm: keeps the norm and a table of its linear layer's outputs."""
 
     table: Tensor
 
     def __init__(self, norm: nn.Module, table: Float[Tensor, "s d"], parts: int) -> None:
-        """`parts`: 6 for AdaLayerNormZero, 3 for AdaLayerNormZeroSingle, 2 for AdaLayerNormContinuous."""
+        """Keep `norm` and `table`.
+
+        Args:
+            norm: the normalisation without modulation.
+            table: output of the linear layer, one row per noise level.
+            parts: outputs per row: 6 for AdaLayerNormZero, 3 for AdaLayerNormZeroSingle, 2 for AdaLayerNormContinuous.
+        """
         super().__init__()
         self.norm, self.parts = norm, parts
         self.register_buffer("table", table, persistent=False)
 
     @no_type_check  # the tests' shape checks cannot be traced by torch.compile
     def forward(self, x: Float[Tensor, "b n d"], emb: Int[Tensor, " b"]) -> Any:
-        """What the norm that was replaced returns."""
+        """Return what the replaced norm returns; `emb` holds the rows of `BakedLevels`."""
         parts = self.table[emb].chunk(self.parts, dim=1)
         if self.parts == 2:
             scale, shift = parts
@@ -52,8 +58,17 @@ class BakedModulation(nn.Module):
 
 
 @torch.no_grad()
-def bake(transformer: Any, prompt: Prompt, levels: tuple[float, ...]) -> int:
-    """Replace the modulation layers of a `FluxTransformer2DModel` in place; returns how many parameters went."""
+def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...]) -> int:
+    """Replace the modulation layers of a `FluxTransformer2DModel` in place.
+
+    Args:
+        transformer: the network.
+        prompt: the only prompt that will be used.
+        levels: all noise levels that will be used, in [0, 1].
+
+    Returns:
+        The number of parameters removed.
+    """
     before = sum(p.numel() for p in transformer.parameters())
     weight = transformer.x_embedder.weight
     pooled = prompt.pooled.to(weight.device, weight.dtype)[None]
@@ -76,7 +91,7 @@ def bake(transformer: Any, prompt: Prompt, levels: tuple[float, ...]) -> int:
 
 
 def fuse_projections(transformer: Any) -> None:
-    """One matrix product for query, key and value; the separate layers go, which diffusers itself would keep."""
+    """Fuse the query, key and value projections in place and delete the separate layers, which diffusers keeps."""
     transformer.fuse_qkv_projections()
     for module in transformer.modules():
         if getattr(module, "fused_projections", False):

@@ -1,4 +1,4 @@
-"""The empty prompt's embeddings, kept in a file so that no text encoder is loaded. Knows nothing about images."""
+"""The empty prompt's text embeddings, read from a file so that no text encoder is loaded."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,34 +7,40 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.harmonization.flux.weights.library import read_tensors, write_tensors
+from splatgraft.harmonization.flux.weights.tensor_file import read_tensors, write_tensors
 
 PROMPT_FILE = "empty_prompt.safetensors"
 
 
 @dataclass(frozen=True)
-class Prompt:
-    """What FLUX is told of a text."""
+class PromptEmbedding:
+    """Text embeddings that FLUX takes."""
 
     tokens: Float[Tensor, "n d"]
     """T5's last hidden states."""
     pooled: Float[Tensor, " p"]
     """CLIP's pooled output."""
 
-    def to(self, device: torch.device, dtype: torch.dtype) -> "Prompt":
-        """The same elsewhere."""
-        return Prompt(self.tokens.to(device, dtype), self.pooled.to(device, dtype))
+    def to(self, device: torch.device, dtype: torch.dtype) -> "PromptEmbedding":
+        """Move to a device and dtype."""
+        return PromptEmbedding(self.tokens.to(device, dtype), self.pooled.to(device, dtype))
 
 
-def write_prompt(path: Path, prompt: Prompt, source: str) -> None:
-    """Write the file; `source` names the text encoders."""
+def write_prompt(path: Path, prompt: PromptEmbedding, source: str) -> None:
+    """Write the embeddings; `source` names the text encoders, for the file's header."""
     write_tensors(path, {"tokens": prompt.tokens, "pooled": prompt.pooled}, {"text": "", "source": source})
 
 
-def read_prompt(path: Path, *, tokens_width: int, pooled_width: int) -> Prompt:
-    """The embeddings, checked against the widths that a network wants.
+def read_prompt(path: Path, *, tokens_width: int, pooled_width: int) -> PromptEmbedding:
+    """Read the embeddings and check their widths.
 
-    Raises: ValueError where the file is missing, broken or made by other text encoders.
+    Args:
+        path: file of `write_prompt`.
+        tokens_width: width of T5's hidden states that the network takes.
+        pooled_width: width of CLIP's pooled output that the network takes.
+
+    Raises:
+        ValueError: the file is missing, broken or made by other text encoders.
     """
     if not path.is_file():
         raise ValueError(
@@ -47,4 +53,4 @@ def read_prompt(path: Path, *, tokens_width: int, pooled_width: int) -> Prompt:
         raise ValueError(f"{path}: expected tokens (n, {tokens_width}) and pooled ({pooled_width},), found {shapes}")
     if found["tokens"].shape[1] != tokens_width or found["pooled"].shape[0] != pooled_width:
         raise ValueError(f"{path}: expected tokens (n, {tokens_width}) and pooled ({pooled_width},), found {shapes}")
-    return Prompt(found["tokens"], found["pooled"])
+    return PromptEmbedding(found["tokens"], found["pooled"])

@@ -1,7 +1,4 @@
-"""A loaded harmoniser: transformer, autoencoder and the empty prompt; pictures to latents, velocity, and back.
-
-Knows nothing about folders, memory or views.
-"""
+"""The loaded FLUX harmoniser: transformer, autoencoder and prompt embeddings, and the calls into them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,33 +7,33 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.harmonization.flux.empty_prompt import Prompt
+from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
 from splatgraft.harmonization.flux.latents import pack, positions, unpack
 from splatgraft.harmonization.flux.weights.folder import Variant
 
 
 @dataclass(frozen=True)
 class Autoencoder:
-    """FLUX's pictures-to-latents network."""
+    """A variational autoencoder between images and latents."""
 
     network: Any
     """An `AutoencoderKL`."""
 
     @property
     def channels(self) -> int:
-        """Of the latents."""
+        """Channels of the latents."""
         return self.network.config.latent_channels
 
     @torch.no_grad()
     def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
-        """Latents (an eighth of the size) of sRGB pictures in [0, 1]: the mean, which needs no noise."""
+        """Encode sRGB images in [0, 1] to latents of an eighth of the size; the mean of the posterior, not a sample."""
         weight = next(self.network.parameters())
         mean = self.network.encode((images * 2 - 1).to(weight)).latent_dist.mode().float()
         return (mean - _shift(self.network)) * self.network.config.scaling_factor
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "b c i j"]) -> Float[Tensor, "b 3 h w"]:
-        """sRGB pictures in [0, 1] of latents."""
+        """Decode latents to sRGB images in [0, 1]."""
         weight = next(self.network.parameters())
         plain = latents / self.network.config.scaling_factor + _shift(self.network)
         return (self.network.decode(plain.to(weight), return_dict=False)[0].float() / 2 + 0.5).clamp(0, 1)
@@ -44,27 +41,31 @@ class Autoencoder:
 
 @dataclass(frozen=True)
 class FluxNetwork:
-    """All parts of one harmoniser, on one device."""
+    """All parts of the harmoniser, on one device."""
 
     transformer: Any
     """A `FluxTransformer2DModel` whose first layer takes noisy latent, composite and condition."""
     autoencoder: Autoencoder
-    prompt: Prompt
+    prompt: PromptEmbedding
     variant: Variant
     device: torch.device
     dtype: torch.dtype
-    """Of the arithmetic in the transformer."""
+    """Of the transformer's arithmetic."""
 
 
 def velocity(
     transformer: Any,
     latents: Float[Tensor, "b k h w"],
     level: Float[Tensor, " b"],
-    prompt: Prompt,
+    prompt: PromptEmbedding,
 ) -> Float[Tensor, "b c h w"]:
-    """eps - z_0 as the transformer sees it, at noise levels in [0, 1].
+    """Predict the velocity eps - z_0.
 
-    `latents`: noisy latent, composite and condition joined along channels (paper, Sec. 4); k = 3 c.
+    Args:
+        transformer: a `FluxTransformer2DModel`.
+        latents: noisy latent, composite and condition, concatenated along channels (paper, Sec. 4); k = 3 c.
+        level: noise levels in [0, 1].
+        prompt: text embeddings, the same for all samples.
     """
     b, _, h, w = latents.shape
     text = prompt.tokens

@@ -1,4 +1,4 @@
-"""Schnell's schedule and the sampling loop of a rectified flow. Knows nothing about networks, pictures or packing."""
+"""Rectified-flow sampling with the noise schedule of FLUX.1-schnell."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -12,9 +12,10 @@ Velocity = Callable[[Tensor, float], Tensor]
 
 
 def schnell_levels(steps: int = 4) -> tuple[float, ...]:
-    """Noise levels from 1 to 0 in equal steps: FLUX.1-schnell's schedule, which is not shifted by resolution.
+    """Noise levels from 1 to 0 in `steps` equal steps: FLUX.1-schnell's schedule, not shifted by resolution.
 
-    Raises: ValueError where there is no step.
+    Raises:
+        ValueError: `steps` is below 1.
     """
     if steps < 1:
         raise ValueError(f"--sampling-steps: expected at least 1, found {steps}")
@@ -22,21 +23,30 @@ def schnell_levels(steps: int = 4) -> tuple[float, ...]:
 
 
 def noise(size: tuple[int, int, int], seed: int) -> Float[Tensor, "c h w"]:
-    """Standard normal latents, the same on every machine and beside every batch."""
+    """Standard normal latents drawn on the CPU: independent of device and batch size."""
     return torch.randn(size, generator=torch.Generator().manual_seed(seed))
 
 
 def noisy(
     clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], level: Float[Tensor, " b"]
 ) -> Float[Tensor, "b c h w"]:
-    """z_t = (1 - t) z_0 + t eps (paper, Sec. 4)."""
+    """Noisy latents z_t = (1 - t) z_0 + t eps (paper, Sec. 4)."""
     t = level[:, None, None, None]
     return (1 - t) * clean + t * noise
 
 
 @torch.no_grad()
 def sample(velocity: Velocity, start: Float[Tensor, "b c h w"], levels: tuple[float, ...]) -> Float[Tensor, "b c h w"]:
-    """Latents at level 0: Euler steps along the velocity d z / d t = eps - z_0, summed in float32."""
+    """Integrate the velocity d z / d t = eps - z_0 by Euler steps in float32.
+
+    Args:
+        velocity: the network.
+        start: latents at `levels[0]`.
+        levels: decreasing noise levels in [0, 1].
+
+    Returns:
+        Latents at `levels[-1]`.
+    """
     latents = start.float()
     for level, following in pairwise(levels):
         latents = latents + (following - level) * velocity(latents, level).float()

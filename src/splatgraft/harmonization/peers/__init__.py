@@ -1,1 +1,1 @@
-"""Other people's methods behind the same protocol; each says in one line what it misses. None is loaded by itself."""
+"""Harmonisers by other authors, for comparison: LBM, IC-Light, MV-CoLight and an image-editing service."""

@@ -1,7 +1,7 @@
-"""IC-Light, foreground and background (Zhang et al. 2024): Stable Diffusion 1.5 whose first layer takes both.
+"""IC-Light with background condition (Zhang et al. 2024): Stable Diffusion 1.5 conditioned on object and background.
 
-Ours around diffusers: weights by id or folder, the empty prompt's embeddings from a file, DDIM without guidance. Not
-run with real weights where it was written; tested on tiny ones.
+An own implementation on diffusers: the empty prompt's embeddings from a file, DDIM sampling without guidance. Tested
+on tiny random networks; untested with the real weights.
 """
 
 from pathlib import Path
@@ -11,54 +11,60 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from splatgraft.harmonization.flux.ddim import NoiseSchedule, ddim
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
 from splatgraft.harmonization.flux.latents import pad_by_reflection
 from splatgraft.harmonization.flux.network import Autoencoder
 from splatgraft.harmonization.flux.sampling import noise
-from splatgraft.harmonization.flux.stable_diffusion import NoiseSchedule, ddim
-from splatgraft.harmonization.flux.weights.folder import local_folder, part
-from splatgraft.harmonization.flux.weights.library import read_tensors, unet_class
+from splatgraft.harmonization.flux.weights.diffusers_library import unet_class
+from splatgraft.harmonization.flux.weights.folder import find_part, local_folder
 from splatgraft.harmonization.flux.weights.loading import load_autoencoder
-from splatgraft.harmonization.flux.weights.widening import widened
+from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
+from splatgraft.harmonization.flux.weights.widening import widen_layer
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
 from splatgraft.harmonization.options import HarmonizerOptions
 
 _BASE = "stablediffusionapi/realistic-vision-v51"
 _STEPS = 20
+"""DDIM steps, set by hand."""
 _MULTIPLE = 64
+"""Pixels: 8 of the autoencoder times 8 of the UNet."""
+_GREY = 127 / 255
+"""sRGB colour around the object in the foreground image, as in the authors' code."""
 
 
 class ICLight:
-    """The network, and the pictures that it is shown."""
+    """The loaded network."""
 
     def __init__(self, unet: Any, autoencoder: Autoencoder, tokens: Float[Tensor, "n d"], seed: int) -> None:
-        """A UNet whose first layer takes noisy latent, foreground and background."""
+        """Use a UNet whose first layer takes noisy latent, foreground and background."""
         self._unet, self._autoencoder, self._tokens, self._seed = unet, autoencoder, tokens, seed
 
     @torch.no_grad()
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """The picture that IC-Light makes of the object, on grey, and of the background."""
+        """Generate the view from the object on grey and the background."""
         height, width = view.mask.shape
         mask = view.mask[..., None]
-        shown = torch.stack([view.composite * mask + 127 / 255 * (1 - mask), view.background]).permute(0, 3, 1, 2)
+        images = torch.stack([view.composite * mask + _GREY * (1 - mask), view.background]).permute(0, 3, 1, 2)
         device = next(self._unet.parameters()).device
-        latents = self._autoencoder.encode(pad_by_reflection(shown, _MULTIPLE).to(device))
+        latents = self._autoencoder.encode(pad_by_reflection(images, _MULTIPLE).to(device))
         condition = torch.cat([latents[:1], latents[1:]], 1)
 
         def predict(noisy: Tensor, step: int) -> Tensor:
-            given = torch.cat([noisy, condition], 1).to(self._tokens.dtype)
-            return self._unet(given, step, self._tokens[None], return_dict=False)[0].float()
+            joined = torch.cat([noisy, condition], 1).to(self._tokens.dtype)
+            return self._unet(joined, step, self._tokens[None], return_dict=False)[0].float()
 
         start = noise(tuple(latents.shape[1:]), self._seed).to(device)[None]  # pyright: ignore
-        made = ddim(predict, start, NoiseSchedule.stable_diffusion(), steps=_STEPS, predicts="noise")
-        image = self._autoencoder.decode(made)[0, :, :height, :width].permute(1, 2, 0).cpu()
+        clean = ddim(predict, start, NoiseSchedule.stable_diffusion(), steps=_STEPS, predicts="noise")
+        image = self._autoencoder.decode(clean)[0, :, :height, :width].permute(1, 2, 0).cpu()
         return Harmonized(image)
 
 
 def load_ic_light(options: HarmonizerOptions) -> ICLight:
-    """The base model and IC-Light's difference to it, `iclight_sd15_fbc.safetensors`.
+    """Load the base model and add IC-Light's weight differences, `iclight_sd15_fbc.safetensors`.
 
-    Raises: ValueError where a file is missing or of other shapes.
+    Raises:
+        ValueError: a file is missing or has other shapes.
     """
     if options.weights is None or not Path(options.weights).is_file():
         raise ValueError(
@@ -67,10 +73,10 @@ def load_ic_light(options: HarmonizerOptions) -> ICLight:
         )
     base = local_folder(options.base or _BASE, options.say)
     beside = Path(options.weights).parent
-    tokens = read_tensors(part(PROMPT_FILE, base, beside))["tokens"]
+    tokens = read_tensors(find_part(PROMPT_FILE, base, beside))["tokens"]
     unet = unet_class().from_pretrained(base / "unet")
     add_difference(unet, Path(options.weights))
-    autoencoder = load_autoencoder(part("vae", base))
+    autoencoder = load_autoencoder(find_part("vae", base))
     dtype = torch.float16 if options.device.type == "cuda" else torch.float32
     unet.to(options.device, dtype).eval().requires_grad_(False)
     autoencoder.network.to(options.device).eval().requires_grad_(False)
@@ -78,11 +84,12 @@ def load_ic_light(options: HarmonizerOptions) -> ICLight:
 
 
 def add_difference(unet: Any, path: Path) -> None:
-    """Widen the first layer by zeros and add the file's tensors to all weights.
+    """Widen the first layer with zeros and add the file's tensors to all weights, in place.
 
-    Raises: ValueError where the file belongs to another network.
+    Raises:
+        ValueError: the file belongs to another network.
     """
-    unet.conv_in = widened(unet.conv_in, 3, "zero")
+    unet.conv_in = widen_layer(unet.conv_in, 3, "zero")
     unet.register_to_config(in_channels=unet.conv_in.in_channels)
     difference, weights = read_tensors(path), unet.state_dict()
     for name, weight in weights.items():

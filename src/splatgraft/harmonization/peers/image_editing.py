@@ -1,4 +1,4 @@
-"""An image-editing service over HTTP, asked with the paper's prompt (Sec. 6); never by default, its cost said first.
+"""An image-editing service over HTTP with the paper's prompt (Sec. 6); used only on request, with a limit on its cost.
 
 The protocol is that of Google's `generateContent` (the paper's Nano Banana is gemini-2.5-flash-image).
 """
@@ -23,7 +23,7 @@ from splatgraft.harmonization.options import HarmonizerOptions
 
 KEY_VARIABLE = "SPLATGRAFT_IMAGE_EDITING_KEY"
 DOLLARS_PER_VIEW = 0.04
-"""What one picture of gemini-2.5-flash-image cost when this was written; others cost other sums."""
+"""Price of one image by gemini-2.5-flash-image at the time of writing; other services differ."""
 _URL = "https://generativelanguage.googleapis.com/v1beta/models/gemini-2.5-flash-image:generateContent"
 _TIMEOUT_SECONDS = 180
 
@@ -34,26 +34,27 @@ PROMPT = (
     "illumination, accurate lighting match, seamless blending etc. This is crucial: Do not change anything else other "
     "than the composited object."
 )
-"""The paper's, word for word."""
+"""The paper's prompt, verbatim."""
 
 
 @dataclass(frozen=True)
 class ImageEditing:
-    """One service, asked once a view."""
+    """An image-editing service; one request per view."""
 
     url: str
     key: str
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """The picture that the service sends back, at the view's size.
+        """Send composite and mask to the service and resize the returned image to the view's size.
 
-        Raises: ValueError where it does not answer with a picture.
+        Raises:
+            ValueError: the service fails or returns no image.
         """
         mask = (view.mask > 0.5).float()[..., None].expand(-1, -1, 3)
         parts: list[Any] = [{"text": PROMPT}]
         for picture in (view.composite, mask):
             parts.append({"inline_data": {"mime_type": "image/png", "data": _png(picture)}})
-        answer = self._ask({"contents": [{"parts": parts}]})
+        answer = self._request({"contents": [{"parts": parts}]})
         try:
             made = next(
                 part["inlineData"]["data"]
@@ -68,9 +69,9 @@ class ImageEditing:
         height, width = view.mask.shape
         return Harmonized(resize(torch.from_numpy(np.array(image)).float() / 255, width, height))
 
-    def _ask(self, question: dict[str, Any]) -> Any:
+    def _request(self, content: dict[str, Any]) -> Any:
         headers = {"Content-Type": "application/json", "x-goog-api-key": self.key}
-        request = urllib.request.Request(self.url, json.dumps(question).encode(), headers)
+        request = urllib.request.Request(self.url, json.dumps(content).encode(), headers)
         try:
             with urllib.request.urlopen(request, timeout=_TIMEOUT_SECONDS) as response:
                 return json.load(response)
@@ -82,17 +83,16 @@ class ImageEditing:
 
 
 def connect_image_editing(options: HarmonizerOptions) -> ImageEditing:
-    """The service at `options.weights` (a URL), or the paper's.
+    """Prepare the service at `options.weights` (a URL), or the paper's.
 
-    Raises: ValueError where the key is missing, or the expected cost is above `options.max_cost`.
+    Raises:
+        ValueError: the key is missing, or the expected cost exceeds `options.max_cost`.
     """
     url = options.weights or _URL
     if not url.startswith(("https://", "http://127.0.0.1", "http://localhost")):
         raise ValueError(f"harmonizer image-editing: expected --weights https://..., found {url}")
     cost = options.views * DOLLARS_PER_VIEW
-    options.say(
-        f"image-editing: {options.views} views to {url}, about {cost:.2f} US dollars; your pictures leave this machine"
-    )
+    options.say(f"image-editing: {options.views} views to {url}, about {cost:.2f} US dollars; your images are uploaded")
     if cost > options.max_cost:
         raise ValueError(f"--max-cost: expected at least {cost:.2f} US dollars, found {options.max_cost:.2f}")
     if not options.key:

@@ -1,6 +1,7 @@
-"""LBM relighting (Chadebec et al. 2025) through the user's own installation of its package. The adaptor is not yet run.
+"""LBM relighting (Chadebec et al. 2025) through the user's own installation of its package.
 
-The package (github.com/gojasper/LBM) and its weights are CC BY-NC: they are neither shipped nor fetched by default.
+The package (github.com/gojasper/LBM) and its weights are CC BY-NC: they are neither shipped nor downloaded by default.
+Untested with the real package and weights.
 """
 
 from importlib.util import find_spec
@@ -17,14 +18,14 @@ _WEIGHTS = "jasperai/LBM_relighting"
 
 
 class LBM:
-    """One bridge step from the composite to the relit picture."""
+    """Latent bridge matching in one step from the composite to the relit image."""
 
     def __init__(self, model: Any, evaluate: Any, steps: int) -> None:
-        """What `lbm.inference` gives."""
+        """Use a model and the function `evaluate` of `lbm.inference`."""
         self._model, self._evaluate, self._steps = model, evaluate, steps
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """The picture that LBM makes of the composite, kept inside the object as its authors do."""
+        """Relight the composite; pixels outside the object keep the composite's colours, as in the authors' code."""
         given = Image.fromarray((view.composite * 255).round().to(torch.uint8).numpy())
         made = (
             self._evaluate(self._model, given, self._steps).convert("RGB").resize(given.size, Image.Resampling.BICUBIC)
@@ -34,9 +35,10 @@ class LBM:
 
 
 def load_lbm(options: HarmonizerOptions) -> LBM:
-    """The network by `options.weights`, or the published one.
+    """Load the network named by `options.weights`, or the published one.
 
-    Raises: ValueError where the package is missing.
+    Raises:
+        ValueError: the package is missing.
     """
     if find_spec("lbm") is None:
         raise ValueError(

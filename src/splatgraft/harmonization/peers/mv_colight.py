@@ -1,6 +1,6 @@
-"""MV-CoLight's network for single pictures (Ren et al. 2025), in the user's own checkout and Python of it.
+"""MV-CoLight's single-view network (Ren et al. 2025), run in the user's own checkout and Python environment.
 
-A small program of ours runs there and exchanges arrays through files. Not run with the real code where it was written.
+A small program is run there and exchanges arrays through files. Untested with the real code and weights.
 """
 
 import tempfile
@@ -17,7 +17,9 @@ from splatgraft.harmonization.options import HarmonizerOptions
 from splatgraft.runtime.child_process import last_line, run_logged
 
 SIDE = 256
-"""Pixels: what the network was trained at."""
+"""Pixels: the size that the network was trained at."""
+RATIO_OFFSET = 0.02
+"""sRGB, added to both sides of the network's output over its input, against noise in the dark. Set by hand."""
 
 # runs in the other project's Python, in its folder, as `python - MODEL_FOLDER INPUT.npy OUTPUT.npy`
 _PROGRAM = """
@@ -42,16 +44,17 @@ np.save(out, made.reshape(3, *made.shape[-2:]).float().cpu().numpy())
 
 
 class MVCoLight:
-    """The network, started once a view: it is small."""
+    """The network, in a new process for each view."""
 
     def __init__(self, checkout: Path, weights: Path, python: Path) -> None:
-        """Folders of code and weights, and the Python that runs them."""
+        """Use the code in `checkout` and the weights in `weights`, run by the interpreter `python`."""
         self._checkout, self._weights, self._python = checkout, weights, python
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """The network's change at its size, laid as a ratio onto the composite's pixels.
+        """Apply the network's change, as a ratio at its own size, to the composite.
 
-        Raises: ValueError where the other program fails.
+        Raises:
+            ValueError: the external program fails.
         """
         height, width = view.mask.shape
         small = network_input(view)
@@ -66,21 +69,22 @@ class MVCoLight:
                 last = last_line(log) or "no output"
                 raise ValueError(f"{self._checkout}: expected MV-CoLight to make a picture, found {last[:200]}")
             made = torch.from_numpy(np.load(out)).permute(1, 2, 0).clamp(0, 1)
-        ratio = (made + 0.02) / (small[:3].permute(1, 2, 0) + 0.02)
+        ratio = (made + RATIO_OFFSET) / (small[:3].permute(1, 2, 0) + RATIO_OFFSET)
         return Harmonized((view.composite * resize(ratio, width, height)).clamp(0, 1))
 
 
 def network_input(view: HarmonizerInputs) -> Float[Tensor, "7 256 256"]:
-    """Composite, background and depth scaled to its own range, at the network's size."""
+    """Composite, background and depth divided by its maximum, at the network's size."""
     depth = view.depth / view.depth.max().clamp_min(1e-6)
     pictures = torch.cat([view.composite, view.background, depth[..., None]], -1)
     return resize(pictures, SIDE, SIDE).permute(2, 0, 1).contiguous()
 
 
 def load_mv_colight(options: HarmonizerOptions) -> MVCoLight:
-    """The adaptor, its folders found.
+    """Find the code and weights that `options` name.
 
-    Raises: ValueError where one is missing.
+    Raises:
+        ValueError: one is missing.
     """
     checkout, weights = options.checkout, Path(options.weights or "")
     if checkout is None or not (checkout / "registry.py").is_file():
@@ -93,5 +97,5 @@ def load_mv_colight(options: HarmonizerOptions) -> MVCoLight:
             "harmonizer mv-colight: expected --weights FOLDER with config.py and model_step_N.pt, found "
             f"{options.weights or 'none'}"
         )
-    own = checkout / ".venv" / "bin" / "python"
-    return MVCoLight(checkout, weights.resolve(), own if own.is_file() else Path("python"))
+    interpreter = checkout / ".venv" / "bin" / "python"
+    return MVCoLight(checkout, weights.resolve(), interpreter if interpreter.is_file() else Path("python"))

@@ -16,21 +16,21 @@ import torch
 from torch import Tensor
 
 from splatgraft.core.images import srgb_from_linear
-from splatgraft.harmonization.compact.features import composed
+from splatgraft.harmonization.compact.features import apply_output
 from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.progress import Progress
-from splatgraft.training.averaging import Average
-from splatgraft.training.compact.augment import augmented, batched
-from splatgraft.training.compact.loss import loss_of
+from splatgraft.training.compact.augmentation import augment, batch_inputs
+from splatgraft.training.compact.loss import compact_loss
 from splatgraft.training.compact.pairs import CompactPairs
-from splatgraft.training.records import LOG_FILE, Curve, cut_log
+from splatgraft.training.moving_average import MovingAverage
+from splatgraft.training.training_log import LOG_FILE, TrainingLog, truncate_log
 
 STATE_FILE = "state.pt"
 
 
 @dataclass(frozen=True)
-class CompactLoop:
+class CompactLoopOptions:
     """Length and rhythm."""
 
     steps: int = 2000
@@ -59,7 +59,7 @@ class CompactTraining:
     """All that one run is given."""
 
     pairs: CompactPairs
-    loop: CompactLoop
+    loop: CompactLoopOptions
     folder: Path
     """Gets state.pt, log.jsonl, validation/."""
     device: torch.device
@@ -85,10 +85,10 @@ def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]
     others = [p for p in network.parameters() if p.ndim <= 1]
     groups = [{"params": decayed, "weight_decay": loop.decay}, {"params": others, "weight_decay": 0.0}]
     optimizer = torch.optim.AdamW(groups, lr=loop.rate, betas=(0.9, 0.99))
-    average = Average(network, loop.ema)
+    average = MovingAverage(network, loop.ema)
     first = _resumed(run, network, optimizer, average)
-    cut_log(run.folder / LOG_FILE, first)
-    with closing(Curve(run.folder, tensorboard=False)) as curve:
+    truncate_log(run.folder / LOG_FILE, first)
+    with closing(TrainingLog(run.folder, tensorboard=False)) as curve:
         for step in range(first, loop.steps):
             for group in optimizer.param_groups:
                 group["lr"] = loop.rate * _schedule(step, loop.steps)
@@ -108,7 +108,7 @@ def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]
             last = step + 1 == loop.steps
             if last or (step + 1) % loop.validate_every == 0:
                 with average.applied():
-                    numbers, sheet = validated(run, network)
+                    numbers, sheet = validate_compact(run, network)
                 words = ", ".join(f"{name} {value:.4f}" for name, value in numbers.items())
                 run.say(f"step {step + 1}, held out: {words}")
                 curve.add_validation(step + 1, numbers, sheet)
@@ -132,17 +132,17 @@ def _one_step(run: CompactTraining, network: CompactNetwork, step: int) -> Tenso
         name = f"compact-{loop.seed}-{position}"
         variant = random.Random(name).randrange(pairs.variants)
         view, truth = pairs.read(pairs.training[int(order[place])], variant)
-        view, truth = augmented(view, truth, loop.size, name)
+        view, truth = augment(view, truth, loop.size, name)
         views.append(view)
         truths.append(truth)
-    view, truth = batched(views).to(run.device), torch.cat(truths).to(run.device)
+    view, truth = batch_inputs(views).to(run.device), torch.cat(truths).to(run.device)
     with torch.autocast(run.device.type, torch.bfloat16, enabled=loop.bf16):
-        answer = network(view.channels())
-    return loss_of(view, answer.whole(), truth)[0]
+        output = network(view.channels())
+    return compact_loss(view, output.float(), truth)[0]
 
 
 @torch.no_grad()
-def validated(run: CompactTraining, network: CompactNetwork) -> tuple[dict[str, float], Tensor]:
+def validate_compact(run: CompactTraining, network: CompactNetwork) -> tuple[dict[str, float], Tensor]:
     """Errors on the families held out, of the network and of the prior, and a sheet: pasted, prior, ours, truth."""
     pairs, loop = run.pairs, run.loop
     chosen = pairs.validation or pairs.training
@@ -151,16 +151,16 @@ def validated(run: CompactTraining, network: CompactNetwork) -> tuple[dict[str, 
     rows = []
     for number, index in enumerate(chosen):
         view, truth = pairs.read(index, number % pairs.variants)
-        view, truth = augmented(view, truth, loop.size, f"validation-{number}")
+        view, truth = augment(view, truth, loop.size, f"validation-{number}")
         view, truth = view.to(run.device), truth.to(run.device)
-        answer = network(view.channels())
-        _, found, before = loss_of(view, answer, truth)
+        output = network(view.channels())
+        _, found, before = compact_loss(view, output, truth)
         for region in ("object", "shadow", "rest"):
             for who, errors in (("", found), ("_prior", before)):
                 key = f"{region}{who}"
                 totals[key] = totals.get(key, 0.0) + float(getattr(errors, region).mean()) / len(chosen)
         if number < 12:
-            pictures = (view.composite, view.prior(), composed(view, answer), truth)
+            pictures = (view.composite, view.prior(), apply_output(view, output), truth)
             line = [srgb_from_linear(p[0].clamp(0, 1)).permute(1, 2, 0).cpu() for p in pictures]
             rows.append(torch.cat(line, 1))
     return totals, torch.cat(rows)
@@ -174,7 +174,7 @@ def _fingerprint(run: CompactTraining) -> dict[str, Any]:
     return json.loads(json.dumps(own | {"pairs": run.pairs.fingerprint(), "begin": begin}))
 
 
-def _save(run: CompactTraining, network: CompactNetwork, optimizer: Any, average: Average, step: int) -> None:
+def _save(run: CompactTraining, network: CompactNetwork, optimizer: Any, average: MovingAverage, step: int) -> None:
     state = {
         "step": step,
         "job": json.dumps(_fingerprint(run)),
@@ -186,7 +186,7 @@ def _save(run: CompactTraining, network: CompactNetwork, optimizer: Any, average
         torch.save(state, stream)
 
 
-def _resumed(run: CompactTraining, network: CompactNetwork, optimizer: Any, average: Average) -> int:
+def _resumed(run: CompactTraining, network: CompactNetwork, optimizer: Any, average: MovingAverage) -> int:
     path = run.folder / STATE_FILE
     if not path.is_file():
         return 0

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import linear_from_srgb
-from splatgraft.harmonization.compact.features import View, relative_depth
+from splatgraft.harmonization.compact.features import CompactInput, relative_depth
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft.synthesis.benchmark import rendered_cameras
 from splatgraft.synthesis.pairs import PairSample, read_manifest
@@ -21,7 +21,7 @@ _LINEAR = linear_from_srgb(torch.arange(256) / 255)
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutOptions:
     """Families that are never trained on."""
 
     materials: tuple[str, ...] = ("brick",)
@@ -33,7 +33,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class Entry:
+class PairEntry:
     """One pair, where its arrays are."""
 
     folder: str
@@ -46,7 +46,9 @@ class Entry:
 class CompactPairs:
     """All pairs of a folder that have priors, decoded once."""
 
-    def __init__(self, pairs: Path, priors: Sequence[Path], held_out: HeldOut, progress: Progress = silent) -> None:
+    def __init__(
+        self, pairs: Path, priors: Sequence[Path], held_out: HeldOutOptions, progress: Progress = silent
+    ) -> None:
         """Read them all, with the priors of every folder in `priors`; some 0.6 MB each at 240x160.
 
         Raises: ValueError where the manifest or a picture is missing or broken, or no pair has a prior.
@@ -54,7 +56,7 @@ class CompactPairs:
         self._arrays: dict[tuple[str, str, int], np.ndarray] = {}
         self._prior_confidence: dict[tuple[str, str], float] = {}
         self.variants = len(priors)
-        self.entries: list[Entry] = []
+        self.entries: list[PairEntry] = []
         samples = read_manifest(pairs)
         folders = sorted({sample.folder for sample in samples})
         for number, folder in enumerate(folders):
@@ -75,7 +77,7 @@ class CompactPairs:
         """What must be the same for a training to be gone on with."""
         return {"training": len(self.training), "validation": len(self.validation), "variants": self.variants}
 
-    def read(self, index: int, variant: int = 0) -> tuple[View, Float[Tensor, "1 3 h w"]]:
+    def read(self, index: int, variant: int = 0) -> tuple[CompactInput, Float[Tensor, "1 3 h w"]]:
         """A pair at full size with one of its priors, composite not normalised, and its truth in linear light."""
         entry = self.entries[index]
 
@@ -89,7 +91,7 @@ class CompactPairs:
         covered = torch.minimum(mask, relit[..., 3])[..., None]
         composite = linear_from_srgb(covered * relit[..., :3] + (1 - covered) * array("background").float() / 255)
         depth = array(f"{entry.object} depth").float()
-        view = View(
+        view = CompactInput(
             composite=_first(composite),
             background=_first(background),
             mask=covered[..., 0][None, None],
@@ -113,7 +115,7 @@ class CompactPairs:
             self._arrays[sample.folder.name, key, sample.camera] = found[take][sample.camera]
             self._prior_confidence[sample.folder.name, key] = float(found[f"{take}_trust"])
 
-    def _read_folder(self, folder: Path, samples: Sequence[PairSample], held_out: HeldOut | None) -> None:
+    def _read_folder(self, folder: Path, samples: Sequence[PairSample], held_out: HeldOutOptions | None) -> None:
         """`held_out`: families; None where the whole folder is."""
         job = json.loads((folder / "job.json").read_text())
         count = len(job["cameras"])
@@ -123,7 +125,7 @@ class CompactPairs:
             patterns = {part["material"]["pattern"] for part in job["objects"][sample.object]}
             light = worlds[f"{sample.object}_{sample.light}"]
             kept_back = held_out is None or bool(patterns & set(held_out.materials)) or light in held_out.lights
-            self.entries.append(Entry(folder.name, sample.object, sample.light, sample.camera, kept_back))
+            self.entries.append(PairEntry(folder.name, sample.object, sample.light, sample.camera, kept_back))
             self._read_pictures(sample, cameras.camera_from_world[sample.camera, :3, :3].numpy())
 
     def _read_pictures(self, sample: PairSample, camera_from_world: np.ndarray) -> None:

@@ -35,8 +35,8 @@ from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft.synthesis.benchmark import rendered_cameras
 from splatgraft.synthesis.pairs import samples_in
-from splatgraft.training.compact.surfaces import Pixels, read_pixels, read_surfels, surfels
-from splatgraft.training.compact.wrong_light import wrong
+from splatgraft.training.compact.light_perturbation import perturb_light
+from splatgraft.training.compact.rendered_surfaces import SurfacePixels, read_pixels, read_surfels, surfels
 
 _REACH = 8.0  # as RelightOptions
 _GRAY = torch.tensor([0.5, 0.5, 0.5])
@@ -45,7 +45,7 @@ _NOISE_DEG = 12.0
 
 
 @dataclass(frozen=True)
-class Prior:
+class PairPrior:
     """What light transfer says of all views of an object under one light."""
 
     log_ratio: Float[Tensor, "v h w 3"]
@@ -67,7 +67,7 @@ def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Pro
             takes = sorted({(s.object, s.light) for s in samples_in(folder)})
             for object_ in sorted({o for o, _ in takes}):
                 lights = [light for o, light in takes if o == object_]
-                for light, prior in zip(lights, priors_of(folder, object_, lights, seed=seed), strict=True):
+                for light, prior in zip(lights, light_transfer_priors(folder, object_, lights, seed=seed), strict=True):
                     arrays[f"{object_}_{light}"] = prior.log_ratio.numpy().astype(np.float16)
                     arrays[f"{object_}_{light}_trust"] = np.array(prior.prior_confidence, np.float32)
             with atomic_write(path) as stream:
@@ -88,7 +88,7 @@ def read_light(folder: Path) -> Light:
     return light_from_probe(panorama, suns)
 
 
-def priors_of(folder: Path, object_: str, lights: list[str], *, seed: int) -> list[Prior]:
+def light_transfer_priors(folder: Path, object_: str, lights: list[str], *, seed: int) -> list[PairPrior]:
     """One prior per light of an object in a folder of pairs.
 
     Raises: ValueError where the folder lacks something.
@@ -102,19 +102,19 @@ def priors_of(folder: Path, object_: str, lights: list[str], *, seed: int) -> li
     found = []
     for light in lights:
         rng = random.Random(f"prior-{seed}-{folder.name}-{object_}-{light}")
-        now, then = wrong(place, rng), wrong(read_light(folder / f"{object_}_{light}_probe"), rng)
+        now, then = perturb_light(place, rng), perturb_light(read_light(folder / f"{object_}_{light}_probe"), rng)
         noise = torch.Generator().manual_seed(rng.randrange(2**31))
         asked = _Asked(pixels, body, scene, now, then)
         on_object, on_scene = asked.object_log_ratio(noise), asked.scene_log_ratio()
         inside = pixels.mask[..., None]
-        found.append(Prior(inside * on_object + (1 - inside) * on_scene, light_confidence(now)))
+        found.append(PairPrior(inside * on_object + (1 - inside) * on_scene, light_confidence(now)))
     return found
 
 
 class _Asked:
     """One object under one pair of lights."""
 
-    def __init__(self, pixels: Pixels, body: Gaussians, scene: Gaussians, now: Light, then: Light) -> None:
+    def __init__(self, pixels: SurfacePixels, body: Gaussians, scene: Gaussians, now: Light, then: Light) -> None:
         self._pixels, self._body, self._then = pixels, body, then
         self._seen = 0.5 * (now.coverage + then.coverage)
         self._beams = sample_light(now)

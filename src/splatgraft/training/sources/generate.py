@@ -14,8 +14,8 @@ from torch import Tensor
 from splatgraft.core.images import resize, write_image
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.progress import Progress, silent
-from splatgraft.training.sources.relighters import Draft, Relighter
-from splatgraft.training.sources.relit import RECORD_FILE, RelitPairs, RelitSample, write_manifest, write_sample
+from splatgraft.training.sources.relighters import Relighter, RelightingInput
+from splatgraft.training.sources.relit_pairs import RECORD_FILE, RelitPairs, RelitSample, write_manifest, write_sample
 
 SHEET_FILE = "sheet.png"
 _REJECTED = "rejected"
@@ -24,7 +24,7 @@ _SMALLEST, _LARGEST = 0.01, 0.6
 
 
 @dataclass(frozen=True)
-class Unlit:
+class UnrelitSample:
     """A target with its mask and background, before it is relit."""
 
     target: Float[Tensor, "h w 3"]
@@ -33,14 +33,14 @@ class Unlit:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class SamplePlan:
     """One sample that is to be made."""
 
     name: str
     """Of its folder."""
     group: str
     """What is held out together."""
-    make: Callable[[], Unlit]
+    make: Callable[[], UnrelitSample]
     record: Mapping[str, Any]
     """How it is made: prompt, seed, models, licence."""
 
@@ -62,7 +62,7 @@ class Lighting:
 
 
 def generate(
-    out: Path, wanted: Iterable[Wanted], lighting: Lighting, *, total: int, progress: Progress = silent
+    out: Path, wanted: Iterable[SamplePlan], lighting: Lighting, *, total: int, progress: Progress = silent
 ) -> int:
     """Make what is missing, up to `total` samples; manifest and sheet at the end; returns how many are there.
 
@@ -101,7 +101,7 @@ def contact_sheet(pairs: RelitPairs, *, rows: int = 24, width: int = 240) -> Flo
     return torch.cat([torch.cat([line, torch.ones(tallest - line.shape[0], *line.shape[1:])]) for line in lines])
 
 
-def _make(out: Path, item: Wanted, lighting: Lighting) -> int:
+def _make(out: Path, item: SamplePlan, lighting: Lighting) -> int:
     made = item.make()
     covered = float((made.mask > 0.5).float().mean())
     if not _SMALLEST <= covered <= _LARGEST:
@@ -110,7 +110,7 @@ def _make(out: Path, item: Wanted, lighting: Lighting) -> int:
             stream.write((json.dumps(note) + "\n").encode())
         return 0
     maps = lighting.choose(item.name)
-    relit = lighting.relighter.relight(Draft(item.name, made.target, made.mask), maps)
+    relit = lighting.relighter.relight(RelightingInput(item.name, made.target, made.mask), maps)
     record = {
         **item.record,
         "group": item.group,

@@ -55,7 +55,7 @@ def read_orida(root: Path) -> list[Photograph]:
     return sorted(found, key=lambda photograph: photograph.name)
 
 
-def balanced(photographs: list[Photograph], count: int, seed: int) -> list[Photograph]:
+def choose_balanced(photographs: list[Photograph], count: int, seed: int) -> list[Photograph]:
     """`count` of them by the rule above; all where there are no more."""
     queues: dict[tuple[str, str], list[Photograph]] = defaultdict(list)
     for photograph in photographs:

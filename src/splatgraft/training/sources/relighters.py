@@ -31,7 +31,7 @@ _PROGRAMS = {
 
 
 @dataclass(frozen=True)
-class Draft:
+class RelightingInput:
     """A picture to relight."""
 
     name: str
@@ -48,7 +48,7 @@ class Relighter(Protocol):
     """For the record."""
     licence: str
 
-    def relight(self, draft: Draft, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
+    def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
         """The picture under each environment map.
 
         Raises: ValueError where that fails.
@@ -56,7 +56,7 @@ class Relighter(Protocol):
         ...
 
 
-class StandIn:
+class SilhouetteRelighter:
     """Our own: the object's silhouette, inflated, under an environment map's diffuse light. No learnt model.
 
     It changes direction, colour and contrast of the light over the object, so that a harmoniser has something to undo;
@@ -66,7 +66,7 @@ class StandIn:
     name = "stand-in of splatgraft (inflated silhouette, diffuse; not DiffusionRenderer)"
     licence = "own"
 
-    def relight(self, draft: Draft, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
+    def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
         """The picture, its object shaded anew."""
         normal = inflated_normals(draft.mask)
         pictures = []
@@ -108,7 +108,7 @@ class DiffusionRenderer:
         except (OSError, subprocess.SubprocessError) as error:
             raise ValueError(f"{python}: expected a Python that runs {self.name}, found {error}") from error
 
-    def relight(self, draft: Draft, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
+    def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
         """The picture under each environment map, at its own size.
 
         Raises: ValueError where a program fails or makes another number of pictures.

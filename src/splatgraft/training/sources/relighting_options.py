@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Literal
 
 from splatgraft.training.sources.generate import Lighting
-from splatgraft.training.sources.relighters import DiffusionRenderer, Relighter, StandIn
+from splatgraft.training.sources.relighters import DiffusionRenderer, Relighter, SilhouetteRelighter
 
 
 @dataclass(frozen=True)
-class Relighting:
+class RelightingOptions:
     """By whom pictures are relit."""
 
     lights: Path = Path("lights")
@@ -38,7 +38,7 @@ class Relighting:
 
     def _relighter(self) -> Relighter:
         if self.relighter == "stand-in":
-            return StandIn()
+            return SilhouetteRelighter()
         if self.renderer is None:
             raise ValueError(
                 "--renderer: expected the folder of DiffusionRenderer's code, found none; or --relighter stand-in"

@@ -8,7 +8,7 @@ from splatgraft.commands.steps.compose import Compose
 from splatgraft.commands.steps.reconstruct import Reconstruct
 from splatgraft.commands.steps.segment import Segment
 from splatgraft.core.posed_images import held_out
-from splatgraft.evaluation.benchmark.published import PublishedScene
+from splatgraft.evaluation.benchmark.published_datasets import PublishedScene
 from splatgraft.formats import read_capture, write_capture
 from splatgraft.project.layout import (
     CAMERAS_FILE,

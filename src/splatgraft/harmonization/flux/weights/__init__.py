@@ -1,1 +1,1 @@
-"""Weights of the FLUX harmoniser: folders, headers, adapters, precision, and text embeddings."""
+"""Weights of the FLUX harmoniser: model folders, downloads, low-rank adaptations, precision, text embeddings."""

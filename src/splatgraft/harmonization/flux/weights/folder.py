@@ -1,9 +1,10 @@
-"""Folders of FLUX harmonisers: where the parts are, which variant it is, what does not fit. Loads no weights.
+"""Folders of FLUX harmonisers: finds their parts, reads the variant and checks shapes without loading weights.
 
     transformer/config.json, diffusion_pytorch_model*.safetensors   (or these in the folder itself)
     vae/  empty_prompt.safetensors  harmonizer.json                 (the base's where a folder has none)
 
-harmonizer.json is ours: {"variant": "image-mask"}. The authors' folders are called image-mask and image-background.
+harmonizer.json is written by this package: {"variant": "image-mask"}. The authors' folders are named by their
+variant.
 """
 
 import json
@@ -13,36 +14,41 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
-from splatgraft.harmonization.flux.weights.library import download, licence_of
-from splatgraft.harmonization.flux.weights.safetensors_header import shapes_in
+from splatgraft.harmonization.flux.weights.hub import download, licence_of
+from splatgraft.harmonization.flux.weights.safetensors_header import read_model_shapes
 from splatgraft.runtime.atomic_file import atomic_write
 
 Variant = Literal["image-mask", "image-background"]
-"""What joins the composite: the object's mask, or the scene without the object."""
+"""The second condition beside the composite: the object's mask, or the scene without the object."""
 VARIANTS: tuple[str, ...] = get_args(Variant)
 CONDITIONS = 2
-"""Pictures that join the noisy latent: the composite and one more."""
-ABOUT_FILE = "harmonizer.json"
+"""Images that condition the network: the composite and one more."""
+DESCRIPTION_FILE = "harmonizer.json"
 AUTHORS = "nviolante/dot3d"
 WEIGHTS = "diffusion_pytorch_model"
 _PARTS = ("", "transformer/", "vae/", "unet/")
 _HUB_PATTERNS = [
-    # neither single files of the whole nor half-precision copies nor text encoders, which would double a download
+    # leaves out single-file models, half-precision copies and text encoders, which would double the download
     *(
         f"{part}{name}"
         for part in _PARTS
         for name in ("config.json", f"{WEIGHTS}.safetensors*", f"{WEIGHTS}-*.safetensors")
     ),
-    *("model_index.json", ABOUT_FILE, PROMPT_FILE),
+    *("model_index.json", DESCRIPTION_FILE, PROMPT_FILE),
 ]
 
 Say = Callable[[str], None]
 
 
 def local_folder(weights: str, say: Say) -> Path:
-    """The folder `weights`, or the hub repository of that name (and a folder in it), downloaded once.
+    """Resolve `weights` to a local folder, downloading it where it is a hub id.
 
-    Raises: ValueError where it is neither.
+    Args:
+        weights: a folder, or a hub id OWNER/NAME or OWNER/NAME/FOLDER.
+        say: receives the repository and its licence before a download.
+
+    Raises:
+        ValueError: it is neither, or the download fails.
     """
     folder = Path(weights)
     if folder.is_dir():
@@ -63,36 +69,37 @@ def local_folder(weights: str, say: Say) -> Path:
 
 @dataclass(frozen=True)
 class FluxFolder:
-    """A checked folder with a FLUX transformer."""
+    """A model folder with a FLUX transformer whose files were checked."""
 
     folder: Path
-    """The whole."""
+    """The model folder."""
     transformer: Path
     """Where the transformer's config.json is."""
     config: dict[str, Any]
-    """Of the transformer."""
+    """The transformer's config.json."""
     inputs: int
-    """Pictures that the first layer takes: 1 for FLUX itself, 3 for a harmoniser."""
+    """Latents that the first layer takes: 1 for FLUX itself, 3 for a harmoniser."""
 
     @staticmethod
     def open(folder: Path) -> "FluxFolder":
-        """The folder, its files found whole and of the shapes that its config says.
+        """Check that the folder's files are complete and have the shapes of its config.
 
-        Raises: ValueError where something is missing, truncated or of other shapes.
+        Raises:
+            ValueError: a file is missing or truncated, or its shapes do not match.
         """
         below = folder / "transformer"
         transformer = below if (below / "config.json").is_file() else folder
         config = read_config(transformer / "config.json", "FluxTransformer2DModel")
-        shapes = shapes_in(transformer, WEIGHTS)
+        shapes = read_model_shapes(transformer, WEIGHTS)
         first, last = shapes.get("x_embedder.weight"), shapes.get("proj_out.weight")
         if first is None or last is None:
             raise ValueError(f"{transformer}: expected x_embedder.weight and proj_out.weight, found {_few(shapes)}")
         # diffusers' defaults, which a config may leave out
         inner = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
-        told = (inner, config.get("in_channels", 64))
-        if first != told:
+        configured = (inner, config.get("in_channels", 64))
+        if first != configured:
             raise ValueError(
-                f"{transformer}: expected x_embedder.weight of {_by(told)} by config.json, found {_by(first)}"
+                f"{transformer}: expected x_embedder.weight of {_by(configured)} by config.json, found {_by(first)}"
             )
         out = last[0]
         if first[1] not in (out, out * (CONDITIONS + 1)):
@@ -102,64 +109,68 @@ class FluxFolder:
             )
         return FluxFolder(folder, transformer, config, first[1] // out)
 
-    def variant(self, wanted: str) -> Variant:
-        """What joins the composite: `wanted`, or by harmonizer.json or the folder's name where that is `auto`.
+    def variant(self, requested: str) -> Variant:
+        """Determine the variant: `requested`, or for `auto` that of harmonizer.json or of the folder's name.
 
-        Raises: ValueError where it cannot be told or contradicts `wanted`.
+        Raises:
+            ValueError: it cannot be determined, contradicts `requested`, or the folder is FLUX itself.
         """
         if self.inputs != CONDITIONS + 1:
             width = self.config.get("in_channels", 64)
             raise ValueError(
                 f"{self.transformer}: expected a first layer of {width * (CONDITIONS + 1)} channels, found {width}: "
-                "FLUX itself, no harmoniser; `splatgraft train flux` makes one of it, --lora adapts it"
+                "FLUX itself, no harmoniser; train one by `splatgraft train flux` or give --lora"
             )
         names = (self.folder.name, self.folder.resolve().name, self.transformer.resolve().parent.name)
-        told = variant_told(self.folder) or next((name for name in names if name in VARIANTS), None)
-        if wanted != "auto" and told not in (None, wanted):
-            raise ValueError(f"{self.folder}: expected {wanted} (--variant), found {told}")
-        chosen = told if wanted == "auto" else wanted
+        declared = declared_variant(self.folder) or next((name for name in names if name in VARIANTS), None)
+        if requested != "auto" and declared not in (None, requested):
+            raise ValueError(f"{self.folder}: expected {requested} (--variant), found {declared}")
+        chosen = declared if requested == "auto" else requested
         if chosen not in VARIANTS:
             raise ValueError(
-                f"{self.folder}: expected {ABOUT_FILE} or a folder called {' or '.join(VARIANTS)}, found neither; "
-                "say which by --variant"
+                f"{self.folder}: expected {DESCRIPTION_FILE} or a folder called {' or '.join(VARIANTS)}, found "
+                "neither; choose by --variant"
             )
         return chosen  # pyright: ignore
 
 
-def variant_told(folder: Path) -> str | None:
-    """The variant that harmonizer.json in `folder` names; None where there is no such file.
+def declared_variant(folder: Path) -> str | None:
+    """Read the variant from harmonizer.json in `folder`; None where there is no such file.
 
-    Raises: ValueError where the file is broken.
+    Raises:
+        ValueError: the file is broken.
     """
-    path = folder / ABOUT_FILE
+    path = folder / DESCRIPTION_FILE
     if not path.is_file():
         return None
     try:
-        told = json.loads(path.read_text())["variant"]
+        variant = json.loads(path.read_text())["variant"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected a variant, found {type(error).__name__}: {error}") from error
-    if told not in VARIANTS:
-        raise ValueError(f"{path}: expected variant {' or '.join(VARIANTS)}, found {told}")
-    return told
+    if variant not in VARIANTS:
+        raise ValueError(f"{path}: expected variant {' or '.join(VARIANTS)}, found {variant}")
+    return variant
 
 
-def part(name: str, *folders: Path) -> Path:
-    """The first of the folders' `name` that is there.
+def find_part(name: str, *folders: Path) -> Path:
+    """Find `name` in the first of `folders` that has it.
 
-    Raises: ValueError where none has it.
+    Raises:
+        ValueError: none has it.
     """
     for folder in folders:
         if (folder / name).exists():
             return folder / name
     if name == PROMPT_FILE:
-        return folders[0] / name  # its reader says how it is made
+        return folders[0] / name  # read_prompt names the command that makes it
     raise ValueError(f"{folders[0]}: expected {name}/ here or in the --base, found neither")
 
 
 def read_config(path: Path, kind: str) -> dict[str, Any]:
-    """A diffusers config of the class `kind`.
+    """Read the diffusers config of a model of class `kind`.
 
-    Raises: ValueError where it is missing, broken or of another class.
+    Raises:
+        ValueError: it is missing, broken or of another class.
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected the config of a {kind}, found none")
@@ -173,9 +184,9 @@ def read_config(path: Path, kind: str) -> dict[str, Any]:
     return config
 
 
-def write_about(folder: Path, about: dict[str, Any]) -> None:
+def write_description(folder: Path, about: dict[str, Any]) -> None:
     """Write harmonizer.json."""
-    with atomic_write(folder / ABOUT_FILE) as stream:
+    with atomic_write(folder / DESCRIPTION_FILE) as stream:
         stream.write((json.dumps(about, indent=1) + "\n").encode())
 
 

@@ -1,4 +1,4 @@
-"""Weights on disk or on the hub become a network on a device, in a precision that fits, said aloud."""
+"""Loads the FLUX harmoniser onto a device, in a precision that fits its memory."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,25 +12,29 @@ from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projection
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE, read_prompt
 from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork
 from splatgraft.harmonization.flux.sampling import schnell_levels
+from splatgraft.harmonization.flux.weights.diffusers_library import (
+    autoencoder_class,
+    flux_transformer_class,
+    nf4_config,
+)
 from splatgraft.harmonization.flux.weights.folder import (
     CONDITIONS,
     VARIANTS,
     FluxFolder,
     Variant,
+    declared_variant,
+    find_part,
     local_folder,
-    part,
-    variant_told,
 )
-from splatgraft.harmonization.flux.weights.library import autoencoder_class, flux_transformer_class, nf4_config
 from splatgraft.harmonization.flux.weights.lora import merge_lora
-from splatgraft.harmonization.flux.weights.memory import (
+from splatgraft.harmonization.flux.weights.placement import (
     PRECISIONS,
     Placement,
     activation_bytes,
     choose_placement,
     decoder_bytes,
 )
-from splatgraft.harmonization.flux.weights.widening import FirstLayer, widened
+from splatgraft.harmonization.flux.weights.widening import FirstLayer, widen_layer
 
 Say = Callable[[str], None]
 BASE = "black-forest-labs/FLUX.1-schnell"
@@ -38,76 +42,83 @@ BASE = "black-forest-labs/FLUX.1-schnell"
 
 @dataclass(frozen=True)
 class FluxWeights:
-    """Which weights, and how they are to lie in memory."""
+    """Which weights to load, and how."""
 
     weights: str
     """Folder or hub id of a harmoniser; of FLUX itself where `lora` is given."""
     base: str | None = None
-    """Folder or hub id whose vae/ and prompt serve where `weights` has none; FLUX.1-schnell where not given."""
+    """Folder or hub id of vae/ and prompt where `weights` has none; FLUX.1-schnell where not given."""
     lora: Path | None = None
-    """An adaptation of ours, merged in."""
+    """A low-rank adaptation of `train flux`, merged into the weights."""
     variant: str = "auto"
-    """image-mask, image-background, or auto: by the folder."""
+    """image-mask, image-background, or auto: as the folder declares."""
     precision: str = "auto"
-    """auto, or one of `memory.PRECISIONS`."""
+    """auto, or one of `placement.PRECISIONS`."""
     compiled: bool = False
-    """torch.compile: pays from some twenty views of one size on."""
+    """Use torch.compile; worthwhile from about twenty views of one size on."""
     steps: int = 4
-    """Of the sampling: the modulations are baked for them."""
+    """Sampling steps; the modulations are precomputed for their noise levels."""
 
 
 def load_flux(
-    wanted: FluxWeights, device: torch.device, *, say: Say, pixels: int = 704 * 496, views: int = 1
+    options: FluxWeights, device: torch.device, *, say: Say, pixels: int = 704 * 496, views: int = 1
 ) -> FluxNetwork:
-    """The network, its modulations baked, its projections fused.
+    """Load the network, with precomputed modulations and fused projections.
 
-    `pixels` of a view and `views` at once are for the prediction of memory.
+    Args:
+        options: weights and options.
+        device: where the network runs.
+        say: receives messages on downloads, precision and parameters.
+        pixels: of one view, for the memory estimate.
+        views: per pass, for the memory estimate.
 
-    Raises: ValueError where a folder is of another kind, a file is broken, or memory does not do.
+    Raises:
+        ValueError: a folder is of another kind, a file is broken, or memory does not suffice.
     """
-    if wanted.precision not in ("auto", *PRECISIONS):
-        raise ValueError(f"--precision: expected auto, {', '.join(PRECISIONS)}, found {wanted.precision}")
-    folder = local_folder(wanted.weights, say)
+    if options.precision not in ("auto", *PRECISIONS):
+        raise ValueError(f"--precision: expected auto, {', '.join(PRECISIONS)}, found {options.precision}")
+    folder = local_folder(options.weights, say)
     checked = FluxFolder.open(folder)
-    lora_variant = wanted.variant if wanted.lora is None else _variant_of_lora(wanted)
-    variant = lora_variant if wanted.lora is not None and checked.inputs == 1 else checked.variant(wanted.variant)
-    base = _Base(folder, wanted.base, say)
+    lora_variant = options.variant if options.lora is None else _variant_of_lora(options)
+    variant = lora_variant if options.lora is not None and checked.inputs == 1 else checked.variant(options.variant)
+    base = _Base(folder, options.base, say)
     config = checked.config
     prompt = read_prompt(
-        part(PROMPT_FILE, folder, *base.folders(PROMPT_FILE)),
+        find_part(PROMPT_FILE, folder, *base.folders(PROMPT_FILE)),
         tokens_width=config.get("joint_attention_dim", 4096),
         pooled_width=config.get("pooled_projection_dim", 768),
     )
-    autoencoder = load_autoencoder(part("vae", folder, *base.folders("vae")))
-    placement = _placement(wanted, checked, device, (pixels, views), autoencoder)
+    autoencoder = load_autoencoder(find_part("vae", folder, *base.folders("vae")))
+    placement = _placement(options, checked, device, (pixels, views), autoencoder)
     say(placement.sentence)
     dtype = torch.float32 if placement.precision == "float32" else torch.bfloat16
     transformer = load_transformer(checked, dtype=dtype, quantized=placement.precision == "nf4")
-    if wanted.lora is not None:
+    if options.lora is not None:
         if placement.precision == "nf4":
-            raise ValueError(f"{wanted.lora}: expected a precision that weights can be added to, found nf4")
+            raise ValueError(f"{options.lora}: expected a precision that weights can be added to, found nf4")
         if checked.inputs == 1:
             widen_transformer(transformer)
-        say(f"lora: {merge_lora(transformer, wanted.lora)} layers adapted by {wanted.lora}")
+        say(f"lora: {merge_lora(transformer, options.lora)} layers adapted by {options.lora}")
     transformer.eval().requires_grad_(False)
     prompt = prompt.to(torch.device("cpu"), dtype)
-    gone = bake(transformer, prompt, schnell_levels(wanted.steps)[:-1])
+    removed = bake(transformer, prompt, schnell_levels(options.steps)[:-1])
     if placement.precision != "nf4":
         fuse_projections(transformer)
-    say(f"flux: {gone / 1e9:.2f} billion parameters of modulation baked into a table")
+    say(f"flux: {removed / 1e9:.2f} billion parameters of modulation replaced by a table")
     _place(transformer, placement, device, dtype)
     autoencoder.network.to(device, dtype).eval().requires_grad_(False)
     if placement.tiled:
         autoencoder.network.enable_tiling()
-    if wanted.compiled:
+    if options.compiled:
         transformer.compile_repeated_blocks()
     return FluxNetwork(transformer, autoencoder, prompt.to(device, dtype), variant, device, dtype)  # pyright: ignore
 
 
 def load_transformer(checked: FluxFolder, *, dtype: torch.dtype, quantized: bool = False) -> Any:
-    """The transformer of a checked folder, on the CPU (on the GPU where quantised).
+    """Load the transformer of a checked folder, on the CPU (on the GPU where quantised).
 
-    Raises: ValueError where the weights do not fit its config.
+    Raises:
+        ValueError: the weights do not fit the config.
     """
     settings = {"quantization_config": nf4_config(dtype)} if quantized else {}
     try:
@@ -118,9 +129,10 @@ def load_transformer(checked: FluxFolder, *, dtype: torch.dtype, quantized: bool
 
 
 def load_autoencoder(folder: Path) -> Autoencoder:
-    """The autoencoder in float32 on the CPU.
+    """Load the autoencoder in float32 on the CPU.
 
-    Raises: ValueError where the folder has none.
+    Raises:
+        ValueError: the folder has none.
     """
     try:
         return Autoencoder(autoencoder_class().from_pretrained(folder))
@@ -130,14 +142,14 @@ def load_autoencoder(folder: Path) -> Autoencoder:
 
 
 def widen_transformer(transformer: Any, init: FirstLayer = "repeat") -> None:
-    """Make room for composite and condition in the first layer, in place; the config says so too."""
+    """Widen the first layer for composite and condition, in place; the config is updated too."""
     out = transformer.proj_out.out_features
-    transformer.x_embedder = widened(transformer.x_embedder, CONDITIONS + 1, init)
+    transformer.x_embedder = widen_layer(transformer.x_embedder, CONDITIONS + 1, init)
     transformer.register_to_config(in_channels=transformer.x_embedder.in_features, out_channels=out)
 
 
 class _Base:
-    """The base's folder, fetched only when a part is missing in the weights' own."""
+    """The base model's folder, downloaded only where a part is missing in the weights' folder."""
 
     def __init__(self, weights: Path, base: str | None, say: Say) -> None:
         self._weights, self._base, self._say = weights, base, say
@@ -153,25 +165,25 @@ class _Base:
         return (local_folder(self._base or BASE, self._say),)
 
 
-def _variant_of_lora(wanted: FluxWeights) -> Variant:
-    told = wanted.variant if wanted.variant != "auto" else variant_told(wanted.lora.parent)  # pyright: ignore
-    if told not in VARIANTS:
-        raise ValueError(f"{wanted.lora}: expected harmonizer.json beside it or --variant, found neither")
-    return told  # pyright: ignore
+def _variant_of_lora(options: FluxWeights) -> Variant:
+    variant = options.variant if options.variant != "auto" else declared_variant(options.lora.parent)  # pyright: ignore
+    if variant not in VARIANTS:
+        raise ValueError(f"{options.lora}: expected harmonizer.json beside it or --variant, found neither")
+    return variant  # pyright: ignore
 
 
 def _placement(
-    wanted: FluxWeights, checked: FluxFolder, device: torch.device, work: tuple[int, int], autoencoder: Autoencoder
+    options: FluxWeights, checked: FluxFolder, device: torch.device, work: tuple[int, int], autoencoder: Autoencoder
 ) -> Placement:
     pixels, views = work
-    if wanted.precision != "auto":
-        return Placement(wanted.precision, False, f"flux: {wanted.precision} on {device}, as asked")  # pyright: ignore
+    if options.precision != "auto":
+        return Placement(options.precision, False, f"flux: {options.precision} on {device}, as asked")  # pyright: ignore
     if device.type != "cuda":
         return Placement("float32", False, f"flux: float32 on {device}; minutes per view at FLUX's size")
     config = checked.config
     width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
     return choose_placement(
-        # 12 width^2 a stream of a double block and a single block, without modulation
+        # without modulation: 12 width^2 per single block and per stream of a double block
         parameters=round(width**2 * (24 * config.get("num_layers", 19) + 12 * config.get("num_single_layers", 38))),
         others=sum(p.numel() for p in autoencoder.network.parameters()),
         activations=activation_bytes(pixels=pixels, views=views, width=width),

@@ -1,4 +1,4 @@
-"""Names and shapes in .safetensors files, and whether the files are whole, from their first bytes. Loads no tensor."""
+"""Tensor names and shapes of .safetensors files from their headers, with a check that the files are complete."""
 
 import json
 from collections.abc import Mapping
@@ -8,9 +8,10 @@ _LARGEST_HEADER = 100_000_000
 
 
 def read_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Shape of each tensor in the file.
+    """Read the shape of each tensor in the file.
 
-    Raises: ValueError where the file is missing, truncated or no .safetensors file.
+    Raises:
+        ValueError: the file is missing, truncated or of another format.
     """
     try:
         size = path.stat().st_size
@@ -31,10 +32,15 @@ def read_shapes(path: Path) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def shapes_in(folder: Path, index: str) -> Mapping[str, tuple[int, ...]]:
-    """Shapes of all tensors of a model in one or several files, each checked to be whole.
+def read_model_shapes(folder: Path, index: str) -> Mapping[str, tuple[int, ...]]:
+    """Read the shapes of all tensors of a model.
 
-    Raises: ValueError where a file is missing or broken.
+    Args:
+        folder: where the files are.
+        index: stem of the file names; with INDEX.safetensors.index.json the model is split over several files.
+
+    Raises:
+        ValueError: a file is missing, truncated or broken.
     """
     listing = folder / f"{index}.safetensors.index.json"
     if listing.is_file():

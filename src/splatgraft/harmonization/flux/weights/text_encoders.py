@@ -1,4 +1,4 @@
-"""Computes the empty prompt's embeddings with the text encoders, once (the only importer of transformers)."""
+"""Computes the empty prompt's embeddings with the text encoders (the only module that imports transformers)."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,16 +6,23 @@ from typing import Any
 
 import torch
 
-from splatgraft.harmonization.flux.empty_prompt import Prompt, write_prompt
-from splatgraft.harmonization.flux.weights.library import write_tensors
+from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding, write_prompt
+from splatgraft.harmonization.flux.weights.tensor_file import write_tensors
 
 Say = Callable[[str], None]
 
 
 def embed_empty_prompt(base: str, out: Path, *, tokens: int, say: Say) -> None:
-    """Write what T5 and CLIP of the FLUX folder or id `base` make of the empty string.
+    """Compute and write FLUX's embeddings of the empty string.
 
-    Raises: ValueError where `base` holds no such text encoders.
+    Args:
+        base: folder or hub id of FLUX with T5 and CLIP.
+        out: file to write.
+        tokens: length of T5's output.
+        say: receives progress messages.
+
+    Raises:
+        ValueError: `base` holds no such text encoders.
     """
     clip_tokenizer, clip = _load(base, "tokenizer", "CLIPTokenizer"), _load(base, "text_encoder", "CLIPTextModel")
     say(f"{base}: CLIP embeds the empty prompt")
@@ -28,13 +35,14 @@ def embed_empty_prompt(base: str, out: Path, *, tokens: int, say: Say) -> None:
     with torch.no_grad():
         ids = t5_tokenizer([""], padding="max_length", max_length=tokens, return_tensors="pt").input_ids
         hidden = t5(ids).last_hidden_state[0]
-    write_prompt(out, Prompt(hidden.float(), pooled.float()), base)
+    write_prompt(out, PromptEmbedding(hidden.float(), pooled.float()), base)
 
 
 def embed_empty_prompt_stable_diffusion(base: str, out: Path, *, say: Say) -> None:
-    """Write what CLIP of the Stable Diffusion folder or id `base` makes of the empty string.
+    """Compute and write Stable Diffusion's embeddings of the empty string, by the CLIP of folder or hub id `base`.
 
-    Raises: ValueError where `base` holds no such text encoder.
+    Raises:
+        ValueError: `base` holds no such text encoder.
     """
     tokenizer, clip = _load(base, "tokenizer", "CLIPTokenizer"), _load(base, "text_encoder", "CLIPTextModel")
     say(f"{base}: CLIP embeds the empty prompt")

@@ -1,4 +1,4 @@
-"""First layers made wider, so that conditions can join the noisy latents (paper, Sec. 4). Knows no network."""
+"""Widens a network's first layer, so that it also takes condition latents (paper, Sec. 4)."""
 
 from typing import Literal, TypeVar
 
@@ -9,20 +9,23 @@ FirstLayer = Literal["repeat", "zero"]
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
 
 
-def widened(layer: Layer, times: int, init: FirstLayer = "repeat") -> Layer:
-    """A layer for `times` as many input channels; its bias and its first weights are those of `layer`.
+def widen_layer(layer: Layer, times: int, init: FirstLayer = "repeat") -> Layer:
+    """Make a layer for `times` as many input channels, with the same bias and the same weights for the first input.
 
-    `repeat` copies the weights for each further input (the paper, after DEGS), `zero` lets them begin at nothing (as
-    in diffusers' control training: the widened network first ignores its conditions).
+    Args:
+        layer: the first layer.
+        times: number of inputs, each with as many channels as `layer` takes.
+        init: weights of the further inputs: `repeat` copies them (the paper, after DEGS), `zero` sets them to 0, so
+            that the widened network ignores its conditions at first (diffusers' control training).
     """
     weight = layer.weight.detach()
     further = weight if init == "repeat" else torch.zeros_like(weight)
-    where = {"device": weight.device, "dtype": weight.dtype, "bias": layer.bias is not None}
+    settings = {"device": weight.device, "dtype": weight.dtype, "bias": layer.bias is not None}
     if isinstance(layer, nn.Linear):
-        wider = nn.Linear(layer.in_features * times, layer.out_features, **where)
+        wider = nn.Linear(layer.in_features * times, layer.out_features, **settings)
     else:
         shape = {"stride": layer.stride, "padding": layer.padding}
-        wider = nn.Conv2d(layer.in_channels * times, layer.out_channels, layer.kernel_size, **shape, **where)  # pyright: ignore
+        wider = nn.Conv2d(layer.in_channels * times, layer.out_channels, layer.kernel_size, **shape, **settings)  # pyright: ignore
     with torch.no_grad():
         wider.weight.copy_(torch.cat([weight, *[further] * (times - 1)], 1))
         if layer.bias is not None:

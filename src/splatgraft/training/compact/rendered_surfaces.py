@@ -18,7 +18,7 @@ from splatgraft.core.spherical_harmonics import C0
 
 
 @dataclass(frozen=True)
-class Pixels:
+class SurfacePixels:
     """The surfaces that the pictures of one object's take show, all cameras."""
 
     points: Float[Tensor, "v h w 3"]
@@ -31,7 +31,7 @@ class Pixels:
     """Whether anything is."""
 
 
-def read_pixels(folder: Path, object_: str, cameras: Cameras) -> Pixels:
+def read_pixels(folder: Path, object_: str, cameras: Cameras) -> SurfacePixels:
     """The pixels of a take, lifted by their depth.
 
     Raises: ValueError where a picture is missing or broken.
@@ -52,7 +52,7 @@ def read_pixels(folder: Path, object_: str, cameras: Cameras) -> Pixels:
         normals.append(torch.nn.functional.normalize(normal, dim=-1))
         masks.append(torch.where(depth > 0, read_mask(take / f"{i:04d}_mask.png"), -1.0))
     mask = torch.stack(masks)
-    return Pixels(torch.stack(points), torch.stack(normals), mask.clamp_min(0), mask >= 0)
+    return SurfacePixels(torch.stack(points), torch.stack(normals), mask.clamp_min(0), mask >= 0)
 
 
 def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussians:

@@ -14,7 +14,7 @@ _MULTIPLE = 64
 """Pixels: eight of the autoencoder times eight of the UNet."""
 
 
-class Remover:
+class ObjectRemover:
     """A loaded network."""
 
     def __init__(self, weights: Path, device: torch.device, say: Callable[[str], None], *, seed: int = 0) -> None:

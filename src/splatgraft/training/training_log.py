@@ -15,7 +15,7 @@ LOG_FILE = "log.jsonl"
 VALIDATION_FOLDER = "validation"
 
 
-class Curve:
+class TrainingLog:
     """Open for writing while a training runs."""
 
     def __init__(self, folder: Path, tensorboard: bool) -> None:
@@ -78,7 +78,7 @@ def read_losses(path: Path) -> list[float]:
     return [entry["loss"] for entry in entries if "loss" in entry]
 
 
-def cut_log(path: Path, step: int) -> None:
+def truncate_log(path: Path, step: int) -> None:
     """Forget what was logged after `step`: it is done again."""
     if not path.is_file():
         return

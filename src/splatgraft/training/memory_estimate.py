@@ -7,7 +7,7 @@ _PER_BLOCK = 54
 
 
 @dataclass(frozen=True)
-class Size:
+class TransformerSize:
     """Of a transformer and of what it is given."""
 
     parameters: int
@@ -21,7 +21,7 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Choice:
+class MemoryOptions:
     """Options that decide."""
 
     pairs: int
@@ -36,7 +36,7 @@ class Choice:
     """Arithmetic in 16 bits."""
 
 
-def training_bytes(size: Size, choice: Choice) -> int:
+def training_bytes(size: TransformerSize, options: MemoryOptions) -> int:
     """Bytes on each device: weights, gradients, optimiser, average, activations.
 
     Learning weights are float32 (4), their gradients too (4), Adam's two moments (8, or 2 in 8 bits), an average (4),
@@ -44,32 +44,32 @@ def training_bytes(size: Size, choice: Choice) -> int:
     FLUX's blocks under autocast: a block keeps 54 bytes a token and channel for its backward pass, or 2 where it is
     computed again; twice that in 32 bits.
     """
-    learning = choice.lora * size.adapted if choice.lora else size.parameters
-    frozen = size.parameters if choice.lora else 0
-    each = 8 + (2 if choice.adam8bit else 8) + (4 if choice.ema else 0) + (2 if choice.half else 0)
-    activations = activation_bytes(size, choice)
-    return (learning * each + frozen * 2) // choice.shards + activations + (1 << 30)
+    learning = options.lora * size.adapted if options.lora else size.parameters
+    frozen = size.parameters if options.lora else 0
+    each = 8 + (2 if options.adam8bit else 8) + (4 if options.ema else 0) + (2 if options.half else 0)
+    activations = activation_bytes(size, options)
+    return (learning * each + frozen * 2) // options.shards + activations + (1 << 30)
 
 
-def activation_bytes(size: Size, choice: Choice) -> int:
+def activation_bytes(size: TransformerSize, options: MemoryOptions) -> int:
     """What of it the backward pass needs."""
-    per_token = 2 * size.blocks + _PER_BLOCK if choice.checkpointing else _PER_BLOCK * size.blocks
-    return choice.pairs * size.tokens * size.width * per_token * (1 if choice.half else 2)
+    per_token = 2 * size.blocks + _PER_BLOCK if options.checkpointing else _PER_BLOCK * size.blocks
+    return options.pairs * size.tokens * size.width * per_token * (1 if options.half else 2)
 
 
-def table(size: Size, choice: Choice) -> list[str]:
+def memory_table(size: TransformerSize, options: MemoryOptions) -> list[str]:
     """A line for each way to train, the chosen one marked."""
     ways = {
         "all weights, adam": (0, False),
         "all weights, adam8bit": (0, True),
-        f"lora of rank {choice.lora or 64}": (choice.lora or 64, choice.adam8bit),
+        f"lora of rank {options.lora or 64}": (options.lora or 64, options.adam8bit),
     }
     lines = []
     for name, (lora, small) in ways.items():
-        way = replace(choice, lora=lora, adam8bit=small)
-        again = replace(way, checkpointing=not choice.checkpointing)
-        chosen = lora == choice.lora and small == choice.adam8bit
-        words = ("with", "without") if choice.checkpointing else ("without", "with")
+        way = replace(options, lora=lora, adam8bit=small)
+        again = replace(way, checkpointing=not options.checkpointing)
+        chosen = lora == options.lora and small == options.adam8bit
+        words = ("with", "without") if options.checkpointing else ("without", "with")
         lines.append(
             f"{'* ' if chosen else '  '}{name}: {training_bytes(size, way) / 1e9:.0f} GB a device {words[0]} "
             f"checkpointing, {training_bytes(size, again) / 1e9:.0f} {words[1]}"

@@ -12,7 +12,7 @@ _WHOLE_BYTES = 36 << 30
 """bf16 FLUX with both text encoders, and room to work."""
 
 
-class Painter:
+class TextToImage:
     """A loaded pipeline."""
 
     def __init__(self, pipeline: Any, device: torch.device, size: tuple[int, int], say: Callable[[str], None]) -> None:
@@ -24,7 +24,7 @@ class Painter:
         else:
             pipeline.to(device)
 
-    def paint(self, prompt: str, *, seed: int) -> Float[Tensor, "h w 3"]:
+    def generate(self, prompt: str, *, seed: int) -> Float[Tensor, "h w 3"]:
         """The picture of a prompt and a seed."""
         width, height = self._size
         made = self._pipeline(

@@ -9,16 +9,16 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.harmonization.compact.features import View
+from splatgraft.harmonization.compact.features import CompactInput
 
 Cut = tuple[int, int, int, int]
 """Top, left, height, width."""
 _NO_PRIOR = 0.08
 
 
-def augmented(
-    view: View, target: Float[Tensor, "1 3 h w"], size: tuple[int, int], seed: str
-) -> tuple[View, Float[Tensor, "1 3 i j"]]:
+def augment(
+    view: CompactInput, target: Float[Tensor, "1 3 h w"], size: tuple[int, int], seed: str
+) -> tuple[CompactInput, Float[Tensor, "1 3 i j"]]:
     """A cut around the object at `size` (height, width), mirrored half of the time, with another exposure and doubt."""
     rng = random.Random(seed)
     top, left, height, width = _cut(view.mask[0, 0], size, rng)
@@ -34,7 +34,7 @@ def augmented(
         pictures = {name: x.flip(-1) for name, x in pictures.items()}
         target = target.flip(-1)
         pictures["normal"] = pictures["normal"] * torch.tensor([-1.0, 1, 1])[:, None, None]
-    out, target = _another_world(View(**pictures, prior_confidence=view.prior_confidence), target, rng)
+    out, target = _another_world(CompactInput(**pictures, prior_confidence=view.prior_confidence), target, rng)
     return _another_exposure(_rough(out, rng), rng), target
 
 
@@ -56,7 +56,7 @@ def _cut(mask: Float[Tensor, "h w"], size: tuple[int, int], rng: random.Random) 
     return place(int(rows[0]), tall, height, h), place(int(columns[0]), wide, width, w), height, width
 
 
-def _another_world(view: View, target: Tensor, rng: random.Random) -> tuple[View, Tensor]:
+def _another_world(view: CompactInput, target: Tensor, rng: random.Random) -> tuple[CompactInput, Tensor]:
     """All light of other colours and strength: a scene is not to be known again by its colours."""
     order = rng.sample(range(3), 3)
     gain = math.exp(rng.gauss(0.0, 0.25)) * torch.tensor([math.exp(rng.gauss(0.0, 0.12)) for _ in range(3)])
@@ -69,7 +69,7 @@ def _another_world(view: View, target: Tensor, rng: random.Random) -> tuple[View
     return replace(view, composite=composite, background=background, log_ratio=swapped), changed(target)
 
 
-def _another_exposure(view: View, rng: random.Random) -> View:
+def _another_exposure(view: CompactInput, rng: random.Random) -> CompactInput:
     """The object brighter or tinted; the prior, which knows the old light, takes that back."""
     shift = rng.gauss(0.0, 0.35) + torch.tensor([rng.gauss(0.0, 0.06) for _ in range(3)])
     shift = view.mask * shift[None, :, None, None]
@@ -82,7 +82,7 @@ def _another_exposure(view: View, rng: random.Random) -> View:
     )
 
 
-def _rough(view: View, rng: random.Random) -> View:
+def _rough(view: CompactInput, rng: random.Random) -> CompactInput:
     """Normals and depth as a reconstruction has them."""
     generator = torch.Generator().manual_seed(rng.randrange(2**31))
     size = view.mask.shape[-2:]
@@ -94,7 +94,7 @@ def _rough(view: View, rng: random.Random) -> View:
     return replace(view, normal=normal, depth=(view.depth + 0.1 * noise[:, 3:]).clamp(-2, 2))
 
 
-def batched(views: list[View]) -> View:
+def batch_inputs(views: list[CompactInput]) -> CompactInput:
     """Views of one size as one batch."""
     names = ("composite", "background", "mask", "log_ratio", "depth", "normal", "prior_confidence")
-    return View(**{name: torch.cat([getattr(view, name) for view in views]) for name in names})
+    return CompactInput(**{name: torch.cat([getattr(view, name) for view in views]) for name in names})

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 
-class Average:
+class MovingAverage:
     """A float32 copy of the learning parameters that follows them slowly."""
 
     def __init__(self, network: nn.Module, decay: float) -> None:

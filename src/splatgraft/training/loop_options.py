@@ -5,7 +5,7 @@ from typing import Literal
 
 
 @dataclass(frozen=True)
-class Loop:
+class LoopOptions:
     """Length, optimiser, precision and rhythm of a training."""
 
     steps: int = 50_000

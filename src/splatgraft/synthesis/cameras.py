@@ -26,7 +26,7 @@ def _eye(target: Vector, azimuth: Number, elevation: Number, distance: Number) -
     )
 
 
-def arc(scene: Scene, place: Place, object_height: Number, seed: int) -> tuple[Camera, ...]:
+def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> tuple[Camera, ...]:
     """Five cameras on a short arc that all see the object's place (paper, Sec. 4.2).
 
     Raises: ValueError where no free arc is found.
@@ -49,7 +49,7 @@ def arc(scene: Scene, place: Place, object_height: Number, seed: int) -> tuple[C
     raise ValueError(f"scene {scene.name}: expected room for an arc of cameras around {place.location}, found none")
 
 
-def capture(scene: Scene, place: Place, object_height: Number, count: int, seed: int) -> tuple[Camera, ...]:
+def capture_cameras(scene: Scene, place: Place, object_height: Number, count: int, seed: int) -> tuple[Camera, ...]:
     """`count` cameras all around the place at two to three heights, in the order of a person who walks around it.
 
     Raises: ValueError where too little of the surroundings is free.

@@ -16,9 +16,9 @@ from torch import Tensor
 from splatgraft.core.images import read_mask, read_rgb, write_image
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.atomic_folder import atomic_folder
-from splatgraft.synthesis.pairs import composite, normalized
-from splatgraft.training.sources.rendered import stamp
-from splatgraft.training.sources.source import Role, TrainingPair
+from splatgraft.synthesis.pairs import composite, match_statistics
+from splatgraft.training.sources.pair_source import Role, TrainingPair
+from splatgraft.training.sources.rendered_pairs import file_fingerprint
 
 MANIFEST_FILE = "manifest.jsonl"
 RECORD_FILE = "record.json"
@@ -91,7 +91,7 @@ class RelitPairs:
     def key(self, index: int, role: Role) -> str:
         """Path, size and time of the file for the role."""
         folder, _, light = self._pairs[index]
-        return stamp(folder / (f"relit_{light}.png" if role == "composite" else f"{role}.png")) + f"|{role}"
+        return file_fingerprint(folder / (f"relit_{light}.png" if role == "composite" else f"{role}.png")) + f"|{role}"
 
     def read(self, index: int) -> TrainingPair:
         """A pair, its composite made here: the relit object brought to the exposure of the one in the scene.
@@ -105,4 +105,6 @@ class RelitPairs:
             if picture.shape[:2] != target.shape[:2]:
                 wanted, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
                 raise ValueError(f"{folder / name}.png: expected {wanted} pixels as target.png, found {found}")
-        return TrainingPair(composite(normalized(relit, target, mask), background, mask), target, background, mask)
+        return TrainingPair(
+            composite(match_statistics(relit, target, mask), background, mask), target, background, mask
+        )

@@ -16,7 +16,7 @@ _STRONGEST = 4.0
 _MISSED = 0.05
 
 
-def wrong(light: Light, rng: random.Random) -> Light:
+def perturb_light(light: Light, rng: random.Random) -> Light:
     """`light` as somebody might have estimated it; `uncertainty_deg` tells the spread that the error was drawn from."""
     spread = rng.uniform(0.0, 20.0)
     level = math.exp(max(-1.4, min(1.4, rng.gauss(0.0, 0.35))))

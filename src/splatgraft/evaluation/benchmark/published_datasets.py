@@ -75,7 +75,7 @@ def download(layout: PublishedLayout, folder: Path, *, parts: tuple[str, ...] | 
     return folder
 
 
-def scenes_of(layout: PublishedLayout, folder: Path) -> list[PublishedScene]:
+def find_scenes(layout: PublishedLayout, folder: Path) -> list[PublishedScene]:
     """All scenes that a downloaded data set holds.
 
     Raises: ValueError where none is found, or a scene lacks its source or target, with what was looked for.

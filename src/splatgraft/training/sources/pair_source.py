@@ -40,7 +40,7 @@ class TrainingPair:
 
 
 @runtime_checkable
-class Source(Protocol):
+class PairSource(Protocol):
     """Pairs on disk."""
 
     name: str
@@ -65,10 +65,10 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True)
-class Drawn:
+class PairReference:
     """One pair of one source."""
 
-    source: Source
+    source: PairSource
     index: int
 
 
@@ -76,29 +76,29 @@ class Drawn:
 class Mixture:
     """Several sources, drawn from by weight."""
 
-    sources: tuple[Source, ...]
+    sources: tuple[PairSource, ...]
     weights: tuple[float, ...]
     """Relative; one a source."""
     indices: tuple[tuple[int, ...], ...]
     """Of each source's pairs, those that belong to this mixture."""
     seed: int
 
-    def draw(self, position: int) -> Drawn:
+    def draw(self, position: int) -> PairReference:
         """The pair at a place in the endless order; independent of what was drawn before, and of who draws."""
         rng = random.Random(f"{self.seed}-{position}")
         which = rng.choices(range(len(self.sources)), self.weights)[0]
-        return Drawn(self.sources[which], rng.choice(self.indices[which]))
+        return PairReference(self.sources[which], rng.choice(self.indices[which]))
 
-    def all(self) -> list[Drawn]:
+    def all(self) -> list[PairReference]:
         """Every pair once, the sources taking turns."""
         longest = max(map(len, self.indices))
         pairs = zip(self.sources, self.indices, strict=True)
-        listed = [(i, Drawn(source, index)) for source, own in pairs for i, index in enumerate(own)]
+        listed = [(i, PairReference(source, index)) for source, own in pairs for i, index in enumerate(own)]
         return [drawn for _, drawn in sorted(listed, key=lambda pair: pair[0])][: longest * len(self.sources)]
 
 
 def split_mixture(
-    sources: Sequence[Source], *, weights: Sequence[float], held_out: float, seed: int
+    sources: Sequence[PairSource], *, weights: Sequence[float], held_out: float, seed: int
 ) -> tuple[Mixture, Mixture | None]:
     """What is trained on and what is held out: whole scenes, by the hash of their names, one at least of each source.
 
@@ -129,7 +129,7 @@ def split_mixture(
     return train, validation
 
 
-def fitted(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "{height} {width} *c"]:
+def crop_to_size(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "{height} {width} *c"]:
     """The picture at another size, its middle where the shapes differ."""
     h, w = image.shape[:2]
     scale = max(width / w, height / h)
@@ -138,9 +138,9 @@ def fitted(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Ten
     return larger[top : top + height, left : left + width]
 
 
-def fitted_pair(pair: TrainingPair, width: int, height: int) -> TrainingPair:
+def crop_pair_to_size(pair: TrainingPair, width: int, height: int) -> TrainingPair:
     """All pictures of a pair at one size."""
-    images = (fitted(image, width, height) for image in (pair.composite, pair.target, pair.background, pair.mask))
+    images = (crop_to_size(image, width, height) for image in (pair.composite, pair.target, pair.background, pair.mask))
     return TrainingPair(*(torch.clamp(image, 0, 1) for image in images))
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from splatgraft.synthesis.pairs import PairSample, load_pair, read_manifest
-from splatgraft.training.sources.source import Role, TrainingPair
+from splatgraft.training.sources.pair_source import Role, TrainingPair
 
 
 class RenderedPairs:
@@ -26,7 +26,7 @@ class RenderedPairs:
 
     def key(self, index: int, role: Role) -> str:
         """Path, size and time of the file that is rendered for the role."""
-        return stamp(_file(self._samples[index], role)) + f"|{role}"
+        return file_fingerprint(_file(self._samples[index], role)) + f"|{role}"
 
     def read(self, index: int) -> TrainingPair:
         """A pair.
@@ -37,7 +37,7 @@ class RenderedPairs:
         return TrainingPair(pair.composite, pair.target, pair.background, pair.mask)
 
 
-def stamp(path: Path) -> str:
+def file_fingerprint(path: Path) -> str:
     """What changes when a file does.
 
     Raises: ValueError where it is missing.
