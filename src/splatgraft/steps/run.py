@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatgraft.project import clear_leftovers, locked, why_stale
+from splatgraft.steps.capture import Capture, doubt_about
 from splatgraft.steps.flow import read_flow
 from splatgraft.steps.step import Positional, job_of, perform
 from splatgraft.steps.terminal import Terminal
@@ -21,9 +22,15 @@ class Run:
     """Stop after this step (reconstruct, or source/reconstruct for one of the two)."""
     force: tuple[str, ...] = ()
     """Do these steps even where they are fresh."""
+    accept_doubtful: bool = False
+    """Go on after a capture whose poses are not plausible, as accept_doubtful = true in [source] or [target] does."""
 
     def execute(self, terminal: Terminal) -> int:
-        """Do the steps; the paths of what was wanted are the last lines of standard output."""
+        """Do the steps; the paths of what was wanted are the last lines of standard output.
+
+        Raises:
+            ValueError: Where the poses of a capture are not plausible and this was not accepted.
+        """
         flow = read_flow(self.project, self.out)
         wanted = flow.up_to(self.to)
         forced = {step for name in self.force for step in flow.named(name)}
@@ -35,6 +42,8 @@ class Run:
                     perform(step, terminal, name=name)
                 else:
                     clear_leftovers(step.out)
+                if isinstance(step, Capture) and not self.accept_doubtful and (doubt := doubt_about(step)):
+                    raise ValueError(doubt)
         terminal.say("results:")
         for name, path in flow.results():
             if name in wanted:
