@@ -37,7 +37,7 @@ class PoseOptions:
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Which pairs are compared: all, or neighbours in name order; `auto` is exhaustive for up to 80 photos."""
     effort: Literal["auto", "quick", "thorough"] = "auto"
-    """`thorough` finds and matches more features at about 20 times the cost; `auto` does so after a doubtful quick result."""
+    """`thorough` finds and matches more features at about 20 times the cost; `auto` does so where quick is doubtful."""
     lens: Literal["shared", "each"] = "shared"
     """Whether photos of equal size and EXIF (maker, model, focal length) share a camera, or each has its own."""
     max_size_px: int = 1600
