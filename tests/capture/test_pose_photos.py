@@ -28,9 +28,18 @@ def model_of(poses, focal=50.0, points=()):
     """What the COLMAP process answers."""
     return {
         "models": 1,
+        "method": "global",
+        "explained": 0.8,
+        "cpu_seconds": {"features": 1.0, "matching": 2.0, "mapping": 0.5},
         "mean_reprojection_px": 0.4,
         "images": [
-            {"name": f"{i:02d}.jpg", "world_from_camera": pose[:3].tolist(), "camera": [focal, 20.0, 15.0, 0.01]}
+            {
+                "name": f"{i:02d}.jpg",
+                "world_from_camera": pose[:3].tolist(),
+                "camera": [focal, 20.0, 15.0, 0.01],
+                "camera_id": 1,
+                "observations": 500,
+            }
             for i, pose in enumerate(poses)
         ],
         "points": [[*p.tolist(), 255, 0, 0, 0.3, 4] for p in points],

@@ -1,10 +1,11 @@
-"""Photos made ready for structure from motion, and freed of distortion after it. Knows nothing about poses."""
+"""Photos made ready for structure from motion, grouped by camera, and freed of distortion after it."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from PIL import Image, ImageOps
+from PIL.ExifTags import IFD, Base
 
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import read_rgb
@@ -34,15 +35,30 @@ def working_copies(photos: Sequence[Path], folder: Path, max_size_px: int) -> li
     return [folder / name for name in names]
 
 
-def camera_mode(copies: Sequence[Path], shared: bool) -> str:
-    """COLMAP's word for which photos share a camera; one camera needs one size."""
+def camera_groups(copies: Sequence[Path], shared: bool) -> list[list[str]]:
+    """File names of the photos that have one camera: equal size and EXIF maker, model and focal length.
+
+    Args:
+        copies: Working copies.
+        shared: Whether photos share cameras at all; else each is a group.
+
+    Returns:
+        Groups in the order of their first photos.
+    """
     if not shared:
-        return "PER_IMAGE"
-    sizes = set()
+        return [[copy.name] for copy in copies]
+    groups: dict[tuple[object, ...], list[str]] = {}
     for copy in copies:
-        with Image.open(copy) as image:
-            sizes.add(image.size)
-    return "SINGLE" if len(sizes) == 1 else "AUTO"
+        groups.setdefault(_camera_traits(copy), []).append(copy.name)
+    return list(groups.values())
+
+
+def _camera_traits(copy: Path) -> tuple[object, ...]:
+    with Image.open(copy) as image:
+        exif = image.getexif()
+        details = exif.get_ifd(IFD.Exif)
+        focal = (details.get(Base.FocalLength), details.get(Base.FocalLengthIn35mmFilm))
+        return (image.size, exif.get(Base.Make), exif.get(Base.Model), *(f and float(f) for f in focal))
 
 
 def write_undistorted(copy: Path, path: Path, distortion: Distortion) -> torch.Tensor:

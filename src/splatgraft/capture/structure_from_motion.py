@@ -1,4 +1,4 @@
-"""Poses for photos that have none, by COLMAP in a process of its own. Knows nothing about Gaussians or projects."""
+"""Poses, intrinsics and sparse points of photos by COLMAP, which runs in a process of its own (colmap_process.py)."""
 
 import json
 import subprocess
@@ -13,7 +13,9 @@ from typing import Any, Literal
 import torch
 
 from splatgraft.capture.orientation import upright
-from splatgraft.capture.photos import camera_mode, working_copies, write_undistorted
+from splatgraft.capture.photos import camera_groups, working_copies, write_undistorted
+from splatgraft.capture.plausibility import Doubt, Found, Lens, find_doubts
+from splatgraft.capture.pose_report import PoseReport
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import stored_size
@@ -23,8 +25,9 @@ from splatgraft.runtime.progress import Progress, silent
 _PHASES = 3
 _ADVICE = (
     "take more photos, a step apart, with two thirds overlap, sharp, of a still scene with texture around plain or "
-    "shiny things, at one zoom setting (or say that each photo has its own camera)"
+    "shiny things, at one zoom setting (or say that each photo has its own camera: lens = each)"
 )
+_SILENT: Callable[[str], None] = lambda sentence: None  # noqa: E731
 
 
 @dataclass(frozen=True)
@@ -34,9 +37,9 @@ class PoseOptions:
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Which pairs are compared: all, or neighbours in name order; `auto` is exhaustive for up to 80 photos."""
     effort: Literal["auto", "quick", "thorough"] = "auto"
-    """`thorough` finds and matches more features at about 20 times the cost; `auto` does so where quick misses any."""
+    """`thorough` finds and matches more features at about 20 times the cost; `auto` does so where quick is doubtful."""
     lens: Literal["shared", "each"] = "shared"
-    """Whether all photos were taken with one camera at one zoom setting."""
+    """Whether photos of equal size and EXIF (maker, model, focal length) share a camera, or each has its own."""
     max_size_px: int = 1600
     """Larger photos are shrunk to this longest side first."""
     threads: int = 2
@@ -45,40 +48,30 @@ class PoseOptions:
     """For the random choices of matching and mapping."""
 
 
-@dataclass(frozen=True)
-class PoseReport:
-    """How well it went."""
-
-    photos: int
-    """Photos given."""
-    registered: int
-    """Photos that have a pose now."""
-    missing: tuple[str, ...]
-    """Names of the others, without suffix."""
-    mean_reprojection_px: float
-    """Mean distance between where points are seen and where they project, pixels of the (shrunk) photos."""
-    points: int
-    """Sparse points kept: seen by three photos or more, at most 1.5 px off."""
-    models: int
-    """Separate models found; the largest was taken."""
-
-    def __str__(self) -> str:
-        """One line for people."""
-        line = (
-            f"{self.registered} of {self.photos} photos registered, mean reprojection error "
-            f"{self.mean_reprojection_px:.2f} px, {self.points} points"
-        )
-        return line + (f"; without a pose: {', '.join(self.missing)}" if self.missing else "")
-
-
 def pose_photos(
-    photos: Sequence[Path], workspace: Path, *, options: PoseOptions = PoseOptions(), progress: Progress = silent
+    photos: Sequence[Path],
+    workspace: Path,
+    *,
+    options: PoseOptions = PoseOptions(),
+    progress: Progress = silent,
+    say: Callable[[str], None] = _SILENT,
 ) -> tuple[PosedImages, PoseReport]:
     """Poses, intrinsics and sparse points of `photos`; upright undistorted images are written to `workspace`/images.
 
     World: +z up, the support plane at z = 0, median camera distance 1 (see `upright`).
 
-    Raises: ValueError where pycolmap is missing, names clash, a photo is unreadable, or under half get a pose.
+    Args:
+        photos: At least three, of different names.
+        workspace: An existing folder.
+        options: How structure from motion is run.
+        progress: Moves a bar.
+        say: Takes a sentence before a second, longer attempt.
+
+    Returns:
+        The photos with a pose, and figures that say how far to trust them (`PoseReport.doubts`).
+
+    Raises:
+        ValueError: Where pycolmap is missing, names clash, a photo is unreadable, or under half get a pose.
     """
     if find_spec("pycolmap") is None:
         raise ValueError("photos without poses: expected pycolmap (pip install 'splatgraft[sfm]'), found none")
@@ -91,15 +84,17 @@ def pose_photos(
         copies = working_copies(photos, Path(scratch) / "photos", options.max_size_px)
         models: list[dict[str, Any]] = []
         for attempt, effort in enumerate(efforts):
-            job = _job(copies, Path(scratch), options, effort)
 
             def advance(done: int, message: str, before: int = attempt * _PHASES) -> None:
                 progress(before + done, total, message)
 
-            models.append(_run(job, advance))
-            if len(models[-1]["images"]) == len(photos):
+            models.append(_run(_job(copies, Path(scratch), options, effort), advance))
+            doubts = _doubts(models[-1], copies)
+            if not doubts:
                 break
-        model = max(models, key=lambda m: len(m["images"]))
+            if effort != efforts[-1]:
+                say(_second_attempt(doubts, models[-1]))
+        model = max(models, key=_score)
         registered = {Path(image["name"]).stem for image in model["images"]}
         if len(registered) < 0.5 * len(photos):
             raise ValueError(
@@ -108,16 +103,60 @@ def pose_photos(
             )
         progress(total - 1, total, "undistorting")
         posed = _posed_images(model, Path(scratch) / "photos", workspace / "images")
-    report = PoseReport(
-        photos=len(photos),
-        registered=len(registered),
-        missing=tuple(sorted(photo.stem for photo in photos if photo.stem not in registered)),
-        mean_reprojection_px=model["mean_reprojection_px"],
-        points=len(posed.points),
-        models=model["models"],
-    )
+        report = PoseReport(
+            photos=len(photos),
+            registered=len(registered),
+            missing=tuple(sorted(photo.stem for photo in photos if photo.stem not in registered)),
+            mean_reprojection_px=model["mean_reprojection_px"],
+            points=len(posed.points),
+            models=model["models"],
+            method=model["method"],
+            explained=model["explained"],
+            lenses=_lenses(model, copies[0].parent),
+            doubts=_doubts(model, copies),
+        )
     progress(total, total, str(report))
     return posed, report
+
+
+def _score(model: dict[str, Any]) -> float:
+    """As in colmap_process.py, where the number of photos is the same for all."""
+    return model["explained"] * len(model["images"])
+
+
+def _doubts(model: dict[str, Any], copies: Sequence[Path]) -> tuple[Doubt, ...]:
+    return find_doubts(
+        Found(
+            photos=len(copies),
+            explained=model["explained"],
+            mean_reprojection_px=model["mean_reprojection_px"],
+            observations=tuple(image["observations"] for image in model["images"]),
+            lenses=_lenses(model, copies[0].parent),
+        )
+    )
+
+
+def _lenses(model: dict[str, Any], folder: Path) -> tuple[Lens, ...]:
+    groups: dict[int, list[dict[str, Any]]] = {}
+    for image in model["images"]:
+        groups.setdefault(image["camera_id"], []).append(image)
+    return tuple(
+        Lens(
+            photos=tuple(Path(image["name"]).stem for image in images),
+            size=stored_size(folder / images[0]["name"]),
+            focal_px=images[0]["camera"][0],
+            distortion=images[0]["camera"][3],
+        )
+        for images in sorted(groups.values(), key=len, reverse=True)
+    )
+
+
+def _second_attempt(doubts: Sequence[Doubt], model: dict[str, Any]) -> str:
+    seconds = sum(model["cpu_seconds"].values())
+    return (
+        f"doubtful after {seconds:.0f} CPU seconds ({'; '.join(str(doubt) for doubt in doubts)}): features, matches "
+        f"and mapping once more with more features, which takes about 20 times as long (effort = quick does not)"
+    )
 
 
 def _job(copies: Sequence[Path], scratch: Path, options: PoseOptions, effort: str) -> dict[str, Any]:
@@ -129,7 +168,7 @@ def _job(copies: Sequence[Path], scratch: Path, options: PoseOptions, effort: st
         "models": str(models),
         "output": str(scratch / f"{effort}.json"),
         "thorough": effort == "thorough",
-        "camera_mode": camera_mode(copies, shared=options.lens == "shared"),
+        "groups": camera_groups(copies, shared=options.lens == "shared"),
         "exhaustive": options.matching == "exhaustive" or (options.matching == "auto" and len(copies) <= 80),
         "threads": options.threads,
         "seed": options.seed,

@@ -20,10 +20,19 @@ class Run:
     """Stop after this step (reconstruct, or source/reconstruct for one of the two)."""
     force: tuple[str, ...] = ()
     """Do these steps even where they are fresh."""
+    accept_doubtful: bool = False
+    """Go on after a capture whose poses are not plausible, as accept_doubtful = true in [source] or [target] does."""
 
     def execute(self, console: Console) -> int:
         """Do the steps; the paths of what was wanted are the last lines of standard output."""
-        run_steps(self.project, console, out=self.out, to=self.to, force=self.force)
+        run_steps(
+            self.project,
+            console,
+            out=self.out,
+            to=self.to,
+            force=self.force,
+            accept_doubtful=self.accept_doubtful,
+        )
         return 0
 
 

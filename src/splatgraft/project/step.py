@@ -18,8 +18,8 @@ from splatgraft.runtime.progress import Progress
 Positional = Annotated[Path, tyro.conf.Positional]
 Device = Literal["auto", "cpu", "cuda"]
 Inputs = Mapping[str, tuple[Path, ...]]
-_MACHINE = ("device", "batch", "compile", "processes", "ray", "max_cost")
-"""Options that say where and how fast work is done, not what comes out."""
+_MACHINE = ("device", "batch", "compile", "processes", "ray", "max_cost", "accept_doubtful")
+"""Options that say where and how fast work is done, or whether to go on after it, not what comes out."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from splatgraft.commands.steps.capture import Capture, doubt_about
 from splatgraft.project.folder_lock import locked
 from splatgraft.project.record import why_stale
 from splatgraft.project.replacement import clear_leftovers
@@ -11,7 +12,13 @@ from splatgraft.workflow.flow import read_flow
 
 
 def run_steps(
-    project: Path, console: Console, *, out: Path | None = None, to: str | None = None, force: tuple[str, ...] = ()
+    project: Path,
+    console: Console,
+    *,
+    out: Path | None = None,
+    to: str | None = None,
+    force: tuple[str, ...] = (),
+    accept_doubtful: bool = False,
 ) -> None:
     """Perform what is stale up to the step `to`, and print the paths of the results.
 
@@ -21,9 +28,11 @@ def run_steps(
         out: Root of the results; the project's folder where None.
         to: Last step, e.g. "reconstruct" (both captures) or "source/reconstruct"; all where None.
         force: Steps that are performed even where they are fresh.
+        accept_doubtful: Whether to go on after a capture whose poses are not plausible.
 
     Raises:
-        ValueError: The project file or an input is bad, or another run works on the project.
+        ValueError: The project file or an input is bad, another run works on the project, or the poses of a capture are
+            not plausible and this was not accepted.
     """
     flow = read_flow(project, out)
     wanted = flow.up_to(to)
@@ -36,6 +45,8 @@ def run_steps(
                 perform(step, console, name=name)
             else:
                 clear_leftovers(step.out)
+            if isinstance(step, Capture) and not accept_doubtful and (doubt := doubt_about(step)):
+                raise ValueError(doubt)
     console.say("results:")
     for name, path in flow.results():
         if name in wanted:

@@ -3,7 +3,16 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatgraft.capture import LookOptions, PoseOptions, extract_frames, find_viewpoints, photographed, pose_photos
+from splatgraft.capture import (
+    LookOptions,
+    PoseOptions,
+    extract_frames,
+    find_viewpoints,
+    photographed,
+    pose_photos,
+    read_pose_report,
+    write_pose_report,
+)
 from splatgraft.core.images import list_images, write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs, has_poses
@@ -22,6 +31,8 @@ class Capture:
     """Folder for transforms.json and points.ply."""
     max_side: int = 1600
     """Longest side at which images are served from here on, pixels; 0 keeps all."""
+    accept_doubtful: bool = False
+    """Whether `run` goes on with poses that are not plausible; without it, it stops after this step."""
     options: PoseOptions = field(default_factory=PoseOptions)
     look: LookOptions = field(default_factory=LookOptions)
 
@@ -40,9 +51,16 @@ class Capture:
             context.console.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points")
         else:
             posed, report = pose_photos(
-                self._photos(folder, context), folder, options=self.options, progress=context.progress
+                self._photos(folder, context),
+                folder,
+                options=self.options,
+                progress=context.progress,
+                say=lambda sentence: context.console.say(f"{self.capture}: {sentence}"),
             )
             context.console.say(f"{self.capture}: {report}")
+            for doubt in report.doubts:
+                context.console.say(f"{self.capture}: doubtful: {doubt}")
+            write_pose_report(folder, report)
         write_capture(folder, _limited(posed, self.max_side))
 
     def _pictures(self, folder: Path, context: Context) -> PosedImages:
@@ -67,6 +85,23 @@ class Capture:
         if self.capture.is_dir():
             return list_images(self.capture)
         return extract_frames(self.capture, folder / "frames", progress=context.progress)
+
+
+def doubt_about(step: Capture) -> str | None:
+    """Why the result of `step` should not be built upon and what to do, in one line; None where it may be.
+
+    Raises:
+        ValueError: Where its pose_report.json is damaged.
+    """
+    report = read_pose_report(step.out)
+    if report is None or not report.doubts or step.accept_doubtful:
+        return None
+    return (
+        f"{step.out}: expected plausible poses, found doubtful ones ({'; '.join(str(d) for d in report.doubts)}); take "
+        f'more photos with more overlap, or set effort = "thorough", or lens = "each" where zoom or focus '
+        f"changed, or give poses (a COLMAP folder or transforms.json); to go on with these poses, which are kept, set "
+        f"accept_doubtful = true for this capture or use run --accept-doubtful"
+    )
 
 
 def _limited(posed: PosedImages, max_side: int) -> PosedImages:

@@ -3,6 +3,9 @@
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import psnr, ssim
@@ -16,6 +19,16 @@ from splatgraft.rendering import RenderOptions, render
 
 EVAL_EVERY = 8
 """As in 3DGS."""
+
+
+@dataclass(frozen=True)
+class FarBelow:
+    """When a held-out view counts as far worse than the rest."""
+
+    deviations: float = 3.0
+    """Robust standard deviations (1.4826 median absolute deviations) below the median: the usual three."""
+    decibels: float = 3.0
+    """And this much below the median in PSNR at least: twice the squared error."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +60,32 @@ class Reconstruct:
         if options.eval_every:
             metrics = _held_out_metrics(scene, options.served(capture), options)
             context.console.say(f"held out: {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}")
+            for sentence in far_worse(metrics["psnr_by_view"]):
+                context.console.say(sentence)
             (folder / METRICS_FILE).write_text(json.dumps(metrics, indent=1))
 
 
-def _held_out_metrics(scene: Gaussians, capture: PosedImages, options: ReconstructOptions) -> dict[str, float]:
-    """Means over the held-out views."""
+def far_worse(psnr_by_view: dict[str, float], rule: FarBelow = FarBelow()) -> list[str]:
+    """One sentence per held-out view that is far worse than the rest, the worst first.
+
+    Args:
+        psnr_by_view: PSNR of each held-out view in dB, by the name of its photo.
+        rule: What far worse means.
+    """
+    values = np.array(list(psnr_by_view.values()))
+    middle = float(np.median(values))
+    spread = 1.4826 * float(np.median(np.abs(values - middle)))
+    limit = middle - max(rule.deviations * spread, rule.decibels)
+    return [
+        f"held out: {name} is far worse than the rest: {value:.1f} dB, median {middle:.1f} dB; its pose may be wrong, "
+        f"or the photo blurred"
+        for name, value in sorted(psnr_by_view.items(), key=lambda item: item[1])
+        if value < limit
+    ]
+
+
+def _held_out_metrics(scene: Gaussians, capture: PosedImages, options: ReconstructOptions) -> dict[str, Any]:
+    """Means over the held-out views, and the PSNR of each."""
     views = capture.select(held_out(len(capture), options.eval_every))
     values: list[tuple[float, float]] = []
     for index, camera in enumerate(views.cameras.to(scene.device)):
@@ -59,7 +93,8 @@ def _held_out_metrics(scene: Gaussians, capture: PosedImages, options: Reconstru
         image, truth = picture[0].cpu().clamp(0, 1), views.image(index)
         values.append((float(psnr(image, truth)), float(ssim(image, truth))))
     means = [sum(column) / len(values) for column in zip(*values, strict=True)]
-    return {"psnr": means[0], "ssim": means[1], "views": len(values), "gaussians": scene.count}
+    by_view = dict(zip(views.cameras.names, (value for value, _ in values), strict=True))
+    return {"psnr": means[0], "ssim": means[1], "views": len(values), "gaussians": scene.count, "psnr_by_view": by_view}
 
 
 COMMAND = Reconstruct
