@@ -1,4 +1,4 @@
-"""Puts the tiny project of the steps' tests on the path: the editor is tested on it too."""
+"""Puts tests/commands on the path, whose tiny project the editor's tests use, and provides a browser."""
 
 import sys
 from pathlib import Path

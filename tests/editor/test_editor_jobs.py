@@ -1,4 +1,4 @@
-"""Long work in a child: it outlives who started it, tells how far it is, and is known to be dead when it is."""
+"""Jobs in child processes: progress, cancellation, detection of killed processes, and time estimates."""
 
 import os
 import signal
@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 from editor_driver import wait_until
 
-from splatgraft.editor.jobs.jobs import Jobs, JobState, PlannedStep, seconds_left, seconds_left_in_all, write_state
+from splatgraft.editor.jobs.jobs import Jobs, JobState, PlannedStep, seconds_left, seconds_left_in_job, write_state
 
 WORK = """
 import sys, os, signal, time
 from pathlib import Path
-from splatgraft.editor.jobs.jobs import JobState, hold, write_state
+from splatgraft.editor.jobs.jobs import JobState, acquire_job_lock, write_state
 folder, seconds = Path(sys.argv[1]), float(sys.argv[2])
 signal.signal(signal.SIGINT, signal.default_int_handler)
-lock = hold(folder)
+lock = acquire_job_lock(folder)
 state = JobState("work", ("run",), os.getpid(), "running", time.time(), step="render", done=3, total=4)
 write_state(folder, state)
 try:
@@ -53,8 +53,8 @@ def test_a_job_is_seen_at_work_by_another_and_ends(tmp_path: Path) -> None:
     wait_until(lambda: outcome(other) == "running", timeout=30, what="work")
     state = other.state()
     assert state is not None
-    assert state.share == 0.75
-    with pytest.raises(ValueError, match="at work"):
+    assert state.fraction == 0.75
+    with pytest.raises(ValueError, match="running"):
         other.start(["true"], title="another", shown=[])
     wait_until(lambda: outcome(other) == "done", timeout=30, what="the end")
     assert outcome(jobs) == "done"
@@ -100,21 +100,21 @@ def test_what_an_earlier_run_did_took_no_time_now() -> None:
 def test_the_time_left_in_all_counts_on_what_was_measured_and_mends_what_was_guessed() -> None:
     plan = (PlannedStep("a", 10.0, True), PlannedStep("b", 4.0, False), PlannedStep("c", 6.0, False))
     state = JobState("work", (), 1, "running", 0.0, step="a", step_started=100.0, plan=plan)
-    assert seconds_left_in_all(state, 103.0) == 7.0 + 4.0 + 6.0
+    assert seconds_left_in_job(state, 103.0) == 7.0 + 4.0 + 6.0
     # its own progress is the better witness, and a measured step says nothing about the guesses
-    assert seconds_left_in_all(replace(state, done=1, total=4, begun_at=100.0), 105.0) == 15.0 + 4.0 + 6.0
+    assert seconds_left_in_job(replace(state, done=1, total=4, begun_at=100.0), 105.0) == 15.0 + 4.0 + 6.0
     # but what it counts may be one of several things
-    assert seconds_left_in_all(replace(state, done=3, total=4, begun_at=100.0), 103.0) == 7.0 + 4.0 + 6.0
+    assert seconds_left_in_job(replace(state, done=3, total=4, begun_at=100.0), 103.0) == 7.0 + 4.0 + 6.0
     # b takes twice what was guessed: so will c
     later = replace(state, step="b", step_started=110.0, begun_at=110.0, done=1, total=2, took=(("a", 10.0),))
-    assert seconds_left_in_all(later, 114.0) == 4.0 + 12.0
-    assert seconds_left_in_all(replace(later, step="c", took=(("a", 10.0), ("b", 8.0)), done=0), 111.0) == 11.0
+    assert seconds_left_in_job(later, 114.0) == 4.0 + 12.0
+    assert seconds_left_in_job(replace(later, step="c", took=(("a", 10.0), ("b", 8.0)), done=0), 111.0) == 11.0
     # at the end of what it counts it is not known what else there is
     assert seconds_left(replace(later, done=2), 114.0) is None
     # nothing is known of the first step, or of the job
-    assert seconds_left_in_all(replace(state, plan=plan[1:], step="b"), 103.0) is None
-    assert seconds_left_in_all(replace(state, plan=()), 103.0) is None
-    assert seconds_left_in_all(replace(state, outcome="done"), 103.0) is None
+    assert seconds_left_in_job(replace(state, plan=plan[1:], step="b"), 103.0) is None
+    assert seconds_left_in_job(replace(state, plan=()), 103.0) is None
+    assert seconds_left_in_job(replace(state, outcome="done"), 103.0) is None
 
 
 def test_the_plan_survives_its_file(tmp_path: Path) -> None:

@@ -101,24 +101,24 @@ def test_large_uploads_and_public_tunnels_are_not_let_in() -> None:
         def part(name: str, content: bytes) -> _messages.FileTransferPart:
             return _messages.FileTransferPart("button", transfer_uuid=name, part_index=0, content=content)
 
-        assert not guarded._bearable(begin("large.ply", 11))
+        assert not guarded._upload_allowed(begin("large.ply", 11))
         assert told == ["large.ply"]
-        assert guarded._bearable(begin("small.ply", 4))
-        assert guarded._bearable(part("small.ply", b"1234"))
+        assert guarded._upload_allowed(begin("small.ply", 4))
+        assert guarded._upload_allowed(part("small.ply", b"1234"))
         # more than was announced, and what was never announced
-        assert not guarded._bearable(part("small.ply", b"5"))
-        assert not guarded._bearable(part("large.ply", b"1"))
+        assert not guarded._upload_allowed(part("small.ply", b"5"))
+        assert not guarded._upload_allowed(part("large.ply", b"1"))
         passed: list[object] = []
 
         async def inner(window: int, message: object) -> None:
             passed.append(message)
 
         def send(window: int, message: object) -> None:
-            coroutine = guarded._filtered(inner, window, message)
+            coroutine = guarded._forward_allowed(inner, window, message)
             with pytest.raises(StopIteration):
                 coroutine.send(None)
 
-        guarded.seat = guarded.seat.joined(1).joined(2)
+        guarded.edit_lock = guarded.edit_lock.with_window(1).with_window(2)
         send(1, _messages.ShareUrlRequest())
         send(2, _messages.GuiFormSubmitMessage("x"))
         assert passed == []

@@ -10,7 +10,7 @@ import pytest
 import torch
 from editor_driver import Editor, Window, state_of, wait_until, with_browser
 from PIL import Image
-from test_bare_scenes import AROUND_THE_BALL
+from test_scenes_without_photos import AROUND_THE_BALL
 from tiny_project import ball, plane
 
 from splatgraft.core.gaussians import concatenate
