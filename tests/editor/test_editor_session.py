@@ -1,4 +1,4 @@
-"""A session without a browser: all edits are saved in the project's files at once, previews equal the steps' results."""
+"""A session without a browser: edits are saved at once, previews equal the results of the steps."""
 
 import shutil
 from dataclasses import replace
@@ -288,7 +288,7 @@ def test_a_project_with_trained_scenes_uses_them(session: Session, tmp_path: Pat
     made.create(captures, scenes=(session.files.source_scene, None))
     files = made.files()
     assert files is not None
-    assert files.pictured == (False, False)
+    assert files.without_photos == (False, False)
     assert main(["run", str(made.file), "--to", "source/reconstruct"]) == 0
     assert files.source_scene.read_bytes() == session.files.source_scene.read_bytes()
 

@@ -65,7 +65,7 @@ def test_a_box_alone_segments_and_the_whole_scene_may_be_the_object(tmp_path: Pa
     assert read_gaussians(project.parent / "object" / "object.ply").count == scene.count
     assert read_gaussians(project.parent / "object" / "surroundings.ply").count == 0
     session = Session(FlowProject(project))
-    assert session.files.pictured == (True, True)
+    assert session.files.without_photos == (True, True)
     assert session.placeable_object(0).base.stands_on == "extent"
     # reading .spz rotates the axes, and the cameras rotate with them
     up = estimate_up(read_cameras(project.parent / "target" / "capture"))

@@ -32,6 +32,8 @@ _TYPES |= {
     ".jpg": "image/jpeg",
 }
 _PATCH_LOCK = threading.Lock()
+_PROBE_SECONDS = 300
+"""Limit of the request to the own server at the start: against a hang, not for a busy machine."""
 
 
 class GuardedServer:
@@ -135,7 +137,7 @@ class GuardedServer:
     def _check(self, host: str) -> None:
         """Send a request with a foreign Origin: a viser version that bypasses the access control must be detected."""
         reached = "127.0.0.1" if host in ("0.0.0.0", "") else "::1" if host == "::" else host
-        probe = http.client.HTTPConnection(reached, self.port, timeout=10)
+        probe = http.client.HTTPConnection(reached, self.port, timeout=_PROBE_SECONDS)
         try:
             probe.request("GET", "/", headers={"Origin": "http://foreign.invalid"})
             status = probe.getresponse().status
