@@ -69,10 +69,10 @@ class LightPhase:
         for key, slider in self._sliders.items():
             slider.value = float(getattr(weights, key))
         light = self._light()
-        is_estimated = light is not None and bool(session.objects())
-        self._estimate_button.visible = session.files.transfers_light and not is_estimated and bool(session.objects())
+        is_known = light is not None and bool(session.objects())
+        self._estimate_button.visible = session.files.transfers_light and not is_known and bool(session.objects())
         self._reset.disabled = session.state.light is None
-        self._source_choice.visible = self._strength.visible = is_estimated and bool(light and light.sources)
+        self._source_choice.visible = self._strength.visible = is_known and bool(light and light.sources)
         if light is None or not session.objects():
             self._text.content = _box(html.escape(self._missing_reason()))
             return
