@@ -1,6 +1,19 @@
-"""Puts the tiny project of the steps' tests on the path: the editor is tested on it too."""
+"""Puts tests/commands on the path, whose tiny project the editor's tests use, and provides a browser."""
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 sys.path.append(str(Path(__file__).parents[1] / "commands"))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser without windows; tests that use it are marked `browser` (tests/conftest.py)."""
+    from editor_driver import with_browser
+
+    with with_browser() as found:
+        yield found

@@ -1,4 +1,4 @@
-"""A project while it is edited, without a browser: what is decided is in its files at once, and nowhere else."""
+"""A session without a browser: edits are saved at once, previews equal the results of the steps."""
 
 import shutil
 from dataclasses import replace
@@ -10,13 +10,13 @@ import torch
 from tiny_project import OPTIONS, write_project
 
 from splatgraft.cli import main
-from splatgraft.commands.edit import StepsProject
+from splatgraft.commands.edit import FlowProject
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.access.uploads import SCENES, keep_upload
+from splatgraft.editor.access.uploads import SCENES, save_upload
 from splatgraft.editor.jobs.exports import export_scene, export_turntable
-from splatgraft.editor.previews.preview import KINDS, Size, wiped
-from splatgraft.editor.session import placement_moves as placing
+from splatgraft.editor.previews.preview import PICTURE_KINDS, PictureSize, wipe_comparison
+from splatgraft.editor.session import placement_operations
 from splatgraft.editor.session.edit_state import EditState, read_state, state_files, write_state
 from splatgraft.editor.session.session import Session
 from splatgraft.editor.session.toml_edit import with_keys
@@ -46,7 +46,7 @@ def composed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def session(composed: Path, tmp_path: Path) -> Session:
     shutil.copytree(composed.parents[1], tmp_path / "copy")
-    return Session(StepsProject(tmp_path / "copy" / "project" / "project.toml"))
+    return Session(FlowProject(tmp_path / "copy" / "project" / "project.toml"))
 
 
 def contents(session: Session) -> dict[str, bytes]:
@@ -59,7 +59,7 @@ def moved(state: EditState) -> EditState:
     return state.with_object(0, ObjectPlacement(move))
 
 
-def test_every_decision_is_on_disk_and_undo_takes_it_off_again(session: Session) -> None:
+def test_every_edit_is_saved_and_undone(session: Session) -> None:
     assert [item.object_path for item in session.objects()] == [None]
     before = contents(session)
     count = session.scenes.gaussians(session.files.target_scene).count
@@ -95,11 +95,11 @@ def test_every_decision_is_on_disk_and_undo_takes_it_off_again(session: Session)
     while session.redo():
         pass
     assert contents(session) == after
-    # all of it is what the steps understand
+    # the steps accept the edited project
     read_flow(session.files.file)
 
 
-def test_undo_goes_on_after_the_editor_ended(session: Session) -> None:
+def test_the_undo_history_survives_the_session(session: Session) -> None:
     count = session.scenes.gaussians(session.files.target_scene).count
     source = session.scenes.gaussians(session.files.source_scene).count
     states = [contents(session)]
@@ -109,7 +109,7 @@ def test_undo_goes_on_after_the_editor_ended(session: Session) -> None:
         lambda s: replace(s, corrections=(torch.arange(source) % 3 - 1).to(torch.int8)),
         lambda s: replace(s, light=LIGHT, box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.5)),
         lambda s: replace(s, weights=LayerWeights(shadow=0.5), light=None, mask_source="grabcut", keep="largest"),
-        # no step: it changes nothing
+        # unchanged, hence no undo step
         lambda s: replace(s, keep="largest"),
     ):
         session.change(step(session.state))
@@ -127,7 +127,7 @@ def test_undo_goes_on_after_the_editor_ended(session: Session) -> None:
             # a file that project.toml no longer names may stay, and a table that was made for a key, empty
             if name in wanted or name == "placement.json":
                 assert found[name].replace(b"\n[relight]\n", b"") == wanted[name].replace(b"\n[relight]\n", b""), name
-    # what was changed while no editor was open is one step more, and what no step leads to is gone
+    # a change while no editor was open is one more step, and states outside the history are deleted
     file = session.files.file
     write_state(file, again.state, replace(again.state, harmonizer="reinhard"))
     third = Session(session.project)
@@ -136,15 +136,15 @@ def test_undo_goes_on_after_the_editor_ended(session: Session) -> None:
     assert third.undo()
     assert third.state.harmonizer is None
     assert {*third.history.past, *third.history.future, third.history.present} <= names
-    # a broken list is said, and hinders nobody
+    # an invalid history is reported, and the session opens without it
     (session.files.root / ".editor" / "history.json").write_text("{")
     fourth = Session(session.project)
     assert fourth.notice is not None
-    assert "undo begins anew" in fourth.notice
+    assert "the undo history is empty now" in fourth.notice
     assert not fourth.undo()
 
 
-def test_what_someone_else_wrote_counts_and_is_a_step_that_can_be_undone(session: Session) -> None:
+def test_outside_changes_are_loaded_as_an_undo_step(session: Session) -> None:
     assert not session.reload()
     outside = read_state(session.files.file)
     write_state(session.files.file, outside, replace(outside, keep="all"))
@@ -158,17 +158,17 @@ def test_what_someone_else_wrote_counts_and_is_a_step_that_can_be_undone(session
     assert read_state(session.files.file).keep is None
 
 
-def test_the_moves_by_name_keep_what_they_promise(session: Session) -> None:
-    item, up = session.placeable(0), torch.tensor([0.0, 0.0, 1.0])
+def test_placement_operations(session: Session) -> None:
+    item, up = session.placeable_object(0), torch.tensor([0.0, 0.0, 1.0])
     target = session.scenes.gaussians(session.files.target_scene)
     start = session.objects()[0].target_from_object
     turned = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.7, 0.4], [0.7, 0, 0], [-0.4, 0, 0]]))
     tilted = Similarity(scale=start.scale, rotation=turned @ start.rotation, translation=start.translation + 0.3 * up)
-    straight = placing.upright(item, tilted, up=up)
+    straight = placement_operations.align_up(item, tilted, up=up)
     # float32 rotations, two deep
     assert torch.allclose(straight.rotation @ item.base.up, up, atol=1e-5)
     assert torch.allclose(straight.points(item.base.point), tilted.points(item.base.point), atol=1e-5)
-    fallen = placing.dropped(target, item, straight, up=up)
+    fallen = placement_operations.drop_to_surface(target, item, straight, up=up)
     assert fallen.scale == straight.scale
     # the plane's Gaussians are a hundredth thick and were trained for sixty steps
     assert abs(float(fallen.points(item.base.point)[2])) < 0.1
@@ -177,16 +177,16 @@ def test_the_moves_by_name_keep_what_they_promise(session: Session) -> None:
     side = torch.linalg.cross(item.base.up, torch.tensor([1.0, 0, 0]))
     heads = [m.rotation @ side / side.norm() for m in (straight, fallen)]
     assert float(heads[0] @ heads[1]) > 0.98
-    again = placing.dropped(target, item, fallen, up=up)
+    again = placement_operations.drop_to_surface(target, item, fallen, up=up)
     assert torch.allclose(again.translation, fallen.translation, atol=0.02)
-    half = placing.resized(item, fallen, 0.5 * fallen.scale)
+    half = placement_operations.rescale(item, fallen, 0.5 * fallen.scale)
     assert torch.allclose(half.points(item.base.point), fallen.points(item.base.point), atol=1e-5)
 
 
-def test_every_kind_of_picture_is_drawn_or_says_why_not(session: Session) -> None:
+def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Session) -> None:
     state = session.placed_state()
     camera = session.scenes.cameras(session.files.target_cameras)[0]
-    for kind in KINDS:
+    for kind in PICTURE_KINDS:
         if kind == "Result":
             with pytest.raises(ValueError, match="finished run"):
                 session.preview.picture(kind, state, camera)
@@ -194,22 +194,22 @@ def test_every_kind_of_picture_is_drawn_or_says_why_not(session: Session) -> Non
         picture = session.preview.picture(kind, state, camera)
         assert picture.shape == (camera.height, camera.width, 3)
         assert picture.std() > 1, kind
-    assert session.transfers.is_lit(state)
-    assert not session.transfers.is_lit(moved(state))
+    assert session.relighting.is_relit(state)
+    assert not session.relighting.is_relit(moved(state))
     picture, other = (session.preview.picture(kind, state, camera) for kind in ("Copy-paste", "Mask"))
-    both = wiped(picture, other, 0.25)
+    both = wipe_comparison(picture, other, 0.25)
     assert (both[:, :10] == picture[:, :10]).all()
     assert (both[:, 20:] == other[:, 20:]).all()
 
 
 @pytest.mark.parametrize("light", [None, LIGHT])
-def test_the_preview_of_the_light_is_the_step_s_result(session: Session, light: Light | None) -> None:
+def test_the_previewed_light_equals_the_step_s_result(session: Session, light: Light | None) -> None:
     session.change(replace(moved(session.placed_state()), weights=LayerWeights(shadow=0.5), light=light))
-    # what comes first must not show in what comes last
-    draft = session.transfers.scene(session.state, draft=True)
-    assert not session.transfers.is_lit(session.state)
-    relit = session.transfers.scene(session.state)
-    assert session.transfers.scene(session.state, draft=True) is relit
+    # a draft must not change the full result
+    draft = session.relighting.scene(session.state, draft=True)
+    assert not session.relighting.is_relit(session.state)
+    relit = session.relighting.scene(session.state)
+    assert session.relighting.scene(session.state, draft=True) is relit
     assert draft.count <= relit.count
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     written = read_gaussians(session.files.relit)
@@ -218,60 +218,60 @@ def test_the_preview_of_the_light_is_the_step_s_result(session: Session, light: 
 
 
 @pytest.mark.parametrize(("seconds", "wanted"), [(0.3, 480), (0.28, 480), (1.2, 240), (0.02, 800), (60.0, 192)])
-def test_slow_pictures_get_smaller_and_quick_ones_larger(seconds: float, wanted: int) -> None:
-    assert Size().after(seconds) == wanted
+def test_the_preview_size_adapts_to_the_rendering_time(seconds: float, wanted: int) -> None:
+    assert PictureSize().adapted(seconds) == wanted
 
 
-def test_uploads_are_read_before_they_are_kept(session: Session, tmp_path: Path) -> None:
+def test_uploads_are_read_before_they_are_stored(session: Session, tmp_path: Path) -> None:
     content = session.files.object.read_bytes()
-    kept = keep_upload(tmp_path, "../../my ball.ply", content, suffixes=SCENES)
+    kept = save_upload(tmp_path, "../../my ball.ply", content, suffixes=SCENES)
     assert kept == tmp_path / "uploads" / "my_ball.ply"
     assert kept.read_bytes() == content
     with pytest.raises(ValueError, match=r"my_ball\.ply"):
-        keep_upload(tmp_path, "my ball.ply", b"ply\nnonsense", suffixes=SCENES)
+        save_upload(tmp_path, "my ball.ply", b"ply\nnonsense", suffixes=SCENES)
     assert kept.read_bytes() == content
     with pytest.raises(ValueError, match="ends in"):
-        keep_upload(tmp_path, "page.html", b"<html>", suffixes=SCENES)
+        save_upload(tmp_path, "page.html", b"<html>", suffixes=SCENES)
     assert sorted(p.name for p in kept.parent.iterdir()) == ["my_ball.ply"]
 
 
-@pytest.mark.parametrize("light_by", ["gain", "off"])
-def test_the_light_that_is_shown_is_what_the_step_writes(session: Session, light_by: str) -> None:
+@pytest.mark.parametrize("light_mode", ["gain", "off"])
+def test_the_shown_light_equals_what_the_step_writes(session: Session, light_mode: str) -> None:
     file = session.files.file
-    text = with_keys(file.read_text(), "relight", {"light": light_by})
+    text = with_keys(file.read_text(), "relight", {"light": light_mode})
     file.write_text(text)
     assert session.reload()
     assert main(["run", str(file), "--to", "relight"]) == 0
     state = session.placed_state()
-    assert session.transfers.is_lit(state)
-    shown, written = session.transfers.scene(state), read_gaussians(session.files.relit)
+    assert session.relighting.is_relit(state)
+    shown, written = session.relighting.scene(state), read_gaussians(session.files.relit)
     assert torch.equal(shown.sh, written.sh)
     assert torch.equal(shown.means, written.means)
-    assert light_by in session.transfers.note()
+    assert light_mode in session.relighting.light_mode_note()
     camera = session.scenes.cameras(session.files.target_cameras)[0]
     with pytest.raises(ValueError, match="physical transfer"):
         session.preview.picture("Shadow layer", state, camera)
 
 
-def test_nothing_is_exported_before_it_is_made(session: Session) -> None:
+def test_exports_of_missing_results_are_refused(session: Session) -> None:
     with pytest.raises(ValueError, match="finished scene"):
         export_scene(session.files, ".ply")
     with pytest.raises(ValueError, match="a turntable"):
         export_turntable(session.files, ".mp4")
 
 
-def test_the_turntable_is_a_film_of_the_same_frames(session: Session) -> None:
+def test_the_orbit_video_has_the_frames_of_the_turntable(session: Session) -> None:
     session.files.report.mkdir()
     frames = [torch.full((25, 41, 3), level) for level in (0.1, 0.5, 0.9)]
     write_animation(session.files.report / "turntable.webp", frames, fps=10.0)
     path, remark = export_turntable(session.files, ".mp4")
-    # this build may know either codec, or none: then it is said
+    # OpenCV may have either codec or none, and then the remark says so
     assert path.suffix == ".mp4" or "instead" in remark
     if path.suffix == ".mp4":
-        film = cv2.VideoCapture(str(path))
-        shown = [film.read()[1] for _ in frames]
-        assert not film.read()[0]
-        assert film.get(cv2.CAP_PROP_FPS) == 10.0
+        video = cv2.VideoCapture(str(path))
+        shown = [video.read()[1] for _ in frames]
+        assert not video.read()[0]
+        assert video.get(cv2.CAP_PROP_FPS) == 10.0
         # a flat picture survives any codec to within its steps of quantisation
         assert all(abs(float(x.mean()) / 255 - float(y.mean())) < 0.03 for x, y in zip(shown, frames, strict=True))
         assert shown[0].shape == (24, 40, 3)
@@ -280,20 +280,20 @@ def test_the_turntable_is_a_film_of_the_same_frames(session: Session) -> None:
     assert remark == ""
 
 
-def test_a_project_with_trained_scenes_takes_those_over(session: Session, tmp_path: Path) -> None:
-    made = StepsProject(tmp_path / "new" / "project.toml")
+def test_a_project_with_trained_scenes_uses_them(session: Session, tmp_path: Path) -> None:
+    made = FlowProject(tmp_path / "new" / "project.toml")
     captures = (session.files.source_cameras.parent, session.files.target_cameras.parent)
     with pytest.raises(ValueError, match="trained scene"):
         made.create(captures, scenes=(tmp_path / "none.ply", None))
     made.create(captures, scenes=(session.files.source_scene, None))
     files = made.files()
     assert files is not None
-    assert files.pictured == (False, False)
+    assert files.without_photos == (False, False)
     assert main(["run", str(made.file), "--to", "source/reconstruct"]) == 0
     assert files.source_scene.read_bytes() == session.files.source_scene.read_bytes()
 
 
-def test_the_plan_of_a_run_is_what_is_stale_as_long_as_it_took_before(session: Session) -> None:
+def test_planned_steps_use_measured_durations(session: Session) -> None:
     flow = read_flow(session.files.file)
     planned = estimate_step_times(flow, ["segment", "relight", "render"])
     assert [step.name for step in planned] == ["segment", "relight", "render"]
@@ -305,11 +305,11 @@ def test_the_plan_of_a_run_is_what_is_stale_as_long_as_it_took_before(session: S
     assert planned[1].seconds / planned[2].seconds == pytest.approx(2.7 / 3.7)
 
 
-def test_a_light_survives_its_file() -> None:
+def test_a_light_is_read_back_as_written() -> None:
     assert light_to_json(light_from_json(light_to_json(LIGHT))) == light_to_json(LIGHT)
 
 
-def test_pictures_are_written_as_they_are(session: Session, tmp_path: Path) -> None:
+def test_the_preview_of_a_photograph_is_unchanged(session: Session, tmp_path: Path) -> None:
     camera = session.scenes.cameras(session.files.target_cameras)[0]
     photo = session.preview.picture("Photograph", session.placed_state(), camera)
     stored = read_rgb(session.files.target_capture.parents[2] / "photos" / "target" / "images" / camera.names[0])

@@ -1,4 +1,4 @@
-"""Undo and redo as laws."""
+"""Properties of undo and redo."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -7,10 +7,10 @@ from splatgraft.editor.session.history import History
 
 
 @given(st.lists(st.integers()))
-def test_undoing_all_gives_the_beginning_and_redoing_all_the_end(values: list[int]) -> None:
+def test_undoing_all_gives_the_first_value_and_redoing_all_the_last(values: list[int]) -> None:
     history = History(-1)
     for value in values:
-        history = history.then(value)
+        history = history.pushed(value)
     back = history
     for _ in values:
         back = back.undone()
@@ -23,7 +23,7 @@ def test_undoing_all_gives_the_beginning_and_redoing_all_the_end(values: list[in
 
 
 @given(st.integers(), st.integers(), st.integers())
-def test_a_new_step_forgets_what_was_undone_and_an_amendment_is_no_step(a: int, b: int, c: int) -> None:
-    history = History(a).then(b).undone().then(c)
+def test_a_new_step_discards_undone_values_and_an_amendment_adds_no_step(a: int, b: int, c: int) -> None:
+    history = History(a).pushed(b).undone().pushed(c)
     assert history.redone() == history
-    assert History(a).then(b).amended(c) == History(c, (a,))
+    assert History(a).pushed(b).amended(c) == History(c, (a,))

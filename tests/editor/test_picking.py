@@ -1,11 +1,19 @@
-"""What a person means by a rectangle, a brush and a click."""
+"""Selection by rectangle, click and brush."""
 
 import torch
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.editor.previews.level_of_detail import shown_indices
-from splatgraft.editor.session.picking import Ray, Rectangle, between, first_hit, in_brush, in_rectangle, painted
+from splatgraft.editor.previews.level_of_detail import largest_coverage_indices
+from splatgraft.editor.session.picking import (
+    Ray,
+    Rectangle,
+    brush_selection,
+    first_surface_hit,
+    in_brush,
+    in_rectangle,
+    interpolate_rays,
+)
 from splatgraft.segmentation import corrected, with_correction
 
 
@@ -25,7 +33,7 @@ def camera() -> Cameras:
     return pinhole(pose, 100.0, width=200, height=100)
 
 
-def test_a_rectangle_takes_what_the_camera_shows_there_and_nothing_behind_it() -> None:
+def test_a_rectangle_selects_centres_that_project_into_it_and_none_behind_the_camera() -> None:
     # at distance 4 one unit is 25 px: x = 1 is at 125 of 200 px, z = 1 at 25 of 100 px
     means = torch.tensor([[1.0, 0, 1], [-1.0, 0, 1], [1.0, 0, -1], [0, -8.0, 0]])
     found = in_rectangle(means, camera(), Rectangle((0.6, 0.2), (0.65, 0.3)))
@@ -33,35 +41,35 @@ def test_a_rectangle_takes_what_the_camera_shows_there_and_nothing_behind_it() -
     assert not in_rectangle(means, camera(), Rectangle((0.0, 0.0), (1.0, 1.0)))[3]
 
 
-def test_a_click_stops_at_the_first_solid_thing() -> None:
+def test_a_ray_stops_at_the_first_opaque_surface() -> None:
     ray = torch.tensor([0.0, -4, 0]), torch.tensor([0.0, 1, 0])
-    hit = first_hit(scene([[0.0, 2, 0], [0.05, 0, 0], [1.0, -2, 0]]), *ray)
+    hit = first_surface_hit(scene([[0.0, 2, 0], [0.05, 0, 0], [1.0, -2, 0]]), *ray)
     assert hit is not None
     assert torch.allclose(hit, torch.zeros(3), atol=1e-6)  # float32 of numbers about 4
-    assert first_hit(scene([[0.0, 0, 0]], logit=-3.0), *ray) is None
-    assert first_hit(scene([[0.0, -8, 0]]), *ray) is None
+    assert first_surface_hit(scene([[0.0, 0, 0]], logit=-3.0), *ray) is None
+    assert first_surface_hit(scene([[0.0, -8, 0]]), *ray) is None
     around = scene([[0.0, 0.5, 0], [0, 1.05, 0], [0, 2, 0]])
     assert in_brush(around, hit, 1.0).tolist() == [True, True, False]
-    # a wide Gaussian is reached from aside, but not by a brush that is far from its centre
+    # a wide Gaussian is touched from its side, but not by a small brush far from its centre
     assert in_brush(scene([[0.0, 0.15, 0], [0, 0.25, 0]], size=1.0), hit, 0.1).tolist() == [True, False]
 
 
-def test_a_quick_stroke_has_no_gaps_and_passes_over_what_is_not_there() -> None:
+def test_a_fast_stroke_has_no_gaps_and_ignores_empty_space() -> None:
     row = scene([[0.1 * i, 0, 0] for i in range(-10, 11) if abs(i) > 2], size=0.05)
     eye = torch.tensor([0.0, -4, 0])
     start, end = (Ray(eye, torch.tensor([x, 4.0, 0])) for x in (-1.0, 1.0))
-    # two moments alone touch the ends; the whole stroke touches all
-    assert int(painted(row, [start, end], size=0.05).sum()) == 4
-    rays = between(start, end, size=0.05)
-    assert bool(painted(row, [start, *rays], size=0.05).all())
+    # the two end rays alone select the ends; the interpolated stroke selects all
+    assert int(brush_selection(row, [start, end], size=0.05).sum()) == 4
+    rays = interpolate_rays(start, end, size=0.05)
+    assert bool(brush_selection(row, [start, *rays], size=0.05).all())
     directions = torch.stack([torch.nn.functional.normalize(ray.direction, dim=0) for ray in [start, *rays]])
     assert (
         float((directions[1:] - directions[:-1]).norm(dim=1).max()) <= 0.25 * 0.05 / 0.97
     )  # the chord between the ends is 0.97 from the eye
-    assert not painted(row, [Ray(eye, torch.tensor([0.0, 4.0, 0]))], size=0.05).any()
+    assert not brush_selection(row, [Ray(eye, torch.tensor([0.0, 4.0, 0]))], size=0.05).any()
 
 
-def test_the_last_stroke_counts() -> None:
+def test_later_corrections_override_earlier_ones() -> None:
     lifted = torch.tensor([True, True, False, False])
     strokes = with_correction(None, torch.tensor([False, True, True, False]), add=True)
     strokes = with_correction(strokes, torch.tensor([False, True, False, False]), add=False)
@@ -69,8 +77,8 @@ def test_the_last_stroke_counts() -> None:
     assert corrected(lifted, None) is lifted
 
 
-def test_thinning_keeps_what_covers_most_in_order() -> None:
+def test_level_of_detail_keeps_the_largest_coverage_in_order() -> None:
     large, small = scene([[0.0, 0, 0]] * 2, size=1.0), scene([[1.0, 0, 0]] * 3)
     both = Gaussians(**{k: torch.cat([getattr(small, k), getattr(large, k)]) for k in large.__dict__})
-    assert shown_indices(both, 2).tolist() == [3, 4]
-    assert shown_indices(both, 5).tolist() == [0, 1, 2, 3, 4]
+    assert largest_coverage_indices(both, 2).tolist() == [3, 4]
+    assert largest_coverage_indices(both, 5).tolist() == [0, 1, 2, 3, 4]

@@ -1,4 +1,4 @@
-"""The editor as others meet it: another site, another machine, another window, another editor on the same project."""
+"""The editor's server: access control, uploads, a second window, a second editor on the same project."""
 
 import subprocess
 import sys
@@ -6,10 +6,12 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from editor_driver import Editor, Window, with_browser
+from editor_driver import Editor, Window
 from tiny_project import write_project
+from waiting import HANG_LIMIT
 
 
 @pytest.fixture
@@ -27,33 +29,38 @@ def editor(project: Path) -> Iterator[Editor]:
 
 def status(url: str, **headers: str) -> int:
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10) as answer:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=HANG_LIMIT) as answer:
             return answer.status
     except urllib.error.HTTPError as error:
         with error:
             return error.code
 
 
-def knock(url: str, origin: str | None) -> int:
-    """The status with which a websocket of that origin is answered."""
+def websocket_status(url: str, origin: str | None) -> int:
+    """HTTP status of the answer to a websocket request with that origin."""
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
     try:
-        with connect(url.replace("http", "ws"), origin=origin, subprotocols=["viser-v1.1.1"], open_timeout=10):  # pyright: ignore
+        with connect(
+            url.replace("http", "ws"),
+            origin=origin,  # pyright: ignore
+            subprotocols=["viser-v1.1.1"],  # pyright: ignore
+            open_timeout=HANG_LIMIT,
+        ):
             return 101
     except InvalidStatus as refused:
         return refused.response.status_code
 
 
-def test_other_sites_names_and_paths_are_refused(editor: Editor, project: Path) -> None:
+def test_foreign_origins_hosts_and_paths_are_refused(editor: Editor, project: Path) -> None:
     own = editor.url.rstrip("/")
     assert status(own) == 200
     assert status(own, Origin="http://evil.example") == 403
     assert status(own, Host="evil.example") == 403
-    assert knock(own, own) == 101
-    assert knock(own, "http://evil.example") == 403
-    assert knock(own, None) == 403
+    assert websocket_status(own, own) == 101
+    assert websocket_status(own, "http://evil.example") == 403
+    assert websocket_status(own, None) == 403
     for path in (
         "/files/../project.toml",
         "/files/%2e%2e/project.toml",
@@ -63,14 +70,14 @@ def test_other_sites_names_and_paths_are_refused(editor: Editor, project: Path) 
     ):
         assert status(own + path) == 404, path
     again = [sys.executable, "-m", "splatgraft", "edit", str(project), "--port", "18081"]
-    done = subprocess.run(again, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(again, capture_output=True, text=True, timeout=HANG_LIMIT, check=False)
     assert done.returncode == 2
     assert "expected no other run at work here" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert editor.end() == 0
 
 
-def test_from_other_machines_one_needs_the_token(project: Path) -> None:
+def test_other_machines_need_the_token(project: Path) -> None:
     editor = Editor(project, "--host", "0.0.0.0")
     try:
         address, _, token = editor.url.replace("0.0.0.0", "127.0.0.1").partition("?token=")
@@ -84,7 +91,7 @@ def test_from_other_machines_one_needs_the_token(project: Path) -> None:
         editor.kill()
 
 
-def test_large_uploads_and_public_tunnels_are_not_let_in() -> None:
+def test_large_uploads_public_tunnels_and_read_only_windows_are_blocked() -> None:
     from viser import _messages
 
     from splatgraft.editor.access.access_control import AccessControl
@@ -92,8 +99,8 @@ def test_large_uploads_and_public_tunnels_are_not_let_in() -> None:
 
     guarded = GuardedServer(AccessControl(), host="127.0.0.1", port=18090, upload_limit=10)
     try:
-        told: list[str] = []
-        guarded.on_large_upload = lambda name, size: told.append(name)
+        reported: list[str] = []
+        guarded.on_large_upload = lambda name, size: reported.append(name)
 
         def begin(name: str, size: int) -> _messages.FileTransferStartUpload:
             return _messages.FileTransferStartUpload("button", name, name, "", 1, size)
@@ -101,24 +108,24 @@ def test_large_uploads_and_public_tunnels_are_not_let_in() -> None:
         def part(name: str, content: bytes) -> _messages.FileTransferPart:
             return _messages.FileTransferPart("button", transfer_uuid=name, part_index=0, content=content)
 
-        assert not guarded._bearable(begin("large.ply", 11))
-        assert told == ["large.ply"]
-        assert guarded._bearable(begin("small.ply", 4))
-        assert guarded._bearable(part("small.ply", b"1234"))
+        assert not guarded._upload_allowed(begin("large.ply", 11))
+        assert reported == ["large.ply"]
+        assert guarded._upload_allowed(begin("small.ply", 4))
+        assert guarded._upload_allowed(part("small.ply", b"1234"))
         # more than was announced, and what was never announced
-        assert not guarded._bearable(part("small.ply", b"5"))
-        assert not guarded._bearable(part("large.ply", b"1"))
+        assert not guarded._upload_allowed(part("small.ply", b"5"))
+        assert not guarded._upload_allowed(part("large.ply", b"1"))
         passed: list[object] = []
 
         async def inner(window: int, message: object) -> None:
             passed.append(message)
 
         def send(window: int, message: object) -> None:
-            coroutine = guarded._filtered(inner, window, message)
+            coroutine = guarded._forward_allowed(inner, window, message)
             with pytest.raises(StopIteration):
                 coroutine.send(None)
 
-        guarded.seat = guarded.seat.joined(1).joined(2)
+        guarded.edit_lock = guarded.edit_lock.with_window(1).with_window(2)
         send(1, _messages.ShareUrlRequest())
         send(2, _messages.GuiFormSubmitMessage("x"))
         assert passed == []
@@ -128,16 +135,16 @@ def test_large_uploads_and_public_tunnels_are_not_let_in() -> None:
         guarded.close()
 
 
-def test_a_second_window_looks_on_until_it_takes_over(editor: Editor) -> None:
-    with with_browser() as browser:
-        first = Window.opened(browser, editor)
-        second = Window.opened(browser, editor)
-        second.says("Here you can only look on")
-        assert first.page.get_by_text("Here you can only look on").count() == 0
-        second.click("Edit here instead")
-        first.says("Here you can only look on")
-        second.page.get_by_text("Here you can only look on").wait_for(state="detached", timeout=20_000)
-        second.page.close()
-        first.page.get_by_text("Here you can only look on").wait_for(state="detached", timeout=20_000)
-        first.turn("Run")
-        first.says("not made yet")
+def test_a_second_window_is_read_only_until_it_takes_the_edit_lock(browser: Any, editor: Editor) -> None:
+    notice = "This window is read-only"
+    first = Window.opened(browser, editor)
+    second = Window.opened(browser, editor)
+    second.says(notice)
+    assert first.page.get_by_text(notice).count() == 0
+    second.click("Edit here instead")
+    first.says(notice)
+    second.page.get_by_text(notice).wait_for(state="detached")
+    second.page.close()
+    first.page.get_by_text(notice).wait_for(state="detached")
+    first.show_phase("Run")
+    first.says("not made yet")

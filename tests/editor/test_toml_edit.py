@@ -1,4 +1,4 @@
-"""Keys of a TOML text change, everything else stays."""
+"""Setting keys of a TOML text leaves everything else unchanged."""
 
 import tomllib
 
@@ -33,7 +33,7 @@ VALUES = st.one_of(
 )
 
 
-def test_a_value_over_several_lines_is_replaced_and_comments_stay() -> None:
+def test_a_multi_line_value_is_replaced_and_comments_stay() -> None:
     found = with_keys(TEXT, "segment", {"box": (0.0, 1.5), "keep": "all", "threshold": None})
     assert tomllib.loads(found)["segment"] == {"box": [0.0, 1.5], "keep": "all"}
     for comment in ("# a comment", "# beside", "# about the next table\n[compose]"):
@@ -43,19 +43,19 @@ def test_a_value_over_several_lines_is_replaced_and_comments_stay() -> None:
 @given(
     st.dictionaries(st.sampled_from(["box", "keep", "threshold", "new"]), VALUES), st.sampled_from(["segment", "light"])
 )
-def test_whatever_is_set_is_read_back_and_nothing_else_changes(values: dict, table: str) -> None:
+def test_set_values_are_read_back_and_others_stay(values: dict, table: str) -> None:
     before, after = tomllib.loads(TEXT), tomllib.loads(with_keys(TEXT, table, values))
     assert after.get(table, {}) == before.get(table, {}) | values
     assert {k: v for k, v in after.items() if k != table} == {k: v for k, v in before.items() if k != table}
 
 
-def test_what_is_set_and_removed_again_leaves_the_values_as_they_were() -> None:
+def test_setting_and_removing_a_key_restores_the_values() -> None:
     text = TEMPLATE.replace("{source}", 'capture = "a"').replace("{target}", 'capture = "b"')
     changed = with_keys(with_keys(text, "relight", {"shade": 0.5}), "relight", {"shade": None})
     assert tomllib.loads(changed) == tomllib.loads(text) | {"relight": {}}
     assert with_keys(text, "relight", {"shade": None}) == text
 
 
-def test_another_layout_is_refused_rather_than_broken() -> None:
+def test_unsupported_layouts_are_refused() -> None:
     with pytest.raises(ValueError, match="by hand"):
         with_keys("segment = {box = [1]}\n", "segment", {"keep": "all"})

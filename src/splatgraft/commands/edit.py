@@ -1,4 +1,4 @@
-"""The command `edit`: the web editor on a project, with the steps that its clicks call. Knows nothing of the page."""
+"""The command `edit`: the web editor on a project."""
 
 import os
 import secrets
@@ -39,20 +39,21 @@ from splatgraft.workflow.staleness import reasons
 
 
 @dataclass(frozen=True)
-class StepsProject:
-    """A project as the editor sees it, by the steps of the command line."""
+class FlowProject:
+    """A project as the editor needs it (`editor.session.project_access.Project`), implemented by the project's flow."""
 
     file: Path
-    """project.toml, there or about to be."""
+    """project.toml; it need not exist yet."""
     out: Path | None = None
-    """Where results go; beside it where not given."""
+    """Folder of all results; None: the folder of project.toml."""
     console: Console = field(default_factory=Console)
-    """For sentences."""
+    """For messages."""
 
     def files(self) -> ProjectFiles | None:
-        """Its files; None where there is no project.toml yet.
+        """The project's files; None where project.toml does not exist yet.
 
-        Raises: ValueError where it is broken.
+        Raises:
+            ValueError: If project.toml is invalid.
         """
         if not self.file.is_file():
             return None
@@ -79,14 +80,14 @@ class StepsProject:
             light=layout.relit / LIGHT_FILE,
             result=layout.result / SCENE_FILE,
             report=layout.report,
-            pictured=(_is_pictured(flow, "source"), _is_pictured(flow, "target")),
-            light_by=relight.light,
-            relighting=relight.options,
-            placing=compose.options,
+            without_photos=(_has_no_photos(flow, "source"), _has_no_photos(flow, "target")),
+            light_mode=relight.light,
+            relight_options=relight.options,
+            place_options=compose.options,
         )
 
     def reasons(self) -> Mapping[str, str | None]:
-        """Why each step is stale, as `status` says it; a file that is missing is the reason of what reads it."""
+        """For each step why it is stale, as in `status`; one entry with the error where project.toml is invalid."""
         try:
             return reasons(read_flow(self.file, self.out))
         except ValueError as error:
@@ -95,7 +96,8 @@ class StepsProject:
     def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
         """Write project.toml.
 
-        Raises: ValueError where a capture or a scene is not there, or a project is.
+        Raises:
+            ValueError: If a capture or a scene is missing, or project.toml exists.
         """
         for scene in scenes:
             if scene is not None and not scene.is_file():
@@ -109,41 +111,47 @@ class StepsProject:
             stream.write(text.encode())
 
     def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
-        """Say how a scene without photographs is looked at."""
+        """Set how images of a scene without photographs are rendered."""
         text = with_keys(self.file.read_text(encoding="utf-8"), side, {"up": up, "look": look})
         with atomic_write(self.file) as stream:
             stream.write(text.encode())
 
     def run_command(self, to: str, title: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The child process for the steps up to `to`, and what a person would type."""
-        found = self.files()
-        root = self.file.parent if found is None else found.root
-        words = (str(root / EDITOR_FOLDER), title, str(self.file), to, *(() if self.out is None else (str(self.out),)))
+        """Commands that run the stale steps up to `to`: that of the child process, and its equivalent for the user."""
+        files = self.files()
+        root = self.file.parent if files is None else files.root
+        arguments = (
+            str(root / EDITOR_FOLDER),
+            title,
+            str(self.file),
+            to,
+            *(() if self.out is None else (str(self.out),)),
+        )
         out = () if self.out is None else ("--out", str(self.out))
-        command = (sys.executable, "-m", "splatgraft.workflow.background_job", *words)
+        command = (sys.executable, "-m", "splatgraft.workflow.background_job", *arguments)
         return command, ("splatgraft", "run", str(self.file), "--to", to, *out)
 
 
-def _is_pictured(flow: Flow, side: Side) -> bool:
+def _has_no_photos(flow: Flow, side: Side) -> bool:
     step = flow.steps[f"{side}/capture"]
     return isinstance(step, Capture) and is_scene(step.capture)
 
 
 @dataclass(frozen=True)
 class Edit:
-    """Open a project in the browser; where there is none yet, start one there."""
+    """Open a project in the browser, or create one there."""
 
     project: Positional = Path(PROJECT_FILE)
-    """The project file, or its folder; it need not exist."""
+    """The project file or its folder; it need not exist."""
     out: Path | None = None
-    """Where all results go; the folder of the project file where not given."""
+    """Folder of all results; the folder of the project file where not given."""
     host: str = "127.0.0.1"
-    """Address to listen at; any but the machine's own makes the page ask for a token, and takes no paths outside the
-    project's folder."""
+    """Address to listen at; beyond loopback the page requires a token and accepts no paths outside the project's
+    folder."""
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
     budget: int = 300_000
-    """Most Gaussians of a scene that the browser is given; files keep all."""
+    """Maximum number of Gaussians per scene that the browser shows; files keep all."""
 
     def execute(self, console: Console) -> int:
         """Serve until Ctrl-C."""
@@ -153,17 +161,17 @@ class Edit:
         is_file = self.project.suffix == ".toml"
         file = (self.project if is_file else self.project / PROJECT_FILE).absolute()
         file.parent.mkdir(parents=True, exist_ok=True)
-        home = self.host in LOOPBACK
-        token = None if home else secrets.token_urlsafe(16)
+        is_loopback = self.host in LOOPBACK
+        token = None if is_loopback else secrets.token_urlsafe(16)
         out = None if self.out is None else self.out.absolute()
         with locked(file.parent / "edit"):
-            gate = AccessControl(hosts=LOOPBACK if home else (), token=token)
-            guarded = GuardedServer(gate, host=self.host, port=self.port, upload_limit=LIMIT_BYTES)
-            project = StepsProject(file, out, console)
-            page = Page(guarded, project, PageOptions(budget=self.budget, inside=None if home else file.parent))
+            access = AccessControl(hosts=LOOPBACK if is_loopback else (), token=token)
+            guarded = GuardedServer(access, host=self.host, port=self.port, upload_limit=LIMIT_BYTES)
+            project = FlowProject(file, out, console)
+            page = Page(guarded, project, PageOptions(budget=self.budget, inside=None if is_loopback else file.parent))
             query = "" if token is None else f"?token={token}"
             console.result(f"http://{self.host}:{guarded.port}/{query}")
-            console.say("open this address in a browser; Ctrl-C ends the editor, not the work that it started")
+            console.say("open this address in a browser; Ctrl-C ends the editor, but not jobs that it started")
             stop = threading.Event()
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: stop.set())

@@ -1,4 +1,5 @@
-"""The web editor: place the object in the browser and see the light. `page/` alone knows viser; the rest is logic.
+"""The web editor: select and place objects and adjust their light in the browser.
 
-Knows no steps: what it needs of them is handed in as a `Project` (project_access.py), long work is a child process.
+Only `page/` imports viser. A `Project` (session/project_access.py) connects the editor to the steps; long work runs in
+child processes.
 """

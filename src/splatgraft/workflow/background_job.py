@@ -1,4 +1,4 @@
-"""The child process in which the editor does long work: the command `run`, telling a state file how far it is.
+"""The child process of the editor's jobs: the command `run`, with its progress written to a state file.
 
 Started as `python -m splatgraft.workflow.background_job FOLDER TITLE project.toml STEP [OUT]`; not a command.
 """
@@ -12,26 +12,26 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from splatgraft.editor.jobs.jobs import JobState, PlannedStep, hold, write_state
+from splatgraft.editor.jobs.jobs import JobState, PlannedStep, acquire_job_lock, write_state
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.progress import Progress
 
 _WRITE_EVERY = 0.2
-"""Seconds."""
+"""Seconds between writes of the state file."""
 
 
 class JobConsole(Console):
-    """A terminal whose bars are also written into the state of a job."""
+    """A console whose progress bars are also written to the state file of a job."""
 
     def __init__(self, folder: Path, state: JobState) -> None:
-        """Begin with `state`."""
+        """Start from `state`; nothing is written yet."""
         super().__init__()
         self._folder, self.state = folder, state
         self._written = 0.0
 
     @contextmanager
     def bar(self, name: str) -> Generator[Progress]:
-        """The bar of `Terminal`, told to the state file as well."""
+        """A progress bar of `Console` that also updates the state file."""
         now = time.time()
         self.write(replace(self.state, step=name, done=0, total=0, message="", step_started=now))
         last: tuple[int, int] | None = None
@@ -41,9 +41,9 @@ class JobConsole(Console):
                 nonlocal last
                 progress(done, total, message)
                 if last is None or done < last[0] or total != last[1]:
-                    # another thing is counted; one that was killed goes on where it was: that part took no time now
-                    since = now if last is None else time.time()
-                    self.state = replace(self.state, begun=done if done > 1 else 0, begun_at=since)
+                    # a new counter; units that an earlier, killed run finished do not count for the speed
+                    began = now if last is None else time.time()
+                    self.state = replace(self.state, begun=done if done > 1 else 0, begun_at=began)
                 last = (done, total)
                 self.state = replace(self.state, done=done, total=total, message=f"{done}/{total} {message}")
                 if time.time() - self._written > _WRITE_EVERY:
@@ -59,17 +59,17 @@ class JobConsole(Console):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do the run; its outcome is in the state file and in the exit status."""
+    """Run the steps; the outcome is in the state file and the exit status."""
     from splatgraft.workflow.run_steps import run_steps
 
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    # a shell starts what it puts in the background deaf to the first of them
-    for asked in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(asked, signal.default_int_handler)
+    # a shell starts background processes with SIGINT ignored
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     folder, title, project, to = Path(arguments[0]), arguments[1], Path(arguments[2]), arguments[3]
     out = Path(arguments[4]) if len(arguments) > 4 else None
     shown = ("run", str(project), "--to", to)
-    lock = hold(folder)
+    lock = acquire_job_lock(folder)
     console = JobConsole(folder, JobState(title, shown, os.getpid(), "running", time.time()))
     try:
         console.write(console.state)
@@ -88,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _plan(project: Path, out: Path | None, to: str) -> tuple[PlannedStep, ...]:
-    """What the run will do; nothing where that cannot be told yet."""
+    """The steps to be run with their expected durations; empty where the project is invalid."""
     from splatgraft.workflow.flow import read_flow
     from splatgraft.workflow.staleness import reasons
     from splatgraft.workflow.time_estimate import estimate_step_times
@@ -98,7 +98,7 @@ def _plan(project: Path, out: Path | None, to: str) -> tuple[PlannedStep, ...]:
         why = reasons(flow)
         return estimate_step_times(flow, [name for name in flow.up_to(to) if why[name] is not None])
     except ValueError:
-        return ()  # the run itself says it, and better
+        return ()  # the run itself reports the error
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Who may use the editor, who may edit, and what may be uploaded."""
+"""Access to the editor's server: which requests are accepted, which window edits, which uploads are stored."""

@@ -1,7 +1,7 @@
-"""Who may talk to the editor: the page itself, from the machine itself, or with a token. Knows no web server.
+"""Access control for the editor's HTTP and websocket requests, by Host, Origin and, beyond loopback, a token.
 
-A page on another site can reach a server on loopback: its Origin gives it away. A name that was made to point here
-(DNS rebinding) shows in Host.
+The Origin header identifies requests of other sites' pages, which can reach a server on loopback. The Host header
+identifies foreign names that resolve to this machine (DNS rebinding).
 """
 
 import hmac
@@ -16,58 +16,67 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What the gate says to a request."""
+class AccessDecision:
+    """The decision on one request."""
 
     allowed: bool
-    """Whether it may pass."""
+    """Whether the request is accepted."""
     reason: str = ""
-    """Why not, for the person who reads the page."""
+    """Why it is refused, as a message for the user."""
     cookie: str | None = None
-    """The Set-Cookie header that keeps the token."""
+    """Set-Cookie header that stores the token in the browser; None: no header."""
 
 
 @dataclass(frozen=True)
 class AccessControl:
-    """The rules of one server."""
+    """The access rules of one server."""
 
     hosts: tuple[str, ...] = LOOPBACK
-    """Names under which the server may be called; empty: any, which wants a token."""
+    """Accepted names in the Host header; empty: any name, and then a token is required."""
     token: str | None = None
-    """What a request must know; None: nothing, on loopback alone."""
+    """Token that each request must carry; None: none, for loopback only."""
 
     def __post_init__(self) -> None:
-        """Raises: ValueError where anyone could come in."""
-        if not self.hosts and not self.token:
-            raise ValueError("gate: expected a token for a server that others can reach, found none")
+        """Check that a server beyond loopback has a token.
 
-    def ask(self, headers: Mapping[str, str], path: str) -> Answer:
-        """Whether a request with these headers may pass; header names in their usual capitals."""
-        stranger = self._stranger(headers)
-        if stranger or self.token is None:
-            return Answer(not stranger, stranger)
+        Raises:
+            ValueError: If it has none.
+        """
+        if not self.hosts and not self.token:
+            raise ValueError("access control: expected a token for a server that other machines can reach, found none")
+
+    def check(self, headers: Mapping[str, str], path: str) -> AccessDecision:
+        """Decide on a request.
+
+        Args:
+            headers: Request headers, names in canonical capitalisation.
+            path: Request path with its query.
+        """
+        refusal = self._refusal(headers)
+        if refusal or self.token is None:
+            return AccessDecision(not refusal, refusal)
         given = parse_qs(urlsplit(path).query).get("token", [""])[0]
         if hmac.compare_digest(given.encode(), self.token.encode()):
-            return Answer(True, cookie=f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/")
+            return AccessDecision(True, cookie=f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/")
         if hmac.compare_digest(_cookie(headers).encode(), self.token.encode()):
-            return Answer(True)
-        return Answer(False, "expected the token that `splatgraft edit` printed: open the whole address it gave")
+            return AccessDecision(True)
+        return AccessDecision(False, "expected the token that `splatgraft edit` printed: open the complete address")
 
-    def _stranger(self, headers: Mapping[str, str]) -> str:
-        """What shows that a request is not the page's own; nothing where it is."""
+    def _refusal(self, headers: Mapping[str, str]) -> str:
+        """Why the Host or Origin header is refused; empty where it is accepted."""
         host = headers.get("Host", "")
         if self.hosts and _name(host) not in self.hosts:
-            return "expected to be called by the name of this machine"
+            return "expected the name of this machine in the address, found another"
         origin = headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             return "expected a request of the editor's own page, found one of another site"
         if headers.get("Upgrade", "").lower() == "websocket" and origin is None:
-            return "expected a browser, which names the page that it talks for"
+            return "expected a websocket of a browser, with an Origin header, found none"
         return ""
 
 
 def _name(host: str) -> str:
-    """The name in a Host header; nothing where it is no honest one."""
+    """The name in a Host header; empty where the header is malformed."""
     found = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(:[0-9]+)?", host)
     return found[1].strip("[]").lower() if found else ""
 

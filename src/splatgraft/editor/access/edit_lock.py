@@ -1,27 +1,27 @@
-"""One window edits, the others look on. Knows nothing about windows but their numbers."""
+"""The edit lock: of all open windows one edits, the others are read-only."""
 
 from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
 class EditLock:
-    """The windows that are open, in the order in which they came, and the one that edits."""
+    """The open windows and the one that holds the lock."""
 
     windows: tuple[int, ...] = ()
-    """All of them."""
+    """Numbers of the open windows, oldest first."""
     holder: int | None = None
-    """The one whose clicks count; None where none is open."""
+    """The window that edits; None where no window is open."""
 
-    def joined(self, window: int) -> "EditLock":
-        """One more window; the first one edits."""
+    def with_window(self, window: int) -> "EditLock":
+        """The lock after `window` opened; the first window takes it."""
         return EditLock((*self.windows, window), window if self.holder is None else self.holder)
 
-    def left(self, window: int) -> "EditLock":
-        """One window less; where it was the editing one, the oldest that is left edits."""
+    def without_window(self, window: int) -> "EditLock":
+        """The lock after `window` closed; the oldest remaining window takes it if `window` held it."""
         rest = tuple(other for other in self.windows if other != window)
         holder = self.holder if self.holder != window else next(iter(rest), None)
         return EditLock(rest, holder)
 
-    def taken(self, window: int) -> "EditLock":
-        """That window edits from now on."""
+    def held_by(self, window: int) -> "EditLock":
+        """The lock after `window` took it; unchanged where that window is not open."""
         return replace(self, holder=window) if window in self.windows else self

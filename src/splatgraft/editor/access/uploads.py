@@ -1,7 +1,4 @@
-"""Files that a person uploads: kept in the project under a plain name, read once to see that they are what they say.
-
-Knows nothing about browsers.
-"""
+"""Uploaded files: stored in the project under a sanitised name after a trial read."""
 
 import re
 from pathlib import Path
@@ -14,12 +11,14 @@ SCENES = (".ply", ".spz", ".splat")
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 SUFFIXES = (*SCENES, *VIDEOS)
 LIMIT_BYTES = 1 << 30
+"""Largest accepted upload."""
 
 
-def keep_upload(folder: Path, name: str, content: bytes, *, suffixes: tuple[str, ...]) -> Path:
-    """The file as uploads/NAME; one of the same name takes the place of an earlier one.
+def save_upload(folder: Path, name: str, content: bytes, *, suffixes: tuple[str, ...]) -> Path:
+    """Store a file as uploads/NAME; it replaces an earlier one of that name.
 
-    Raises: ValueError where its kind is not among `suffixes`, or a scene cannot be read.
+    Raises:
+        ValueError: If its suffix is not in `suffixes`, or a scene cannot be read.
     """
     plain = re.sub(r"[^A-Za-z0-9._-]+", "_", Path(name.replace("\\", "/")).name).lstrip(".") or "upload"
     path = folder / UPLOADS_FOLDER / plain

@@ -1,1 +1,1 @@
-"""Long work that the editor starts: child processes, exports, videos."""
+"""Jobs in child processes, and exports of results."""

@@ -1,4 +1,4 @@
-"""What a person takes home: the scene in any format, a picture, the report. Knows nothing about browsers."""
+"""Exports of results: the scene in any supported format, images, the orbit video and the report."""
 
 import shutil
 from pathlib import Path
@@ -13,9 +13,10 @@ EXPORTS_FOLDER = "export"
 
 
 def export_scene(files: ProjectFiles, suffix: str) -> Path:
-    """The finished scene as export/scene.SUFFIX; a .ply is the result byte for byte.
+    """Write the result as export/scene.SUFFIX; in the result's own format byte for byte.
 
-    Raises: ValueError where nothing is finished yet.
+    Raises:
+        ValueError: If there is no result yet.
     """
     if not files.result.is_file():
         raise ValueError(f"{files.result}: expected a finished scene, found none yet; run the transfer first")
@@ -29,9 +30,13 @@ def export_scene(files: ProjectFiles, suffix: str) -> Path:
 
 
 def export_turntable(files: ProjectFiles, suffix: str) -> tuple[Path, str]:
-    """The turntable of the report as export/turntable.SUFFIX, and what is to be said of it.
+    """Write the report's turntable as export/turntable.SUFFIX.
 
-    Raises: ValueError where there is none yet.
+    Returns:
+        The file, and a remark where it is not in the requested format or browsers do not play it; else an empty string.
+
+    Raises:
+        ValueError: If there is none yet.
     """
     found = next((p for p in (files.report / "turntable.webp", files.report / "turntable.gif") if p.is_file()), None)
     if found is None:
@@ -42,14 +47,20 @@ def export_turntable(files: ProjectFiles, suffix: str) -> tuple[Path, str]:
     try:
         codec = write_orbit_video(path, found)
     except ValueError as error:
-        return Path(shutil.copy2(found, _folder(files) / found.name)), f"{error}; here is {found.name} instead"
-    return path, "" if codec == "H.264" else f"in {codec}, which players show but browsers do not; .webp is for those"
+        return Path(shutil.copy2(found, _folder(files) / found.name)), f"{error}; exported {found.name} instead"
+    return (
+        path,
+        ""
+        if codec == "H.264"
+        else f"in {codec}, which video players support but browsers do not; .webp plays in browsers",
+    )
 
 
 def report_page(files: ProjectFiles) -> Path:
-    """The report.
+    """The report's page.
 
-    Raises: ValueError where there is none yet.
+    Raises:
+        ValueError: If there is none yet.
     """
     page = files.report / REPORT_FILE
     if not page.is_file():
@@ -58,7 +69,7 @@ def report_page(files: ProjectFiles) -> Path:
 
 
 def picture_path(files: ProjectFiles, name: str) -> Path:
-    """Where an exported picture goes."""
+    """Path of an exported image."""
     return _folder(files) / f"{name}.png"
 
 

@@ -1,6 +1,6 @@
-"""Long work in a child process of its own session: it outlives the page and the server, and tells how far it is.
+"""Jobs: child processes that outlive the page and the server and report progress in a state file.
 
-Knows nothing about what is done: a command line is started, a state file is read.
+A lock file shows whether the process of a job is alive.
 """
 
 import json
@@ -24,75 +24,75 @@ _LIVE = ("starting", "running")
 
 @dataclass(frozen=True)
 class PlannedStep:
-    """A step that a job will do or has done."""
+    """A step of a job's plan."""
 
     name: str
-    """As the state names it."""
+    """Name of the step."""
     seconds: float
-    """What it will roughly take."""
+    """Expected duration."""
     is_measured: bool
-    """Whether that is how long it took here before, rather than what is usual."""
+    """Whether `seconds` is the duration of an earlier run of this step, rather than a default."""
 
 
 @dataclass(frozen=True)
 class JobState:
-    """How far a job is, as its process wrote it last."""
+    """Progress of a job, as last written by its process."""
 
     title: str
-    """What a person asked for."""
+    """Title for the user."""
     command: tuple[str, ...]
-    """The words a person would type after `splatgraft`."""
+    """Arguments of the equivalent `splatgraft` command."""
     pid: int
-    """Of the process, which leads its own group."""
+    """Process id; the process leads its own process group."""
     outcome: Outcome
-    """killed: it ended without a word, as by a power cut; the same command goes on from there."""
+    """`killed`: the process ended without writing an outcome."""
     started: float
-    """Seconds since 1970."""
+    """Time of the start, seconds since 1970."""
     step: str = ""
-    """The step at work."""
+    """The running step."""
     done: int = 0
-    """Of the step's own units."""
+    """Finished units of the running step."""
     total: int = 0
-    """Of the same; 0 where not known yet."""
+    """Total units of the running step; 0 where not known yet."""
     message: str = ""
-    """What the step says about itself."""
+    """Progress message of the step."""
     step_started: float = 0.0
-    """Seconds since 1970."""
+    """Start of the running step, seconds since 1970."""
     begun: int = 0
-    """Units that were done when it began to count: by an earlier run that was killed."""
+    """Units that an earlier, killed run had finished when counting began."""
     begun_at: float = 0.0
-    """Seconds since 1970: when it began to count; a step that counts several things begins several times."""
+    """When counting began, seconds since 1970; a step with several counters begins several times."""
     error: str = ""
-    """One line where it failed."""
+    """Error message, one line; empty unless the outcome is `failed`."""
     plan: tuple[PlannedStep, ...] = ()
-    """All steps of the job in their order; empty where that is not known."""
+    """All steps of the job in order; empty where they are not known."""
     took: tuple[tuple[str, float], ...] = ()
-    """Steps of this run that have ended, with their seconds."""
+    """Finished steps of this run with their durations in seconds."""
 
     @property
     def live(self) -> bool:
-        """Whether it is still at work."""
+        """Whether the job is starting or running."""
         return self.outcome in _LIVE
 
     @property
-    def share(self) -> float:
-        """Of the step at work, in [0, 1]."""
+    def fraction(self) -> float:
+        """Finished fraction of the running step, in [0, 1]."""
         return min(1.0, self.done / self.total) if self.total else 0.0
 
 
 def seconds_left(state: JobState, now: float) -> float | None:
-    """Until what the step counts is done, if it goes on as it has; None at its end, and where it is too early."""
+    """Seconds until the running step's counter is complete, extrapolated; None at its end and where it is too early."""
     spent, done = now - state.begun_at, state.done - state.begun
     if not state.live or not 0 < done < state.total - state.begun or spent < 1:
         return None
     return spent * (state.total - state.done) / done
 
 
-def seconds_left_in_all(state: JobState, now: float) -> float | None:
-    """Until the whole job ends; None where it is too early to tell.
+def seconds_left_in_job(state: JobState, now: float) -> float | None:
+    """Seconds until the job ends; None where it is too early to estimate.
 
-    The steps to come take what they took before; guesses among them are corrected by how far off the steps of this
-    run were, the one at work as far as its progress tells.
+    Later steps count with their measured durations. Default durations are scaled by the ratio of actual to default
+    duration of this run's steps, the running one included as far as its progress allows.
     """
     names = [step.name for step in state.plan]
     if not state.live or state.step not in names:
@@ -102,69 +102,75 @@ def seconds_left_in_all(state: JobState, now: float) -> float | None:
     left, spent = seconds_left(state, now), now - state.step_started
     if left is None and not current.is_measured and at == 0:
         return None
-    factor = _slowness(state, None if left is None else spent + left)
+    factor = _time_factor(state, None if left is None else spent + left)
     expected = current.seconds * (1.0 if current.is_measured else factor) - spent
-    # what it counts now may be one of several things
+    # the counter may be one of several of this step
     left = max(left or 0.0, expected if left is None or current.is_measured else 0.0)
     return left + sum(step.seconds * (1.0 if step.is_measured else factor) for step in later)
 
 
-def _slowness(state: JobState, current: float | None) -> float:
-    """How many times what was guessed the steps of this run take; 1 where nothing is known."""
+def _time_factor(state: JobState, current: float | None) -> float:
+    """Ratio of actual to default duration of this run's steps without a measured duration; 1 where not known."""
     took = dict(state.took) | ({} if current is None else {state.step: current})
-    guessed = {step.name: step.seconds for step in state.plan if not step.is_measured and step.name in took}
-    whole = sum(guessed.values())
-    return sum(took[name] for name in guessed) / whole if whole > 0 else 1.0
+    defaults = {step.name: step.seconds for step in state.plan if not step.is_measured and step.name in took}
+    expected = sum(defaults.values())
+    return sum(took[name] for name in defaults) / expected if expected > 0 else 1.0
 
 
 def write_state(folder: Path, state: JobState) -> None:
-    """Replace the state file, whole or not at all."""
+    """Replace the state file atomically."""
     with atomic_write(folder / STATE_FILE) as stream:
         stream.write((json.dumps(asdict(state)) + "\n").encode())
 
 
 class Jobs:
-    """At most one job at a time in one folder, whoever started it."""
+    """At most one job at a time per folder, also across processes."""
 
     def __init__(self, folder: Path) -> None:
-        """Take up what runs in `folder` or was left there."""
+        """Attach to the job that runs in `folder`, if any."""
         self.folder = folder
         self._child: subprocess.Popen[bytes] | None = None
 
     def start(self, command: Sequence[str], *, title: str, shown: Sequence[str]) -> None:
-        """Run `command`, whose process must call `hold`; `shown` is what a person would type.
+        """Start a job.
 
-        Raises: ValueError where one is at work already.
+        Args:
+            command: Command line; its process must call `acquire_job_lock`.
+            title: Title for the user.
+            shown: Arguments of the equivalent `splatgraft` command.
+
+        Raises:
+            ValueError: If a job is running already.
         """
         state = self.state()
         if state is not None and state.live:
-            raise ValueError(f"{state.title}: expected it to be over, found it at work; wait or cancel")
+            raise ValueError(f"{state.title}: expected no other job, found this one running; wait or cancel it")
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / LOG_FILE).open("wb") as log:
             self._child = subprocess.Popen(
                 list(command), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
             )
         first = JobState(title, tuple(shown), self._child.pid, "starting", time.time())
-        # the child may have written already; its word is newer
+        # the child may have written a newer state already
         if not (found := self._read()) or found.pid != self._child.pid:
             write_state(self.folder, first)
 
     def state(self) -> JobState | None:
-        """The job at work or the last one; None where there never was one."""
+        """The state of the running job, else of the last one; None where there was none."""
         if self._child is not None:
             self._child.poll()
         state = self._read()
         if state is None or not state.live:
             return state
-        # a process that only just began has not locked yet; one that locked is alive as long as the lock is held
-        at_work = _held(self.folder / LOCK_FILE) if state.outcome == "running" else self._is_alive(state.pid)
-        if at_work:
+        # a starting process has not locked yet; a running one is alive as long as the lock is held
+        is_alive = _is_locked(self.folder / LOCK_FILE) if state.outcome == "running" else self._is_alive(state.pid)
+        if is_alive:
             return state
         state = self._read() or state
         return replace(state, outcome="killed") if state.live else state
 
     def cancel(self) -> None:
-        """Ask the process and all that it started to stop; earlier results stay whole."""
+        """Interrupt the process group of the running job; earlier results stay complete."""
         state = self.state()
         if state is not None and state.live:
             if hasattr(os, "killpg"):
@@ -173,7 +179,7 @@ class Jobs:
                 os.kill(state.pid, signal.SIGTERM)
 
     def log_tail(self, lines: int = 12) -> str:
-        """The end of what it said."""
+        """The last lines of the job's log."""
         path = self.folder / LOG_FILE
         return "\n".join(path.read_text(errors="replace").splitlines()[-lines:]) if path.is_file() else ""
 
@@ -198,20 +204,21 @@ class Jobs:
         return True
 
 
-def hold(folder: Path) -> filelock.BaseFileLock:
-    """The lock by which others know that a job's process is alive; the system lets go of it when that ends.
+def acquire_job_lock(folder: Path) -> filelock.BaseFileLock:
+    """Lock the job folder; the operating system releases the lock when the process ends.
 
-    Raises: ValueError where another job holds it.
+    Raises:
+        ValueError: If another job holds the lock.
     """
     lock = filelock.FileLock(folder / LOCK_FILE)
     try:
         lock.acquire(timeout=0)
     except filelock.Timeout as error:
-        raise ValueError(f"{folder}: expected no other job at work here, found one") from error
+        raise ValueError(f"{folder}: expected no other job running here, found one") from error
     return lock
 
 
-def _held(path: Path) -> bool:
+def _is_locked(path: Path) -> bool:
     try:
         with filelock.FileLock(path).acquire(timeout=0):
             return False

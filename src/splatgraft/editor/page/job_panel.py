@@ -1,4 +1,4 @@
-"""The long work that goes on: what it does, how far it is, the time left, a way to cancel it. Knows no kind of work."""
+"""The panel of the running job: step, progress, remaining time and a cancel button."""
 
 from __future__ import annotations
 
@@ -8,28 +8,29 @@ from typing import TYPE_CHECKING
 
 import viser
 
-from splatgraft.editor.jobs.jobs import JobState, seconds_left, seconds_left_in_all
+from splatgraft.editor.jobs.jobs import JobState, seconds_left, seconds_left_in_job
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
 
 
 class JobPanel:
-    """Shown while a job is at work, whoever started it and when."""
+    """Visible while a job of this project runs, also one that an earlier page started."""
 
     def __init__(self, page: Page) -> None:
-        """Build it."""
+        """Build the controls."""
         self._page, gui = page, page.gui
-        self._seen = ""
+        self._last_seen = ""
         self._text = gui.add_html("", visible=False)
         self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="red", visible=False)
-        self._cancel.on_click(page.act(lambda _: self._stop()))
+        self._cancel.on_click(page.callback(lambda _: self._stop()))
 
     def refresh(self) -> None:
-        """How far it is now; where a step of it has ended, the page shows what came out.
+        """Update the panel; redraw the page when a step has ended.
 
-        Raises: ValueError where the job's state cannot be read.
+        Raises:
+            ValueError: If the job's state cannot be read.
         """
         state = None if self._page.session is None else self._page.session.job()
         live = state is not None and state.live
@@ -38,20 +39,20 @@ class JobPanel:
             return
         if live:
             self._show(state)
-        seen = f"{state.pid} {state.outcome} {state.step}"
-        if seen == self._seen:
+        current = f"{state.pid} {state.outcome} {state.step}"
+        if current == self._last_seen:
             return
-        ended, self._seen = bool(self._seen) and not live, seen
+        ended, self._last_seen = bool(self._last_seen) and not live, current
         if ended or state.outcome == "killed":
             self._say_end(state)
         self._page.redraw()
 
     def _show(self, state: JobState) -> None:
         now = time.time()
-        whole, left = seconds_left_in_all(state, now), seconds_left(state, now)
-        parts = [f"about {_minutes(whole)} left in all"] if whole is not None else []
+        whole, left = seconds_left_in_job(state, now), seconds_left(state, now)
+        parts = [f"about {_minutes(whole)} left in total"] if whole is not None else []
         parts += [f"{_minutes(left)} in this step"] if left is not None else []
-        rest = ", ".join(parts) or "time left not known yet"
+        rest = ", ".join(parts) or "remaining time not known yet"
         names = [step.name for step in state.plan]
         if state.step in names:
             rest += f" &middot; step {names.index(state.step) + 1} of {len(names)}"
@@ -60,21 +61,21 @@ class JobPanel:
             f"<b>{html.escape(state.title)}</b><br>"
             f"{html.escape(state.step or 'starting')}: {html.escape(state.message or '...')}<br>{rest}</div>"
         )
-        self._bar.value = 100 * state.share
+        self._bar.value = 100 * state.fraction
 
     def _say_end(self, state: JobState) -> None:
         sentences = {
             "done": "done",
             "failed": state.error,
-            "cancelled": "cancelled; earlier results are whole, and the same run goes on from here",
-            "killed": "ended without a word; start it again, it goes on from where it was",
+            "cancelled": "cancelled; finished steps are kept, and the same run resumes from here",
+            "killed": "the process ended unexpectedly; start it again, it resumes from where it was",
         }
         bad = state.outcome in ("failed", "killed")
         self._page.say(f"{state.title}: {sentences.get(state.outcome, state.outcome)}", bad=bad)
 
     def _stop(self) -> None:
-        self._page.need().jobs.cancel()
-        self._page.say("asked to stop")
+        self._page.require_session().jobs.cancel()
+        self._page.say("stopping")
 
 
 def _minutes(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""Light: what was found as arrows that can be dragged, and how strong each layer is. Knows nothing about estimation."""
+"""The phase `Light`: light sources as draggable arrows, and the strength of each layer of the light transfer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 import viser
 
 from splatgraft.editor.page.place_phase import NO_NAMES, hide_target, show_target
-from splatgraft.editor.previews.light_handles import aimed, arrow_points, ring_points
+from splatgraft.editor.previews.light_handles import arrow_points, uncertainty_ring_points, with_direction
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.relighting import LayerWeights, Light
 
@@ -19,114 +19,113 @@ if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
 
 _LAYERS = (("shade", "Shade"), ("shadow", "Shadow"), ("bounce", "Bounce"), ("gloss", "Gloss"))
-_SHOWN = 4
+_MAX_SOURCES = 4
 
 
 class LightPhase:
-    """The controls of the fourth step, and the lights in 3D."""
+    """The controls of the phase, and the light sources in the 3D view."""
 
     def __init__(self, page: Page) -> None:
-        """Build them."""
+        """Build the controls."""
         self._page, gui = page, page.gui
-        self._inside = False
+        self._is_active = False
         self._text = gui.add_html("")
-        self._find = gui.add_button("Find the light", icon=viser.Icon.SUN)
-        self._which = gui.add_dropdown("Aim", NO_NAMES, initial_value=NO_NAMES[0], visible=False)
-        self._strength = gui.add_slider("Its strength", 0.0, 3.0, 0.05, 1.0, visible=False)
+        self._estimate_button = gui.add_button("Estimate the light", icon=viser.Icon.SUN)
+        self._source_choice = gui.add_dropdown("Source", NO_NAMES, initial_value=NO_NAMES[0], visible=False)
+        self._strength = gui.add_slider("Strength", 0.0, 3.0, 0.05, 1.0, visible=False)
         self._sliders = {key: gui.add_slider(label, 0.0, 2.0, 0.05, 1.0) for key, label in _LAYERS}
-        self._estimate = gui.add_button("Back to the estimate", color="gray")
+        self._reset = gui.add_button("Back to the estimate", color="gray")
         self._handle: viser.TransformControlsHandle | None = None
-        self._aiming: Light | None = None
-        self._start: Light | None = None
-        act = page.act
-        self._find.on_click(act(lambda _: self._found()))
-        self._which.on_update(act(lambda _: self._remove_handle()))
-        self._strength.on_update(act(lambda _: self._strengthen()))
-        self._estimate.on_click(act(lambda _: self._to_estimate()))
+        self._dragged_light: Light | None = None
+        callback = page.callback
+        self._estimate_button.on_click(callback(lambda _: self._show_estimate()))
+        self._source_choice.on_update(callback(lambda _: self._remove_handle()))
+        self._strength.on_update(callback(lambda _: self._scale_source()))
+        self._reset.on_click(callback(lambda _: self._reset_to_estimate()))
         for slider in self._sliders.values():
-            slider.on_update(act(lambda _: self._weigh()))
+            slider.on_update(callback(lambda _: self._set_weights()))
 
     def enter(self) -> None:
-        """Show the target and the lights."""
-        self._inside = True
+        """Show the target and the light sources."""
+        self._is_active = True
         session = self._page.session
         if session is not None and session.files.target_scene.is_file():
             show_target(self._page)
         self.refresh()
 
     def leave(self) -> None:
-        """Take them away."""
-        self._inside = False
+        """Hide them."""
+        self._is_active = False
         hide_target(self._page)
         self._remove_handle()
         self._hide_arrows()
 
     def refresh(self) -> None:
-        """Lights, sentences and strengths as they are now."""
+        """Update arrows, description and strengths."""
         session = self._page.session
-        if session is None or not self._inside:
+        if session is None or not self._is_active:
             return
         weights = session.state.weights
         for key, slider in self._sliders.items():
             slider.value = float(getattr(weights, key))
         light = self._light()
-        ready = light is not None and bool(session.objects())
-        self._find.visible = session.files.transfers_light and not ready and bool(session.objects())
-        self._estimate.disabled = session.state.light is None
-        self._which.visible = self._strength.visible = ready and bool(light and light.sources)
+        is_known = light is not None and bool(session.objects())
+        self._estimate_button.visible = session.files.transfers_light and not is_known and bool(session.objects())
+        self._reset.disabled = session.state.light is None
+        self._source_choice.visible = self._strength.visible = is_known and bool(light and light.sources)
         if light is None or not session.objects():
-            self._text.content = _box(html.escape(self._why_none()))
+            self._text.content = _box(html.escape(self._missing_reason()))
             return
-        names = tuple(f"{i + 1}: {s.name}" for i, s in enumerate(light.sources[:_SHOWN]))
-        if names and tuple(self._which.options) != names:
-            self._which.options = names
-        self._text.content = _box(html.escape(_sentences(session.state, light, self._page.need().up())))
+        names = tuple(f"{i + 1}: {s.name}" for i, s in enumerate(light.sources[:_MAX_SOURCES]))
+        if names and tuple(self._source_choice.options) != names:
+            self._source_choice.options = names
+        self._text.content = _box(html.escape(_description(session.state, light, self._page.require_session().up())))
         self._draw(light)
 
     def _light(self) -> Light | None:
-        """As given by hand, else as the last preview found it."""
+        """The light set by hand, else the last estimate of the preview."""
         session = self._page.session
         if session is None or not session.objects():
             return None
         if session.state.light is not None:
             return session.state.light
         state = session.placed_state()
-        return session.transfers.relit(state).light if session.transfers.is_lit(state) else None
+        return session.relighting.relit(state).light if session.relighting.is_relit(state) else None
 
-    def _why_none(self) -> str:
-        session = self._page.need()
+    def _missing_reason(self) -> str:
+        session = self._page.require_session()
         if not session.files.transfers_light:
-            return f"The light is no physical transfer: {session.transfers.note()}. There is nothing to aim."
+            return f"The physical light transfer is off: {session.relighting.light_mode_note()}."
         if not session.objects():
-            return "No object is placed yet: see step 3."
+            return "No object is placed yet: see Place."
         state = session.placed_state()
         return (
-            " ".join(session.transfers.relit(state).report)
-            if session.transfers.is_lit(state)
-            else "Looking for the light."
+            " ".join(session.relighting.relit(state).report)
+            if session.relighting.is_relit(state)
+            else "Estimating the light."
         )
 
-    def _found(self) -> None:
-        session = self._page.need()
-        relit = session.transfers.relit(session.placed_state())
+    def _show_estimate(self) -> None:
+        session = self._page.require_session()
+        relit = session.relighting.relit(session.placed_state())
         for sentence in relit.report[:1]:
             self._page.say(sentence)
 
-    def _weigh(self) -> None:
-        session = self._page.need()
+    def _set_weights(self) -> None:
+        session = self._page.require_session()
         weights = LayerWeights(**{key: float(slider.value) for key, slider in self._sliders.items()})
         session.change(replace(session.state, weights=weights))
-        self._page.preview.ask()
+        self._page.preview.update()
 
-    def _to_estimate(self) -> None:
-        session = self._page.need()
+    def _reset_to_estimate(self) -> None:
+        session = self._page.require_session()
         session.change(replace(session.state, light=None))
 
     def _index(self) -> int:
-        return list(self._which.options).index(self._which.value)
+        return list(self._source_choice.options).index(self._source_choice.value)
 
-    def _strengthen(self) -> None:
-        session, light = self._page.need(), self._light()
+    def _scale_source(self) -> None:
+        session, light = self._page.require_session(), self._light()
         if light is None:
             return
         index, factor = self._index(), float(self._strength.value)
@@ -139,45 +138,45 @@ class LightPhase:
     # arrows
 
     def _centre(self) -> torch.Tensor:
-        session = self._page.need()
-        base = session.placeable(0).base
+        session = self._page.require_session()
+        base = session.placeable_object(0).base
         return session.objects()[0].target_from_object.points(base.point + 0.5 * base.height * base.up)
 
-    def _reach(self) -> float:
-        session = self._page.need()
-        base, scale = session.placeable(0).base, session.objects()[0].target_from_object.scale
+    def _arrow_length(self) -> float:
+        session = self._page.require_session()
+        base, scale = session.placeable_object(0).base, session.objects()[0].target_from_object.scale
         return 4.0 * scale * max(base.height, base.radius)
 
     def _draw(self, light: Light) -> None:
-        centre, reach, scene = self._centre(), self._reach(), self._page.server.scene
-        self._hide_arrows(keep=len(light.sources[:_SHOWN]))
+        centre, length, scene = self._centre(), self._arrow_length(), self._page.server.scene
+        self._hide_arrows(keep=len(light.sources[:_MAX_SOURCES]))
         brightest = max((s.luminance for s in light.sources), default=1.0)
-        for index, source in enumerate(light.sources[:_SHOWN]):
-            thick = 0.25 + 0.75 * (source.luminance / max(brightest, 1e-9)) ** 0.5
+        for index, source in enumerate(light.sources[:_MAX_SOURCES]):
+            thickness = 0.25 + 0.75 * (source.luminance / max(brightest, 1e-9)) ** 0.5
             color = np.array(source.irradiance) / max(*source.irradiance, 1e-9)
             rgb = tuple(int(255 * float(c)) for c in color.clip(0, 1) ** (1 / 2.2))
             scene.add_arrows(
                 f"/light/{index}/arrow",
-                points=arrow_points(source, centre, reach).numpy()[None],
+                points=arrow_points(source, centre, length).numpy()[None],
                 colors=(rgb[0], rgb[1], rgb[2]),
-                shaft_radius=0.012 * reach * thick,
-                head_radius=0.035 * reach * thick,
-                head_length=0.1 * reach,
+                shaft_radius=0.012 * length * thickness,
+                head_radius=0.035 * length * thickness,
+                head_length=0.1 * length,
             )
             scene.add_line_segments(
-                f"/light/{index}/doubt",
-                points=ring_points(source, centre, reach).numpy(),
+                f"/light/{index}/uncertainty",
+                points=uncertainty_ring_points(source, centre, length).numpy(),
                 colors=(rgb[0], rgb[1], rgb[2]),
             )
-        if light.sources and self._aiming is None:
+        if light.sources and self._dragged_light is None:
             self._show_handle(light)
 
     def _show_handle(self, light: Light) -> None:
         index = min(self._index(), len(light.sources) - 1)
-        position = arrow_points(light.sources[index], self._centre(), self._reach())[0].numpy()
+        position = arrow_points(light.sources[index], self._centre(), self._arrow_length())[0].numpy()
         if self._handle is None:
             self._handle = self._page.server.scene.add_transform_controls(
-                "/light/handle", scale=0.45 * self._reach(), disable_rotations=True, position=position
+                "/light/handle", scale=0.45 * self._arrow_length(), disable_rotations=True, position=position
             )
             self._handle.on_update(self._dragged)
         else:
@@ -189,27 +188,27 @@ class LightPhase:
             self._handle = None
 
     def _hide_arrows(self, keep: int = 0) -> None:
-        for index in range(keep, _SHOWN):
-            for part in ("arrow", "doubt"):
+        for index in range(keep, _MAX_SOURCES):
+            for part in ("arrow", "uncertainty"):
                 self._page.view.remove(f"/light/{index}/{part}")
 
     async def _dragged(self, event: viser.TransformControlsEvent) -> None:
-        session, handle, light = self._page.session, self._handle, self._aiming or self._light()
+        session, handle, light = self._page.session, self._handle, self._dragged_light or self._light()
         if session is None or handle is None or light is None or event.phase == "start":
             return
         towards = torch.tensor(np.asarray(handle.position), dtype=torch.float32) - self._centre()
-        self._aiming = aimed(light, self._index(), towards)
+        self._dragged_light = with_direction(light, self._index(), towards)
         ended = event.phase == "end"
-        after = replace(session.placed_state(), light=self._aiming)
-        self._draw(self._aiming)
+        edited = replace(session.placed_state(), light=self._dragged_light)
+        self._draw(self._dragged_light)
         if ended:
-            self._aiming = None
-            self._page.act(lambda _: session.change(after))(None)
-        self._page.preview.moving(None if ended else after)
+            self._dragged_light = None
+            self._page.callback(lambda _: session.change(edited))(None)
+        self._page.preview.set_dragged_state(None if ended else edited)
 
 
-def _sentences(state: EditState, light: Light, up: torch.Tensor) -> str:
-    return ("As you aimed it: " if state.light is not None else "Found: ") + light.describe(up)
+def _description(state: EditState, light: Light, up: torch.Tensor) -> str:
+    return ("Set by hand: " if state.light is not None else "Estimated: ") + light.describe(up)
 
 
 def _box(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Open: two captures or scenes become a project; what is missing is reconstructed. Knows nothing about how."""
+"""The phase `Open`: create a project of two captures or scenes, and reconstruct the scenes that are missing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import viser
 
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.editor.access.uploads import SCENES, SUFFIXES, keep_upload
+from splatgraft.editor.access.uploads import SCENES, SUFFIXES, save_upload
 from splatgraft.editor.session.project_access import Triple
 from splatgraft.editor.session.session import Session
 from splatgraft.project.layout import Side
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _HELP = (
     "A capture is a folder of photos, a video, a COLMAP folder, or a folder with a `transforms.json`. "
-    "A trained scene (`.ply`, `.spz`, `.splat`) will do as well: it is looked at from all around."
+    "A trained scene (`.ply`, `.spz`, `.splat`) works as well: its images are rendered from cameras around it."
 )
 _SIDES: tuple[tuple[Side, str], ...] = (("source", "Object from"), ("target", "Place into"))
 _UPS: dict[str, Triple | None] = {
@@ -35,10 +35,10 @@ _LOOKS: dict[str, str | None] = {"from around": None, "from within": "within"}
 
 
 class OpenPhase:
-    """The controls of the first step."""
+    """The controls of the phase."""
 
     def __init__(self, page: Page) -> None:
-        """Build them."""
+        """Build the controls."""
         self._page, gui = page, page.gui
         self._help = gui.add_markdown(_HELP)
         self._source = gui.add_text("Object from", "", hint="The capture or scene with the object: a path")
@@ -49,53 +49,53 @@ class OpenPhase:
                 gui.add_text("Of the first", "", hint="A .ply, .spz or .splat in the same frame as its capture"),
                 gui.add_text("Of the second", "", hint="A .ply, .spz or .splat in the same frame as its capture"),
             )
-        # viser shows an upload button also where it is told not to; what hides is the folder
+        # viser shows upload buttons even where `visible` is false; the folder hides it
         self._uploads = gui.add_folder("From this computer")
         with self._uploads:
             self._upload = gui.add_upload_button("Upload a video or a scene", icon=viser.Icon.UPLOAD, color="gray")
         self._start = gui.add_button("Start the project", icon=viser.Icon.PLUS)
         self._facts = gui.add_html("")
-        self._looks = {side: gui.add_dropdown(f"Seen: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}
+        self._looks = {side: gui.add_dropdown(f"Cameras: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}
         self._ups = {side: gui.add_dropdown(f"Up: {side}", tuple(_UPS), visible=False) for side, _ in _SIDES}
         self._build = gui.add_button("Reconstruct both scenes", icon=viser.Icon.PLAYER_PLAY)
-        self._start.on_click(page.act(lambda _: self._create()))
-        self._upload.on_upload(page.act(self._uploaded))
+        self._start.on_click(page.callback(lambda _: self._create()))
+        self._upload.on_upload(page.callback(self._uploaded))
         for side, _ in _SIDES:
             for control in (self._looks[side], self._ups[side]):
-                control.on_update(page.act(partial(self._set_view, side)))
-        self._build.on_click(page.act(lambda _: page.run("reconstruct", "Reconstruct both scenes")))
+                control.on_update(page.callback(partial(self._set_view, side)))
+        self._build.on_click(page.callback(lambda _: page.run("reconstruct", "Reconstruct both scenes")))
 
     def enter(self) -> None:
-        """Show what is there of the target."""
+        """Show the target, where it is reconstructed."""
         session = self._page.session
         if session is not None and session.files.target_scene.is_file():
-            self._page.view.splats("/target/scene", session.scenes.gaussians(session.files.target_scene))
+            self._page.view.show_splats("/target/scene", session.scenes.gaussians(session.files.target_scene))
 
     def leave(self) -> None:
-        """Hide it."""
-        self._page.view.hide("/target/scene")
+        """Hide the target."""
+        self._page.view.hide_splats("/target/scene")
 
     def refresh(self) -> None:
-        """Fields before there is a project, facts after."""
+        """Show the fields of a new project, or the facts of the open one."""
         session = self._page.session
         for control in (self._help, self._source, self._target, self._trained, self._uploads, self._start):
             control.visible = session is None
         self._facts.visible = self._build.visible = session is not None
         for index, (side, _) in enumerate(_SIDES):
-            pictured = session is not None and session.files.pictured[index]
-            self._looks[side].visible = self._ups[side].visible = pictured
+            without_photos = session is not None and session.files.without_photos[index]
+            self._looks[side].visible = self._ups[side].visible = without_photos
         if session is None:
             return
         lines = [self._line(session, index) for index in range(len(_SIDES))]
         for name, shown in self._page.view.shown.items():
             if shown.count < shown.total:
-                lines.append(f"{name}: {shown.count:,} of {shown.total:,} shown; files keep all")
+                lines.append(f"{name}: {shown.count:,} of {shown.total:,} shown; the files contain all")
         self._facts.content = (
             f'<div style="font-size:.85em;line-height:1.6;padding:2px 12px">{"<br>".join(lines)}</div>'
         )
-        both = session.files.source_scene.is_file() and session.files.target_scene.is_file()
-        self._build.label = "Reconstruct again what is stale" if both else self._title(session)
-        self._build.color = "gray" if both else None
+        have_both = session.files.source_scene.is_file() and session.files.target_scene.is_file()
+        self._build.label = "Reconstruct again what is stale" if have_both else self._title(session)
+        self._build.color = "gray" if have_both else None
 
     def _line(self, session: Session, index: int) -> str:
         files, name = session.files, _SIDES[index][1]
@@ -104,35 +104,35 @@ class OpenPhase:
         if not scene.is_file():
             return f"<b>{name}</b>: not reconstructed yet"
         text = f"<b>{name}</b>: {session.scenes.gaussians(scene).count:,} Gaussians"
-        if files.pictured[index] and cameras.is_file():
+        if files.without_photos[index] and cameras.is_file():
             made = session.scenes.cameras(cameras)
             up = ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in estimate_up(made).tolist())
-            text += f"; it came without photographs: {len(made)} pictures were made of it, with ({up}) as up"
+            text += f"; without photographs: {len(made)} images were rendered of it, with ({up}) as up"
         return text
 
     def _title(self, session: Session) -> str:
-        return "Take over both scenes" if all(session.files.pictured) else "Reconstruct both scenes"
+        return "Import both scenes" if all(session.files.without_photos) else "Reconstruct both scenes"
 
     def _set_view(self, side: Side, _: viser.GuiEvent) -> None:
-        session = self._page.need()
+        session = self._page.require_session()
         session.set_view(side, up=_UPS[self._ups[side].value], look=_LOOKS[self._looks[side].value])
-        self._page.run("reconstruct", "Look at the scene again")
+        self._page.run("reconstruct", "Render the scene again")
 
     def _create(self) -> None:
-        source, target = (self._page.allowed(field.value) for field in (self._source, self._target))
-        scenes = [self._page.allowed(field.value) if field.value.strip() else None for field in self._scenes]
+        source, target = (self._page.parse_path(field.value) for field in (self._source, self._target))
+        scenes = [self._page.parse_path(field.value) if field.value.strip() else None for field in self._scenes]
         self._page.project.create((source, target), scenes=(scenes[0], scenes[1]))
         self._page.open_project()
-        session = self._page.need()
-        if all(session.files.pictured):
-            # nothing is trained, so there is nothing to wait for
+        session = self._page.require_session()
+        if all(session.files.without_photos):
+            # importing two scenes takes no training, so it starts at once
             self._page.run("reconstruct", self._title(session))
             return
-        self._page.say("the project is there; reconstruct both scenes next")
+        self._page.say("the project was created; reconstruct both scenes next")
 
     def _uploaded(self, event: viser.GuiEvent) -> None:
         file = event.target.value
-        path = keep_upload(self._page.project.file.parent, file.name, file.content, suffixes=SUFFIXES)
+        path = save_upload(self._page.project.file.parent, file.name, file.content, suffixes=SUFFIXES)
         fields = (self._source, self._target, *(self._scenes if path.suffix.lower() in SCENES else ()))
         next((field for field in fields if not field.value), fields[-1]).value = str(path)
-        self._page.say(f"{Path(file.name).name}: kept as {path}")
+        self._page.say(f"{Path(file.name).name}: stored as {path}")

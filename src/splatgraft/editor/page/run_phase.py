@@ -1,4 +1,4 @@
-"""Run: the steps of the project, with what they need and what comes out. Knows nothing about what steps do."""
+"""The phase `Run`: run the remaining steps, show which steps are stale, and export the results."""
 
 from __future__ import annotations
 
@@ -20,34 +20,38 @@ if TYPE_CHECKING:
 
 
 class RunPhase:
-    """The controls of the last step."""
+    """The controls of the phase."""
 
     def __init__(self, page: Page) -> None:
-        """Build them."""
+        """Build the controls."""
         self._page, gui = page, page.gui
-        self._inside = False
+        self._is_active = False
         self._method = gui.add_dropdown("Image model", tuple(HARMONIZERS), initial_value="none")
         self._transfer = gui.add_button("Harmonise and consolidate", icon=viser.Icon.PLAYER_PLAY)
-        self._report = gui.add_button("Make the report too", color="gray")
+        self._report = gui.add_button("Make the report", color="gray")
         self._steps = gui.add_html("")
-        with gui.add_folder("Take home"):
+        with gui.add_folder("Export"):
             self._scene = gui.add_button_group("Scene", (".ply", ".spz", ".splat"))
             self._picture = gui.add_button("Picture of this view", icon=viser.Icon.PHOTO, color="gray")
             self._turntable = gui.add_button_group("Turntable", (".mp4", ".webp"))
             self._link = gui.add_html("")
-        act = page.act
-        self._method.on_update(act(lambda _: self._set_method()))
-        self._transfer.on_click(act(lambda _: page.run("consolidate", "Harmonise and consolidate")))
-        self._report.on_click(act(lambda _: page.run("evaluate", "Make the report")))
+        callback = page.callback
+        self._method.on_update(callback(lambda _: self._set_method()))
+        self._transfer.on_click(callback(lambda _: page.run("consolidate", "Harmonise and consolidate")))
+        self._report.on_click(callback(lambda _: page.run("evaluate", "Make the report")))
         self._scene.on_click(
-            act(lambda event: self._send(event, exports.export_scene(page.need().files, event.target.value)))
+            callback(
+                lambda event: self._download(
+                    event, exports.export_scene(page.require_session().files, event.target.value)
+                )
+            )
         )
-        self._turntable.on_click(act(self._send_turntable))
-        self._picture.on_click(act(self._send_picture))
+        self._turntable.on_click(callback(self._send_turntable))
+        self._picture.on_click(callback(self._send_picture))
 
     def enter(self) -> None:
-        """Show the target, compare with the result."""
-        self._inside = True
+        """Show the target, and compare with the result in the preview."""
+        self._is_active = True
         session = self._page.session
         if session is not None and session.files.target_scene.is_file():
             show_target(self._page)
@@ -56,14 +60,14 @@ class RunPhase:
         self.refresh()
 
     def leave(self) -> None:
-        """Take it away."""
-        self._inside = False
+        """Hide the target."""
+        self._is_active = False
         hide_target(self._page)
 
     def refresh(self) -> None:
-        """Steps and results as they are now."""
+        """Update the table of steps and the exports."""
         session = self._page.session
-        if session is None or not self._inside:
+        if session is None or not self._is_active:
             return
         self._method.value = session.state.harmonizer or "none"
         rows = []
@@ -74,30 +78,31 @@ class RunPhase:
         shown = shlex.join(session.project.run_command("consolidate", "")[1])
         self._steps.content = (
             f'<div style="font-size:.8em;line-height:1.5;padding:2px 12px"><table>{"".join(rows)}</table>'
-            f'<div style="opacity:.6;margin-top:6px">the same by command:</div><code>{html.escape(shown)}</code></div>'
+            f'<div style="opacity:.6;margin-top:6px">the same on the command line:</div>'
+            f"<code>{html.escape(shown)}</code></div>"
         )
-        there = (session.files.report / "index.html").is_file()
-        self._turntable.visible = there
+        has_report = (session.files.report / "index.html").is_file()
+        self._turntable.visible = has_report
         self._scene.visible = session.files.result.is_file()
-        link = f'<a href="{FILES_PREFIX}index.html" target="_blank">Open the report</a>' if there else ""
+        link = f'<a href="{FILES_PREFIX}index.html" target="_blank">Open the report</a>' if has_report else ""
         self._link.content = f'<div style="padding:2px 12px">{link}</div>'
 
     def _set_method(self) -> None:
-        session = self._page.need()
+        session = self._page.require_session()
         session.change(replace(session.state, harmonizer=self._method.value))
 
     def _send_picture(self, event: viser.GuiEvent) -> None:
-        path = exports.picture_path(self._page.need().files, "view")
+        path = exports.picture_path(self._page.require_session().files, "view")
         self._page.preview.save_picture(path)
-        self._send(event, path)
+        self._download(event, path)
 
     def _send_turntable(self, event: viser.GuiEvent) -> None:
-        path, remark = exports.export_turntable(self._page.need().files, event.target.value)
-        self._send(event, path)
+        path, remark = exports.export_turntable(self._page.require_session().files, event.target.value)
+        self._download(event, path)
         if remark:
             self._page.say(f"written: {path}; {remark}")
 
-    def _send(self, event: viser.GuiEvent, path: Path) -> None:
+    def _download(self, event: viser.GuiEvent, path: Path) -> None:
         if event.client is not None:
             event.client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
         self._page.say(f"written: {path}")

@@ -1,4 +1,4 @@
-"""The 3D part of the page: splats, boxes, arrows, cameras. Knows nothing about what they mean."""
+"""The 3D view: Gaussian splats, boxes and cameras as viser scene nodes."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import C0
-from splatgraft.editor.previews.level_of_detail import shown_indices
-from splatgraft.editor.session.gizmo import gizmo_of
+from splatgraft.editor.previews.level_of_detail import largest_coverage_indices
+from splatgraft.editor.session.gizmo import gizmo_from_similarity
 from splatgraft.segmentation import Box
 
 Color = tuple[float, float, float]
@@ -23,70 +23,78 @@ _EDGES = np.array([[i, j] for i in range(8) for j in range(i) if bin(i ^ j).coun
 
 
 @dataclass(frozen=True)
-class Shown:
-    """How many of a scene's Gaussians a browser was given."""
+class ShownCount:
+    """How many of a scene's Gaussians are shown."""
 
     count: int
-    """Sent."""
+    """Gaussians sent to the browser."""
     total: int
-    """In the file."""
+    """Gaussians in the file."""
 
 
 class SceneView:
-    """Scene nodes by name; what is shown already is not sent again."""
+    """Scene nodes by name; unchanged splats are not sent again."""
 
     def __init__(self, server: viser.ViserServer, *, budget: int) -> None:
-        """Nothing shown yet; `budget` is how many Gaussians a browser gets per scene."""
+        """Show nothing yet; `budget` is the maximum number of Gaussians per node."""
         self._scene = server.scene
         self._budget = budget
-        self._splats: dict[str, tuple[tuple[object, ...], viser.GaussianSplatHandle | None, Shown]] = {}
-        self._kept: dict[str, object] = {}
-        self.shown: dict[str, Shown] = {}
+        self._splats: dict[str, tuple[tuple[object, ...], viser.GaussianSplatHandle | None, ShownCount]] = {}
+        self._references: dict[str, object] = {}
+        self.shown: dict[str, ShownCount] = {}
 
-    def splats(
+    def show_splats(
         self,
         name: str,
         gaussians: Gaussians,
         *,
         which: Bool[Tensor, "n"] | None = None,
         tint: Color | None = None,
-        move: Similarity | None = None,
+        transform: Similarity | None = None,
     ) -> None:
-        """Show the Gaussians (those in `which`), moved as a whole by `move`; a move alone sends no splats again."""
+        """Show a node of splats; a change of `transform` alone sends no splats again.
+
+        Args:
+            name: Path of the node.
+            gaussians: The scene.
+            which: Flags of the Gaussians to show; None: all.
+            tint: Colour blended over the Gaussians' own.
+            transform: World from the scene's frame; None: identity.
+        """
         key = (id(gaussians), id(which), tint)
-        kept = self._splats.get(name)
-        if kept is None or kept[0] != key:
-            # what `key` names must live as long as the key, or its number could be given to another
-            self._kept[name] = (gaussians, which)
+        known = self._splats.get(name)
+        if known is None or known[0] != key:
+            # keeps the objects alive whose ids are in `key`, so that no other object gets the same id
+            self._references[name] = (gaussians, which)
             chosen = gaussians if which is None else gaussians.select(which)
-            kept = (key, *self._add(name, chosen, tint))
-            self._splats[name] = kept
-        handle, self.shown[name] = kept[1], kept[2]
+            known = (key, *self._add(name, chosen, tint))
+            self._splats[name] = known
+        handle, self.shown[name] = known[1], known[2]
         if handle is not None:
-            self._place(handle, move or Similarity.identity())
+            self._place(handle, transform or Similarity.identity())
             handle.visible = True
 
-    def hide(self, prefix: str) -> None:
+    def hide_splats(self, prefix: str) -> None:
         """Hide all splats whose name begins with `prefix`."""
         for name, (_, handle, _) in self._splats.items():
             if name.startswith(prefix) and handle is not None:
                 handle.visible = False
                 self.shown.pop(name, None)
 
-    def drop(self, name: str) -> None:
+    def remove_splats(self, name: str) -> None:
         """Remove one node of splats."""
         _, handle, _ = self._splats.pop(name, (None, None, None))
         self.shown.pop(name, None)
         if handle is not None:
             handle.remove()
 
-    def move(self, name: str, move: Similarity) -> None:
+    def set_transform(self, name: str, transform: Similarity) -> None:
         """Move splats that are shown."""
         _, handle, _ = self._splats.get(name, (None, None, None))
         if handle is not None:
-            self._place(handle, move)
+            self._place(handle, transform)
 
-    def box(self, name: str, box: Box, color: tuple[int, int, int]) -> None:
+    def show_box(self, name: str, box: Box, color: tuple[int, int, int]) -> None:
         """The edges of a box."""
         corners = box.corners.numpy()
         self._scene.add_line_segments(name, points=corners[_EDGES], colors=color)
@@ -96,8 +104,8 @@ class SceneView:
         if self._scene.get_handle_by_name(name) is not None:
             self._scene.remove_by_name(name)
 
-    def cameras(self, cameras: Cameras | None, *, size: float) -> None:
-        """Where the photographs were taken; None takes them away."""
+    def show_cameras(self, cameras: Cameras | None, *, size: float) -> None:
+        """Show camera frusta of that size in world units; None removes them."""
         self.remove("/cameras")
         if cameras is None:
             return
@@ -118,12 +126,12 @@ class SceneView:
 
     def _add(
         self, name: str, gaussians: Gaussians, tint: Color | None
-    ) -> tuple[viser.GaussianSplatHandle | None, Shown]:
-        shown = gaussians.select(shown_indices(gaussians, self._budget))
+    ) -> tuple[viser.GaussianSplatHandle | None, ShownCount]:
+        shown = gaussians.select(largest_coverage_indices(gaussians, self._budget))
         if not shown.count:
             self.remove(name)
-            return None, Shown(0, gaussians.count)
-        # viser keeps covariances in half precision: sizes are brought to where that is exact, the node takes them back
+            return None, ShownCount(0, gaussians.count)
+        # viser stores covariances in half precision: the scene is scaled so that their range fits, the node scales back
         unit = float(shown.log_scales.median().exp()) * 10
         colors = (0.5 + C0 * shown.sh[:, 0]).clamp(0, 1)
         if tint is not None:
@@ -136,20 +144,26 @@ class SceneView:
             rgbs=colors.numpy(),
             opacities=shown.opacities[:, None].numpy(),
         )
-        self._kept[f"{name} unit"] = unit
-        return handle, Shown(shown.count, gaussians.count)
+        self._references[f"{name} unit"] = unit
+        return handle, ShownCount(shown.count, gaussians.count)
 
-    def _place(self, handle: viser.GaussianSplatHandle, move: Similarity) -> None:
-        unit = self._kept[f"{handle.name} unit"]
+    def _place(self, handle: viser.GaussianSplatHandle, transform: Similarity) -> None:
+        unit = self._references[f"{handle.name} unit"]
         assert isinstance(unit, float)
-        gizmo = gizmo_of(move, torch.zeros(3))
+        gizmo = gizmo_from_similarity(transform, torch.zeros(3))
         handle.position, handle.wxyz = np.array(gizmo.position), np.array(gizmo.wxyz)
         handle.scale = gizmo.scale * unit
 
 
-def view_of(camera: viser.CameraHandle, *, width: int, least_aspect: float = 0.0) -> Cameras:
-    """A window's camera as one of ours, `width` pixels wide; a narrower one than `least_aspect` sees more aside."""
-    aspect = max(least_aspect, camera.aspect if camera.aspect > 0 else 1.5)
+def camera_from_viser(camera: viser.CameraHandle, *, width: int, min_aspect: float = 0.0) -> Cameras:
+    """The camera of a window as `Cameras`.
+
+    Args:
+        camera: viser's camera.
+        width: Image width, pixels.
+        min_aspect: Minimum of width over height; a narrower window's field of view is widened.
+    """
+    aspect = max(min_aspect, camera.aspect if camera.aspect > 0 else 1.5)
     height = max(16, round(width / aspect))
     pose = torch.eye(4)
     pose[:3, :3] = viser_rotation(camera.wxyz)
@@ -160,5 +174,5 @@ def view_of(camera: viser.CameraHandle, *, width: int, least_aspect: float = 0.0
 
 
 def viser_rotation(wxyz: np.ndarray) -> Float[Tensor, "3 3"]:
-    """The rotation of a quaternion as viser holds it."""
+    """The rotation matrix of a viser quaternion."""
     return rotation_from_quaternion(torch.tensor(np.asarray(wxyz), dtype=torch.float32)[None])[0]

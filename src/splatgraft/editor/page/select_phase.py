@@ -1,4 +1,4 @@
-"""Select: the object in the source, from masks or a box, mended by hand. Knows nothing about how masks are lifted."""
+"""The phase `Select`: select the object in the source by masks or a box, with corrections by hand."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import viser
 
 from splatgraft.editor.page.box_handles import BoxHandles
 from splatgraft.editor.page.brush import Brush
-from splatgraft.editor.page.scene_view import TINT, Color, view_of
+from splatgraft.editor.page.scene_view import TINT, Color, camera_from_viser
 from splatgraft.editor.session.picking import Rectangle, in_rectangle
 from splatgraft.formats import read_capture
 from splatgraft.segmentation import Box, Keep, default_box
@@ -22,7 +22,7 @@ _SOURCES = {
     "masks beside the photos": "files",
     "a box around the object": "grabcut",
     "a network (BiRefNet)": "birefnet",
-    "no masks: all that is in the box": "box",
+    "no masks: everything inside the box": "box",
 }
 
 
@@ -32,10 +32,10 @@ _REMOVES: Color = (0.9, 0.1, 0.2)
 
 
 class SelectPhase:
-    """The controls of the second step, and the source in 3D."""
+    """The controls of the phase, and the source in the 3D view."""
 
     def __init__(self, page: Page) -> None:
-        """Build them."""
+        """Build the controls."""
         self._page, gui = page, page.gui
         self._count = gui.add_html("")
         self._source = gui.add_dropdown("Masks from", tuple(_SOURCES), initial_value=next(iter(_SOURCES)))
@@ -44,45 +44,45 @@ class SelectPhase:
         self._upper = gui.add_vector3("Box to", (0.0, 0.0, 0.0), step=0.001, visible=False)
         self._keep = gui.add_dropdown("Keep pieces", _KEEP, initial_value=_KEEP[0])
         self._cut = gui.add_button("Cut out the object", icon=viser.Icon.WAND)
-        with gui.add_folder("Mend by hand"):
+        with gui.add_folder("Correct by hand"):
             self._mode = gui.add_dropdown("A stroke", ("adds", "removes"), initial_value="removes")
             self._use_brush = gui.add_checkbox("Brush", False, hint="Drag or click on the picture (key B)")
             self._size = gui.add_slider(
-                "Brush size", 0.01, 0.5, 0.01, 0.1, hint="Share of the distance to what it hits"
+                "Brush size", 0.01, 0.5, 0.01, 0.1, hint="Diameter over the distance to the surface"
             )
             gui.add_markdown("Shift and drag: a rectangle.")
-            self._stroke_box = gui.add_checkbox("Box for strokes", False, hint="Another box than the object's")
-            self._box_group = gui.add_button_group("All in that box", ("Add", "Remove"), visible=False)
-            self._forget = gui.add_button("Forget all strokes", icon=viser.Icon.ERASER, color="gray")
+            self._show_correction_box = gui.add_checkbox("Box for strokes", False, hint="Another box than the object's")
+            self._box_group = gui.add_button_group("All inside that box", ("Add", "Remove"), visible=False)
+            self._clear = gui.add_button("Clear all strokes", icon=viser.Icon.ERASER, color="gray")
         self._isolate = gui.add_checkbox("Show the object alone", False)
         self._handles = BoxHandles(page.server, page.view, "/source/box", color=(255, 150, 40))
-        self._handles.on_moved = self._box_dragged
-        self._stroke_handles = BoxHandles(page.server, page.view, "/source/stroke_box", color=(60, 160, 255))
-        self._brush = Brush(page, on_stroke=self._stroke, color=lambda: _ADDS if self._adds() else _REMOVES)
-        self._inside = False
+        self._handles.on_dragged = self._box_dragged
+        self._correction_handles = BoxHandles(page.server, page.view, "/source/correction_box", color=(60, 160, 255))
+        self._brush = Brush(page, on_stroke=self._apply_stroke, color=lambda: _ADDS if self._adds() else _REMOVES)
+        self._is_active = False
         self._connect()
 
     def enter(self) -> None:
-        """Show the source; asked again, show it as it is now."""
-        if not self._inside:
-            self._page.server.scene.on_rect_select(modifier="shift")(self._rectangle)
-        self._inside = True
+        """Show the source, or update it where it is shown."""
+        if not self._is_active:
+            self._page.server.scene.on_rect_select(modifier="shift")(self._rectangle_drawn)
+        self._is_active = True
         self._draw()
 
     def leave(self) -> None:
-        """Take it away."""
-        if self._inside:
-            self._page.server.scene.remove_rect_select_callback(self._rectangle)
-        self._inside = False
-        self._brush.off()
-        self._page.view.hide("/source")
+        """Hide the source."""
+        if self._is_active:
+            self._page.server.scene.remove_rect_select_callback(self._rectangle_drawn)
+        self._is_active = False
+        self._brush.deactivate()
+        self._page.view.hide_splats("/source")
         self._handles.hide()
-        self._stroke_handles.hide()
+        self._correction_handles.hide()
 
     def refresh(self) -> None:
-        """Selection, counts and box as they are now."""
+        """Update selection, counts and box."""
         session = self._page.session
-        if session is None or not self._inside:
+        if session is None or not self._is_active:
             return
         state = session.state
         name = next((n for n, value in _SOURCES.items() if value == (state.mask_source or "files")), None)
@@ -98,65 +98,67 @@ class SelectPhase:
             self._handles.show(box)
         else:
             self._handles.hide()
-        self._box_group.visible = self._stroke_box.value
-        if not self._stroke_box.value:
-            self._stroke_handles.hide()
+        self._box_group.visible = self._show_correction_box.value
+        if not self._show_correction_box.value:
+            self._correction_handles.hide()
         if self._use_brush.value and session.files.source_scene.is_file():
             scene = session.scenes.gaussians(session.files.source_scene)
-            self._brush.on(scene, size=float(self._size.value))
+            self._brush.activate(scene, size=float(self._size.value))
         else:
-            self._brush.off()
-        self._forget.disabled = state.corrections is None
+            self._brush.deactivate()
+        self._clear.disabled = state.corrections is None
         self._draw()
 
     def _connect(self) -> None:
-        act = self._page.act
-        self._source.on_update(act(lambda _: self._set(mask_source=_SOURCES[self._source.value])))
-        self._keep.on_update(act(lambda _: self._set(keep=self._keep.value)))
-        self._show_box.on_update(act(lambda _: self._toggle_box()))
+        callback = self._page.callback
+        self._source.on_update(callback(lambda _: self._set(mask_source=_SOURCES[self._source.value])))
+        self._keep.on_update(callback(lambda _: self._set(keep=self._keep.value)))
+        self._show_box.on_update(callback(lambda _: self._toggle_box()))
         for field in (self._lower, self._upper):
-            field.on_update(act(lambda _: self._box_typed()))
-        self._cut.on_click(act(lambda _: self._page.run("segment", "Cut out the object")))
-        self._isolate.on_update(act(lambda _: None))
-        self._use_brush.on_update(act(lambda _: self._say_brush()))
-        self._size.on_update(act(lambda _: None))
-        self._stroke_box.on_update(act(lambda _: self._toggle_stroke_box()))
-        self._box_group.on_click(act(lambda event: self._stroke_in_box(add=event.target.value == "Add")))
-        self._page.gui.add_command("Brush on or off", hotkey="B").on_trigger(act(lambda _: self._toggle_brush()))
-        self._forget.on_click(act(lambda _: self._set(corrections=None)))
+            field.on_update(callback(lambda _: self._box_typed()))
+        self._cut.on_click(callback(lambda _: self._page.run("segment", "Cut out the object")))
+        self._isolate.on_update(callback(lambda _: None))
+        self._use_brush.on_update(callback(lambda _: self._say_brush()))
+        self._size.on_update(callback(lambda _: None))
+        self._show_correction_box.on_update(callback(lambda _: self._toggle_correction_box()))
+        self._box_group.on_click(callback(lambda event: self._apply_box(add=event.target.value == "Add")))
+        self._page.gui.add_command("Brush on or off", hotkey="B").on_trigger(callback(lambda _: self._toggle_brush()))
+        self._clear.on_click(callback(lambda _: self._set(corrections=None)))
 
     def _draw(self) -> None:
         session = self._page.session
         if session is None or not session.files.source_scene.is_file():
-            self._count.content = _line("There is no reconstruction yet: see step 1.")
+            self._count.content = _line("The source is not reconstructed yet: see Open.")
             return
         scene, selection = session.scenes.gaussians(session.files.source_scene), session.selection()
         assert selection is not None
-        self._page.view.splats("/source/object", scene, which=selection, tint=None if self._isolate.value else TINT)
+        self._page.view.show_splats(
+            "/source/object", scene, which=selection, tint=None if self._isolate.value else TINT
+        )
         if self._isolate.value:
-            self._page.view.hide("/source/rest")
+            self._page.view.hide_splats("/source/rest")
         else:
-            self._page.view.splats("/source/rest", scene, which=session.scenes.others("selected", selection))
-        kind = "the object" if session.scenes.lifted() is not None else "inside the box"
+            self._page.view.show_splats("/source/rest", scene, which=session.scenes.complement("selected", selection))
+        kind = "the object" if session.scenes.segmented() is not None else "inside the box"
         shown = [s for n, s in self._page.view.shown.items() if n.startswith("/source") and s.count < s.total]
-        thin = f"<br>{sum(s.count for s in shown):,} are shown; files keep all" if shown else ""
-        self._count.content = _line(f"<b>{int(selection.sum()):,}</b> of {scene.count:,} Gaussians are {kind}{thin}")
+        limited = f"<br>{sum(s.count for s in shown):,} are shown; the files contain all" if shown else ""
+        self._count.content = _line(f"<b>{int(selection.sum()):,}</b> of {scene.count:,} Gaussians are {kind}{limited}")
 
     def _set(self, **fields: object) -> None:
-        session = self._page.need()
+        session = self._page.require_session()
         session.change(replace(session.state, **fields))  # pyright: ignore[reportArgumentType]
 
     def _toggle_box(self) -> None:
-        session = self._page.need()
+        session = self._page.require_session()
         if not self._show_box.value:
             self._set(box=None)
         elif session.box() is None:
-            self._set_box(self._guess())
-            self._page.say("drag the two corners until the object is inside; the table stays outside")
+            self._set_box(self._default_box())
+            self._page.say("drag the two corners until the box contains the object but not its support")
 
-    def _guess(self) -> Box:
-        """Around what the cameras look at; where that cannot be told, the middle of the scene."""
-        session = self._page.need()
+    def _default_box(self) -> Box:
+        """The box around the cameras' common focus; where there is no capture, the middle half of the scene."""
+        session = self._page.require_session()
         try:
             return default_box(read_capture(session.files.source_cameras.parent))
         except ValueError:
@@ -174,33 +176,33 @@ class SelectPhase:
 
     def _box_dragged(self, box: Box, ended: bool) -> None:
         if ended:
-            self._page.act(lambda _: self._set_box(box))(None)
+            self._page.callback(lambda _: self._set_box(box))(None)
 
     def _toggle_brush(self) -> None:
-        if self._inside:
+        if self._is_active:
             self._use_brush.value = not self._use_brush.value
             self._say_brush()
 
     def _say_brush(self) -> None:
-        on = "the brush is on: drag or click on the picture; B puts it away, so that a drag turns the view again"
-        self._page.say(on if self._use_brush.value else "the brush is away")
+        on = "the brush is on: drag or click in the view; B switches it off, so that a drag rotates the view again"
+        self._page.say(on if self._use_brush.value else "the brush is off")
 
-    def _toggle_stroke_box(self) -> None:
-        if self._stroke_box.value:
-            whole = self._page.need().box() or self._guess()
-            self._stroke_handles.show(whole.grown(1.1))
+    def _toggle_correction_box(self) -> None:
+        if self._show_correction_box.value:
+            box = self._page.require_session().box() or self._default_box()
+            self._correction_handles.show(box.grown(1.1))
 
-    def _rectangle(self, event: viser.SceneRectSelectEvent) -> None:
-        self._page.act(self._stroke_rectangle)(event)
+    def _rectangle_drawn(self, event: viser.SceneRectSelectEvent) -> None:
+        self._page.callback(self._apply_rectangle)(event)
 
-    def _stroke_rectangle(self, event: viser.SceneRectSelectEvent) -> None:
-        session = self._page.need()
+    def _apply_rectangle(self, event: viser.SceneRectSelectEvent) -> None:
+        session = self._page.require_session()
         scene = session.scenes.gaussians(session.files.source_scene)
-        camera = view_of(event.client.camera, width=1000)
-        self._stroke(in_rectangle(scene.means, camera, Rectangle(event.screen_min, event.screen_max)))
+        camera = camera_from_viser(event.client.camera, width=1000)
+        self._apply_stroke(in_rectangle(scene.means, camera, Rectangle(event.screen_min, event.screen_max)))
 
-    def _stroke_in_box(self, *, add: bool) -> None:
-        session, box = self._page.need(), self._stroke_handles.box
+    def _apply_box(self, *, add: bool) -> None:
+        session, box = self._page.require_session(), self._correction_handles.box
         if box is None:
             raise ValueError("box: expected one in view, found none")
         self._correct(box.contains(session.scenes.gaussians(session.files.source_scene).means), add=add)
@@ -208,11 +210,11 @@ class SelectPhase:
     def _adds(self) -> bool:
         return self._mode.value == "adds"
 
-    def _stroke(self, touched: torch.Tensor) -> None:
+    def _apply_stroke(self, touched: torch.Tensor) -> None:
         self._correct(touched, add=self._adds())
 
     def _correct(self, touched: torch.Tensor, *, add: bool) -> None:
-        self._page.need().correct(touched, add=add)
+        self._page.require_session().correct(touched, add=add)
         self._page.say(
             f"{'added' if add else 'removed'}: {int(touched.sum()):,} Gaussians under the stroke; cut again to use it"
         )

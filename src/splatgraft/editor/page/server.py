@@ -1,7 +1,4 @@
-"""A viser server that only the editor's own page can reach, with one editing window and limited uploads.
-
-Knows nothing about what the page shows.
-"""
+"""A viser server with access control, an edit lock and an upload limit."""
 
 import contextlib
 import http
@@ -23,10 +20,10 @@ from splatgraft.editor.access.access_control import AccessControl
 from splatgraft.editor.access.edit_lock import EditLock
 
 FILES_PREFIX = "/files/"
-_LOOKING_ON = (_messages.ViewerCameraMessage, _messages.GetRenderResponseMessage)
-_UPLOAD = (_messages.FileTransferStartUpload, _messages.FileTransferPart)
-# the request opens a public tunnel to this machine
-_NEVER = (_messages.ShareUrlRequest,)
+_CAMERA_MESSAGES = (_messages.ViewerCameraMessage, _messages.GetRenderResponseMessage)
+_UPLOAD_MESSAGES = (_messages.FileTransferStartUpload, _messages.FileTransferPart)
+# this message asks viser for a public tunnel to this machine
+_BLOCKED_MESSAGES = (_messages.ShareUrlRequest,)
 _TYPES = {".html": "text/html; charset=utf-8", ".png": "image/png", ".webp": "image/webp", ".gif": "image/gif"}
 _TYPES |= {
     ".css": "text/css; charset=utf-8",
@@ -34,66 +31,73 @@ _TYPES |= {
     ".json": "application/json",
     ".jpg": "image/jpeg",
 }
-_SERVING = threading.Lock()
+_PATCH_LOCK = threading.Lock()
+_PROBE_SECONDS = 300
+"""Limit of the request to the own server at the start: against a hang, not for a busy machine."""
 
 
 class GuardedServer:
-    """viser behind a gate."""
+    """A viser server with access control in front."""
 
-    def __init__(self, gate: AccessControl, *, host: str, port: int, upload_limit: int) -> None:
-        """Start to listen; at once, or at the next free port.
+    def __init__(self, access: AccessControl, *, host: str, port: int, upload_limit: int) -> None:
+        """Start to listen at `port` or the next free one.
 
-        Raises: OSError where the gate does not hold.
+        Raises:
+            OSError: If the running viser does not apply the access control.
         """
-        self.seat = EditLock()
-        self.on_seat: Callable[[], None] = lambda: None
+        self.edit_lock = EditLock()
+        self.on_edit_lock_changed: Callable[[], None] = lambda: None
         self.on_large_upload: Callable[[str, int], None] = lambda name, size: None
         self.files: Callable[[str], Path | None] = lambda name: None
-        self._gate, self._limit = gate, upload_limit
+        self._access, self._limit = access, upload_limit
         self._uploads: dict[str, int] = {}
-        with _SERVING:
-            # viser asks websockets to serve with no regard to who asks; it is asked here with the gate in front
+        with _PATCH_LOCK:
+            # viser has no hook for requests: websockets.serve is replaced while viser starts
             original = websockets.asyncio.server.serve
             websockets.asyncio.server.serve = partial(self._serve, original)  # pyright: ignore
             try:
-                # its banner names an address without the token, on a stream that is for results
+                # viser prints an address without the token to stdout, which is for results
                 with contextlib.redirect_stdout(io.StringIO()):
                     self.viser = viser.ViserServer(host=host, port=port, verbose=False)
             finally:
                 websockets.asyncio.server.serve = original
         inner = self.viser._websock_server
-        # pyright would have viser's parameter names
-        setattr(inner, "_handle_incoming_message", partial(self._filtered, inner._handle_incoming_message))  # noqa: B010
-        inner.on_client_connect(lambda connection: self._seated(self.seat.joined(connection.client_id)))
-        inner.on_client_disconnect(lambda connection: self._seated(self.seat.left(connection.client_id)))
+        # setattr, because pyright compares parameter names with viser's
+        setattr(inner, "_handle_incoming_message", partial(self._forward_allowed, inner._handle_incoming_message))  # noqa: B010
+        inner.on_client_connect(
+            lambda connection: self._set_edit_lock(self.edit_lock.with_window(connection.client_id))
+        )
+        inner.on_client_disconnect(
+            lambda connection: self._set_edit_lock(self.edit_lock.without_window(connection.client_id))
+        )
         self._check(host)
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The port."""
         return self.viser.get_port()
 
-    def take_seat(self, window: int) -> None:
-        """Let that window edit."""
-        self._seated(self.seat.taken(window))
+    def take_edit_lock(self, window: int) -> None:
+        """Give the edit lock to a window."""
+        self._set_edit_lock(self.edit_lock.held_by(window))
 
     def close(self) -> None:
-        """Stop to listen."""
+        """Stop the server."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.viser.stop()
 
-    def _seated(self, seat: EditLock) -> None:
-        self.seat = seat
-        self.on_seat()
+    def _set_edit_lock(self, edit_lock: EditLock) -> None:
+        self.edit_lock = edit_lock
+        self.on_edit_lock_changed()
 
     def _serve(self, original: Callable[..., Any], *args: Any, **options: Any) -> Any:
         inner = options["process_request"]
         return original(*args, **options | {"process_request": partial(self._answer, inner)})
 
     def _answer(self, inner: Callable[..., Response | None], connection: Any, request: Request) -> Response | None:
-        answer = self._gate.ask(_plain(request.headers), request.path)
-        if not answer.allowed:
-            return _response(http.HTTPStatus.FORBIDDEN, f"splatgraft: {answer.reason}\n".encode(), "text/plain")
+        decision = self._access.check(_plain(request.headers), request.path)
+        if not decision.allowed:
+            return _response(http.HTTPStatus.FORBIDDEN, f"splatgraft: {decision.reason}\n".encode(), "text/plain")
         path = request.path.partition("?")[0]
         if path.startswith(FILES_PREFIX):
             found = self.files(path.removeprefix(FILES_PREFIX))
@@ -102,22 +106,24 @@ class GuardedServer:
             kind = _TYPES.get(found.suffix, "application/octet-stream")
             return _response(http.HTTPStatus.OK, found.read_bytes(), kind)
         response = inner(connection, request)
-        if response is not None and answer.cookie is not None:
-            response.headers["Set-Cookie"] = answer.cookie
+        if response is not None and decision.cookie is not None:
+            response.headers["Set-Cookie"] = decision.cookie
         if response is not None:
-            # no other page may show this one in a frame and lead clicks astray
+            # no other site may embed this page in a frame (clickjacking)
             response.headers["X-Frame-Options"] = "DENY"
         return response
 
-    async def _filtered(self, inner: Callable[..., Any], window: int, message: Any) -> None:
-        """Pass on what may come in: the editing window's messages, the others' cameras, uploads of bearable size."""
-        if isinstance(message, _NEVER) or (window != self.seat.holder and not isinstance(message, _LOOKING_ON)):
+    async def _forward_allowed(self, inner: Callable[..., Any], window: int, message: Any) -> None:
+        """Forward messages of the editing window, camera messages of all windows, and uploads within the limit."""
+        if isinstance(message, _BLOCKED_MESSAGES) or (
+            window != self.edit_lock.holder and not isinstance(message, _CAMERA_MESSAGES)
+        ):
             return
-        if isinstance(message, _UPLOAD) and not self._bearable(message):
+        if isinstance(message, _UPLOAD_MESSAGES) and not self._upload_allowed(message):
             return
         await inner(window, message)
 
-    def _bearable(self, message: Any) -> bool:
+    def _upload_allowed(self, message: Any) -> bool:
         if isinstance(message, _messages.FileTransferStartUpload):
             if message.size_bytes > self._limit:
                 self.on_large_upload(message.filename, message.size_bytes)
@@ -129,23 +135,25 @@ class GuardedServer:
         return left >= 0
 
     def _check(self, host: str) -> None:
-        """Knock with a stranger's Origin: a viser that serves in another way must not go unnoticed."""
+        """Send a request with a foreign Origin: a viser version that bypasses the access control must be detected."""
         reached = "127.0.0.1" if host in ("0.0.0.0", "") else "::1" if host == "::" else host
-        knock = http.client.HTTPConnection(reached, self.port, timeout=10)
+        probe = http.client.HTTPConnection(reached, self.port, timeout=_PROBE_SECONDS)
         try:
-            knock.request("GET", "/", headers={"Origin": "http://stranger.invalid"})
-            status = knock.getresponse().status
+            probe.request("GET", "/", headers={"Origin": "http://foreign.invalid"})
+            status = probe.getresponse().status
         finally:
-            knock.close()
+            probe.close()
         if status != http.HTTPStatus.FORBIDDEN:
             self.close()
-            raise OSError(f"viser {viser.__version__}: expected it to refuse other sites, found {status}; take 1.1.1")
+            raise OSError(
+                f"viser {viser.__version__}: expected it to refuse other sites, found status {status}; install 1.1.1"
+            )
 
 
 def _plain(headers: Headers) -> dict[str, str]:
     names = ("Host", "Origin", "Upgrade", "Cookie")
     found = {name: headers.get_all(name) for name in names}
-    # a header that comes twice is nobody's honest request: joined, it matches nothing
+    # a repeated header is joined, so that it matches no accepted value
     return {name: ", ".join(values) for name, values in found.items() if values}
 
 

@@ -1,1 +1,1 @@
-"""Pictures of the scene while it is edited: full and draft renders and relighting."""
+"""Preview images of the edited scene, with full or draft relighting."""

@@ -1,7 +1,4 @@
-"""A light transfer on fewer Gaussians, carried over to all: what makes a large scene as quick to light as a small one.
-
-Knows nothing about light itself, and nothing about files.
-"""
+"""Draft relighting: relight a reduced level of detail and copy the layers to the nearest full-detail Gaussians."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,51 +11,54 @@ from torch import Tensor
 
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.editor.previews.level_of_detail import shown_indices
+from splatgraft.editor.previews.level_of_detail import largest_coverage_indices
 from splatgraft.relighting import Relit
 
 TARGET_BUDGET, OBJECT_BUDGET = 30_000, 8_000
-"""Gaussians with which a light that is aimed takes about a second of work on one core."""
+"""Numbers of Gaussians; relighting this many after a change of the light takes about a second on one core."""
 
 
 @dataclass(frozen=True)
-class Thinned:
-    """Some Gaussians of a scene, and which of them stands for each of its Gaussians."""
+class CoarseGaussians:
+    """A subset of a scene's Gaussians, with the nearest member of the subset for each Gaussian of the scene."""
 
     gaussians: Gaussians
-    """Those that cover most."""
+    """The m Gaussians that cover most."""
     nearest: Int[Tensor, "n"]
-    """For every Gaussian of the scene the position of the nearest of `gaussians`."""
+    """For each of the scene's n Gaussians the index of the nearest of `gaussians`."""
 
     @cached_property
-    def none(self) -> Bool[Tensor, "m"]:
-        """That none of `gaussians` is erased; always the same tensor, by which caches know that nothing changed."""
+    def none_erased(self) -> Bool[Tensor, "m"]:
+        """All False; always the same tensor, so that memos compare it by identity."""
         return torch.zeros(self.gaussians.count, dtype=torch.bool)
 
 
-def thinned(gaussians: Gaussians, budget: int) -> Thinned:
-    """At most `budget` Gaussians; the very same ones where they are no more."""
+def coarsen(gaussians: Gaussians, budget: int) -> CoarseGaussians:
+    """Reduce a scene to at most `budget` Gaussians; the same object where it has no more."""
     if gaussians.count <= budget:
-        return Thinned(gaussians, torch.arange(gaussians.count))
-    few = gaussians.select(shown_indices(gaussians, budget))
-    nearest = KDTree(few.means.double().numpy()).query(gaussians.means.double().numpy())[1]
-    return Thinned(few, torch.from_numpy(nearest).long())
+        return CoarseGaussians(gaussians, torch.arange(gaussians.count))
+    subset = gaussians.select(largest_coverage_indices(gaussians, budget))
+    nearest = KDTree(subset.means.double().numpy()).query(gaussians.means.double().numpy())[1]
+    return CoarseGaussians(subset, torch.from_numpy(nearest).long())
 
 
-def thinned_composite(composite: Composite, target: Thinned, objects: Sequence[Thinned]) -> Composite:
-    """The composite of what was left of its kept target and of its objects."""
+def coarse_composite(composite: Composite, target: CoarseGaussians, objects: Sequence[CoarseGaussians]) -> Composite:
+    """The composite of the coarse target, from which the erased Gaussians are removed, and the coarse objects."""
     placed = zip(composite.objects, objects, strict=True)
     return Composite(
         target=target.gaussians,
-        objects=tuple(replace(one, gaussians=few.gaussians) for one, few in placed),
-        erased=target.none,
+        objects=tuple(replace(one, gaussians=coarse.gaussians) for one, coarse in placed),
+        erased=target.none_erased,
     )
 
 
-def carried_over(relit: Relit, composite: Composite, parts: Sequence[Thinned]) -> Relit:
-    """The light of the thinned composite on all of `composite`; `parts` are its kept target, then its objects.
+def upsample_light(relit: Relit, composite: Composite, parts: Sequence[CoarseGaussians]) -> Relit:
+    """Copy the layers of a relit coarse composite to all Gaussians of `composite`, from the nearest coarse Gaussian.
 
-    `relit` must have split nothing.
+    Args:
+        relit: Result on the coarse composite; no Gaussian of it may have been split.
+        composite: The full composite.
+        parts: The coarse target, then the coarse objects.
     """
     counts = [part.gaussians.count for part in parts]
     assert relit.gaussians.count == sum(counts)
@@ -72,7 +72,7 @@ def carried_over(relit: Relit, composite: Composite, parts: Sequence[Thinned]) -
         shade=relit.shade[row],
         shadow=relit.shadow[row],
         bounce=relit.bounce[row],
-        slope=torch.zeros_like(relit.slope[row]),  # holds for the width of the thinned only
+        slope=torch.zeros_like(relit.slope[row]),  # valid over the width of a coarse Gaussian only
         gloss=relit.gloss[row],
         objects=tuple(placed.in_target() for placed in composite.objects),
         light=relit.light,

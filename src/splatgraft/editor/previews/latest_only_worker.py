@@ -1,4 +1,4 @@
-"""One worker that does the newest request and forgets those it had no time for. Knows nothing about the work."""
+"""A worker thread that processes only the newest request and discards older waiting ones."""
 
 import threading
 from collections.abc import Callable
@@ -8,35 +8,40 @@ T = TypeVar("T")
 
 
 class LatestOnlyWorker(Generic[T]):
-    """A thread with at most one request waiting."""
+    """A thread with at most one waiting request."""
 
-    def __init__(self, work: Callable[[T], None], failed: Callable[[Exception], None]) -> None:
-        """Start the thread; `work` gets one request at a time, `failed` what it raises."""
-        self._work, self._failed = work, failed
+    def __init__(self, work: Callable[[T], None], on_error: Callable[[Exception], None]) -> None:
+        """Start the thread.
+
+        Args:
+            work: Called in the thread with one request at a time.
+            on_error: Called in the thread with each exception that `work` raises.
+        """
+        self._work, self._on_error = work, on_error
         self._waiting: list[T] = []
         self._wake = threading.Condition()
         self._open = True
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    def ask(self, request: T) -> None:
-        """Do this as soon as the present one is done, in place of any that waits."""
+    def submit(self, request: T) -> None:
+        """Process `request` after the current one; it replaces any waiting request."""
         with self._wake:
             self._waiting = [request]
             self._wake.notify()
 
     @property
-    def overtaken(self) -> bool:
-        """Whether a newer request waits: long work may stop here."""
+    def superseded(self) -> bool:
+        """Whether a newer request waits; long work may stop then."""
         return bool(self._waiting)
 
-    def idle(self, seconds: float) -> bool:
-        """Whether no newer request came for so long: time for work that cannot be stopped."""
+    def wait_idle(self, seconds: float) -> bool:
+        """Wait until a newer request arrives, at most `seconds`; whether none arrived."""
         with self._wake:
             return not self._wake.wait_for(lambda: bool(self._waiting) or not self._open, timeout=seconds)
 
     def close(self) -> None:
-        """Let the present one end, then stop."""
+        """Discard the waiting request, finish the current one and stop the thread."""
         with self._wake:
             self._open, self._waiting = False, []
             self._wake.notify()
@@ -52,5 +57,5 @@ class LatestOnlyWorker(Generic[T]):
                 request = self._waiting.pop()
             try:
                 self._work(request)
-            except Exception as error:  # a picture that fails must not end the thread that makes all others
-                self._failed(error)
+            except Exception as error:  # one failed request must not end the thread
+                self._on_error(error)

@@ -1,4 +1,4 @@
-"""Fewer Gaussians for display, so that a browser stays quick; files are never thinned. Knows nothing about browsers."""
+"""Level of detail: the subset of a scene's Gaussians that covers most, for display and draft relighting."""
 
 import torch
 from jaxtyping import Int
@@ -7,10 +7,10 @@ from torch import Tensor
 from splatgraft.core.gaussians import Gaussians
 
 
-def shown_indices(gaussians: Gaussians, budget: int) -> Int[Tensor, "m"]:
-    """At most `budget` Gaussians, in their order: those that cover most, by opacity times the area of their disc."""
+def largest_coverage_indices(gaussians: Gaussians, budget: int) -> Int[Tensor, "m"]:
+    """Indices of the at most `budget` Gaussians with the largest opacity times disc area, in ascending order."""
     if gaussians.count <= budget:
         return torch.arange(gaussians.count)
     two_largest = gaussians.log_scales.sort(dim=1).values[:, 1:].sum(1)
-    cover = torch.nn.functional.logsigmoid(gaussians.opacity_logits) + two_largest
-    return cover.topk(budget).indices.sort().values
+    log_coverage = torch.nn.functional.logsigmoid(gaussians.opacity_logits) + two_largest
+    return log_coverage.topk(budget).indices.sort().values

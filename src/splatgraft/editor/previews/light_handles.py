@@ -1,4 +1,4 @@
-"""Lights as arrows: where they are drawn, and what dragging one means. Knows nothing about browsers."""
+"""Geometry of the arrows that show light sources in the 3D view, and the light after an arrow is dragged."""
 
 import math
 from dataclasses import replace
@@ -9,29 +9,29 @@ from torch import Tensor
 
 from splatgraft.relighting import Light, LightSource
 
-_RING = 48
+_RING_SEGMENTS = 48
 
 
-def arrow_points(source: LightSource, centre: Float[Tensor, "3"], reach: float) -> Float[Tensor, "2 3"]:
-    """From where the light comes, `reach` away, to shortly before the object at `centre`."""
+def arrow_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "2 3"]:
+    """Tail and head of the arrow of a source: from `length` away towards `centre`, ending at 0.3 `length`."""
     direction = torch.tensor(source.direction)
-    return torch.stack([centre + reach * direction, centre + 0.3 * reach * direction])
+    return torch.stack([centre + length * direction, centre + 0.3 * length * direction])
 
 
-def ring_points(source: LightSource, centre: Float[Tensor, "3"], reach: float) -> Float[Tensor, "s 2 3"]:
-    """A circle around the arrow's far end, as wide as the direction is uncertain, as line segments."""
+def uncertainty_ring_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "s 2 3"]:
+    """Line segments of a circle around the arrow's tail; its angular radius is the uncertainty of the direction."""
     direction = torch.tensor(source.direction)
-    helper = torch.eye(3)[int(direction.abs().argmin())]
-    across = torch.nn.functional.normalize(torch.linalg.cross(direction, helper), dim=0)
+    axis = torch.eye(3)[int(direction.abs().argmin())]
+    across = torch.nn.functional.normalize(torch.linalg.cross(direction, axis), dim=0)
     along = torch.linalg.cross(direction, across)
-    radius = reach * math.tan(math.radians(min(60.0, max(0.5, source.uncertainty_deg))))
-    angle = torch.linspace(0, 2 * math.pi, _RING + 1)
-    points = centre + reach * direction + radius * (angle.cos()[:, None] * across + angle.sin()[:, None] * along)
+    radius = length * math.tan(math.radians(min(60.0, max(0.5, source.uncertainty_deg))))
+    angle = torch.linspace(0, 2 * math.pi, _RING_SEGMENTS + 1)
+    points = centre + length * direction + radius * (angle.cos()[:, None] * across + angle.sin()[:, None] * along)
     return torch.stack([points[:-1], points[1:]], 1)
 
 
-def aimed(light: Light, index: int, towards: Float[Tensor, "3"]) -> Light:
-    """The light with one source in another direction, which is certain now: a person said so."""
+def with_direction(light: Light, index: int, towards: Float[Tensor, "3"]) -> Light:
+    """The light with one source's direction set by hand, hence without uncertainty."""
     length = float(towards.norm())
     if length < 1e-9:
         return light

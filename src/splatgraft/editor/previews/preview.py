@@ -1,7 +1,4 @@
-"""True pictures of what is placed, by our own renderer: pasted, lit, finished, and what lies behind them.
-
-Knows nothing about browsers.
-"""
+"""Preview images of the edited scene by splatgraft's renderer: composite, relit scene, result and their layers."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -14,14 +11,14 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.editor.previews.transfers import Transfers
+from splatgraft.editor.previews.preview_relighting import PreviewRelighting
 from splatgraft.editor.session.edit_state import EditState
-from splatgraft.editor.session.scene_cache import Scenes
+from splatgraft.editor.session.scene_cache import SceneCache
 from splatgraft.formats import read_capture
 from splatgraft.rendering import render
 from splatgraft.runtime.memo import Memo
 
-Kind = Literal[
+PictureKind = Literal[
     "Copy-paste",
     "Light transfer",
     "Result",
@@ -33,7 +30,7 @@ Kind = Literal[
     "Source",
     "Object alone",
 ]
-KINDS: tuple[Kind, ...] = (
+PICTURE_KINDS: tuple[PictureKind, ...] = (
     "Copy-paste",
     "Light transfer",
     "Result",
@@ -43,49 +40,53 @@ KINDS: tuple[Kind, ...] = (
     "Shadow layer",
     "Photograph",
 )
-"""What can be compared in the target; the source has `Source` and `Object alone`."""
-NEEDS_LIGHT: tuple[Kind, ...] = ("Light transfer", "Shadow layer")
+"""Kinds of images of the target; those of the source are `Source` and `Object alone`."""
+NEEDS_LIGHT: tuple[PictureKind, ...] = ("Light transfer", "Shadow layer")
+"""Kinds that need the light transfer."""
 
 
 @dataclass(frozen=True)
-class Size:
-    """How large previews are made, so that one takes about as long as it may."""
+class PictureSize:
+    """Width of preview images, adapted so that rendering one takes about `seconds`."""
 
     width: int = 480
     """Pixels."""
-    least: int = 160
+    min_width: int = 160
     """Pixels."""
-    greatest: int = 800
+    max_width: int = 800
     """Pixels."""
     seconds: float = 0.3
-    """What one picture may take."""
+    """Wanted rendering time of one image."""
 
-    def after(self, seconds: float) -> int:
-        """The width to take after a picture of `width` took `seconds`: time goes with the area; small changes wait."""
+    def adapted(self, seconds: float) -> int:
+        """The width for the next image after one took `seconds`; time is proportional to area, and 20% is tolerated."""
         wanted = self.width * min(2.0, max(0.4, (self.seconds / max(seconds, 1e-3)) ** 0.5))
-        wanted = min(self.greatest, max(self.least, round(wanted / 16) * 16))
+        wanted = min(self.max_width, max(self.min_width, round(wanted / 16) * 16))
         return self.width if abs(wanted - self.width) < 0.2 * self.width else wanted
 
 
 class Preview:
-    """Pictures of one project, with what moving an object leaves unchanged kept."""
+    """Preview images of one project; intermediate results are memoised."""
 
-    def __init__(self, scenes: Scenes, transfers: Transfers) -> None:
-        """Nothing made yet."""
-        self._scenes, self._transfers = scenes, transfers
-        self._kept = Memo()
+    def __init__(self, scenes: SceneCache, relighting: PreviewRelighting) -> None:
+        """Start with an empty memo."""
+        self._scenes, self._relighting = scenes, relighting
+        self._memo = Memo()
 
     def picture(
-        self, kind: Kind, state: EditState, camera: Cameras, *, draft: bool = False
+        self, kind: PictureKind, state: EditState, camera: Cameras, *, draft: bool = False
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """One picture from one camera; with `draft` its light is the one that is there soonest.
+        """One picture from one camera; with `draft` its light is the one that is there best_available.
 
-        Raises: ValueError where what it shows is not there yet.
+        Raises:
+            ValueError: If a file that the image needs does not exist yet.
         """
-        with self._transfers.work:
+        with self._relighting.lock:
             return self._picture(kind, state, camera, draft=draft)
 
-    def _picture(self, kind: Kind, state: EditState, camera: Cameras, *, draft: bool) -> UInt8[np.ndarray, "h w 3"]:
+    def _picture(
+        self, kind: PictureKind, state: EditState, camera: Cameras, *, draft: bool
+    ) -> UInt8[np.ndarray, "h w 3"]:
         if kind == "Photograph":
             return self._photograph(camera)
         if kind in ("Mask", "Depth"):
@@ -96,70 +97,72 @@ class Preview:
         return _bytes(color[0])
 
     def source_picture(self, which: Bool[Tensor, "n"] | None, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-        """The source scene, or those of its Gaussians that `which` names."""
+        """Render the source scene, or the Gaussians selected by `which`."""
         scene = self._scenes.gaussians(self._scenes.files.source_scene)
         color = render(scene if which is None else scene.select(which), camera).color
         return _bytes(color[0])
 
-    def _scene(self, kind: Kind, state: EditState, *, draft: bool) -> Gaussians:
+    def _scene(self, kind: PictureKind, state: EditState, *, draft: bool) -> Gaussians:
         if kind == "Result":
             if not self._scenes.files.result.is_file():
                 raise ValueError("Result: expected a finished run, found none yet")
             return self._scenes.gaussians(self._scenes.files.result)
         if kind == "Light transfer":
-            return self._transfers.scene(state, draft=draft)
-        composite = self._transfers.composite(state)
+            return self._relighting.scene(state, draft=draft)
+        composite = self._relighting.composite(state)
         if kind == "Target alone":
             inputs = (composite.target, composite.erased)
-            return self._kept.get("bare", inputs, lambda: composite.target.select(~composite.erased))
-        return self._transfers.pasted(composite)[0]
+            return self._memo.get("target alone", inputs, lambda: composite.target.select(~composite.erased))
+        return self._relighting.pasted(composite)[0]
 
     def _mask(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-        composite = self._transfers.composite(state)
-        gaussians, is_object = self._transfers.pasted(composite)
+        composite = self._relighting.composite(state)
+        gaussians, is_object = self._relighting.pasted(composite)
         features = render(gaussians, camera, outputs=frozenset(), features=is_object[:, None].float()).features
         return _bytes(features[0].expand(-1, -1, 3))
 
     def _depth(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-        composite = self._transfers.composite(state)
-        gaussians, _ = self._transfers.pasted(composite)
+        composite = self._relighting.composite(state)
+        gaussians, _ = self._relighting.pasted(composite)
         depth = render(gaussians, camera, outputs=frozenset({"depth"})).depth
-        near = depth[0][depth[0] > 0]
-        if not len(near):
+        covered = depth[0][depth[0] > 0]
+        if not len(covered):
             return _bytes(torch.zeros(*depth[0].shape, 3))
-        # of reciprocal depth, as eyes have it; the ends are of the picture, without its few stray Gaussians
+        # reciprocal depth between its 2nd and 98th percentile, so that floaters do not set the range
         inverse = 1 / depth[0].clamp_min(1e-6)
-        low, high = 1 / float(near.quantile(0.98)), 1 / float(near.quantile(0.02))
+        low, high = 1 / float(covered.quantile(0.98)), 1 / float(covered.quantile(0.02))
         level = ((inverse - low) / max(high - low, 1e-9)).clamp(0, 1) * (depth[0] > 0)
         colored = cv2.applyColorMap((level * 255).byte().numpy(), cv2.COLORMAP_TURBO)
         return np.ascontiguousarray(colored[..., ::-1])
 
     def _shadow(self, state: EditState, camera: Cameras, *, draft: bool) -> UInt8[np.ndarray, "h w 3"]:
         if not self._scenes.files.transfers_light:
-            raise ValueError(f"Shadow layer: expected the physical transfer, found {self._transfers.note()}")
-        transfers = self._transfers
-        relit = transfers.soonest(state) if draft else transfers.relit(state)
-        layers = self._kept.get("layers", (relit, state.weights), lambda: relit.ratio(state.weights))
-        # half grey is unchanged, so that both what is darkened and what is brightened can be seen
-        seen = render(relit.gaussians, camera, outputs=frozenset(), features=(0.5 * layers).clamp(0, 1))
-        return _bytes(seen.features[0] + 0.5 * (1 - seen.alpha[0])[..., None])
+            raise ValueError(
+                f"Shadow layer: expected the physical transfer, found {self._relighting.light_mode_note()}"
+            )
+        relighting = self._relighting
+        relit = relighting.best_available(state) if draft else relighting.relit(state)
+        layers = self._memo.get("layers", (relit, state.weights), lambda: relit.ratio(state.weights))
+        # a ratio of 1 is mid grey, so that darkening and brightening both show
+        rendered = render(relit.gaussians, camera, outputs=frozenset(), features=(0.5 * layers).clamp(0, 1))
+        return _bytes(rendered.features[0] + 0.5 * (1 - rendered.alpha[0])[..., None])
 
     def _photograph(self, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         path = self._scenes.files.target_cameras
         stamp = path.stat().st_mtime_ns if path.is_file() else 0
-        capture = self._kept.get("capture", (path, stamp), lambda: read_capture(self._scenes.files.target_capture))
+        capture = self._memo.get("capture", (path, stamp), lambda: read_capture(self._scenes.files.target_capture))
         if camera.names[0] not in capture.cameras.names:
             raise ValueError("Photograph: expected one of the target's cameras, found a free view; step to a camera")
         image = capture.image(capture.cameras.names.index(camera.names[0]))
         return cv2.resize(_bytes(image), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 
-def wiped(
-    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], share: float
+def wipe_comparison(
+    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], split: float
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """`left` up to `share` of the width and `right` beyond, with a line between them."""
+    """`left` up to fraction `split` of the width, `right` beyond it, and a white line between them."""
     width = left.shape[1]
-    at = round(min(1.0, max(0.0, share)) * width)
+    at = round(min(1.0, max(0.0, split)) * width)
     out = np.concatenate([left[:, :at], right[:, at:]], axis=1)
     if 0 < at < width:
         out[:, max(0, at - 1) : at + 1] = 255

@@ -1,1 +1,1 @@
-"""The state of a project while it is edited: placement, selection and light, with undo."""
+"""The state of an edited project: its edits with undo, its scenes and its files."""

@@ -1,7 +1,4 @@
-"""All that a person decides in the editor, as one immutable value, and the files beside project.toml that hold it.
-
-Knows nothing about browsers and scenes.
-"""
+"""The edits of a project as one immutable value, read from and written to project.toml and the files beside it."""
 
 import json
 from collections.abc import Mapping
@@ -26,37 +23,38 @@ BoxNumbers = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class EditState:
-    """What counts now. None: project.toml says nothing, so the step's default holds."""
+    """The current edits. None means that project.toml has no entry and the step's default applies."""
 
     objects: tuple[ObjectPlacement, ...] | None = None
-    """Placed objects; one without a path is the project's own. None: `compose` finds a place."""
+    """Placed objects; one without a path is the project's own object. None: `compose` finds a place."""
     erased: Bool[Tensor, "n"] | None = None
-    """Gaussians of the target that are left out."""
+    """Gaussians of the target that are erased."""
     corrections: Int8[Tensor, "m"] | None = None
-    """What was added to the object and removed from it by hand."""
+    """Per Gaussian of the source: 1 added to the object by hand, -1 removed, 0 unchanged."""
     mask_source: str | None = None
-    """Where the object's masks come from."""
+    """Source of the object's masks: `mask_source` of [segment]."""
     box: BoxNumbers | None = None
-    """Around the object in the source's world: least x, y, z, then greatest."""
+    """Box around the object in the source's world: minimum x, y, z, then maximum."""
     keep: str | None = None
-    """Which pieces of the selection stay."""
+    """Which connected pieces of the selection are kept: `keep` of [segment]."""
     light: Light | None = None
-    """The light as given by hand; None: it is estimated."""
+    """The light set by hand; None: it is estimated."""
     weights: LayerWeights = field(default_factory=LayerWeights)
-    """How strong each layer of the light transfer is."""
+    """Strength of each layer of the light transfer."""
     harmonizer: str | None = None
-    """The image model."""
+    """Name of the harmonisation method."""
 
     def with_object(self, index: int, item: ObjectPlacement) -> "EditState":
-        """Another placement of one object."""
+        """The state with another placement of one object."""
         assert self.objects is not None
         return replace(self, objects=(*self.objects[:index], item, *self.objects[index + 1 :]))
 
 
 def read_state(project: Path) -> EditState:
-    """What project.toml and the files beside it say.
+    """Read the state from project.toml and the files beside it.
 
-    Raises: ValueError where one of them is broken.
+    Raises:
+        ValueError: If one of these files is invalid.
     """
     content, folder = read_toml(project), project.parent
     segment, relight = content.get("segment", {}), content.get("relight", {})
@@ -80,11 +78,12 @@ def read_state(project: Path) -> EditState:
 
 
 def write_state(project: Path, before: EditState, after: EditState) -> None:
-    """Bring the files from what `before` says to what `after` says; what both say is left as it is.
+    """Update the files from state `before` to state `after`; what both agree on stays untouched.
 
-    Files that project.toml names are written before it, so that it never names one that is not there.
+    Files that project.toml refers to are written before it, so that it never refers to a missing file.
 
-    Raises: ValueError where project.toml cannot be changed line by line.
+    Raises:
+        ValueError: If project.toml cannot be changed line by line.
     """
     folder = project.parent
     text = project.read_text(encoding="utf-8")
@@ -103,7 +102,7 @@ def write_state(project: Path, before: EditState, after: EditState) -> None:
 
 
 def as_written(state: EditState, before: EditState) -> EditState:
-    """The state as it will be read again: a light.json has six digits. What `before` has stays the same object."""
+    """The state as it is read back: light.json rounds to six digits. A light shared with `before` stays identical."""
     if state.light is None or state.light is before.light:
         return state
     return replace(state, light=light_from_json(light_to_json(state.light)))
@@ -140,7 +139,7 @@ def _segment_keys(state: EditState) -> dict[str, Any]:
 
 
 def _relight_keys(state: EditState) -> dict[str, Any]:
-    # what physics says is the default and needs no key
+    # the physical weight, 1, is the default and needs no key
     weights = {key: None if value == 1.0 else value for key, value in asdict(state.weights).items()}
     return weights | {"given_light": None if state.light is None else LIGHT_FILE}
 

@@ -1,7 +1,4 @@
-"""Between a gizmo (a pose at an object's foot, and a size) and the `Similarity` that places the object.
-
-Knows nothing about browsers or scenes.
-"""
+"""Conversions between a gizmo (pose at an object's base point, and scale) and the object's `Similarity`."""
 
 import math
 from dataclasses import dataclass
@@ -18,34 +15,34 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Gizmo:
-    """What a person drags: it stands where the object's pivot stands."""
+    """Pose and scale of the transform gizmo, which is shown at the object's pivot."""
 
     position: Triple
-    """Of the pivot, in the target."""
+    """Position of the pivot in the target."""
     wxyz: tuple[float, float, float, float]
-    """How the object is turned."""
+    """Rotation from the object's to the target's axes."""
     scale: float
     """Size in the target over size in the object's capture."""
 
 
-def gizmo_of(move: Similarity, pivot: Float[Tensor, "3"]) -> Gizmo:
-    """The gizmo of an object placed by `move`, at `pivot` of the object's own frame."""
-    quaternion = quaternion_from_rotation(move.rotation[None])[0].tolist()
-    return Gizmo(_triple(move.points(pivot)), (quaternion[0], *quaternion[1:]), move.scale)
+def gizmo_from_similarity(target_from_object: Similarity, pivot: Float[Tensor, "3"]) -> Gizmo:
+    """The gizmo of an object placed by `target_from_object`, at `pivot` of the object's own frame."""
+    quaternion = quaternion_from_rotation(target_from_object.rotation[None])[0].tolist()
+    return Gizmo(_triple(target_from_object.points(pivot)), (quaternion[0], *quaternion[1:]), target_from_object.scale)
 
 
-def similarity_of(gizmo: Gizmo, pivot: Float[Tensor, "3"]) -> Similarity:
+def similarity_from_gizmo(gizmo: Gizmo, pivot: Float[Tensor, "3"]) -> Similarity:
     """The placement that puts `pivot` where the gizmo is."""
     rotation = rotation_from_quaternion(torch.tensor([gizmo.wxyz], dtype=torch.float64))[0]
     translation = torch.tensor(gizmo.position, dtype=torch.float64) - gizmo.scale * rotation @ pivot.double()
     return Similarity(scale=gizmo.scale, rotation=rotation.float(), translation=translation.float())
 
 
-def degrees_of(wxyz: tuple[float, float, float, float]) -> Triple:
-    """Turns about the fixed x, then y, then z axis, in degrees: what a person types."""
+def degrees_from_quaternion(wxyz: tuple[float, float, float, float]) -> Triple:
+    """Rotation angles about the fixed x, then y, then z axis, in degrees."""
     m = rotation_from_quaternion(torch.tensor([wxyz], dtype=torch.float64))[0]
     pitch = math.asin(max(-1.0, min(1.0, -float(m[2, 0]))))
-    # looking straight along y, x and z turn about the same axis: all of it is given to z
+    # gimbal lock: at a pitch of 90 degrees x and z rotate about the same axis; all of it goes to z
     if abs(float(m[2, 0])) > 1 - 1e-9:
         roll, yaw = 0.0, math.atan2(-float(m[0, 1]), float(m[1, 1]))
     else:
@@ -53,8 +50,8 @@ def degrees_of(wxyz: tuple[float, float, float, float]) -> Triple:
     return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
 
 
-def wxyz_of(degrees: Triple) -> tuple[float, float, float, float]:
-    """The quaternion of turns about the fixed x, then y, then z axis."""
+def quaternion_from_degrees(degrees: Triple) -> tuple[float, float, float, float]:
+    """The quaternion wxyz of rotations about the fixed x, then y, then z axis, in degrees."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(math.radians(d) / 2), math.sin(math.radians(d) / 2)) for d in degrees)
     return (
         cr * cp * cy + sr * sp * sy,

@@ -1,4 +1,4 @@
-"""Undo and redo without bound, as a value. Knows nothing about what is kept."""
+"""An unbounded undo and redo history as an immutable value."""
 
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
@@ -11,18 +11,18 @@ class History(Generic[T]):
     """A present value, all earlier ones, and those that were undone."""
 
     present: T
-    """What counts now."""
+    """The current value."""
     past: tuple[T, ...] = ()
     """Earlier values, oldest first."""
     future: tuple[T, ...] = ()
-    """Undone values, the nearest last."""
+    """Undone values, the most recently undone last."""
 
-    def then(self, value: T) -> "History[T]":
-        """`value` counts from now on; what was undone before is forgotten."""
+    def pushed(self, value: T) -> "History[T]":
+        """The history after a new step to `value`; undone values are discarded."""
         return History(value, (*self.past, self.present))
 
     def amended(self, value: T) -> "History[T]":
-        """`value` in place of the present one, without a step of its own: what nobody asked for cannot be undone."""
+        """The history with `value` in place of the present one, without a new step."""
         return replace(self, present=value)
 
     def undone(self) -> "History[T]":

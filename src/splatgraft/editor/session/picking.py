@@ -1,4 +1,4 @@
-"""Which Gaussians a person means: a box in space, a rectangle of the picture, a brush. Knows nothing about browsers."""
+"""Selection of Gaussians by a rectangle in the image, by ray casting, and by a brush."""
 
 import math
 from collections.abc import Sequence
@@ -11,43 +11,43 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 
-_REACH = 3.0
-"""Standard deviations beyond which a Gaussian stops nothing."""
+_CUTOFF_SIGMAS = 3.0
+"""Distance from its centre, in standard deviations, beyond which a Gaussian does not occlude a ray."""
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A part of the picture, in shares of its width and height from the upper left corner."""
+    """A part of the image, in fractions of its width and height from the upper left corner."""
 
-    least: tuple[float, float]
+    lower: tuple[float, float]
     """Left and upper edge."""
-    greatest: tuple[float, float]
+    upper: tuple[float, float]
     """Right and lower edge."""
 
 
 def in_rectangle(means: Float[Tensor, "n 3"], camera: Cameras, rectangle: Rectangle) -> Bool[Tensor, "n"]:
-    """Which centres one camera sees inside the rectangle, however far behind others."""
+    """Which centres project into the rectangle in one camera, occluded ones included."""
     pose = camera.camera_from_world[0].to(means)
     local = means @ pose[:3, :3].T + pose[:3, 3]
     pixels = (local @ camera.intrinsics[0].to(means).T)[:, :2] / local[:, 2:].clamp_min(1e-9)
     share = pixels / camera.sizes[0].to(means)
-    inside = (share >= torch.tensor(rectangle.least)) & (share <= torch.tensor(rectangle.greatest))
+    inside = (share >= torch.tensor(rectangle.lower)) & (share <= torch.tensor(rectangle.upper))
     return inside.all(1) & (local[:, 2] > 0)
 
 
-def first_hit(
+def first_surface_hit(
     gaussians: Gaussians, origin: Float[Tensor, "3"], direction: Float[Tensor, "3"]
 ) -> Float[Tensor, "3"] | None:
-    """Where a ray meets what the picture shows: where half of the light is stopped; None where it never is.
+    """The point on a ray where accumulated opacity exceeds one half; None where it never does.
 
-    Each Gaussian stops its share at the point of the ray where it is densest (3DGS, Eq. 3, along a ray).
+    Each Gaussian contributes its opacity at the point of the ray where its density is largest (3DGS, Eq. 3).
     """
     direction = torch.nn.functional.normalize(direction, dim=0).double()
     offset = gaussians.means.double() - origin.double()
-    beside = (offset - (offset @ direction)[:, None] * direction).norm(dim=1)
-    near = beside < _REACH * gaussians.scales.amax(1)
+    distance = (offset - (offset @ direction)[:, None] * direction).norm(dim=1)
+    near = distance < _CUTOFF_SIGMAS * gaussians.scales.amax(1)
     covariances = gaussians.select(near).covariances.double()
-    # a thousandth of the largest axis keeps needles and discs invertible
+    # regularised by a thousandth of the root trace, so that flat covariances are invertible
     floor = 1e-6 * covariances.diagonal(dim1=1, dim2=2).sum(1)
     inverse = torch.linalg.inv(covariances + floor[:, None, None] * torch.eye(3, dtype=torch.float64))
     forward = torch.einsum("i,nij->nj", direction, inverse)
@@ -56,41 +56,48 @@ def first_hit(
     alpha = gaussians.opacities[near] * torch.exp(-0.5 * torch.einsum("ni,nij,nj->n", rest, inverse, rest))
     depth, alpha = depth[depth > 0], alpha[depth > 0]
     order = depth.argsort()
-    stopped = 1 - (1 - alpha[order]).cumprod(0) > 0.5
-    return origin + float(depth[order][stopped][0]) * direction.to(origin) if bool(stopped.any()) else None
+    occluded = 1 - (1 - alpha[order]).cumprod(0) > 0.5
+    return origin + float(depth[order][occluded][0]) * direction.to(origin) if bool(occluded.any()) else None
 
 
 def in_brush(gaussians: Gaussians, centre: Float[Tensor, "3"], radius: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians a brush's ball reaches: by their middle size, but none whose centre is two radii away.
+    """Which Gaussians a spherical brush touches.
 
-    A narrow brush would else slip between the centres of wide Gaussians, and a wide one take the backdrop.
+    A Gaussian counts as a ball with its median scale as radius, at most the brush's radius: a narrow brush then does
+    not miss wide Gaussians between their centres, and a wide brush does not take the background.
     """
-    reach = gaussians.scales.median(1).values.clamp_max(radius)
-    return (gaussians.means - centre).norm(dim=1) <= radius + reach
+    extent = gaussians.scales.median(1).values.clamp_max(radius)
+    return (gaussians.means - centre).norm(dim=1) <= radius + extent
 
 
 @dataclass(frozen=True)
 class Ray:
-    """Where a person points."""
+    """A ray from the camera through the pointer."""
 
     origin: Float[Tensor, "3"]
-    """The eye."""
+    """Camera centre, world units."""
     direction: Float[Tensor, "3"]
-    """Of any length."""
+    """Direction, of any length."""
 
 
-def painted(gaussians: Gaussians, rays: Sequence[Ray], *, size: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians a stroke takes: a ball around each hit, `size` of its distance wide."""
-    touched = torch.zeros(gaussians.count, dtype=torch.bool)
+def brush_selection(gaussians: Gaussians, rays: Sequence[Ray], *, size: float) -> Bool[Tensor, "n"]:
+    """Which Gaussians a brush stroke selects.
+
+    Args:
+        gaussians: The scene.
+        rays: The stroke.
+        size: Diameter of the brush over the distance of the hit point.
+    """
+    selected = torch.zeros(gaussians.count, dtype=torch.bool)
     for ray in rays:
-        hit = first_hit(gaussians, ray.origin, ray.direction)
+        hit = first_surface_hit(gaussians, ray.origin, ray.direction)
         if hit is not None:
-            touched |= in_brush(gaussians, hit, 0.5 * size * float((hit - ray.origin).norm()))
-    return touched
+            selected |= in_brush(gaussians, hit, 0.5 * size * float((hit - ray.origin).norm()))
+    return selected
 
 
-def between(start: Ray, end: Ray, *, size: float) -> list[Ray]:
-    """Rays from after `start` up to `end`, a quarter of the brush apart, so that a quick stroke has no gaps."""
+def interpolate_rays(start: Ray, end: Ray, *, size: float) -> list[Ray]:
+    """Rays after `start` up to `end`, at most a quarter of the brush's diameter `size` apart."""
     a, b = (torch.nn.functional.normalize(ray.direction, dim=0) for ray in (start, end))
     count = max(1, math.ceil(float((b - a).norm()) / (0.25 * size)))
     return [Ray(end.origin, a + (b - a) * (step + 1) / count) for step in range(count)]

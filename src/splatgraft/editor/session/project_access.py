@@ -1,4 +1,4 @@
-"""What the editor asks of a project: where its files are, what is stale, how to run it. Made by `steps/edit.py`."""
+"""The project as the editor needs it: its files, stale steps and commands. Implemented in `commands/edit.py`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,13 +9,13 @@ from splatgraft.composition import PlaceOptions
 from splatgraft.project.layout import Side
 from splatgraft.relighting import RelightOptions
 
-LightBy = Literal["transfer", "gain", "off"]
+LightMode = Literal["transfer", "gain", "off"]
 Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class ProjectFiles:
-    """Where the files of one project are; most need not exist yet."""
+    """Paths and options of one project; most files need not exist yet."""
 
     file: Path
     """project.toml; placement.json, light.json, erased.npy and corrections.npy lie beside it."""
@@ -49,52 +49,64 @@ class ProjectFiles:
     """The consolidated scene."""
     report: Path
     """The folder of index.html."""
-    pictured: tuple[bool, bool]
-    """Whether the source and the target are scenes without photographs: their pictures were made of them."""
-    light_by: LightBy
-    """What [relight] asks for: the physical transfer, a gain of the object alone, or nothing."""
-    relighting: RelightOptions
-    """What it says of the physical transfer."""
-    placing: PlaceOptions
-    """What [compose] says of the place, where none is decided yet."""
+    without_photos: tuple[bool, bool]
+    """Whether source and target are scenes without photographs, whose images are rendered from the scene."""
+    light_mode: LightMode
+    """`light` of [relight]: the physical transfer, a gain of the object alone, or nothing."""
+    relight_options: RelightOptions
+    """The other options of [relight]."""
+    place_options: PlaceOptions
+    """Placement options of [compose], for objects without a placement."""
 
     @property
     def transfers_light(self) -> bool:
-        """Whether there is a light to find and to aim."""
-        return self.light_by == "transfer"
+        """Whether the physical light transfer is used, so that there is a light to estimate and edit."""
+        return self.light_mode == "transfer"
 
 
 @runtime_checkable
 class Project(Protocol):
-    """One project, there or about to be."""
+    """A project whose project.toml may not exist yet."""
 
     @property
     def file(self) -> Path:
-        """Where project.toml is or will be."""
+        """Path of project.toml."""
         ...
 
     def files(self) -> ProjectFiles | None:
-        """Its files as project.toml says now; None where there is no project.toml yet.
+        """Its files according to project.toml; None where project.toml does not exist yet.
 
-        Raises: ValueError where it is broken.
+        Raises:
+            ValueError: If project.toml is invalid.
         """
         ...
 
     def reasons(self) -> Mapping[str, str | None]:
-        """Why each step is stale, None where it is not, in the order of the flow."""
+        """For each step, in the order of the flow, why it is stale; None where it is up to date."""
         ...
 
     def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
-        """Write project.toml for two captures or scenes, source first, and scenes that were trained on these captures.
+        """Write project.toml.
 
-        Raises: ValueError where one of them is not there, or a project is.
+        Args:
+            captures: Source and target: captures or scene files.
+            scenes: Scenes trained on these captures, where there are any.
+
+        Raises:
+            ValueError: If one of the files is missing, or project.toml exists.
         """
         ...
 
     def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
-        """Say how a scene without photographs is looked at; None: its up is found, it is looked at from around."""
+        """Set how images of a scene without photographs are rendered.
+
+        Args:
+            side: Source or target.
+            up: Up direction in the scene's frame; None: estimated.
+            look: `within` for cameras inside the scene; None: cameras around it.
+        """
         ...
 
     def run_command(self, to: str, title: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The child process that does what is stale up to the step `to`, and the words a person would type."""
+        """Commands that run the stale steps up to `to`: that of the child process, and its equivalent for the user."""
         ...

@@ -1,6 +1,6 @@
-"""States that were left behind, as files by their content, and the history as a list of their names.
+"""The undo history on disk: each state in a file named by the hash of its content, and a list of these names.
 
-So undo has no bound, costs no memory, and goes on after the editor ended. Knows nothing about what a state is for.
+Undo is therefore unbounded, needs little memory, and survives the end of the editor.
 """
 
 import hashlib
@@ -25,22 +25,27 @@ from splatgraft.runtime.atomic_file import atomic_write
 
 HISTORY_FILE, STATES_FOLDER = "history.json", "states"
 _IN_MEMORY = 20
-"""States that need not be read again; also, what was drawn for them is known by them being the same objects."""
+"""Number of states held in memory; memos recognise such a state by the identity of its parts."""
 
 
 class StateStore:
-    """The states of one project, under `folder`; paths of objects are kept relative to `home`."""
+    """The stored states of one project."""
 
-    def __init__(self, folder: Path, *, home: Path) -> None:
-        """Nothing is read yet."""
-        self._folder, self._home = folder, home
-        self._near: OrderedDict[str, EditState] = OrderedDict()
+    def __init__(self, folder: Path, *, project_folder: Path) -> None:
+        """Open the store without reading.
+
+        Args:
+            folder: Folder of the stored states.
+            project_folder: Folder to which the paths of objects are stored relative.
+        """
+        self._folder, self._project_folder = folder, project_folder
+        self._recent: OrderedDict[str, EditState] = OrderedDict()
         self._arrays: dict[int, tuple[Tensor, str]] = {}
 
-    def keep(self, state: EditState) -> str:
-        """Write the state where it is not there yet; its name."""
+    def save(self, state: EditState) -> str:
+        """Write the state unless it is stored already; returns its name."""
         (self._folder / STATES_FOLDER).mkdir(parents=True, exist_ok=True)
-        text = json.dumps(self._plain(state), sort_keys=True)
+        text = json.dumps(self._to_json(state), sort_keys=True)
         name = _name(text.encode())
         if not self._path(name, ".json").is_file():
             with atomic_write(self._path(name, ".json")) as stream:
@@ -51,21 +56,23 @@ class StateStore:
     def read(self, name: str) -> EditState:
         """The state of that name.
 
-        Raises: ValueError where its file is missing or broken.
+        Raises:
+            ValueError: If its file is missing or invalid.
         """
-        if name not in self._near:
+        if name not in self._recent:
             path = self._path(name, ".json")
             try:
-                self._remember(name, self._state(json.loads(path.read_text(encoding="utf-8"))))
+                self._remember(name, self._from_json(json.loads(path.read_text(encoding="utf-8"))))
             except (OSError, ValueError, KeyError, TypeError) as error:
                 raise ValueError(f"{path}: expected an earlier state, found {type(error).__name__}: {error}") from error
-        self._near.move_to_end(name)
-        return self._near[name]
+        self._recent.move_to_end(name)
+        return self._recent[name]
 
-    def history(self) -> History[str] | None:
-        """The names of all states as they were left; None where there are none. What no step leads to is removed.
+    def read_history(self) -> History[str] | None:
+        """Read the history and delete states that are not in it; None where none is stored.
 
-        Raises: ValueError where the list is broken.
+        Raises:
+            ValueError: If the list is invalid.
         """
         path = self._folder / HISTORY_FILE
         try:
@@ -75,11 +82,11 @@ class StateStore:
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: expected a history, found {type(error).__name__}: {error}") from error
-        self._clear({history.present, *history.past, *history.future})
+        self._remove_unused({history.present, *history.past, *history.future})
         return history
 
-    def keep_history(self, history: History[str]) -> None:
-        """Replace the list of names."""
+    def save_history(self, history: History[str]) -> None:
+        """Write the list of names."""
         record = {"past": history.past, "present": history.present, "future": history.future}
         with atomic_write(self._folder / HISTORY_FILE) as stream:
             stream.write(json.dumps(record).encode())
@@ -88,28 +95,28 @@ class StateStore:
         return self._folder / STATES_FOLDER / f"{name}{suffix}"
 
     def _remember(self, name: str, state: EditState) -> None:
-        self._near.setdefault(name, state)
-        while len(self._near) > _IN_MEMORY:
-            self._near.popitem(last=False)
-        used = {id(array) for kept in self._near.values() for array in (kept.erased, kept.corrections)}
+        self._recent.setdefault(name, state)
+        while len(self._recent) > _IN_MEMORY:
+            self._recent.popitem(last=False)
+        used = {id(array) for state in self._recent.values() for array in (state.erased, state.corrections)}
         self._arrays = {key: value for key, value in self._arrays.items() if key in used}
 
-    def _clear(self, used: set[str]) -> None:
-        """Remove states that none of `used` is, and arrays that none of them names."""
+    def _remove_unused(self, used: set[str]) -> None:
+        """Delete all states but those in `used`, and all arrays that these do not refer to."""
         texts = [path.read_text() for name in used if (path := self._path(name, ".json")).is_file()]
         arrays = {found[key] for text in texts for found in [json.loads(text)] for key in ("erased", "corrections")}
         for path in (self._folder / STATES_FOLDER).glob("*"):
             if path.stem not in used and path.stem not in arrays:
                 path.unlink()
 
-    # a state as JSON; arrays have files of their own, since most steps leave them as they are
+    # a state as JSON; arrays are stored in separate files, because most steps do not change them
 
-    def _plain(self, state: EditState) -> dict[str, Any]:
-        objects = None if state.objects is None else [self._plain_object(item) for item in state.objects]
+    def _to_json(self, state: EditState) -> dict[str, Any]:
+        objects = None if state.objects is None else [self._object_to_json(item) for item in state.objects]
         return {
             "objects": objects,
-            "erased": self._kept_array(state.erased),
-            "corrections": self._kept_array(state.corrections),
+            "erased": self._save_array(state.erased),
+            "corrections": self._save_array(state.corrections),
             "mask_source": state.mask_source,
             "box": state.box,
             "keep": state.keep,
@@ -118,35 +125,39 @@ class StateStore:
             "harmonizer": state.harmonizer,
         }
 
-    def _state(self, plain: dict[str, Any]) -> EditState:
-        objects, box, light = plain["objects"], plain["box"], plain["light"]
+    def _from_json(self, fields: dict[str, Any]) -> EditState:
+        objects, box, light = fields["objects"], fields["box"], fields["light"]
         a, b, c, d, e, f = (float(x) for x in box) if box is not None else (0.0,) * 6
         return EditState(
-            objects=None if objects is None else tuple(self._object(item) for item in objects),
-            erased=self._array(plain["erased"]),
-            corrections=self._array(plain["corrections"]),
-            mask_source=plain["mask_source"],
+            objects=None if objects is None else tuple(self._object_from_json(item) for item in objects),
+            erased=self._read_array(fields["erased"]),
+            corrections=self._read_array(fields["corrections"]),
+            mask_source=fields["mask_source"],
             box=None if box is None else (a, b, c, d, e, f),
-            keep=plain["keep"],
+            keep=fields["keep"],
             light=None if light is None else light_from_json(light),
-            weights=LayerWeights(**plain["weights"]),
-            harmonizer=plain["harmonizer"],
+            weights=LayerWeights(**fields["weights"]),
+            harmonizer=fields["harmonizer"],
         )
 
-    def _plain_object(self, item: ObjectPlacement) -> dict[str, Any]:
-        move, path = item.target_from_object, item.object_path
-        numbers = {"scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()}
-        return numbers | {"object": None if path is None else os.path.relpath(path, self._home)}
+    def _object_to_json(self, item: ObjectPlacement) -> dict[str, Any]:
+        placement, path = item.target_from_object, item.object_path
+        numbers = {
+            "scale": placement.scale,
+            "rotation": placement.rotation.tolist(),
+            "translation": placement.translation.tolist(),
+        }
+        return numbers | {"object": None if path is None else os.path.relpath(path, self._project_folder)}
 
-    def _object(self, plain: dict[str, Any]) -> ObjectPlacement:
-        move = Similarity(
-            scale=float(plain["scale"]),
-            rotation=torch.tensor(plain["rotation"]),
-            translation=torch.tensor(plain["translation"]),
+    def _object_from_json(self, fields: dict[str, Any]) -> ObjectPlacement:
+        placement = Similarity(
+            scale=float(fields["scale"]),
+            rotation=torch.tensor(fields["rotation"]),
+            translation=torch.tensor(fields["translation"]),
         )
-        return ObjectPlacement(move, None if plain["object"] is None else self._home / plain["object"])
+        return ObjectPlacement(placement, None if fields["object"] is None else self._project_folder / fields["object"])
 
-    def _kept_array(self, array: Tensor | None) -> str | None:
+    def _save_array(self, array: Tensor | None) -> str | None:
         if array is None:
             return None
         known = self._arrays.get(id(array))
@@ -162,10 +173,10 @@ class StateStore:
         self._arrays[id(array)] = (array, name)
         return name
 
-    def _array(self, name: str | None) -> Tensor | None:
+    def _read_array(self, name: str | None) -> Tensor | None:
         if name is None:
             return None
-        # the very tensor that a near state has, so that what was made of it is known to be right still
+        # the same tensor as in a recent state, so that memos of it stay valid
         for array, known in self._arrays.values():
             if known == name:
                 return array

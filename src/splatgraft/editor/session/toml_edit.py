@@ -1,4 +1,4 @@
-"""Changes keys of a TOML text and leaves all other lines, comments too, as they are. Knows no particular key."""
+"""Set keys of a TOML text line by line, so that comments and all other lines stay unchanged."""
 
 import json
 import re
@@ -8,9 +8,10 @@ from typing import Any
 
 
 def with_keys(text: str, table: str, values: Mapping[str, Any]) -> str:
-    """`text` with the keys of one top-level `table` set; None removes a key.
+    """Set keys of one top-level table; a value of None removes the key.
 
-    Raises: ValueError where the text is laid out so that this cannot be done line by line.
+    Raises:
+        ValueError: If the text's layout does not allow it line by line.
     """
     wanted = tomllib.loads(text)
     inside = dict(wanted.get(table, {}))
@@ -26,24 +27,24 @@ def with_keys(text: str, table: str, values: Mapping[str, Any]) -> str:
         found = tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         found = None
-    if _plain(found) != _plain(wanted):
+    if _comparable(found) != _comparable(wanted):
         raise ValueError(f"[{table}]: expected one plain `key = value` per line, found another layout; edit it by hand")
     return text
 
 
 def _with_key(text: str, table: str, key: str, value: Any) -> str:
-    # not splitlines, for which a string may hold ends of lines that TOML does not know
+    # not splitlines, which also splits at characters that end no line in TOML
     lines = text.removesuffix("\n").split("\n")
     start = next((i for i, line in enumerate(lines) if re.match(rf"\s*\[{re.escape(table)}\]\s*(#.*)?$", line)), None)
     if start is None:
         if value is None:
             return text
-        return "\n".join([*lines, "", f"[{table}]", f"{key} = {_written(value)}", ""])
+        return "\n".join([*lines, "", f"[{table}]", f"{key} = {_toml_value(value)}", ""])
     end = next((i for i in range(start + 1, len(lines)) if re.match(r"\s*\[", lines[i])), len(lines))
     at = next((i for i in range(start + 1, end) if re.match(rf"\s*{re.escape(key)}\s*=", lines[i])), None)
-    new = [] if value is None else [f"{key} = {_written(value)}"]
+    new = [] if value is None else [f"{key} = {_toml_value(value)}"]
     if at is None:
-        # behind the table's last key, so that comments that introduce the next table stay with it
+        # after the table's last key, so that comments before the next table stay with that table
         last = max((i for i in range(start, end) if i == start or re.match(r"\s*[\w\"'\]]", lines[i])), default=start)
         lines[last + 1 : last + 1] = new
     else:
@@ -52,7 +53,7 @@ def _with_key(text: str, table: str, key: str, value: Any) -> str:
 
 
 def _value_lines(lines: list[str], at: int) -> int:
-    """How many lines the value that begins in line `at` takes."""
+    """Number of lines of the value that begins in line `at`."""
     for count in range(1, len(lines) - at + 1):
         try:
             tomllib.loads("\n".join(lines[at : at + count]))
@@ -62,10 +63,10 @@ def _value_lines(lines: list[str], at: int) -> int:
     return 1
 
 
-def _written(value: Any) -> str:
-    # JSON's strings, numbers, booleans and lists are TOML's too
+def _toml_value(value: Any) -> str:
+    # JSON strings, numbers, booleans and lists are valid TOML
     return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
 
 
-def _plain(content: Any) -> Any:
+def _comparable(content: Any) -> Any:
     return json.loads(json.dumps(content, default=str))

@@ -1,4 +1,4 @@
-"""Scenes without photographs and cameras, as source and as target: the whole transfer through the steps."""
+"""Transfers between scenes without photographs and cameras, through the steps."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import torch
 from tiny_project import ball, plane
 
 from splatgraft.cli import main
-from splatgraft.commands.edit import StepsProject
+from splatgraft.commands.edit import FlowProject
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import concatenate
 from splatgraft.editor.session.session import Session
@@ -19,8 +19,8 @@ from splatgraft.runtime.settings import read_toml
 AROUND_THE_BALL = [-0.35, -0.35, 0.03, 0.35, 0.35, 0.65]
 
 
-def bare_project(root: Path, *, suffix: str, **segment: object) -> Path:
-    """Two scene files and a project of them."""
+def scene_project(root: Path, *, suffix: str, **segment: object) -> Path:
+    """Write two scene files and a project of them; returns project.toml."""
     scenes = [concatenate([plane((0.3, 0.5, 0.3)), ball()]), plane((0.5, 0.45, 0.6))]
     paths = [root / f"{name}{suffix}" for name in ("source", "target")]
     for path, scene in zip(paths, scenes, strict=True):
@@ -35,48 +35,48 @@ def bare_project(root: Path, *, suffix: str, **segment: object) -> Path:
     return project
 
 
-def test_a_transfer_between_two_bare_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    project = bare_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, threshold=0.5)
+def test_a_transfer_between_two_scene_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = scene_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, threshold=0.5)
     assert main(["run", str(project), "--to", "consolidate"]) == 0
     said = capsys.readouterr().err
     assert "a scene without photographs: 8 pictures" in said
     assert "up is taken to be (0.00, 0.00, 1.00)" in said
     root = project.parent
     assert (root / "source/scene/scene.ply").read_bytes() == (tmp_path / "source.ply").read_bytes()
-    # pictures alone tell the ball, which is red, from the plane, which is not
+    # the masks of the rendered images separate the red ball from the plane
     object_ = read_gaussians(root / "object" / "object.ply")
     assert 40 < object_.count <= ball().count
     assert bool((object_.sh[:, 0, 0] > object_.sh[:, 0, 1]).all())
     placed = read_placement(root / "composite" / "placement.json").objects[0].target_from_object
-    # of 0.65, where a ball that is cut 0.03 above its foot is half a blob lower or higher
+    # the box cuts the ball 0.03 above its lowest point: of its height 0.65 it may stand half a blob lower or higher
     assert abs(float(placed.points(object_.means)[:, 2].median()) - 0.8 * 0.3) < 0.1
     assert (root / "result" / "scene.ply").is_file()
 
 
-def test_a_box_alone_cuts_and_the_whole_file_may_be_the_object(tmp_path: Path) -> None:
-    project = bare_project(tmp_path, suffix=".spz", box=AROUND_THE_BALL, mask_source="box")
+def test_a_box_alone_segments_and_the_whole_scene_may_be_the_object(tmp_path: Path) -> None:
+    project = scene_project(tmp_path, suffix=".spz", box=AROUND_THE_BALL, mask_source="box")
     assert main(["run", str(project), "--to", "segment"]) == 0
     assert read_gaussians(project.parent / "object" / "object.ply").count == ball().count
     everything = [-9.0, -9.0, -9.0, 9.0, 9.0, 9.0]
     project.write_text(with_keys(project.read_text(), "segment", {"box": everything}))
-    # nothing is left to tell the light or the surface that it came from: the transfer must do without
+    # no surroundings are left to estimate the source's light or support: the transfer works without
     assert main(["run", str(project), "--to", "relight"]) == 0
     scene = read_gaussians(tmp_path / "source.spz")
     assert read_gaussians(project.parent / "object" / "object.ply").count == scene.count
     assert read_gaussians(project.parent / "object" / "surroundings.ply").count == 0
-    session = Session(StepsProject(project))
-    assert session.files.pictured == (True, True)
-    assert session.placeable(0).base.stands_on == "extent"
-    # the .spz turned the plane's axes, and the cameras were turned with it
+    session = Session(FlowProject(project))
+    assert session.files.without_photos == (True, True)
+    assert session.placeable_object(0).base.stands_on == "extent"
+    # reading .spz rotates the axes, and the cameras rotate with them
     up = estimate_up(read_cameras(project.parent / "target" / "capture"))
     assert torch.allclose(
         up, torch.tensor([0.0, 0.0, 1.0]), atol=0.02
     )  # of a plane whose centres are rounded to 1/4096
 
 
-def test_up_can_be_put_right_and_that_is_no_step(tmp_path: Path) -> None:
-    project = bare_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, mask_source="box")
-    session = Session(StepsProject(project))
+def test_up_can_be_set_and_is_no_undo_step(tmp_path: Path) -> None:
+    project = scene_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, mask_source="box")
+    session = Session(FlowProject(project))
     session.set_view("target", up=(0.0, 0.0, -1.0), look=None)
     assert not session.reload()
     assert not session.undo()
@@ -94,8 +94,8 @@ def test_up_can_be_put_right_and_that_is_no_step(tmp_path: Path) -> None:
     assert main(["run", str(project), "--to", "target/reconstruct"]) == 0
 
 
-def test_what_is_named_wrongly_is_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    project = bare_project(tmp_path, suffix=".ply")
+def test_wrong_inputs_are_reported_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project = scene_project(tmp_path, suffix=".ply")
     text = project.read_text()
     for wrong, message in (
         (text.replace('scene = "../source.ply"', 'capture = "../source.ply"'), "write scene = instead"),

@@ -1,40 +1,31 @@
-"""The whole story in a browser, from two folders of photographs to the exported scene, with kills in between."""
+"""A transfer in the browser, from two folders of photographs to the exported scene; the server is killed in between."""
 
 import hashlib
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
-from editor_driver import Editor, Window, state_of, wait_until, with_browser
+from editor_driver import Editor, Window, history_of, jobs_of, state_of, wait_for_job
 from tiny_project import OPTIONS, ball, photograph, plane
+from waiting import HANG_LIMIT
 
-from splatgraft.editor.jobs.jobs import Jobs
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import read_placement
 
 SCENES = ("source/scene/scene.ply", "target/scene/scene.ply", "object/object.ply", "composite/scene.ply")
 RELIT, RESULT = "relit/scene.ply", "result/scene.ply"
-# a ball and a plane have no photographed surroundings worth an estimate, but the transfer must run on them
+# a ball and a plane give little evidence of the light, but the transfer must run on them
 LIT = OPTIONS.replace('light = "gain"', 'light = "transfer"')
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with with_browser() as found:
-        yield found
 
 
 def object_at(project: Path) -> torch.Tensor:
     return read_placement(project.parent / "placement.json").objects[0].target_from_object.translation
 
 
-@pytest.mark.timeout(600)
-def test_the_whole_story(browser: Any, tmp_path: Path) -> None:
+def test_a_transfer_from_photographs_to_the_exported_scene(browser: Any, tmp_path: Path) -> None:
     photograph(tmp_path / "photos" / "source", plane((0.3, 0.5, 0.3)), ball())
     photograph(tmp_path / "photos" / "target", plane((0.5, 0.45, 0.6)), None)
     project = tmp_path / "project" / "project.toml"
@@ -43,12 +34,12 @@ def test_the_whole_story(browser: Any, tmp_path: Path) -> None:
     try:
         window = Window.opened(browser, editor)
         start_project(window, tmp_path)
-        window = leave_and_come_back(window, browser, editor)
+        window = close_the_window_during_a_job(window, browser, editor, project)
         select(window, project)
         place(window, project)
-        editor, window = killed_while_dragging(window, browser, editor, project)
+        editor, window = kill_the_editor_during_a_drag(window, browser, editor, project)
         light(window, project)
-        editor, window = killed_while_running(window, browser, editor, project)
+        editor, window = kill_the_editor_during_a_job(window, browser, editor, project)
         export(window, project, tmp_path)
         assert editor.end() == 0
     finally:
@@ -63,90 +54,83 @@ def start_project(window: Window, root: Path) -> None:
     window.says("expected photos, a video, a posed capture or a scene, found nothing")
     window.write("Object from", str(root / "photos" / "source"))
     window.click("Start the project")
-    window.says("the project is there")
+    window.says("the project was created")
     project = root / "project" / "project.toml"
-    # what is written by hand while the editor runs is taken over
+    # changes by hand while the editor runs are loaded
     project.write_text(project.read_text() + LIT)
     window.says("changed outside the editor")
 
 
-def leave_and_come_back(window: Window, browser: Any, editor: Editor) -> Window:
-    window.click("Reconstruct both scenes")
-    window.page.wait_for_selector(".sg-job", timeout=30_000)
+def close_the_window_during_a_job(window: Window, browser: Any, editor: Editor, project: Path) -> Window:
+    window.start_job(project, "Reconstruct both scenes")
     window.page.close()
     window = Window.opened(browser, editor)
-    window.quiet()
+    state = jobs_of(project).state
+    window.until(lambda: window.shows_job() or not ((job := state()) and job.live), what="the job on the page")
+    window.finish_job(project)
     window.says("400 Gaussians")
     return window
 
 
 def select(window: Window, project: Path) -> None:
-    window.turn("Select")
+    window.show_phase("Select")
     window.check("Box around the object")
-    wait_until(lambda: state_of(project).box is not None, timeout=20, what="a box in project.toml")
+    window.until(lambda: state_of(project).box is not None, what="a box in project.toml")
     window.says("are inside the box")
-    window.click("Cut out the object")
+    window.start_job(project, "Cut out the object")
     window.says("Cut out the object: done")
     window.says("are the object")
     before = len(read_gaussians(project.parent / "object" / "object.ply").means)
     window.choose("A stroke", "removes")
-    # a rectangle over the upper left part of the picture, in the middle of the canvas
-    window.page.keyboard.down("Shift")
-    window.page.wait_for_timeout(150)
-    window.drag((640, 300), (60, 400))
-    window.page.keyboard.up("Shift")
-    wait_until(lambda: state_of(project).corrections is not None, timeout=20, what="strokes")
-    window.click("Undo")
-    wait_until(lambda: state_of(project).corrections is None, timeout=20, what="the stroke undone")
+
+    def drag_a_rectangle() -> None:
+        # over the upper left part of the image, in the middle of the canvas
+        window.page.keyboard.down("Shift")
+        window.drag((640, 300), (60, 400))
+        window.page.keyboard.up("Shift")
+
+    window.act_until(drag_a_rectangle, lambda: state_of(project).corrections is not None, what="corrections")
+    window.undo_until(project, lambda: state_of(project).corrections is None)
     window.click("Redo")
-    wait_until(lambda: state_of(project).corrections is not None, timeout=20, what="the stroke again")
-    # the ball is in the middle between the two panels
+    window.until(lambda: state_of(project).corrections is not None, what="the corrections again")
+    selected = history_of(project)["present"]
     window.check("Brush")
     window.says("the brush is on")
-    # the page hears of it a moment after its text
-    window.page.wait_for_timeout(500)
-    window.page.mouse.click(648, 450)
-    window.says("Gaussians under the stroke")
-    window.check("Brush")
-    window.click("Undo")
-    window.says("undone")
-    window.click("Cut out the object")
-    window.page.wait_for_selector(".sg-job", timeout=30_000)
-    window.quiet()
+    # the ball is in the middle between the two panels
+    stroke = "Gaussians under the stroke"
+    window.act_until(lambda: window.page.mouse.click(648, 450), lambda: window.shows(stroke), what="a brush stroke")
+    window.check("Brush", False)
+    window.says("the brush is off")
+    window.undo_until(project, lambda: history_of(project)["present"] == selected)
+    window.start_job(project, "Cut out the object")
+    window.finish_job(project)
     after = len(read_gaussians(project.parent / "object" / "object.ply").means)
     assert 0 < after < before
 
 
 def place(window: Window, project: Path) -> None:
-    window.turn("Place")
+    window.show_phase("Place")
     window.click("Find a place for it")
-    wait_until((project.parent / "placement.json").is_file, timeout=30, what="a placement")
+    window.until((project.parent / "placement.json").is_file, what="a placement")
     found = object_at(project)
-    window.write("Scale", "0.5")
-    wait_until(
-        lambda: abs(read_placement(project.parent / "placement.json").objects[0].target_from_object.scale - 0.5) < 1e-6,
-        timeout=20,
-        what="the typed scale",
-    )
-    window.click("Undo")
-    wait_until(lambda: torch.equal(object_at(project), found), timeout=20, what="the place before")
+
+    def scale() -> float:
+        return read_placement(project.parent / "placement.json").objects[0].target_from_object.scale
+
+    window.write("Scale", "0.5", effect=lambda: abs(scale() - 0.5) < 1e-6)
+    window.undo_until(project, lambda: torch.equal(object_at(project), found) and abs(scale() - 0.5) > 1e-6)
     window.click("Drop")
     window.says("dropped")
     window.click("Duplicate")
-    wait_until(lambda: len(state_of(project).objects or ()) == 2, timeout=20, what="two objects")
+    window.until(lambda: len(state_of(project).objects or ()) == 2, what="two objects")
     window.page.keyboard.press("Control+z")
-    wait_until(lambda: len(state_of(project).objects or ()) == 1, timeout=20, what="one object again")
-    window.page.wait_for_function(
-        "() => [...document.querySelectorAll('.sg-caption')].some(e => e.textContent.includes('Light transfer'))",
-        timeout=60_000,
-    )
+    window.until(lambda: len(state_of(project).objects or ()) == 1, what="one object again")
+    window.until(lambda: "Light transfer" in window.caption(), what="a preview of the light transfer")
 
 
-def killed_while_dragging(window: Window, browser: Any, editor: Editor, project: Path) -> tuple[Editor, Window]:
+def kill_the_editor_during_a_drag(window: Window, browser: Any, editor: Editor, project: Path) -> tuple[Editor, Window]:
     before = object_at(project)
-    at = window.handle_of_the_gizmo()
-    window.drag(at, (0, -60), release=False)
-    wait_until(lambda: not torch.equal(object_at(project), before), timeout=20, what="the drag in placement.json")
+    window.drag_gizmo((0, -60), lambda: not torch.equal(object_at(project), before), what="a drag in placement.json")
     editor.kill()
     window.page.mouse.up()
     window.page.close()
@@ -156,37 +140,34 @@ def killed_while_dragging(window: Window, browser: Any, editor: Editor, project:
     assert float((moved - before)[:2].norm()) < 0.035 * float(moved[2] - before[2])
     editor = Editor(project)
     window = Window.opened(browser, editor)
-    window.turn("Place")
+    window.show_phase("Place")
     window.click("Drop")
-    wait_until(lambda: float(object_at(project)[2]) < float(moved[2]), timeout=20, what="the drop")
+    window.until(lambda: float(object_at(project)[2]) < float(moved[2]), what="the drop")
     return editor, window
 
 
 def light(window: Window, project: Path) -> None:
-    window.turn("Light")
-    window.write("Shadow", "0.5")
-    wait_until(lambda: state_of(project).weights.shadow == 0.5, timeout=20, what="the shadow's strength")
+    window.show_phase("Light")
+    window.write("Shadow", "0.5", effect=lambda: state_of(project).weights.shadow == 0.5)
 
 
-def killed_while_running(window: Window, browser: Any, editor: Editor, project: Path) -> tuple[Editor, Window]:
-    jobs = Jobs(project.parent / ".editor")
-    window.turn("Run")
-    window.click("Harmonise and consolidate")
-    wait_until(lambda: (state := jobs.state()) is not None and state.live, timeout=30, what="the job")
+def kill_the_editor_during_a_job(window: Window, browser: Any, editor: Editor, project: Path) -> tuple[Editor, Window]:
+    window.show_phase("Run")
+    window.start_job(project, "Harmonise and consolidate")
     editor.kill()
     window.page.close()
     editor = Editor(project)
     window = Window.opened(browser, editor)
-    wait_until(lambda: (state := jobs.state()) is not None and state.outcome == "done", timeout=120, what="the end")
+    wait_for_job(project)
     assert (project.parent / "result" / "scene.ply").is_file()
-    window.turn("Run")
-    window.click("Make the report too")
-    window.says("Make the report: done", timeout=90)
+    window.show_phase("Run")
+    window.start_job(project, "Make the report")
+    window.says("Make the report: done")
     return editor, window
 
 
 def first_difference(one: Path, other: Path) -> str:
-    """The first scene, in the order in which they are made, that two runs of one project disagree on."""
+    """Describe the first scene, in the order of the flow, that differs between two runs; empty where none does."""
     for name in (*SCENES, RELIT, RESULT):
         files = [folder / name for folder in (one, other)]
         assert [file.is_file() for file in files] in ([True, True], [False, False]), name
@@ -202,25 +183,20 @@ def first_difference(one: Path, other: Path) -> str:
 
 
 def export(window: Window, project: Path, root: Path) -> None:
-    with window.page.expect_download() as download:
-        window.click(".ply")
-    clicked = Path(download.value.path()).read_bytes()
-    # the same decisions, by commands alone, in another place
+    clicked = window.download(".ply").read_bytes()
+    # the same edits in another folder, run by a command
     again = root / "again" / "project.toml"
     again.parent.mkdir()
     for name in ("project.toml", "placement.json", "corrections.npy"):
         shutil.copy(project.parent / name, again.parent / name)
     placement = again.parent / "placement.json"
     assert str(root) not in placement.read_text()
-    # as a person would: a process of its own
     words = [sys.executable, "-m", "splatgraft", "run", str(again), "--to", "consolidate"]
-    subprocess.run(words, check=True, stdout=subprocess.DEVNULL, timeout=200)
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL, timeout=HANG_LIMIT)
     assert not first_difference(project.parent, again.parent)
     digests = [hashlib.sha256(content).hexdigest() for content in (clicked, (again.parent / RESULT).read_bytes())]
     assert digests[0] == digests[1]
-    with window.page.expect_download() as download:
-        window.click(".spz")
-    assert read_gaussians(Path(shutil.copy(download.value.path(), root / "taken.spz"))).count > 100
+    assert read_gaussians(Path(shutil.copy(window.download(".spz"), root / "taken.spz"))).count > 100
     report = window.page.request.get(window.page.url.rstrip("/") + "/files/index.html")
     assert report.ok
     assert "<html" in report.text()

@@ -1,0 +1,99 @@
+"""The browser windows on the page: their cameras, and a notice in each window without the edit lock."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import viser
+
+from splatgraft.core.cameras import Cameras
+
+if TYPE_CHECKING:
+    from splatgraft.editor.page.page import Page
+
+
+class Windows:
+    """All open windows; one of them holds the edit lock."""
+
+    def __init__(self, page: Page) -> None:
+        """Start without windows; `connect` makes them known."""
+        self._page, self._guarded, self._server = page, page.guarded, page.server
+        self._notices: dict[int, Any] = {}
+        self._views: dict[str, tuple[Any, ...]] = {}
+
+    def connect(self) -> None:
+        """Handle windows that open and close from now on; the page must be built."""
+        self._guarded.on_edit_lock_changed = self._update_notices
+        self._server.on_client_connect(self._connected)
+        self._server.on_client_disconnect(lambda client: self._notices.pop(client.client_id, None))
+
+    def editing(self) -> viser.ClientHandle | None:
+        """The window that holds the edit lock; None where no window is open."""
+        holder = self._guarded.edit_lock.holder
+        return None if holder is None else self._server.get_clients().get(holder)
+
+    def look_through(self, camera: Cameras) -> None:
+        """Move the editing window's view to a camera."""
+        window = self.editing()
+        if window is None:
+            return
+        pose = camera.world_from_camera[0].double().numpy()
+        # the whole photograph is in view, however narrow the window
+        aspect = camera.width / camera.height
+        half = camera.height / (2 * float(camera.intrinsics[0, 1, 1]))
+        if window.camera.aspect > 0:
+            half *= max(1.0, aspect / window.camera.aspect)
+        with window.atomic():
+            window.camera.up_direction = -pose[:3, 1]
+            window.camera.position = pose[:3, 3]
+            window.camera.look_at = pose[:3, 3] + pose[:3, 2] * self._page.scene_scale()
+            window.camera.fov = 2 * math.atan(half)
+
+    def save_view(self, scene: str) -> None:
+        """Store the editing window's view of `scene`."""
+        window = self.editing()
+        if window is not None:
+            camera = window.camera
+            self._views[scene] = (camera.position, camera.look_at, camera.up_direction, camera.fov)
+
+    def restore_view(self, scene: str) -> None:
+        """Restore the stored view of `scene`; the first time, look through its first camera."""
+        window, view = self.editing(), self._views.get(scene)
+        if window is None:
+            return
+        if view is None:
+            self._set_first_view(window)
+            return
+        with window.atomic():
+            window.camera.up_direction = view[2]
+            window.camera.position, window.camera.look_at, window.camera.fov = view[0], view[1], view[3]
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(lambda _: self._page.preview.camera_moved(client.client_id))
+        self._set_first_view(client)
+        self._update_notices()
+
+    def _set_first_view(self, client: viser.ClientHandle) -> None:
+        # the reconstruction covers what the first photograph shows
+        camera = self._page.preview.first_camera()
+        if camera is not None and client.client_id == self._guarded.edit_lock.holder:
+            self.look_through(camera)
+
+    def _update_notices(self) -> None:
+        for number, client in self._server.get_clients().items():
+            holds = number == self._guarded.edit_lock.holder
+            notice = self._notices.get(number)
+            if holds and notice is not None:
+                notice.close()
+                self._notices.pop(number, None)
+            elif not holds and notice is None:
+                self._notices[number] = self._show_notice(client)
+
+    def _show_notice(self, client: viser.ClientHandle) -> Any:
+        modal = client.gui.add_modal("Open in another window")
+        with modal:
+            client.gui.add_markdown("This project is being edited in another window. This window is read-only.")
+            take = client.gui.add_button("Edit here instead")
+            take.on_click(lambda _: self._guarded.take_edit_lock(client.client_id))
+        return modal

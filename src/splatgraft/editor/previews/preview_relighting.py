@@ -1,0 +1,176 @@
+"""Relighting of the edited scene for previews: the result of the step `relight`, and faster drafts of it."""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from jaxtyping import Bool
+from torch import Tensor
+
+from splatgraft.core.composite import Composite
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.previews.draft_preview import (
+    OBJECT_BUDGET,
+    TARGET_BUDGET,
+    CoarseGaussians,
+    coarse_composite,
+    coarsen,
+    upsample_light,
+)
+from splatgraft.editor.session.edit_state import EditState
+from splatgraft.editor.session.scene_cache import SceneCache
+from splatgraft.relighting import Light, Relit, SourceScene, relight
+from splatgraft.relighting.gain_transfer import relight_by_gain
+from splatgraft.runtime.memo import Memo
+
+
+class PreviewRelighting:
+    """Relit scenes of one project; intermediate results are memoised by their inputs."""
+
+    def __init__(self, scenes: SceneCache) -> None:
+        """Start with empty memos."""
+        self._scenes = scenes
+        self._relight_memo, self._draft_memo = Memo(), Memo()
+        self._memo = Memo()
+        self.lock = threading.RLock()
+        """Held while a memoised result is computed, so that two threads do not compute it twice."""
+
+    def composite(self, state: EditState) -> Composite:
+        """The target with the placed objects; the same object for the same edits.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        inputs = (self._scenes.gaussians(self._scenes.files.target_scene), state.objects, state.erased)
+        return self._memo.get("composite", inputs, lambda: self._scenes.composite(state))
+
+    def is_relit(self, state: EditState) -> bool:
+        """Whether the relit scene of this state is available without the physical light transfer."""
+        return not self._scenes.files.transfers_light or self._memo.peek("relit", self._inputs(state)) is not None
+
+    def relit(self, state: EditState) -> Relit:
+        """The layers of the full light transfer of this state.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        return self._make_once("relit", state, self._relight)
+
+    def draft(self, state: EditState) -> Relit:
+        """A draft of the light transfer: shadow edges are coarse, and the first draft leaves out the source's light.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        return self._make_once("draft", state, self._draft)
+
+    def best_available(self, state: EditState) -> Relit:
+        """The full transfer where it is memoised, else a draft.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        return self.relit(state) if self.is_relit(state) else self.draft(state)
+
+    def scene(self, state: EditState, *, draft: bool = False) -> Gaussians:
+        """The scene that the step `relight` writes, or a draft of it.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        composite, light_mode = self.composite(state), self._scenes.files.light_mode
+        if light_mode == "off":
+            return self.pasted(composite)[0]
+        if light_mode == "gain":
+            return self._memo.get("gain adjusted", (composite,), lambda: self._gain_adjusted(composite, state))
+        relit = self.best_available(state) if draft else self.relit(state)
+        return self._memo.get("scene", (relit, state.weights), lambda: relit.bake(state.weights)[0])
+
+    def pasted(self, composite: Composite) -> tuple[Gaussians, Bool[Tensor, "n"]]:
+        """The scene that the step `compose` writes, and which Gaussians belong to objects."""
+        return self._memo.get("pasted", (composite,), composite.bake)
+
+    def light_mode_note(self) -> str:
+        """What the preview `Light transfer` shows where project.toml selects no physical transfer; else empty."""
+        light_mode = self._scenes.files.light_mode
+        described = {"gain": "exposure and white balance of the object alone", "off": "nothing: the object as captured"}
+        return (
+            ""
+            if light_mode == "transfer"
+            else f"{described[light_mode]}, as set in project.toml ([relight] light = {light_mode})"
+        )
+
+    def _gain_adjusted(self, composite: Composite, state: EditState) -> Gaussians:
+        cameras, sources = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.source_scenes(state)
+        adjusted, _ = relight_by_gain(composite, cameras, sources=sources)
+        return adjusted.bake()[0]
+
+    def _make_once(self, name: str, state: EditState, make: Callable[[EditState], Relit]) -> Relit:
+        inputs = self._inputs(state)
+        # a memoised result must not wait for a computation in another thread
+        found = self._memo.peek(name, inputs)
+        if found is None:
+            with self.lock:
+                found = self._memo.get(name, inputs, lambda: make(state))
+        return found
+
+    def _inputs(self, state: EditState) -> tuple[Any, ...]:
+        return (self.composite(state), state.light, repr(self._scenes.files.relight_options))
+
+    def _relight(self, state: EditState) -> Relit:
+        composite, sources = self.composite(state), self._scenes.source_scenes(state)
+        draft: Relit | None = self._memo.peek("draft", self._inputs(state))
+        if state.light is not None or draft is None or draft.light is None or _is_large(composite):
+            return self._relight_composite(composite, sources, light=state.light)
+        # a draft that used all Gaussians estimated the same light as the step, at the same place
+        relit = self._relight_composite(composite, sources, light=draft.light)
+        return replace(relit, report=(*draft.report[:1], *relit.report[1:]))
+
+    def _draft(self, state: EditState) -> Relit:
+        composite, sources = self.composite(state), self._scenes.source_scenes(state)
+        if not self._memo.has("relit"):
+            # analysing the source scene takes half of the time of the first result
+            sources = [None] * len(sources)
+        if not _is_large(composite):
+            return self._relight_composite(composite, sources, light=state.light, is_draft=True)
+        target = self._coarse_target(composite)
+        objects = [self._coarse_object(i, one.gaussians) for i, one in enumerate(composite.objects)]
+        coarse = coarse_composite(composite, target, objects)
+        coarse_sources = [None if source is None else self._coarse_source(source) for source in sources]
+        relit = self._relight_composite(coarse, coarse_sources, light=state.light, is_draft=True)
+        return upsample_light(relit, composite, [target, *objects])
+
+    def _relight_composite(
+        self,
+        composite: Composite,
+        sources: Sequence[SourceScene | None],
+        *,
+        light: Light | None,
+        is_draft: bool = False,
+    ) -> Relit:
+        cameras, options = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.files.relight_options
+        options = replace(options, most_added=0.0) if is_draft else options
+        full_target = self._scenes.gaussians(self._scenes.files.target_scene)
+        memo = self._relight_memo if composite.target is full_target else self._draft_memo
+        return relight(composite, cameras, sources=sources, light=light, options=options, cache=memo)
+
+    def _coarse_target(self, composite: Composite) -> CoarseGaussians:
+        def make() -> CoarseGaussians:
+            return coarsen(composite.target.select(~composite.erased), TARGET_BUDGET)
+
+        return self._memo.get("coarse target", (composite.target, composite.erased), make)
+
+    def _coarse_object(self, index: int, gaussians: Gaussians) -> CoarseGaussians:
+        return self._memo.get(f"coarse object {index}", (gaussians,), lambda: coarsen(gaussians, OBJECT_BUDGET))
+
+    def _coarse_source(self, source: SourceScene) -> SourceScene:
+        def make() -> SourceScene:
+            return replace(source, gaussians=coarsen(source.gaussians, TARGET_BUDGET).gaussians)
+
+        return self._memo.get("coarse source", (source,), make)
+
+
+def _is_large(composite: Composite) -> bool:
+    objects = [one.gaussians.count for one in composite.objects]
+    return composite.kept_count > TARGET_BUDGET or max(objects, default=0) > OBJECT_BUDGET

@@ -1,0 +1,147 @@
+"""Operations on an object's placement: drop to the surface, align up, rescale, suggest a place, duplicate beside."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.composition import ObjectBase, PlaceOptions, RestOptions, object_base, place_object, rest_on_surface
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.similarity import Similarity
+
+
+@dataclass(frozen=True)
+class PlaceableObject:
+    """An object with its base and the capture that it comes from."""
+
+    gaussians: Gaussians
+    """In the frame of its own capture."""
+    base: ObjectBase
+    """Its base: lowest point, up and size, in the same frame."""
+    cameras: Cameras
+    """Cameras of its capture; those of the target where the object was added from a file."""
+    surroundings: Gaussians | None
+    """Its capture without the object; None where not known."""
+
+
+def placeable_object(gaussians: Gaussians, cameras: Cameras, surroundings: Gaussians | None) -> PlaceableObject:
+    """Estimate an object's base.
+
+    Raises:
+        ValueError: If the object is empty.
+    """
+    base = object_base(gaussians, up=estimate_up(cameras), surroundings=surroundings)
+    return PlaceableObject(gaussians, base, cameras, surroundings)
+
+
+def suggest_placement(
+    target: Gaussians, item: PlaceableObject, cameras: Cameras, options: PlaceOptions = PlaceOptions()
+) -> Similarity:
+    """A visible, level place at a plausible size, found as by `compose` with `options`.
+
+    Raises:
+        ValueError: If there is no such place.
+    """
+    both = (cameras, item.cameras)
+    placed = place_object(target, item.gaussians, cameras=both, surroundings=item.surroundings, options=options)
+    return placed.target_from_object
+
+
+def drop_to_surface(
+    target: Gaussians, item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]
+) -> Similarity:
+    """Move vertically onto the surface and align with it; scale and rotation about the vertical stay.
+
+    Raises:
+        ValueError: If nothing level lies below.
+    """
+    base_point = target_from_object.points(item.base.point)
+    # start at half the object's height: a sunk object is lifted, and surfaces above the object are ignored
+    above = base_point + 0.5 * target_from_object.scale * item.base.height * torch.nn.functional.normalize(up, dim=0)
+    straight, support = rest_on_surface(
+        target, item.base, point=above, up=up, options=RestOptions(scale=target_from_object.scale)
+    )
+    twist = _twist_about(target_from_object.rotation @ straight.rotation.T, support.normal)
+    options = RestOptions(scale=target_from_object.scale, yaw_deg=math.degrees(twist))
+    return rest_on_surface(target, item.base, point=above, up=up, options=options)[0]
+
+
+def align_up(item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]) -> Similarity:
+    """Apply the smallest rotation that aligns the object's up with `up`; the base point stays fixed."""
+    up = torch.nn.functional.normalize(up, dim=0)
+    rotation = _shortest_rotation(target_from_object.rotation @ item.base.up, up) @ target_from_object.rotation
+    return _about_base_point(item, target_from_object, rotation=rotation, scale=target_from_object.scale)
+
+
+def rescale(item: PlaceableObject, target_from_object: Similarity, scale: float) -> Similarity:
+    """Set the scale; the base point stays fixed."""
+    return _about_base_point(item, target_from_object, rotation=target_from_object.rotation, scale=scale)
+
+
+def plausible_scale(
+    target: Gaussians, item: PlaceableObject, target_from_object: Similarity, cameras: Cameras
+) -> float:
+    """The scale at which the object fills the default share of the views at its place.
+
+    Raises:
+        ValueError: If nothing level lies below.
+    """
+    x, y, z = (
+        target_from_object.points(item.base.point)
+        + 0.25 * target_from_object.scale * item.base.height * estimate_up(cameras)
+    ).tolist()
+    options = PlaceOptions(point=(x, y, z), yaw_deg=0.0)
+    return place_object(
+        target, item.gaussians, cameras=(cameras, item.cameras), surroundings=item.surroundings, options=options
+    ).target_from_object.scale
+
+
+def place_beside(item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]) -> Similarity:
+    """The same placement, shifted horizontally by three base radii."""
+    up = torch.nn.functional.normalize(up, dim=0)
+    axis = torch.eye(3)[int(up.abs().argmin())]
+    across = torch.nn.functional.normalize(axis - (axis @ up) * up, dim=0)
+    step = 3.0 * target_from_object.scale * item.base.radius * across
+    return Similarity(
+        scale=target_from_object.scale,
+        rotation=target_from_object.rotation,
+        translation=target_from_object.translation + step,
+    )
+
+
+def _about_base_point(
+    item: PlaceableObject, target_from_object: Similarity, *, rotation: Float[Tensor, "3 3"], scale: float
+) -> Similarity:
+    base_point = target_from_object.points(item.base.point)
+    return Similarity(scale=scale, rotation=rotation, translation=base_point - scale * rotation @ item.base.point)
+
+
+def _twist_about(rotation: Float[Tensor, "3 3"], axis: Float[Tensor, "3"]) -> float:
+    """The twist angle of `rotation` about unit `axis` (swing-twist decomposition), radians."""
+    skew = torch.stack(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    trace = rotation.diagonal().sum()
+    # the quaternion is (1 + trace, skew) up to a factor, which gives the tangent of half the twist angle
+    return 2 * math.atan2(float(skew @ axis), 1 + float(trace))
+
+
+def _shortest_rotation(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    axis = torch.linalg.cross(start, end)
+    sine, cosine = float(axis.norm()), float(start @ end)
+    if sine < 1e-6:
+        if cosine > 0:
+            return torch.eye(3)
+        helper = torch.eye(3)[int(start.abs().argmin())]
+        axis, sine = torch.linalg.cross(start, helper), 0.0
+    unit = torch.nn.functional.normalize(axis, dim=0).double()
+    return torch.linalg.matrix_exp(math.atan2(sine, cosine) * _cross_matrix(unit)).float()
+
+
+def _cross_matrix(axis: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    x, y, z = axis.tolist()
+    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)

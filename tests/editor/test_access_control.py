@@ -1,0 +1,64 @@
+"""Access control of requests, and the edit lock."""
+
+import pytest
+
+from splatgraft.editor.access.access_control import COOKIE, AccessControl
+from splatgraft.editor.access.edit_lock import EditLock
+
+HERE = {"Host": "127.0.0.1:8080"}
+PAGE = HERE | {"Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
+
+
+def test_the_page_s_own_requests_are_accepted() -> None:
+    for headers in (HERE, PAGE, {"Host": "localhost:8080"}, {"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}):
+        assert AccessControl().check(headers, "/").allowed, headers
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        HERE | {"Origin": "http://evil.example"},
+        HERE | {"Origin": "null"},
+        HERE | {"Origin": "http://127.0.0.1:9999"},
+        PAGE | {"Origin": "http://evil.example"},
+        HERE | {"Upgrade": "websocket"},
+        # DNS rebinding: a foreign name that resolves to this machine
+        {"Host": "evil.example:8080"},
+        {"Host": "evil.example:8080", "Origin": "http://evil.example:8080"},
+        {"Host": "127.0.0.1:8080, evil.example"},
+        {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080, http://evil.example"},
+        {},
+    ],
+)
+def test_foreign_requests_are_refused(headers: dict[str, str]) -> None:
+    assert not AccessControl().check(headers, "/").allowed
+
+
+def test_other_machines_need_the_token_and_keep_it_as_a_cookie() -> None:
+    access = AccessControl(hosts=(), token="secret")
+    remote = {"Host": "studio.lan:8080"}
+    assert not access.check(remote, "/").allowed
+    assert not access.check(remote, "/?token=other").allowed
+    decision = access.check(remote, "/?token=secret")
+    assert decision.allowed
+    assert decision.cookie is not None
+    assert "HttpOnly" in decision.cookie
+    assert access.check(remote | {"Cookie": f"a=b; {COOKIE}=secret"}, "/assets/x.js").allowed
+    assert not access.check(remote | {"Cookie": f"{COOKIE}=other"}, "/").allowed
+    assert not access.check(remote | {"Origin": "http://evil.example", "Cookie": f"{COOKIE}=secret"}, "/").allowed
+
+
+def test_a_server_beyond_loopback_needs_a_token() -> None:
+    with pytest.raises(ValueError, match="token"):
+        AccessControl(hosts=())
+
+
+def test_one_window_holds_the_edit_lock_until_it_closes_or_another_takes_it() -> None:
+    lock = EditLock().with_window(1).with_window(2).with_window(3)
+    assert lock.holder == 1
+    assert lock.without_window(2).holder == 1
+    assert lock.without_window(1).holder == 2
+    assert lock.held_by(3).holder == 3
+    assert lock.held_by(9).holder == 1
+    assert lock.held_by(3).without_window(3).holder == 1
+    assert EditLock().with_window(1).without_window(1) == EditLock()
