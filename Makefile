@@ -1,6 +1,6 @@
 # make install: the environment in .venv; make demo: the whole job on shipped data; make test: all checks;
 # make blender: Blender as a Python module in .venv-blender, for `splatgraft synth --blender-python`;
-# make browser: Chromium, for the editor's tests; make docs: the documentation site in build/site.
+# make browser: Chromium, for the editor's tests.
 SHELL := /bin/bash
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
@@ -8,7 +8,7 @@ STAMP := .venv/.installed
 # threads of torch and numba that spin while they wait take the cores from each other
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: install demo test docs blender browser clean
+.PHONY: install demo test blender browser clean
 .DEFAULT_GOAL := install
 
 install: $(STAMP)
@@ -40,7 +40,8 @@ browser:
 test:
 	.ci/run
 
-# strict: a broken link, a missing page or an unexplained message ends it; mkdocs comes with the extra `docs`
+# the documentation site in build/site; strict: a broken link, a missing page or an unexplained message ends it
+.PHONY: docs
 docs: install
 	@$(BIN)/python -c 'import mkdocs, mkdocstrings' 2>/dev/null || \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

@@ -7,7 +7,7 @@ end for any text.
 
 import ast
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -35,13 +35,28 @@ def on_pre_build(config: MkDocsConfig) -> None:
 def raised_messages() -> Iterator[tuple[str, str]]:
     """Every message with words of its own, and the file that has it."""
     for path in sorted((ROOT / "src").rglob("*.py")):
-        for call in ast.walk(ast.parse(path.read_text())):
-            if isinstance(call, ast.Call) and getattr(call.func, "id", "") in _MAKERS and call.args:
-                whole = _template(call.args[0])
-                inner = map(_template, ast.walk(call.args[0])) if whole == "…" else ()
-                for text in (whole, *(text for text in inner if "expected" in text)):
-                    if _WORDLESS.sub("", text):
-                        yield text, path.relative_to(ROOT / "src/splatgraft").as_posix()
+        for scope in ast.walk(ast.parse(path.read_text())):
+            if isinstance(scope, ast.FunctionDef):
+                for text in _messages(scope):
+                    yield text, path.relative_to(ROOT / "src/splatgraft").as_posix()
+
+
+def _messages(function: ast.FunctionDef) -> Iterator[str]:
+    nodes = list(ast.walk(function))
+    texts = {
+        target.id: node.value
+        for node in nodes
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.JoinedStr)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    }
+    for call in nodes:
+        if isinstance(call, ast.Call) and getattr(call.func, "id", "") in _MAKERS and call.args:
+            whole = _template(call.args[0], texts)
+            inner = (_template(node, {}) for node in ast.walk(call.args[0])) if whole == "…" else ()
+            for text in (whole, *(text for text in inner if "expected" in text)):
+                if _WORDLESS.sub("", text):
+                    yield text
 
 
 def page_patterns() -> list[str]:
@@ -50,14 +65,16 @@ def page_patterns() -> list[str]:
     return [pattern for cell in first_cells for pattern in re.findall(r"`([^`]+)`", cell)]
 
 
-def _template(node: ast.AST) -> str:
-    """The text of a string expression, with "…" for what is only known when it runs."""
+def _template(node: ast.AST, texts: Mapping[str, ast.expr]) -> str:
+    """The text of a string expression, with "…" for what is known only when it runs; `texts` are local variables."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value.replace("`", "'")
     if isinstance(node, ast.JoinedStr):
-        return "".join(map(_template, node.values))
+        return "".join(_template(part, texts) for part in node.values)
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
-        return _template(node.left) + _template(node.right)
+        return _template(node.left, texts) + _template(node.right, texts)
+    if isinstance(node, ast.FormattedValue) and isinstance(node.value, ast.Name) and node.value.id in texts:
+        return _template(texts[node.value.id], {})
     return "…"
 
 

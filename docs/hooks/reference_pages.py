@@ -20,19 +20,26 @@ from splatgraft.cli import COMMANDS, module_of
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOT_PAGES = {f"{name.lower()}.md": f"{name}.md" for name in ("CHANGELOG", "ARCHITECTURE", "CONTRIBUTING")}
-_LINK_INTO_DOCS = re.compile(r"\]\(docs/")
+_STACKED = '<div class="stacked" markdown>\n'
 _END_OF_HELP = re.compile(r"\s*\((required|default: (?P<default>.*)|optional|repeatable)\)\s*$", re.DOTALL)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages."""
-    pages = {name: _LINK_INTO_DOCS.sub("](", (ROOT / path).read_text()) for name, path in ROOT_PAGES.items()}
+    pages = {name: _root_page(ROOT / path) for name, path in ROOT_PAGES.items()}
     pages["reference/commands.md"] = "\n".join(_commands_page())
     pages["reference/project.md"] = "\n".join(_project_page())
     pages["reference/api.md"] = "\n".join(_api_page())
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
     return files
+
+
+def _root_page(path: Path) -> str:
+    text = path.read_text().replace("](docs/", "](")
+    for name, target in ROOT_PAGES.items():
+        text = text.replace(f"]({target})", f"]({name})")
+    return text
 
 
 def _commands_page() -> Iterator[str]:
@@ -72,10 +79,11 @@ def _parser_section(parser: argparse.ArgumentParser, purpose: str) -> Iterator[s
     nested = [action for action in actions if isinstance(action.choices, dict)]
     plain = [action for action in actions if action not in nested]
     if plain:
+        yield _STACKED
         yield "| option | value | default | meaning |\n| --- | --- | --- | --- |"
         for action in plain:
             yield _option_row(action)
-        yield ""
+        yield "\n</div>\n"
     for action in nested:
         for name, inner in (action.choices or {}).items():
             yield f"\n### {inner.prog.strip() or name}\n"
@@ -121,10 +129,12 @@ def _tables() -> Sequence[Any]:
 def _key_table(keys: Sequence[Any]) -> Iterator[str]:
     if not keys:
         return
+    yield _STACKED
     yield "| key | type | default | meaning |\n| --- | --- | --- | --- |"
     for key in keys:
         cells = (f"`{key.name}`", key.type, f"`{key.default}`" if key.default != "none" else "", key.meaning)
         yield "| " + " | ".join(_cell(" ".join(str(cell).split())) for cell in cells) + " |"
+    yield "\n</div>\n"
 
 
 def _api_page() -> Iterator[str]:
