@@ -60,5 +60,13 @@ test:
 test-fast: dev
 	$(BIN)/python -m pytest -q -m "not browser and not slow"
 
+# the documentation site in build/site; strict: a broken link, a missing page or an unexplained message ends it
+.PHONY: docs
+docs: dev
+	@$(BIN)/python -c 'import mkdocs, mkdocstrings' 2>/dev/null || \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --quiet --strict
+	@echo "build/site/index.html"
+
 clean:
 	rm -rf demo build .pytest_cache .ruff_cache .hypothesis

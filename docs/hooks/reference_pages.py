@@ -1,0 +1,163 @@
+"""Pages of the site that are made from the code: commands, keys of project.toml, the Python API; and the root's pages.
+
+mkdocs calls `on_files` once per build.
+"""
+
+import argparse
+import importlib
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+import splatgraft
+from splatgraft.cli import COMMANDS, module_of
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOT_PAGES = {f"{name.lower()}.md": f"{name}.md" for name in ("CHANGELOG", "ARCHITECTURE", "CONTRIBUTING")}
+_STACKED = '<div class="stacked" markdown>\n'
+_END_OF_HELP = re.compile(r"\s*\((required|default: (?P<default>.*)|optional|repeatable)\)\s*$", re.DOTALL)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages."""
+    pages = {name: _root_page(ROOT / path) for name, path in ROOT_PAGES.items()}
+    pages["reference/commands.md"] = "\n".join(_commands_page())
+    pages["reference/project.md"] = "\n".join(_project_page())
+    pages["reference/api.md"] = "\n".join(_api_page())
+    for name, text in pages.items():
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def _root_page(path: Path) -> str:
+    text = path.read_text().replace("](docs/", "](")
+    for name, target in ROOT_PAGES.items():
+        text = text.replace(f"]({target})", f"]({name})")
+    return text
+
+
+def _commands_page() -> Iterator[str]:
+    yield "# Commands\n"
+    yield "Made from the code of each command; `splatgraft COMMAND --help` prints the same.\n"
+    yield "| command | purpose |\n| --- | --- |"
+    for name, purpose in COMMANDS.items():
+        yield f"| [`{name}`](#{_anchor(name)}) | {purpose} |"
+    yield (
+        "\n`splatgraft COMMAND project.toml` runs the project up to that step. `--debug`, with any command, shows the"
+        " traceback of an error. The exit code is 0 after success, 2 after an error in the input, 130 after Ctrl-C."
+    )
+    for name, purpose in COMMANDS.items():
+        yield f"\n## splatgraft {name} {{#{_anchor(name)}}}\n"
+        yield from _parser_section(_parser(name), purpose)
+
+
+def _parser(name: str) -> argparse.ArgumentParser:
+    module = importlib.import_module(module_of(name))
+    with warnings.catch_warnings():
+        # tyro has no other public way to its options; constraints.txt pins its version
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return tyro.extras.get_parser(
+            module.COMMAND,
+            prog=f"splatgraft {name}",
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+        )
+
+
+def _anchor(name: str) -> str:
+    return "command-" + name.replace(" ", "-")
+
+
+def _parser_section(parser: argparse.ArgumentParser, purpose: str) -> Iterator[str]:
+    yield (parser.description or purpose[:1].upper() + purpose[1:] + ".").strip() + "\n"
+    actions = [action for action in parser._actions if action.dest != "help"]
+    nested = [action for action in actions if isinstance(action.choices, dict)]
+    plain = [action for action in actions if action not in nested]
+    if plain:
+        yield _STACKED
+        yield "| option | value | default | meaning |\n| --- | --- | --- | --- |"
+        for action in plain:
+            yield _option_row(action)
+        yield "\n</div>\n"
+    for action in nested:
+        for name, inner in (action.choices or {}).items():
+            yield f"\n### {inner.prog.strip() or name}\n"
+            yield from _parser_section(inner, name)
+
+
+def _option_row(action: argparse.Action) -> str:
+    text = " ".join(str(action.help or "").split())
+    default = "required" if action.required else ""
+    if found := _END_OF_HELP.search(text):
+        text = text[: found.start()]
+        default = f"`{found['default']}`" if found["default"] else default
+    name = f"`{action.option_strings[-1]}`" if action.option_strings else f"`{action.metavar}` (position)"
+    value = "flag" if action.nargs == 0 else f"`{action.metavar}`"
+    return "| " + " | ".join(_cell(part) for part in (name, value, default, text)) + " |"
+
+
+def _cell(text: str) -> str:
+    return text.replace("{None}|", "").replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
+
+
+def _project_page() -> Iterator[str]:
+    yield "# project.toml\n"
+    yield (
+        "Made from the code. A project file has the tables `[source]` and `[target]`, and one optional table per step."
+        " Paths are relative to the file. The keys of a step are the options of its command, with `_` for `-`;"
+        " `[source.reconstruct]` and `[target.reconstruct]` apply to one capture alone.\n"
+    )
+    for table in _tables():
+        yield f"\n## [{table.name}] {{#{table.name}}}\n\n{table.meaning}\n"
+        yield from _key_table(table.keys)
+        for variant in table.variants:
+            yield f"\n### {variant.name} {{#{table.name}-{variant.name}}}\n\n{variant.meaning}\n"
+            yield from _key_table(variant.keys)
+
+
+def _tables() -> Sequence[Any]:
+    from splatgraft.workflow.project_reference import project_keys
+
+    return project_keys()
+
+
+def _key_table(keys: Sequence[Any]) -> Iterator[str]:
+    if not keys:
+        return
+    yield _STACKED
+    yield "| key | type | default | meaning |\n| --- | --- | --- | --- |"
+    for key in keys:
+        cells = (f"`{key.name}`", key.type, f"`{key.default}`" if key.default != "none" else "", key.meaning)
+        yield "| " + " | ".join(_cell(" ".join(str(cell).split())) for cell in cells) + " |"
+    yield "\n</div>\n"
+
+
+def _api_page() -> Iterator[str]:
+    yield "# Python API\n"
+    yield (
+        "Values are frozen dataclasses of tensors; stages are functions from values to values. Quantities are in"
+        " radians, world units, sRGB in [0, 1], OpenCV camera axes and wxyz quaternions unless a name says otherwise.\n"
+    )
+    yield "The scripts in `examples/` use the API from capture to result.\n"
+    if getattr(splatgraft, "__all__", None):
+        yield from _exports(splatgraft.__name__)
+        return
+    stages = ("capture", "reconstruction", "segmentation", "composition", "relighting", "rendering")
+    for name in (*stages, "harmonization", "consolidation", "evaluation", "formats"):
+        yield f"\n## splatgraft.{name}\n"
+        yield from _exports(f"splatgraft.{name}")
+
+
+def _exports(module_name: str) -> Iterator[str]:
+    """A mkdocstrings directive for each public name, at the place of its definition."""
+    module = importlib.import_module(module_name)
+    for name in sorted(getattr(module, "__all__", ()), key=str.lower):
+        value = getattr(module, name)
+        home, defined = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
+        if home is not None and defined is not None and home.startswith("splatgraft"):
+            yield f"\n::: {home}.{defined}\n"
