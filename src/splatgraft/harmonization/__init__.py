@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from splatgraft.harmonization.compact.factory import make_compact
 from splatgraft.harmonization.flux.factory import make_flux
+from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize
 from splatgraft.harmonization.inputs import render_views
 from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
 from splatgraft.harmonization.keep_prior import KeepPrior
@@ -15,9 +16,11 @@ __all__ = [
     "HARMONIZERS",
     "BatchHarmonizer",
     "Harmonized",
+    "HarmonizedViews",
     "Harmonizer",
     "HarmonizerInputs",
     "HarmonizerOptions",
+    "harmonize",
     "make_harmonizer",
     "render_views",
 ]

@@ -31,7 +31,7 @@ _AS_IT_IS = ((1.0, 1.0),)
 
 def reconstruct(
     capture: PosedImages,
-    options: ReconstructOptions,
+    options: ReconstructOptions = ReconstructOptions(),
     *,
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
