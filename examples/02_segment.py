@@ -14,7 +14,8 @@ def main() -> None:
     cut = sg.segment(scene, capture, solidify=sg.SolidifyOptions(iterations=40))
     print(f"the vase: {cut.object.count} Gaussians; its surroundings: {cut.surroundings.count}")
     # the share of each Gaussian's blending weight that falls inside the masks
-    print(f"mean feature inside {cut.feature[cut.selection].mean():.2f}, outside {cut.feature[~cut.selection].mean():.2f}")
+    inside, outside = (float(cut.feature[which].mean()) for which in (cut.selection, ~cut.selection))
+    print(f"mean feature of the vase {inside:.2f}, of the rest {outside:.2f}")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ def main() -> None:
     scene, is_object = composite.bake()
     prior, _ = relit.bake()
     test = sg.held_out(len(target))
-    cameras = target.select(~test).cameras
+    cameras = target.select(~test).cameras[::3]
     views = sg.render_views(scene, is_object, cameras, prior=prior, prior_confidence=relit.confidence)
     harmonized = sg.harmonize(views, "compact")
     result = sg.consolidate(prior, cameras, harmonized.images, weights=harmonized.confidence)

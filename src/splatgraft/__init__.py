@@ -62,6 +62,7 @@ if TYPE_CHECKING:
         select_object,
         solidify_object,
     )
+    from splatgraft.workflow.projects import run_project, stale_steps
 
 __version__ = "0.1.0"
 
@@ -114,11 +115,13 @@ __all__ = [
     "relight",
     "render",
     "render_views",
+    "run_project",
     "save",
     "save_image",
     "segment",
     "select_object",
     "solidify_object",
+    "stale_steps",
     "true_views",
 ]
 
@@ -171,11 +174,13 @@ _SOURCES = {
     "relight": "relighting.relight",
     "render": "rendering.render",
     "render_views": "harmonization.render_views",
+    "run_project": "workflow.projects.run_project",
     "save": "formats.write_gaussians",
     "save_image": "core.images.write_image",
     "segment": "segmentation.segment",
     "select_object": "segmentation.select_object",
     "solidify_object": "segmentation.solidify_object",
+    "stale_steps": "workflow.projects.stale_steps",
     "true_views": "evaluation.true_views",
 }
 """Where each name of `__all__` is defined, below splatgraft; the imports above are for type checkers."""

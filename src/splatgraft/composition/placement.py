@@ -54,12 +54,21 @@ def place_object(
     surroundings: Gaussians | None = None,
     options: PlaceOptions = PlaceOptions(),
 ) -> Placed:
-    """Stand `object_` upright in `target`; `cameras` are the target's and the source's, in this order.
+    """Find a placement that rests an object upright on a surface of a target scene.
 
-    `surroundings` is the source without the object: what it stood on tells where its foot is. For a further object,
-    give as `target` the scene baked with the objects before.
+    Args:
+        target: The scene that receives the object. For a further object: the composite so far, merged.
+        object_: The object's Gaussians, in the frame of the capture that it comes from.
+        cameras: The target's cameras and the source's, in this order; from them follow the up directions, the size
+            of the object in the picture and which sides of it were seen.
+        surroundings: The source without the object, whose surface below the object gives the object's base.
+        options: Point, scale and turn where they are not to be found.
 
-    Raises: ValueError where the object is empty or there is nothing level to stand on.
+    Returns:
+        The placement, the surface that it rests on, and warnings.
+
+    Raises:
+        ValueError: The object is empty, or there is no level surface.
     """
     target_cameras, source_cameras = cameras
     up = estimate_up(target_cameras)

@@ -39,10 +39,17 @@ HARMONIZERS: dict[str, Callable[[HarmonizerOptions], Harmonizer]] = {
 
 
 def make_harmonizer(name: str, options: HarmonizerOptions | None = None) -> Harmonizer:
-    """The harmoniser called `name`.
+    """Make a harmoniser.
 
-    Raises: ValueError where there is none of that name (the message lists those there are), or where its weights or
-    packages are missing.
+    Args:
+        name: A key of `HARMONIZERS`.
+        options: Weights, device and the method's own settings.
+
+    Returns:
+        The harmoniser, with its weights loaded.
+
+    Raises:
+        ValueError: There is no method of that name, or its weights or packages are missing.
     """
     if name not in HARMONIZERS:
         raise ValueError(f"harmonizer: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
