@@ -1,24 +1,21 @@
-"""2D masks are lifted to the Gaussians of an object, which is then taken out of its scene."""
+"""Take an object out of its scene by 2D masks of it."""
 
 from pathlib import Path
 
-from splatgraft.formats import read_capture
-from splatgraft.reconstruction import ReconstructOptions, reconstruct
-from splatgraft.segmentation import lift_masks, select_object
+import splatgraft as sg
 
 DATA = Path(__file__).parents[1] / "data"
 
 
 def main() -> None:
-    capture = read_capture(DATA / "vase").resized(0.25)
-    scene = reconstruct(capture, ReconstructOptions(iterations=60, budget=4000))
-    masks = [mask for index in range(len(capture)) if (mask := capture.mask(index)) is not None]
+    capture = sg.read_capture(DATA / "vase").resized(0.25)
+    scene = sg.reconstruct(capture, sg.ReconstructOptions(iterations=60, budget=4000))
 
-    # one number per Gaussian: the share of what it contributes to pictures that falls inside the masks
-    feature = lift_masks(scene, capture.cameras, masks)
-    selection = select_object(scene, feature)
-    vase, stage = scene.select(selection), scene.select(~selection)
-    print(f"the vase: {vase.count} Gaussians; the stage without it: {stage.count}")
+    cut = sg.segment(scene, capture, solidify=sg.SolidifyOptions(iterations=40))
+    print(f"the vase: {cut.object.count} Gaussians; its surroundings: {cut.surroundings.count}")
+    # the share of each Gaussian's blending weight that falls inside the masks
+    inside, outside = (float(cut.feature[which].mean()) for which in (cut.selection, ~cut.selection))
+    print(f"mean feature of the vase {inside:.2f}, of the rest {outside:.2f}")
 
 
 if __name__ == "__main__":

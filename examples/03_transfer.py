@@ -1,63 +1,38 @@
-"""An object is placed in another scene, lit by it, and all views are made to agree: the whole transfer as values."""
+"""The whole transfer: an object of one capture in another one's scene, lit by it, in all views, and measured.
+
+The benchmark scene has a ground truth, and both of its captures share world coordinates. For captures of your own,
+`sg.place_object` finds a place (05_several_objects.py).
+"""
 
 from pathlib import Path
 
-from splatgraft.composition import compose
-from splatgraft.consolidation import consolidate
-from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.posed_images import PosedImages
-from splatgraft.core.similarity import Similarity
-from splatgraft.formats import read_capture
-from splatgraft.harmonization import HarmonizerInputs, make_harmonizer
-from splatgraft.reconstruction import ReconstructOptions, reconstruct
-from splatgraft.relighting import SourceScene, relight
-from splatgraft.rendering import render
-from splatgraft.segmentation import lift_masks, select_object
+import splatgraft as sg
 
-DATA = Path(__file__).parents[1] / "data"
+DATA = Path(__file__).parents[1] / "data" / "benchmark" / "terrace"
+SHORT = sg.ReconstructOptions(iterations=60, budget=4000)
 
 
 def main() -> None:
-    vase_capture, room_capture = (read_capture(DATA / name).resized(0.25) for name in ("vase", "room"))
-    options = ReconstructOptions(iterations=60, budget=4000)
-    stage, room = reconstruct(vase_capture, options), reconstruct(room_capture, options)
-    masks = [mask for index in range(len(vase_capture)) if (mask := vase_capture.mask(index)) is not None]
-    selection = select_object(stage, lift_masks(stage, vase_capture.cameras, masks))
+    source, target, truth = (sg.read_capture(DATA / name).resized(0.5) for name in ("source", "target", "ground_truth"))
+    source_scene, target_scene = sg.reconstruct(source, SHORT), sg.reconstruct(target, SHORT)
+    cut = sg.segment(source_scene, source, solidify=sg.SolidifyOptions(iterations=40))
 
-    # these two captures share world coordinates; otherwise splatgraft.composition.place_object finds a place
-    composite = compose(room, [stage.select(selection)], target_from_objects=[Similarity.identity()])
-    source = SourceScene(stage.select(~selection), vase_capture.cameras)
-    relit = relight(composite, room_capture.cameras, sources=[source])
+    composite = sg.compose(target_scene, [cut.object], target_from_objects=[sg.Similarity.identity()])
+    relit = sg.relight(composite, target.cameras, sources=[sg.SourceScene(cut.surroundings, source.cameras)])
     print(*relit.report, sep="\n")
 
-    scene = relit.bake()
-    harmonizer = make_harmonizer("reinhard")
-    views = room_capture.cameras[[0, 9, 18, 27]]
-    images = [harmonizer.harmonize(view_of(scene, room, index, room_capture)).image for index in (0, 9, 18, 27)]
-    result = consolidate(scene, views, images)
-    changed = int((result.sh != scene.sh).flatten(1).any(1).sum())
-    print(f"{result.count} Gaussians, {changed} of another colour than before")
+    scene, is_object = composite.bake()
+    prior, _ = relit.bake()
+    test = sg.held_out(len(target))
+    cameras = target.select(~test).cameras[::3]
+    views = sg.render_views(scene, is_object, cameras, prior=prior, prior_confidence=relit.confidence)
+    harmonized = sg.harmonize(views, "compact")
+    result = sg.consolidate(prior, cameras, harmonized.images, weights=harmonized.confidence)
 
-
-def view_of(scene: Gaussians, room: Gaussians, index: int, capture: PosedImages) -> HarmonizerInputs:
-    """What a harmoniser is given of one view; here the light prior is also the composite."""
-    camera = capture.cameras[index]
-    drawn = render(scene, camera, outputs=frozenset({"color", "depth", "normal"}))
-    before = render(room, camera).color
-    assert drawn.color is not None
-    assert drawn.depth is not None
-    assert drawn.normal is not None
-    assert before is not None
-    mask = (drawn.color - before).abs().amax(-1)[0] > 0.1
-    color = drawn.color[0].clamp(0, 1)
-    return HarmonizerInputs(
-        composite=color,
-        background=before[0].clamp(0, 1),
-        mask=mask.float(),
-        depth=drawn.depth[0],
-        normal=drawn.normal[0],
-        prior=color,
-    )
+    expected = sg.true_views(truth.select(test), target)
+    images, backgrounds = (list(sg.render(s, target.cameras[test]).color) for s in (result, target_scene))
+    metrics = sg.evaluate(images, expected, backgrounds=backgrounds)
+    print(f"{result.count} Gaussians; held-out views: {metrics['psnr']:.1f} dB, object {metrics['object_psnr']:.1f} dB")
 
 
 if __name__ == "__main__":

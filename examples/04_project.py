@@ -1,12 +1,9 @@
-"""A project from Python: the steps that `splatgraft run` does, one by one, and why each is stale or not."""
+"""A project from Python: run its steps up to one, and see which are stale and why."""
 
 import tempfile
 from pathlib import Path
 
-from splatgraft.project.record import why_stale
-from splatgraft.project.step import job_of, perform
-from splatgraft.runtime.console import Console
-from splatgraft.workflow.flow import read_flow
+import splatgraft as sg
 
 DATA = Path(__file__).parents[1] / "data"
 PROJECT = f"""
@@ -18,18 +15,21 @@ capture = {str(DATA / "room")!r}
 iterations = 40
 budget = 3000
 resolution = 0.25
+[segment]
+solidify = 40
 """
 
 
 def main() -> None:
-    folder = Path(tempfile.mkdtemp(prefix="splatgraft_"))
-    (folder / "project.toml").write_text(PROJECT)
-    flow = read_flow(folder)
-    for name, step in flow.up_to("segment").items():
-        print(f"{name}: {why_stale(job_of(step))}")
-        perform(step, Console(), name=name)
-        assert why_stale(job_of(step)) is None
-    print(f"the object: {flow.steps['segment'].out / 'object.ply'}")
+    project = Path(tempfile.mkdtemp(prefix="splatgraft_")) / "project.toml"
+    project.write_text(PROJECT)
+    folders = sg.run_project(project, to="segment")
+    print(f"the object: {sg.load(folders['segment'] / 'object.ply').count} Gaussians in {folders['segment']}")
+    print("still to do:", sg.stale_steps(project))
+
+    # an option was changed: what depends on it is stale, and the next run does it again
+    project.write_text(PROJECT.replace("solidify = 40", "solidify = 0"))
+    print("stale now:", sg.stale_steps(project)["segment"])
 
 
 if __name__ == "__main__":

@@ -1,3 +1,198 @@
-"""splatgraft: move an object from one 3D Gaussian Splatting capture into another and make the light agree."""
+"""Move an object from one 3D Gaussian Splatting capture into another, with consistent light.
+
+    import splatgraft as sg
+
+    source, target = sg.read_capture("vase"), sg.read_capture("room")
+    cut = sg.segment(sg.reconstruct(source), source)
+    composite = sg.compose(sg.reconstruct(target), [cut.object], target_from_objects=[sg.Similarity.identity()])
+    relit = sg.relight(composite, target.cameras, sources=[sg.SourceScene(cut.surroundings, source.cameras)])
+    scene, is_object = relit.bake()
+    sg.save("scene.ply", scene)
+
+Every name is loaded when it is first used: `import splatgraft` itself imports neither torch nor numba.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from splatgraft.composition import Placed, PlaceOptions, compose, place_object
+    from splatgraft.consolidation import ConsolidateOptions, consolidate
+    from splatgraft.core.cameras import Cameras, look_at, pinhole
+    from splatgraft.core.composite import Composite, PlacedObject
+    from splatgraft.core.gaussians import Gaussians
+    from splatgraft.core.images import read_rgb as load_image
+    from splatgraft.core.images import write_image as save_image
+    from splatgraft.core.posed_images import PosedImages, held_out
+    from splatgraft.core.similarity import Similarity
+    from splatgraft.evaluation import Truth, evaluate, true_views
+    from splatgraft.formats import read_cameras, read_capture
+    from splatgraft.formats import read_gaussians as load
+    from splatgraft.formats import write_gaussians as save
+    from splatgraft.harmonization import (
+        Harmonized,
+        HarmonizedViews,
+        Harmonizer,
+        HarmonizerInputs,
+        harmonize,
+        make_harmonizer,
+        render_views,
+    )
+    from splatgraft.reconstruction import ReconstructOptions, reconstruct
+    from splatgraft.relighting import (
+        LayerWeights,
+        Light,
+        LightSource,
+        RelightOptions,
+        Relit,
+        SourceScene,
+        light_from_json,
+        light_to_json,
+        relight,
+    )
+    from splatgraft.rendering import Render, RenderOptions, render
+    from splatgraft.segmentation import (
+        Box,
+        LiftOptions,
+        Segmentation,
+        SelectOptions,
+        SolidifyOptions,
+        lift_masks,
+        segment,
+        select_object,
+        solidify_object,
+    )
+    from splatgraft.workflow.projects import run_project, stale_steps
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Box",
+    "Cameras",
+    "Composite",
+    "ConsolidateOptions",
+    "Gaussians",
+    "Harmonized",
+    "HarmonizedViews",
+    "Harmonizer",
+    "HarmonizerInputs",
+    "LayerWeights",
+    "LiftOptions",
+    "Light",
+    "LightSource",
+    "PlaceOptions",
+    "Placed",
+    "PlacedObject",
+    "PosedImages",
+    "ReconstructOptions",
+    "RelightOptions",
+    "Relit",
+    "Render",
+    "RenderOptions",
+    "Segmentation",
+    "SelectOptions",
+    "Similarity",
+    "SolidifyOptions",
+    "SourceScene",
+    "Truth",
+    "compose",
+    "consolidate",
+    "evaluate",
+    "harmonize",
+    "held_out",
+    "lift_masks",
+    "light_from_json",
+    "light_to_json",
+    "load",
+    "load_image",
+    "look_at",
+    "make_harmonizer",
+    "pinhole",
+    "place_object",
+    "read_cameras",
+    "read_capture",
+    "reconstruct",
+    "relight",
+    "render",
+    "render_views",
+    "run_project",
+    "save",
+    "save_image",
+    "segment",
+    "select_object",
+    "solidify_object",
+    "stale_steps",
+    "true_views",
+]
+
+_SOURCES = {
+    "Box": "segmentation.Box",
+    "Cameras": "core.cameras.Cameras",
+    "Composite": "core.composite.Composite",
+    "ConsolidateOptions": "consolidation.ConsolidateOptions",
+    "Gaussians": "core.gaussians.Gaussians",
+    "Harmonized": "harmonization.Harmonized",
+    "HarmonizedViews": "harmonization.HarmonizedViews",
+    "Harmonizer": "harmonization.Harmonizer",
+    "HarmonizerInputs": "harmonization.HarmonizerInputs",
+    "LayerWeights": "relighting.LayerWeights",
+    "LiftOptions": "segmentation.LiftOptions",
+    "Light": "relighting.Light",
+    "LightSource": "relighting.LightSource",
+    "PlaceOptions": "composition.PlaceOptions",
+    "Placed": "composition.Placed",
+    "PlacedObject": "core.composite.PlacedObject",
+    "PosedImages": "core.posed_images.PosedImages",
+    "ReconstructOptions": "reconstruction.ReconstructOptions",
+    "RelightOptions": "relighting.RelightOptions",
+    "Relit": "relighting.Relit",
+    "Render": "rendering.Render",
+    "RenderOptions": "rendering.RenderOptions",
+    "Segmentation": "segmentation.Segmentation",
+    "SelectOptions": "segmentation.SelectOptions",
+    "Similarity": "core.similarity.Similarity",
+    "SolidifyOptions": "segmentation.SolidifyOptions",
+    "SourceScene": "relighting.SourceScene",
+    "Truth": "evaluation.Truth",
+    "compose": "composition.compose",
+    "consolidate": "consolidation.consolidate",
+    "evaluate": "evaluation.evaluate",
+    "harmonize": "harmonization.harmonize",
+    "held_out": "core.posed_images.held_out",
+    "lift_masks": "segmentation.lift_masks",
+    "light_from_json": "relighting.light_from_json",
+    "light_to_json": "relighting.light_to_json",
+    "load": "formats.read_gaussians",
+    "load_image": "core.images.read_rgb",
+    "look_at": "core.cameras.look_at",
+    "make_harmonizer": "harmonization.make_harmonizer",
+    "pinhole": "core.cameras.pinhole",
+    "place_object": "composition.place_object",
+    "read_cameras": "formats.read_cameras",
+    "read_capture": "formats.read_capture",
+    "reconstruct": "reconstruction.reconstruct",
+    "relight": "relighting.relight",
+    "render": "rendering.render",
+    "render_views": "harmonization.render_views",
+    "run_project": "workflow.projects.run_project",
+    "save": "formats.write_gaussians",
+    "save_image": "core.images.write_image",
+    "segment": "segmentation.segment",
+    "select_object": "segmentation.select_object",
+    "solidify_object": "segmentation.solidify_object",
+    "stale_steps": "workflow.projects.stale_steps",
+    "true_views": "evaluation.true_views",
+}
+"""Where each name of `__all__` is defined, below splatgraft; the imports above are for type checkers."""
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first used (PEP 562)."""
+    if name not in _SOURCES:
+        raise AttributeError(f"module 'splatgraft' has no attribute {name!r}")
+    module, _, own = _SOURCES[name].rpartition(".")
+    return getattr(import_module(f"splatgraft.{module}"), own)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

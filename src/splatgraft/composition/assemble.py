@@ -18,16 +18,19 @@ def compose(
     target_from_objects: Sequence[Similarity],
     erased: Bool[Tensor, "n"] | None = None,
 ) -> Composite:
-    """Place each of `objects` in `target` by its transform.
+    """Place objects in a target scene.
 
     Args:
-        target: The receiving scene.
-        objects: Each in the frame of its own capture.
-        target_from_objects: One transform per object.
-        erased: True for Gaussians of the target to leave out; None leaves out none.
+        target: The scene that receives the objects, n Gaussians.
+        objects: The objects, each in the frame of the capture that it comes from.
+        target_from_objects: The placement of each object, such as `place_object` finds.
+        erased: Gaussians of the target that are left out; none where not given.
+
+    Returns:
+        The composite; its parts are kept apart until it is baked.
 
     Raises:
-        ValueError: Where there is not one transform per object, or `erased` has another length than the target.
+        ValueError: There is not one transform per object, or `erased` has another length than the target.
     """
     if len(objects) != len(target_from_objects):
         raise ValueError(f"placement: expected {len(objects)} objects, one per .ply, found {len(target_from_objects)}")

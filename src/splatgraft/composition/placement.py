@@ -54,17 +54,21 @@ def place_object(
     surroundings: Gaussians | None = None,
     options: PlaceOptions = PlaceOptions(),
 ) -> Placed:
-    """Place `object_` upright on a surface of `target`.
+    """Find a placement that rests an object upright on a surface of a target scene.
 
     Args:
-        target: The receiving scene; for a further object, baked with the objects before.
-        object_: The object in the frame of its capture.
-        cameras: Of the target and of the source, in this order.
-        surroundings: The source without the object, whose ground gives the object's base; None uses its lowest parts.
-        options: What the user decides.
+        target: The scene that receives the object. For a further object: the composite so far, merged.
+        object_: The object's Gaussians, in the frame of the capture that it comes from.
+        cameras: The target's cameras and the source's, in this order; from them follow the up directions, the size
+            of the object in the picture and which sides of it were seen.
+        surroundings: The source without the object, whose surface below the object gives the object's base.
+        options: Point, scale and turn where they are not to be found.
+
+    Returns:
+        The placement, the surface that it rests on, and warnings.
 
     Raises:
-        ValueError: Where the object is empty or no level surface is found.
+        ValueError: The object is empty, or there is no level surface.
     """
     target_cameras, source_cameras = cameras
     up = estimate_up(target_cameras)

@@ -27,25 +27,30 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
-    """The composite with SH colours of all bands fitted to the harmonised images; higher bands start from zero.
+    """Fit the colours of a scene (all SH bands) to harmonised images of it; geometry and opacity stay.
+
+    Paper: section Multi-View Consolidation. Higher bands start from zero. With the method `fast`, Gaussians that no
+    changed pixel sees keep their colours exactly. The same inputs and seed give the same result.
 
     Memory above the inputs, for n Gaussians with k coefficients: 4 n (k^2 + 50 k) bytes for `fast`, 4 n 24 k for
-    `adam`, plus `options.cache_bytes`, plus the tile lists of two views and a few images; it does not grow with the
-    number of views. With `fast`, Gaussians on no changed pixel keep their colours exactly. The same inputs and seed
-    give the same result.
+    `adam`, plus `options.cache_bytes`, the tile lists of two views and a few images; it does not grow with the number
+    of views.
 
     Args:
-        composite: The scene before harmonisation.
-        cameras: Of the harmonised views.
-        images: One per camera, (h, w, 3), sRGB; read one at a time.
-        options: Method and its parameters.
-        weights: Confidence of each pixel per view, (h, w) in [0, 1]; read one at a time. None: all are 1.
-        progress: Called after each round or iteration.
-        checkpoint: Where `adam` saves its state.
+        composite: The scene of which the images were made.
+        cameras: v cameras, on the device of `composite`.
+        images: v harmonised images (h, w, 3), sRGB in [0, 1], each of its camera's size, read one at a time.
+        options: Method, loss, nuisance parameters and rates.
+        weights: Confidence of every pixel, v images (h, w) in [0, 1]; 1 everywhere where not given.
+        progress: Called with steps done, steps in all and a short text.
+        checkpoint: Where `adam` saves its state and from where it continues.
+
+    Returns:
+        The scene with the fitted colours.
 
     Raises:
-        ValueError: Where there is no camera, not one image per camera, or an image does not have its camera's size or
-            has numbers that are not finite.
+        ValueError: There is no camera or not one image per camera, or an image has another size than its camera or
+            numbers that are not finite.
     """
     _check_counts(cameras, images, weights)
     views = Views(

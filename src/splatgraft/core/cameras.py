@@ -108,7 +108,18 @@ class Cameras:
 def pinhole(
     world_from_camera: Float[Tensor, "v 4 4"], focal_px: float, *, width: int, height: int, prefix: str = "view"
 ) -> Cameras:
-    """Cameras that share one focal length, with the principal point at the image centre."""
+    """Cameras that share one focal length, with the principal point at the image centre.
+
+    Args:
+        world_from_camera: Rigid poses.
+        focal_px: Focal length, pixels.
+        width: Image width, pixels.
+        height: Image height, pixels.
+        prefix: Start of the cameras' names.
+
+    Returns:
+        v cameras called PREFIX_0000 and so on.
+    """
     v = len(world_from_camera)
     intrinsics = torch.tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]]).repeat(v, 1, 1)
     return Cameras(
@@ -120,7 +131,16 @@ def pinhole(
 
 
 def look_at(eye: Float[Tensor, "v 3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "v 4 4"]:
-    """Poses at `eye` that look at `target` with `up` upwards in the image."""
+    """Poses of cameras that look at one point.
+
+    Args:
+        eye: Optical centres, world units.
+        target: The point at the image centre, world units.
+        up: Direction that points upwards in the image; not parallel to a line of sight.
+
+    Returns:
+        The poses `world_from_camera` (OpenCV axes).
+    """
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.expand_as(forward)), dim=-1)
     down = torch.linalg.cross(forward, right)

@@ -58,6 +58,10 @@ class Composite:
         """How many of the target's Gaussians are not erased."""
         return int((~self.erased).sum())
 
+    def with_object(self, gaussians: Gaussians, target_from_object: Similarity) -> "Composite":
+        """The composite with one more object, after the others."""
+        return replace(self, objects=(*self.objects, PlacedObject(gaussians, target_from_object)))
+
     def with_object_colors(self, recolored: tuple[Gaussians, ...]) -> "Composite":
         """The composite with `recolored`, in the objects' own frames, in place of the objects' Gaussians."""
         pairs = zip(self.objects, recolored, strict=True)

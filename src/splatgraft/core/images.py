@@ -42,12 +42,19 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
 
 
-def read_rgb(path: Path) -> Float[Tensor, "h w 3"]:
-    """sRGB in [0, 1] with the EXIF rotation applied; transparent pixels are black.
+def read_rgb(path: Path | str) -> Float[Tensor, "h w 3"]:
+    """Read a picture as a viewer shows it, with EXIF rotation applied.
 
-    Raises: ValueError where the file is no readable image.
+    Args:
+        path: A .png, .jpg, .webp, .tif or .bmp file.
+
+    Returns:
+        sRGB in [0, 1]; transparent pixels are black.
+
+    Raises:
+        ValueError: The file is no readable image.
     """
-    return _rgb(ImageOps.exif_transpose(_open(path)))
+    return _rgb(ImageOps.exif_transpose(_open(Path(path))))
 
 
 def read_stored_rgb(path: Path) -> Float[Tensor, "h w 3"]:
@@ -139,11 +146,17 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise ValueError(f"{path}: expected a readable image, found {type(error).__name__}: {error}") from error
 
 
-def write_image(path: Path, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"]) -> None:
-    """Write 8-bit sRGB or grey; the format follows the suffix. Atomic.
+def write_image(path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"]) -> None:
+    """Write 8-bit sRGB or grey in the format of the suffix; the file appears whole or not at all.
 
-    Raises: ValueError where the suffix names no image format.
+    Args:
+        path: A file that ends in .png, .jpg, .webp, .tif or .bmp.
+        image: Values in [0, 1]; others are clamped.
+
+    Raises:
+        ValueError: The suffix names no image format.
     """
+    path = Path(path)
     kind = Image.registered_extensions().get(path.suffix.lower())
     if path.suffix.lower() not in IMAGE_SUFFIXES or kind is None:
         raise ValueError(f"{path}: expected an image name that ends in {', '.join(sorted(IMAGE_SUFFIXES))}")

@@ -62,6 +62,11 @@ class PosedImages:
             distortions=tuple(self.distortions[i] for i in indices) if self.distortions else (),
         )
 
+    def with_masks(self) -> "PosedImages":
+        """The views that have an object mask."""
+        paths = self.mask_paths or (None,) * len(self)
+        return self.select(torch.tensor([path is not None for path in paths], dtype=torch.bool))
+
     def resized(self, factor: float) -> "PosedImages":
         """The same capture with images resampled by `factor`."""
         return replace(self, cameras=self.cameras.resized(factor))

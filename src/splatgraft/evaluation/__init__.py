@@ -1,5 +1,6 @@
 """Evaluate: pictures become numbers and a page that explains them. Knows nothing about scenes or how they were made."""
 
+from splatgraft.evaluation.evaluate import evaluate, true_views
 from splatgraft.evaluation.light_change import change_map, describe_change
 from splatgraft.evaluation.measure import ComparedView, compare, measure
 from splatgraft.evaluation.pictures import side_by_side, write_animation
@@ -18,9 +19,11 @@ __all__ = [
     "change_map",
     "compare",
     "describe_change",
+    "evaluate",
     "find_regions",
     "measure",
     "side_by_side",
+    "true_views",
     "turntable_cameras",
     "write_animation",
     "write_report",

@@ -36,20 +36,34 @@ def is_scene(path: Path) -> bool:
     return path.suffix.lower() in _READERS
 
 
-def read_gaussians(path: Path) -> Gaussians:
-    """The scene in a .ply, .splat or .spz file.
+def read_gaussians(path: Path | str) -> Gaussians:
+    """Read a trained scene.
 
-    Raises: ValueError where the suffix is another, or the file is not what its suffix says.
+    Args:
+        path: A .ply (of 3DGS, or SuperSplat's compressed form), .splat or .spz file.
+
+    Returns:
+        Its Gaussians, in the file's order and frame.
+
+    Raises:
+        ValueError: The suffix is another, or the file is not what its suffix says.
     """
+    path = Path(path)
     with _readable(path):
         return _by_suffix(path, _READERS)(path)
 
 
-def write_gaussians(path: Path, gaussians: Gaussians) -> None:
-    """Write a scene in the format of the suffix; the file appears whole or not at all. Only .ply is exact.
+def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
+    """Write a scene in the format of the suffix; the file appears whole or not at all.
 
-    Raises: ValueError where the suffix is another, or the format cannot hold the scene.
+    Args:
+        path: A file that ends in .ply (exact), .splat or .spz (both quantised; .splat keeps band 0 of the colour only).
+        gaussians: The scene, on the CPU.
+
+    Raises:
+        ValueError: The suffix is another, or the format cannot hold the scene.
     """
+    path = Path(path)
     _by_suffix(path, _WRITERS)(path, gaussians)
 
 
@@ -60,13 +74,21 @@ def _by_suffix(path: Path, functions: dict[str, Callable]) -> Callable:
     return function
 
 
-def read_capture(path: Path) -> PosedImages:
-    """Posed photographs: a COLMAP folder, a folder with transforms.json (or Blender's), or that file itself.
+def read_capture(path: Path | str) -> PosedImages:
+    """Read a capture: posed images, sparse points, and object masks where there are some.
 
-    Where a folder has both, transforms.json counts. Masks are found by stem in masks/, or in the images' alpha.
+    Args:
+        path: A folder with transforms.json (or Blender's transforms_train.json), that file itself, or a COLMAP folder;
+            of a folder with both, transforms.json is read. Masks are found by file name in masks/, or in the alpha
+            channel of the images.
 
-    Raises: ValueError where nothing of these is there, or what is there is broken.
+    Returns:
+        The capture; image files are read when asked for.
+
+    Raises:
+        ValueError: There is none of these at `path`, or a file is broken.
     """
+    path = Path(path)
     with _readable(path):
         transforms = _transforms_path(path)
         return transforms_json.read_capture(transforms) if transforms else colmap.read_capture(path)
@@ -87,11 +109,19 @@ def write_capture(folder: Path, posed_images: PosedImages) -> None:
     transforms_json.write_capture(folder, posed_images)
 
 
-def read_cameras(path: Path) -> Cameras:
-    """The cameras of a capture, a transforms.json or a cameras.json of the original code; images need not exist.
+def read_cameras(path: Path | str) -> Cameras:
+    """Read the cameras of a capture, whose images need not exist.
 
-    Raises: ValueError where nothing of these is there, or what is there is broken.
+    Args:
+        path: A capture folder, a transforms.json, or a cameras.json of the original 3DGS code.
+
+    Returns:
+        Undistorted pinhole cameras, in the file's order and frame.
+
+    Raises:
+        ValueError: There is none of these at `path`, or a file is broken.
     """
+    path = Path(path)
     with _readable(path):
         if cameras_json.is_cameras_json(path):
             return cameras_json.read_cameras(path)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from splatgraft.harmonization.compact.factory import make_compact
 from splatgraft.harmonization.flux.factory import make_flux
 from splatgraft.harmonization.identity import IdentityHarmonizer
+from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize
 from splatgraft.harmonization.inputs import render_views
 from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
 from splatgraft.harmonization.options import HarmonizerOptions
@@ -15,9 +16,11 @@ __all__ = [
     "HARMONIZERS",
     "BatchHarmonizer",
     "Harmonized",
+    "HarmonizedViews",
     "Harmonizer",
     "HarmonizerInputs",
     "HarmonizerOptions",
+    "harmonize",
     "make_harmonizer",
     "render_views",
 ]
@@ -36,10 +39,17 @@ HARMONIZERS: dict[str, Callable[[HarmonizerOptions], Harmonizer]] = {
 
 
 def make_harmonizer(name: str, options: HarmonizerOptions | None = None) -> Harmonizer:
-    """The harmoniser called `name`.
+    """Make a harmoniser.
 
-    Raises: ValueError where there is none of that name (the message lists those there are), or where its weights or
-    packages are missing.
+    Args:
+        name: A key of `HARMONIZERS`.
+        options: Weights, device and the method's own settings.
+
+    Returns:
+        The harmoniser, with its weights loaded.
+
+    Raises:
+        ValueError: There is no method of that name, or its weights or packages are missing.
     """
     if name not in HARMONIZERS:
         raise ValueError(f"harmonizer: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")

@@ -31,14 +31,24 @@ _AS_IT_IS = ((1.0, 1.0),)
 
 def reconstruct(
     capture: PosedImages,
-    options: ReconstructOptions,
+    options: ReconstructOptions = ReconstructOptions(),
     *,
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
-    """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023), at most `options.most_gaussians`.
+    """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023; density control after 3DGS-MCMC).
 
-    Raises: ValueError where there are too few views, too little memory, or the fit stops being finite.
+    Args:
+        capture: Posed images; sparse points are the start where there are at least 100.
+        options: Length, size, resolution and seed.
+        progress: Called with steps done, steps in all and a short text.
+        checkpoint: Where the state is saved, and from where a run that was stopped continues.
+
+    Returns:
+        At most `options.most_gaussians` Gaussians in the frame of the cameras, on `options.device`.
+
+    Raises:
+        ValueError: There are fewer than 2 views or too little memory, or a value stops being finite.
     """
     require_memory(capture, options)
     if options.eval_every:

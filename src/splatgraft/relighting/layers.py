@@ -13,6 +13,7 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.splitting import split_wide_around
+from splatgraft.relighting.light.confidence import light_confidence
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.shading.gain import apply_gain
 
@@ -59,6 +60,11 @@ class Relit:
     """The light at the object's place that was used; None where there was no transfer."""
     report: tuple[str, ...]
     """Plain sentences: what was found, how sure, and what was not done and why."""
+
+    @property
+    def confidence(self) -> float:
+        """How reliable the light is, in [0, 1]; 0 where there was no transfer."""
+        return 0.0 if self.light is None else light_confidence(self.light)
 
     def bake(self, weights: LayerWeights = LayerWeights()) -> tuple[Gaussians, Bool[Tensor, "b"]]:
         """The scene to write or to draw, and which of its Gaussians belong to an object.

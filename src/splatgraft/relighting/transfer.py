@@ -60,13 +60,25 @@ def relight(
     options: RelightOptions = RelightOptions(),
     cache: Memo | None = None,
 ) -> Relit:
-    """Light `composite` as one scene: no training, no views.
+    """Light the objects of a composite by the target scene, and add their shadows and reflected light to it.
 
-    `cameras` are the target's. `sources` holds, per object, the scene it was taken from; without it the object keeps
-    its mean brightness. A `light` given by the user replaces the estimate. `cache` serves moves of the same objects.
-    Where a transfer is impossible, the copy-paste result with a plain reason.
+    Colours change by ratios of irradiance (differential rendering), without training and without images.
 
-    Raises: ValueError where `sources` is neither empty nor one per object.
+    Args:
+        composite: The target with the objects placed in it.
+        cameras: The target's cameras; from them follows the up direction.
+        sources: For every object the scene that it was taken from, without the object, whose light is divided out;
+            None, or no sources at all, where it is not known: the object then keeps its mean brightness.
+        light: The light at the place of the objects; estimated from the target where not given.
+        options: How far shadows reach and how many Gaussians may be added.
+        cache: Intermediate results, which later calls with the same objects at other places use again.
+
+    Returns:
+        The composite with its change of light in layers. Where no light can be estimated the layers change nothing
+        and `report` gives the reason.
+
+    Raises:
+        ValueError: `sources` is neither empty nor one per object.
     """
     if len(sources) not in (0, len(composite.objects)):
         raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")

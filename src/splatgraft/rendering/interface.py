@@ -1,4 +1,4 @@
-"""What rendering takes and gives, and the choice of the device's implementation. Holds no arithmetic of its own."""
+"""Rendering of Gaussians: options, results, and the choice of the implementation by device."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,14 +17,14 @@ Output = Literal["color", "depth", "normal"]
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What changes the picture but belongs to no scene."""
+    """How a scene is drawn."""
 
     low_pass: Literal["classic", "antialiased"] = "classic"
     """Both add 0.3 px^2 to the covariance; `antialiased` also scales opacity by the area ratio (Mip-Splatting)."""
     near: float = 0.01
     """Gaussians whose centre is nearer than this along the optical axis are not drawn, world units."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """sRGB seen through what is not opaque."""
+    """sRGB behind the scene."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,20 @@ def render(
     features: Float[Tensor, "n f"] | None = None,
     options: RenderOptions = RenderOptions(),
 ) -> Render:
-    """Splat `gaussians` into `cameras`, which share a size; differentiable in every field and in `features`.
+    """Render Gaussians by splatting (3DGS, sections 4 and 6); differentiable in every field and in `features`.
 
-    Raises: ValueError where camera sizes differ.
+    Args:
+        gaussians: n Gaussians, on the CPU (numba) or a CUDA device (gsplat).
+        cameras: v cameras that share one image size.
+        outputs: Which of color, depth and normal to render.
+        features: f values per Gaussian that are blended like colours.
+        options: Low-pass filter, near plane and background.
+
+    Returns:
+        The pictures that were asked for, with opacity and visibility, on the device of `gaussians`.
+
+    Raises:
+        ValueError: The cameras' image sizes differ, or gsplat is not installed.
     """
     implementation = _implementation(gaussians)
     _ = cameras.width  # refuses what cannot be stacked

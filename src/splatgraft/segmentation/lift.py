@@ -44,12 +44,24 @@ def lift_masks(
     *,
     progress: Progress = silent,
 ) -> Float[Tensor, "n"]:
-    """How much each Gaussian belongs to what the masks (1 inside) show, in [0, 1]; 0 for one that no view sees.
+    """Lift masks of images to one number per Gaussian, its share in the masked object.
 
-    `closed_form`: the share of its blending weight that falls inside, which the object's own Gaussians miss only at
-    the outline. `bce`: the sigmoid of the trained logit. Both are compared with the same threshold, the paper's 0.75.
+    `closed_form` computes the share of the Gaussian's blending weight that falls inside the masks; only Gaussians at
+    the outline of the object have less than 1. `bce` trains a logit per Gaussian (section 3.1 of the paper) and gives
+    its sigmoid. Both are compared with the same threshold, the paper's 0.75.
 
-    Raises: ValueError where masks and cameras do not fit together.
+    Args:
+        gaussians: n Gaussians.
+        cameras: v cameras, on the device of `gaussians`.
+        masks: v masks (h, w) in [0, 1], 1 inside the object, each of its camera's size.
+        options: The method and the rates of `bce`.
+        progress: Called with steps done, steps in all and a short text.
+
+    Returns:
+        The feature in [0, 1]; 0 for a Gaussian that no view sees.
+
+    Raises:
+        ValueError: There is not one mask per camera, or one has another size.
     """
     _check(cameras, masks)
     if options.method == "closed_form":

@@ -34,9 +34,18 @@ class SelectOptions:
 def select_object(
     gaussians: Gaussians, feature: Float[Tensor, "n"], options: SelectOptions = SelectOptions()
 ) -> Bool[Tensor, "n"]:
-    """The Gaussians at or above the threshold, inside the box, in the pieces to keep.
+    """Select the Gaussians of the object by threshold, box and connected piece.
 
-    Raises: ValueError where none is left.
+    Args:
+        gaussians: n Gaussians of the scene.
+        feature: Share of each in the object, in [0, 1], as `lift_masks` gives it.
+        options: Threshold, box, and which connected pieces stay.
+
+    Returns:
+        True for the object's Gaussians.
+
+    Raises:
+        ValueError: No Gaussian reaches the threshold, or none of these is inside the box.
     """
     chosen = feature >= options.threshold
     if not chosen.any():

@@ -57,11 +57,23 @@ def solidify_object(
     options: SolidifyOptions = SolidifyOptions(),
     progress: Progress = silent,
 ) -> Gaussians:
-    """The selected Gaussians, fitted to image and mask of each camera as seen alone.
+    """Fit an extracted object alone to its masked images over random backgrounds, so that it becomes opaque.
 
-    Pixels outside the mask where something else stands well before the object say nothing about it and do not count.
+    Pixels outside the mask where the object is hidden by something in front of it are not used.
 
-    Raises: ValueError where no view shows the object.
+    Args:
+        scene: n Gaussians of the whole scene.
+        selection: Which of them are the object's.
+        cameras: v cameras, on the device of `scene`.
+        photographs: The image (h, w, 3), sRGB in [0, 1], and the object mask (h, w) of each camera.
+        options: Steps and rates.
+        progress: Called with steps done, steps in all and a short text.
+
+    Returns:
+        The object's Gaussians, changed in every field.
+
+    Raises:
+        ValueError: All masks are empty.
     """
     chosen = scene.select(selection)
     sights = [

@@ -111,7 +111,7 @@ def fit_ambient(radiance: Float[Tensor, "3"]) -> Float[Tensor, "9 3"]:
 
 
 def light_to_json(light: Light) -> str:
-    """The text of light.json, made to be read and changed by hand."""
+    """The text of a light.json, which can be changed by hand and read with `light_from_json`."""
     sources = [
         {
             "name": s.name,
@@ -135,9 +135,17 @@ def light_to_json(light: Light) -> str:
 
 
 def light_from_json(text: str, *, name: str = "light.json") -> Light:
-    """The light that the text of a light.json describes; `name` is what messages call the file.
+    """Read a light from the text of a light.json.
 
-    Raises: ValueError where the text is no JSON, a key is missing or unknown, or a value is out of its range.
+    Args:
+        text: What `light_to_json` gives, perhaps changed by hand.
+        name: The file's name in error messages.
+
+    Returns:
+        The light, directions normalised.
+
+    Raises:
+        ValueError: The text is no JSON, a key is missing or unknown, or a value is out of its range.
     """
     try:
         record = json.loads(text)

@@ -1,0 +1,43 @@
+"""Two objects of two captures in one scene: each is placed where it fits, and all light and shade each other."""
+
+import tempfile
+from pathlib import Path
+
+import splatgraft as sg
+
+DATA = Path(__file__).parents[1] / "data"
+SHORT = sg.ReconstructOptions(iterations=60, budget=4000)
+
+
+def main() -> None:
+    target = sg.read_capture(DATA / "room").resized(0.25)
+    room = sg.reconstruct(target, SHORT)
+    composite = sg.compose(room, [], target_from_objects=[])
+    sources: list[sg.SourceScene] = []
+    for name in ("vase", "bananas"):
+        source = sg.read_capture(DATA / name).resized(0.25)
+        cut = sg.segment(sg.reconstruct(source, SHORT), source, solidify=sg.SolidifyOptions(iterations=40))
+        sources.append(sg.SourceScene(cut.surroundings, source.cameras))
+        # the scene with the objects before it, so that each finds a place of its own; both captures are in metres
+        scene, _ = composite.merged()
+        placed = sg.place_object(
+            scene,
+            cut.object,
+            cameras=(target.cameras, source.cameras),
+            surroundings=cut.surroundings,
+            options=sg.PlaceOptions(scale=1.0),
+        )
+        print(name, "at", [round(x, 2) for x in placed.support.point.tolist()], *placed.warnings)
+        composite = composite.with_object(cut.object, placed.target_from_object)
+
+    relit = sg.relight(composite, target.cameras, sources=sources)
+    print(*relit.report, sep="\n")
+    scene, is_object = relit.bake()
+    folder = Path(tempfile.mkdtemp(prefix="splatgraft_"))
+    sg.save(folder / "scene.ply", scene)
+    sg.save_image(folder / "view.png", sg.render(scene, target.cameras[0]).color[0])
+    print(f"{int(is_object.sum())} of {scene.count} Gaussians are the objects'; {folder / 'view.png'}")
+
+
+if __name__ == "__main__":
+    main()

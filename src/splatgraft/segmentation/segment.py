@@ -1,0 +1,76 @@
+"""Segmentation of a scene by the object masks of its capture: lifted to the Gaussians, selected, made solid."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.runtime.lazy_sequence import LazySequence
+from splatgraft.runtime.progress import Progress, silent
+from splatgraft.segmentation.lift import LiftOptions, lift_masks
+from splatgraft.segmentation.selection import SelectOptions, select_object
+from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """A scene of n Gaussians divided into an object and its surroundings."""
+
+    object: Gaussians
+    """The object's Gaussians, made solid where that was asked for."""
+    surroundings: Gaussians
+    """All other Gaussians of the scene, unchanged."""
+    selection: Bool[Tensor, "n"]
+    """Which Gaussians of the scene are the object's."""
+    feature: Float[Tensor, "n"]
+    """Share of each Gaussian's blending weight that falls inside the masks, in [0, 1]."""
+
+
+def segment(
+    scene: Gaussians,
+    capture: PosedImages,
+    *,
+    lift: LiftOptions = LiftOptions(),
+    select: SelectOptions = SelectOptions(),
+    solidify: SolidifyOptions | None = SolidifyOptions(),
+    progress: Progress = silent,
+) -> Segmentation:
+    """Divide a scene into the object that the masks of its capture show and everything else.
+
+    Lifts the masks (`lift_masks`), selects Gaussians by threshold, box and connected piece (`select_object`), and fits
+    the object alone to its masked images, so that it is opaque without its surroundings (`solidify_object`).
+
+    Args:
+        scene: n Gaussians reconstructed from `capture`.
+        capture: The capture with object masks; views without a mask are not used.
+        lift: How masks become a number per Gaussian.
+        select: Which Gaussians are the object.
+        solidify: Length and rates of the fit of the object alone; None leaves its Gaussians as they are in the scene.
+        progress: Called with steps done, steps in all and a short text.
+
+    Returns:
+        The object, its surroundings, and which Gaussian is which.
+
+    Raises:
+        ValueError: The capture has no masks, or no Gaussian is inside them.
+    """
+    masked = capture.with_masks()
+    if len(masked) == 0:
+        raise ValueError(f"segment: expected masks of the object for some of {len(capture)} views, found none")
+    cameras = masked.cameras.to(scene.device)
+    masks = LazySequence(len(masked), lambda index: _mask(masked, index))
+    feature = lift_masks(scene, cameras, masks, lift, progress=progress)
+    selection = select_object(scene, feature, select)
+    chosen = scene.select(selection)
+    if solidify is not None and solidify.iterations:
+        photographs = LazySequence(len(masked), lambda index: (masked.image(index), masks[index]))
+        chosen = solidify_object(scene, selection, cameras, photographs, options=solidify, progress=progress)
+    return Segmentation(chosen, scene.select(~selection), selection, feature)
+
+
+def _mask(capture: PosedImages, index: int) -> Float[Tensor, "h w"]:
+    mask = capture.mask(index)
+    assert mask is not None
+    return mask
