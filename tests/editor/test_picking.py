@@ -6,7 +6,7 @@ from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.previews.level_of_detail import shown_indices
 from splatgraft.editor.session.picking import Ray, Rectangle, between, first_hit, in_brush, in_rectangle, painted
-from splatgraft.segmentation import corrected, with_correction
+from splatgraft.segmentation import add_correction, apply_corrections
 
 
 def scene(means: list[list[float]], *, size: float = 0.1, logit: float = 3.0) -> Gaussians:
@@ -63,10 +63,10 @@ def test_a_quick_stroke_has_no_gaps_and_passes_over_what_is_not_there() -> None:
 
 def test_the_last_stroke_counts() -> None:
     lifted = torch.tensor([True, True, False, False])
-    strokes = with_correction(None, torch.tensor([False, True, True, False]), add=True)
-    strokes = with_correction(strokes, torch.tensor([False, True, False, False]), add=False)
-    assert corrected(lifted, strokes).tolist() == [True, False, True, False]
-    assert corrected(lifted, None) is lifted
+    strokes = add_correction(None, torch.tensor([False, True, True, False]), add=True)
+    strokes = add_correction(strokes, torch.tensor([False, True, False, False]), add=False)
+    assert apply_corrections(lifted, strokes).tolist() == [True, False, True, False]
+    assert apply_corrections(lifted, None) is lifted
 
 
 def test_thinning_keeps_what_covers_most_in_order() -> None:

@@ -26,7 +26,7 @@ from splatgraft.editor.session.scene_cache import Scenes
 from splatgraft.editor.session.state_store import StateStore
 from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.project.results import Side
-from splatgraft.segmentation import Box, corrected, with_correction
+from splatgraft.segmentation import Box, add_correction, apply_corrections
 
 EDITOR_FOLDER = ".editor"
 
@@ -186,7 +186,7 @@ class Session:
             lifted = torch.zeros(scene.count, dtype=torch.bool) if box is None else box.contains(scene.means)
         # strokes over a scene that is no more say nothing about this one
         fits = corrections is None or len(corrections) == scene.count
-        return corrected(lifted, corrections) if fits else lifted
+        return apply_corrections(lifted, corrections) if fits else lifted
 
     def box(self) -> Box | None:
         """The box around the object, in the source's world."""
@@ -201,7 +201,7 @@ class Session:
         corrections = self.state.corrections
         if corrections is not None and len(corrections) != len(touched):
             corrections = None  # of a scene that is no more
-        self.change(replace(self.state, corrections=with_correction(corrections, touched, add=add)))
+        self.change(replace(self.state, corrections=add_correction(corrections, touched, add=add)))
 
     # what is placed in the target
 
