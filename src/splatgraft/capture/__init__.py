@@ -1,18 +1,23 @@
-"""Capture: photos, a video or a scene without either become posed images. Trains nothing."""
+"""Capture: posed images from photos, from a video, or from a trained scene that comes without images."""
 
 from splatgraft.capture.orientation import upright
 from splatgraft.capture.structure_from_motion import PoseOptions, PoseReport, pose_photos
 from splatgraft.capture.video import extract_frames
-from splatgraft.capture.virtual_cameras import LookOptions, Viewpoints, find_viewpoints, photographed
+from splatgraft.capture.virtual_cameras import (
+    VirtualCameraOptions,
+    VirtualCameras,
+    place_virtual_cameras,
+    render_pictures,
+)
 
 __all__ = [
-    "LookOptions",
     "PoseOptions",
     "PoseReport",
-    "Viewpoints",
+    "VirtualCameraOptions",
+    "VirtualCameras",
     "extract_frames",
-    "find_viewpoints",
-    "photographed",
+    "place_virtual_cameras",
     "pose_photos",
+    "render_pictures",
     "upright",
 ]

@@ -3,7 +3,14 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatgraft.capture import LookOptions, PoseOptions, extract_frames, find_viewpoints, photographed, pose_photos
+from splatgraft.capture import (
+    PoseOptions,
+    VirtualCameraOptions,
+    extract_frames,
+    place_virtual_cameras,
+    pose_photos,
+    render_pictures,
+)
 from splatgraft.core.images import list_images, write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs, has_poses
@@ -23,7 +30,7 @@ class Capture:
     max_side: int = 1600
     """Longest side at which images are served from here on, pixels; 0 keeps all."""
     options: PoseOptions = field(default_factory=PoseOptions)
-    look: LookOptions = field(default_factory=LookOptions)
+    look: VirtualCameraOptions = field(default_factory=VirtualCameraOptions)
 
     def inputs(self) -> Inputs:
         """The photos, or the video, or the scene, or the files of the posed capture."""
@@ -48,12 +55,12 @@ class Capture:
     def _pictures(self, folder: Path, context: Context) -> PosedImages:
         """Pictures of a scene that came without photographs."""
         scene = read_gaussians(self.capture)
-        found = find_viewpoints(scene, self.look, progress=context.progress)
+        found = place_virtual_cameras(scene, self.look, progress=context.progress)
         for sentence in found.report:
             context.console.say(f"{self.capture}: {sentence}")
         (folder / "images").mkdir()
         paths = {name: folder / "images" / f"{name}.png" for name in found.cameras.names}
-        photographed(
+        render_pictures(
             scene, found, write=lambda name, picture: write_image(paths[name], picture), progress=context.progress
         )
         return PosedImages(
