@@ -57,9 +57,9 @@ def test_the_foot_of_an_object_on_a_plain_table_is_seen():
     scene, thing = table(0.15, 0.12), post()
     whole = concatenate([scene, thing])
     is_object = torch.arange(whole.count) >= scene.count
-    serialized = coverage(thing, torch.ones(thing.count, dtype=torch.bool))
+    alone = coverage(thing, torch.ones(thing.count, dtype=torch.bool))
     fine, still = split_wide_around(whole, is_object, [thing])
-    there = serialized > 0.9
+    there = alone > 0.9
     hidden, shown = (1 - coverage(*pair)[there].mean() for pair in ((whole, is_object), (fine, still)))
     # a disc whose centre is nearer than the post covers its foot; of pieces a quarter as wide only a rim remains
     assert hidden > 0.15

@@ -14,7 +14,7 @@ from splatgraft.editor.session.picking import (
     in_rectangle,
     interpolate_rays,
 )
-from splatgraft.segmentation import corrected, with_correction
+from splatgraft.segmentation import add_correction, apply_corrections
 
 
 def scene(means: list[list[float]], *, size: float = 0.1, logit: float = 3.0) -> Gaussians:
@@ -71,10 +71,10 @@ def test_a_fast_stroke_has_no_gaps_and_ignores_empty_space() -> None:
 
 def test_later_corrections_override_earlier_ones() -> None:
     lifted = torch.tensor([True, True, False, False])
-    strokes = with_correction(None, torch.tensor([False, True, True, False]), add=True)
-    strokes = with_correction(strokes, torch.tensor([False, True, False, False]), add=False)
-    assert corrected(lifted, strokes).tolist() == [True, False, True, False]
-    assert corrected(lifted, None) is lifted
+    strokes = add_correction(None, torch.tensor([False, True, True, False]), add=True)
+    strokes = add_correction(strokes, torch.tensor([False, True, False, False]), add=False)
+    assert apply_corrections(lifted, strokes).tolist() == [True, False, True, False]
+    assert apply_corrections(lifted, None) is lifted
 
 
 def test_level_of_detail_keeps_the_largest_coverage_in_order() -> None:

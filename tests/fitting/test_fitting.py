@@ -8,7 +8,7 @@ import torch
 from splatgraft.core import cameras as camera_values
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import ssim
-from splatgraft.fitting import FitOptions, Pictures, Rates, adam, fit, l1_dssim
+from splatgraft.fitting import FitOptions, FixedViews, LearningRates, adam, fit, l1_dssim
 from splatgraft.rendering import render
 
 
@@ -34,10 +34,10 @@ def ring(count: int, size: int = 32) -> camera_values.Cameras:
     return camera_values.pinhole(poses, 1.2 * size, width=size, height=size)
 
 
-def pictures(scene: Gaussians, count: int = 6) -> Pictures:
+def pictures(scene: Gaussians, count: int = 6) -> FixedViews:
     cameras = ring(count)
     with torch.no_grad():
-        return Pictures(cameras, tuple(render(scene, cameras).color))
+        return FixedViews(cameras, tuple(render(scene, cameras).color))
 
 
 class Memo:
@@ -133,7 +133,7 @@ def test_colours_alone_are_recovered_and_all_else_stays():
     truth = blobs(60, 4)
     start = replace(truth, sh=torch.zeros_like(truth.sh))
     views = pictures(truth)
-    options = FitOptions(iterations=120, rates=Rates(sh=0.05, sh_higher=0.05))
+    options = FitOptions(iterations=120, rates=LearningRates(sh=0.05, sh_higher=0.05))
     fitted = fit(start, views, options=options)
     assert torch.equal(fitted.means, truth.means)
     assert torch.equal(fitted.opacity_logits, truth.opacity_logits)
@@ -147,7 +147,7 @@ def test_colours_alone_are_recovered_and_all_else_stays():
 
 def test_every_field_that_has_a_rate_moves():
     truth = blobs(60, 5)
-    rates = Rates(means=1e-3, log_scales=1e-3, quaternions=1e-3, opacity_logits=1e-3, sh=1e-3)
+    rates = LearningRates(means=1e-3, log_scales=1e-3, quaternions=1e-3, opacity_logits=1e-3, sh=1e-3)
     fitted = fit(truth, pictures(blobs(60, 6)), options=FitOptions(iterations=6, rates=rates))
     for name in rates.active():
         assert not torch.equal(getattr(fitted, name), getattr(truth, name)), name
@@ -157,7 +157,7 @@ def test_every_field_that_has_a_rate_moves():
 def test_a_killed_fit_resumes_bit_for_bit(monkeypatch):
     monkeypatch.setattr("splatgraft.fitting.loop._CHECKPOINT_SECONDS", -1.0)
     views, start = pictures(blobs(60, 7)), blobs(60, 8)
-    rates = Rates(means=1e-2, means_final=1e-4, log_scales=1e-2, quaternions=1e-2, opacity_logits=1e-2, sh=1e-2)
+    rates = LearningRates(means=1e-2, means_final=1e-4, log_scales=1e-2, quaternions=1e-2, opacity_logits=1e-2, sh=1e-2)
     options = FitOptions(iterations=40, rates=rates, seed=3)
     whole = fit(start, views, options=options)
     checkpoint = Memo()
@@ -177,19 +177,23 @@ def test_a_killed_fit_resumes_bit_for_bit(monkeypatch):
 
 def test_what_is_not_finite_is_an_error_that_says_so():
     views = pictures(blobs(20, 9))
-    broken = Pictures(views.cameras, tuple(image * float("nan") for image in views.images))
+    broken = FixedViews(views.cameras, tuple(image * float("nan") for image in views.images))
     with pytest.raises(ValueError, match="found a loss of nan at step 0"):
-        fit(blobs(20, 9), broken, options=FitOptions(iterations=3, rates=Rates(sh=0.1)))
+        fit(blobs(20, 9), broken, options=FitOptions(iterations=3, rates=LearningRates(sh=0.1)))
 
 
 def test_no_views_is_an_error():
     views = pictures(blobs(5, 9))
     with pytest.raises(ValueError, match="at least one view"):
-        fit(blobs(5, 9), Pictures(views.cameras[:0], ()), options=FitOptions(iterations=3, rates=Rates(sh=0.1)))
+        fit(
+            blobs(5, 9),
+            FixedViews(views.cameras[:0], ()),
+            options=FitOptions(iterations=3, rates=LearningRates(sh=0.1)),
+        )
 
 
 def test_rates_fall_as_3dgs_says():
-    rates = Rates(means=1.6e-4, means_final=1.6e-6, sh=0.0025, sh_higher=0.0025 / 20)
+    rates = LearningRates(means=1.6e-4, means_final=1.6e-6, sh=0.0025, sh_higher=0.0025 / 20)
     # exponential: the geometric mean half-way
     assert rates.means_at(0.5) == pytest.approx(1.6e-5)
     assert torch.allclose(rates.at("sh", 0.9, 12), torch.tensor([0.0025] * 3 + [0.0025 / 20] * 9))

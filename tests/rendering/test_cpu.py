@@ -142,9 +142,9 @@ def test_views_of_a_batch_are_the_single_views():
     )
     both = rendering.render(scene, pair, outputs=ALL)
     for i, single in enumerate([one, moved]):
-        serialized = rendering.render(scene, single, outputs=ALL)
-        assert torch.equal(both.color[i], serialized.color[0])
-        assert torch.equal(both.visible[i], serialized.visible[0])
+        alone = rendering.render(scene, single, outputs=ALL)
+        assert torch.equal(both.color[i], alone.color[0])
+        assert torch.equal(both.visible[i], alone.visible[0])
 
 
 def test_a_tiny_image_and_a_wide_one():

@@ -38,9 +38,9 @@ def test_a_second_part_of_the_object_stays_unless_the_largest_alone_is_wanted(ba
     fainter = replace(ball, opacity_logits=ball.opacity_logits - 0.5)
     both = concatenate([ball, away.gaussians(fainter)])
     assert select_object(both, torch.ones(2 * BALL))[BALL:].float().mean() > 0.95
-    serialized = select_object(both, torch.ones(2 * BALL), SelectOptions(keep="largest"))
-    assert serialized[:BALL].float().mean() > 0.95
-    assert not serialized[BALL:].any()
+    alone = select_object(both, torch.ones(2 * BALL), SelectOptions(keep="largest"))
+    assert alone[:BALL].float().mean() > 0.95
+    assert not alone[BALL:].any()
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])

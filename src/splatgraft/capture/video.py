@@ -1,4 +1,4 @@
-"""Sharp, evenly spaced frames of a video. Knows nothing about cameras or poses."""
+"""Extracts evenly spaced frames of a video, each the sharpest of its interval."""
 
 import math
 from collections.abc import Iterator
@@ -11,13 +11,26 @@ import numpy as np
 
 from splatgraft.runtime.progress import Progress, silent
 
+_SHARPNESS_PX = 480
+"""Longest side at which sharpness is measured, so that it does not depend on the resolution."""
+
 
 def extract_frames(video: Path, folder: Path, *, count: int = 120, progress: Progress = silent) -> list[Path]:
-    """The sharpest frame of each of `count` equal stretches of `video`, as PNG in `folder`; fewer if it is shorter.
+    """Write the sharpest frame of each of `count` equal intervals of `video` to `folder`, as PNG.
 
-    Sharpness is the variance of the Laplacian of the frame at 480 px, which falls with motion blur.
+    Sharpness is the variance of the Laplacian of the frame, reduced to 480 px; motion blur lowers it.
 
-    Raises: ValueError where `video` cannot be read or holds fewer than three frames.
+    Args:
+        video: Any file that OpenCV can read.
+        folder: Made where it does not exist.
+        count: Frames to write; fewer if the video has fewer.
+        progress: Called every 25 frames, in two passes.
+
+    Returns:
+        The files, in order of time.
+
+    Raises:
+        ValueError: Where `video` cannot be read or has fewer than three frames.
     """
     if count < 1:
         raise ValueError(f"{video}: expected at least 1 frame to extract, found {count}")
@@ -25,7 +38,7 @@ def extract_frames(video: Path, folder: Path, *, count: int = 120, progress: Pro
         sharpness = np.array([_sharpness(frame) for frame in _frames(capture, progress, "looking for sharp frames")])
     if len(sharpness) < 3:
         raise ValueError(f"{video}: expected a video of at least 3 frames, found {len(sharpness)}")
-    chosen = _sharpest_per_stretch(sharpness, count)
+    chosen = _sharpest_per_interval(sharpness, count)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     with _opened(video) as capture:
@@ -37,7 +50,7 @@ def extract_frames(video: Path, folder: Path, *, count: int = 120, progress: Pro
     return paths
 
 
-def _sharpest_per_stretch(sharpness: np.ndarray, count: int) -> set[int]:
+def _sharpest_per_interval(sharpness: np.ndarray, count: int) -> set[int]:
     edges = np.linspace(0, len(sharpness), min(count, len(sharpness)) + 1).round().astype(int)
     return {int(start + np.argmax(sharpness[start:end])) for start, end in pairwise(edges)}
 
@@ -70,6 +83,6 @@ def _frames(capture: cv2.VideoCapture, progress: Progress, message: str) -> Iter
 
 
 def _sharpness(frame: np.ndarray) -> float:
-    scale = 480 / max(frame.shape[:2])
+    scale = _SHARPNESS_PX / max(frame.shape[:2])
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else frame
     return float(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var())

@@ -1,6 +1,7 @@
-"""Cameras around a scene that came without any: where its dense part is, which way is up, from where it can be seen.
+"""Virtual cameras for a trained scene that comes without images: its dense part, its up direction, and camera poses.
 
-Knows nothing about files, and nothing of how the scene was made.
+The dense part is found by trimmed means, up as the normal of the largest plane (RANSAC), the poses on rings around the
+dense part or within it (`camera_positions`).
 """
 
 import math
@@ -12,31 +13,65 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.capture.camera_positions import HALF_FOV, LEAST_VIEWS, best_poses, positions_around, positions_within
+from splatgraft.capture.camera_positions import (
+    HALF_FOV,
+    LEAST_VIEWS,
+    positions_around,
+    positions_within,
+    unoccluded_poses,
+)
 from splatgraft.core.cameras import Cameras, pinhole
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.planes import least_squares_normal, sample_planes
+from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering import render
 from splatgraft.runtime.progress import Progress, silent
 
-_HOLLOW = 0.08
-"""Of the points within half the radius of the dense part: a filled ball has 0.06 there, a table with things more."""
-_POINTS = 20_000
-_TRIALS = 1000
-_ALIGNED = math.cos(math.radians(25))
+
+@dataclass(frozen=True)
+class SceneOrientationOptions:
+    """How dense part and up of a scene are found; lengths over the dense part's radius, values set by hand."""
+
+    least_opacity: float = 0.3
+    """Opacity above which a Gaussian counts as solid."""
+    largest_scale: float = 20.0
+    """Scale over the median one from which a Gaussian counts as backdrop."""
+    most_points: int = 20_000
+    """Solid Gaussians that are used."""
+    least_points: int = 20
+    """Solid Gaussians that are needed."""
+    trim_rounds: int = 10
+    """Means of the nearer half of the points, each around the one before."""
+    plane_points: int = 4000
+    """Points that planes are fitted to, about the dense part within twice its radius."""
+    trials: int = 1000
+    """Random planes."""
+    thickness: float = 0.02
+    """Largest distance of a point that counts as on a plane."""
+    aligned_deg: float = 25.0
+    """Angle to a customary up direction (y or z of the file) below which a plane is taken for a floor."""
+    unaligned_weight: float = 0.6
+    """Factor on the points of other planes: walls are as large as floors."""
+    least_share: float = 0.1
+    """Least share of the points on the plane."""
+    side_ratio: float = 3.0
+    """Points on one side of the plane over those on the other, above which the first side is up."""
+    hollow_share: float = 0.08
+    """Share of points within half the radius below which a scene is hollow: a solid ball has 0.06, a table more."""
 
 
 @dataclass(frozen=True)
-class LookOptions:
-    """How a scene without photographs is looked at."""
+class VirtualCameraOptions:
+    """Pictures to render of a trained scene that comes without photographs."""
 
     views: int = 36
-    """Of a trained scene: how many pictures are made of it; fewer where things stand in the way."""
+    """Of a trained scene: number of pictures to render; fewer where the view is blocked."""
     look: Literal["around", "within"] = "around"
-    """Of a trained scene: at its dense part from all around, or out of its middle, as of a room seen from within."""
+    """Of a trained scene: at its dense part from all around, or outwards from its middle, as in a room."""
     picture_width: int = 640
     """Of these pictures, pixels; their height is three quarters of it."""
     up: tuple[float, float, float] | None = None
-    """Of a trained scene: its up; found from its largest level surface where not given."""
+    """Of a trained scene: its up direction; found from its largest level surface where not given."""
 
     def __post_init__(self) -> None:
         """Raises: ValueError where there would be too few views, or up has no length."""
@@ -49,32 +84,46 @@ class LookOptions:
 
 
 @dataclass(frozen=True)
-class Viewpoints:
-    """Places from which a scene can be looked at."""
+class VirtualCameras:
+    """Cameras placed around or in a scene, and its sparse points."""
 
     cameras: Cameras
-    """Around the dense part, looking at its middle; or in it, looking out."""
+    """Around the dense part, looking at its middle; or within it, looking outwards."""
     points: Float[Tensor, "m 3"]
-    """Centres of solid Gaussians: what structure from motion would have found."""
+    """Centres of solid Gaussians, in place of the points of structure from motion."""
     point_colors: Float[Tensor, "m 3"]
     """sRGB in [0, 1]."""
     report: tuple[str, ...]
-    """Plain sentences: what was assumed."""
+    """Sentences for the user: what was assumed."""
 
 
-def find_viewpoints(scene: Gaussians, options: LookOptions, *, progress: Progress = silent) -> Viewpoints:
-    """Rings of cameras around the scene's dense part or in it, those left out that see only what stands in the way.
+def place_virtual_cameras(
+    scene: Gaussians,
+    options: VirtualCameraOptions,
+    *,
+    orientation: SceneOrientationOptions = SceneOrientationOptions(),
+    progress: Progress = silent,
+) -> VirtualCameras:
+    """Place rings of cameras around the scene's dense part or within it, without those whose view is blocked.
 
-    Raises: ValueError where the scene has too few solid Gaussians to tell what it shows.
+    Args:
+        scene: A trained scene in any frame.
+        options: Number, size and kind of the views.
+        orientation: How dense part and up are found.
+        progress: Called after each view.
+
+    Raises:
+        ValueError: Where the scene has too few solid Gaussians.
     """
-    solid = _solid(scene)
-    centre, radius = dense_part(solid.means)
+    solid = _solid(scene, orientation)
+    centre, radius = dense_part(solid.means, orientation.trim_rounds)
     if options.up is None:
-        up, reason = find_up(solid.means, centre, radius)
+        up, reason = estimate_scene_up(solid.means, centre, radius, options=orientation)
     else:
         up, reason = torch.nn.functional.normalize(torch.tensor(options.up), dim=0), "as given"
-    stands = positions_around if options.look == "around" else positions_within
-    poses, dropped = best_poses(scene, stands(centre, radius, up=up, views=options.views), up=up, progress=progress)
+    positions = positions_around if options.look == "around" else positions_within
+    candidates = positions(centre, radius, up=up, views=options.views)
+    poses, dropped = unoccluded_poses(scene, candidates, up=up, progress=progress)
     width = options.picture_width
     focal = 0.5 * width / math.tan(HALF_FOV)
     cameras = pinhole(poses, focal, width=width, height=width * 3 // 4, prefix="look")
@@ -85,73 +134,90 @@ def find_viewpoints(scene: Gaussians, options: LookOptions, *, progress: Progres
     if dropped:
         report.append(f"{dropped} of {options.views} views were left out: something stands in their way")
     inner = float(((solid.means - centre).norm(dim=1) < 0.5 * radius).float().mean())
-    if options.look == "around" and inner < _HOLLOW:
+    if options.look == "around" and inner < orientation.hollow_share:
         report.append("it is hollow: where it was seen from within, as a room from its middle, say look = within")
-    return Viewpoints(cameras, solid.means, (0.5 + 0.28209479 * solid.sh[:, 0]).clamp(0, 1), tuple(report))
+    colors = rgb_from_dc(solid.sh[:, 0]).clamp(0, 1)
+    return VirtualCameras(cameras, solid.means, colors, tuple(report))
 
 
-def photographed(
-    scene: Gaussians, found: Viewpoints, *, write: Callable[[str, Tensor], None], progress: Progress = silent
+def render_pictures(
+    scene: Gaussians, found: VirtualCameras, *, write: Callable[[str, Tensor], None], progress: Progress = silent
 ) -> None:
-    """Hand a picture of `scene` from every viewpoint to `write`, by the camera's name."""
+    """Render `scene` from every camera and hand each picture, sRGB, to `write` with the camera's name."""
     for index, camera in enumerate(found.cameras):
         color = render(scene, camera).color
         write(camera.names[0], color[0].clamp(0, 1))
         progress(index + 1, len(found.cameras), "pictures of the scene")
 
 
-def dense_part(points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "3"], float]:
-    """Centre of the densest half of the points, and the radius that holds half of them."""
+def dense_part(points: Float[Tensor, "m 3"], rounds: int = 10) -> tuple[Float[Tensor, "3"], float]:
+    """Centre of the densest half of the points, by iterated trimmed means, and the radius that holds half of them."""
     centre = points.median(0).values
-    for _ in range(10):
+    for _ in range(rounds):
         distance = (points - centre).norm(dim=1)
         centre = points[distance <= distance.median()].mean(0)
     return centre, float((points - centre).norm(dim=1).median())
 
 
-def find_up(points: Float[Tensor, "m 3"], centre: Float[Tensor, "3"], radius: float) -> tuple[Float[Tensor, "3"], str]:
-    """Unit up, and why: the normal of the largest plane about the dense part, to the side on which things stand.
+def estimate_scene_up(
+    points: Float[Tensor, "m 3"],
+    centre: Float[Tensor, "3"],
+    radius: float,
+    *,
+    options: SceneOrientationOptions = SceneOrientationOptions(),
+) -> tuple[Float[Tensor, "3"], str]:
+    """Up direction of a scene: the normal of the largest plane in the dense part, on the side with more points.
 
-    The custom of the files decides where z is vertical (+z), since below a table there stands as much as on it, and
-    where both sides are alike (-y as structure from motion leaves it, or +z).
+    The conventions of files decide the sign where the normal is nearly z (+z, since there may be as much below a table
+    as on it), and where both sides are alike (-y, as structure from motion leaves it, or +z).
+
+    Args:
+        points: Centres of solid Gaussians.
+        centre: Of the dense part.
+        radius: Of the dense part, world units.
+        options: Of the plane.
+
+    Returns:
+        A unit vector, and the reason for it, for the user.
     """
     near = points[(points - centre).norm(dim=1) < 2 * radius]
-    near = near[:: max(1, len(near) // 4000)]
-    generator = torch.Generator().manual_seed(0)
-    corners = near[torch.randint(len(near), (_TRIALS, 3), generator=generator)]
-    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    # three points in a row span no plane
+    near = near[:: max(1, len(near) // options.plane_points)]
+    normals, on_plane = sample_planes(near, options.trials, seed=0)
+    # three points on a line span no plane
     spans = normals.norm(dim=1) > 1e-4 * radius**2
-    normals, corners = torch.nn.functional.normalize(normals[spans], dim=1), corners[spans]
-    heights = normals @ near.T - (normals * corners[:, 0]).sum(1)[:, None]
-    thickness = 0.02 * radius
+    normals, on_plane = torch.nn.functional.normalize(normals[spans], dim=1), on_plane[spans]
+    heights = normals @ near.T - (normals * on_plane).sum(1)[:, None]
+    thickness = options.thickness * radius
+    aligned = math.cos(math.radians(options.aligned_deg))
     counts = (heights.abs() < thickness).sum(1).float()
-    # walls are as large as floors: those at right angles to the customary ups count less
-    customary = normals[:, 1:].abs().amax(1) > _ALIGNED
-    best = int((counts * torch.where(customary, 1.0, 0.6)).argmax())
-    if counts[best] < 0.1 * len(near):
+    customary = normals[:, 1:].abs().amax(1) > aligned
+    best = int((counts * torch.where(customary, 1.0, options.unaligned_weight)).argmax())
+    if counts[best] < options.least_share * len(near):
         return torch.tensor([0.0, -1.0, 0.0]), "no level surface was found, and most files have it so"
     inliers = near[heights[best].abs() < thickness]
     middle = inliers.mean(0)
-    normal = torch.linalg.eigh((inliers - middle).double().T @ (inliers - middle).double()).eigenvectors[:, 0].float()
+    normal = least_squares_normal(inliers - middle).float()
     height = (near - middle) @ normal
     beside = ((near - centre) - ((near - centre) @ normal)[:, None] * normal).norm(dim=1) < radius
     above = float(((height > 3 * thickness) & (height < radius) & beside).sum())
     below = float(((height < -3 * thickness) & (height > -radius) & beside).sum())
     share = f"the normal of a surface that holds {float(counts[best]) / len(near):.0%} of the dense part"
-    if abs(float(normal[2])) < _ALIGNED and max(above, below) > 3 * min(above, below) + 1:
+    if abs(float(normal[2])) < aligned and max(above, below) > options.side_ratio * min(above, below) + 1:
         return normal if above > below else -normal, f"{share}, on whose one side most things stand"
     customary_side = float(normal @ torch.tensor([0.0, -1.0, 1.0])) >= 0
     return normal if customary_side else -normal, f"{share}; which of its sides is a guess by custom"
 
 
-def _solid(scene: Gaussians) -> Gaussians:
-    """At most so many Gaussians that stop light and are no backdrop."""
+def _solid(scene: Gaussians, options: SceneOrientationOptions) -> Gaussians:
+    """Opaque Gaussians that are not backdrop, at most `options.most_points`, evenly taken."""
     largest = scene.scales.amax(1)
-    which = ((scene.opacities > 0.3) & (largest < 20 * largest.median())).nonzero()[:, 0]
-    if len(which) < 20:
-        raise ValueError(f"scene: expected at least 20 solid Gaussians, found {len(which)} of {scene.count}")
-    return scene.select(which[:: math.ceil(len(which) / _POINTS)])
+    which = (
+        (scene.opacities > options.least_opacity) & (largest < options.largest_scale * largest.median())
+    ).nonzero()[:, 0]
+    if len(which) < options.least_points:
+        least = options.least_points
+        raise ValueError(f"scene: expected at least {least} solid Gaussians, found {len(which)} of {scene.count}")
+    return scene.select(which[:: math.ceil(len(which) / options.most_points)])
 
 
 def _shown(vector: Float[Tensor, "3"]) -> str:

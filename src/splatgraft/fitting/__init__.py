@@ -1,9 +1,19 @@
-"""Fitting chosen fields of Gaussians to images: the loop that reconstruct and consolidate share. Knows no files."""
+"""Fitting chosen fields of Gaussians to images by gradient descent, with image losses and a sparse Adam."""
 
-from splatgraft.fitting.loop import Control, FitOptions, FitState, Loss, Pictures, Step, Views, fit, keep
+from splatgraft.fitting.learning_rates import LearningRates
+from splatgraft.fitting.loop import Control, FitOptions, FitState, FixedViews, Loss, Step, Views, fit, leave_unchanged
 from splatgraft.fitting.photometric import l1_dssim
-from splatgraft.fitting.rates import Rates
 
 __all__ = [
-    "Control", "FitOptions", "FitState", "Loss", "Pictures", "Rates", "Step", "Views", "fit", "keep", "l1_dssim",
+    "Control",
+    "FitOptions",
+    "FitState",
+    "FixedViews",
+    "LearningRates",
+    "Loss",
+    "Step",
+    "Views",
+    "fit",
+    "l1_dssim",
+    "leave_unchanged",
 ]  # fmt: skip

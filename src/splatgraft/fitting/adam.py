@@ -1,7 +1,7 @@
-"""Adam that moves only the Gaussians a view sees, fused for the CPU. Knows nothing about images or fields' meaning.
+"""Adam that updates only the Gaussians that a view sees, fused for the CPU.
 
 Sparse updates follow Taming 3DGS (Mallick et al. 2024, Sec. 4.4). Each Gaussian counts its own steps, so that the bias
-correction (Kingma & Ba 2015, Alg. 1) is right for those seen seldom and for those born late.
+correction (Kingma & Ba 2015, Alg. 1) is right for rarely seen ones and for those added later.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ class Moments:
     second: dict[str, Tensor]
     """Mean squared gradient."""
     steps: Int[Tensor, "n"]
-    """Steps that each Gaussian has taken, int32."""
+    """Updates of each Gaussian so far, int32."""
 
     def select(self, which: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "Moments":
         """The moments of the chosen Gaussians."""
@@ -39,8 +39,8 @@ class Moments:
             self.steps[which],
         )
 
-    def forget(self, which: Int[Tensor, "m"]) -> "Moments":
-        """Copies in which the chosen Gaussians start anew."""
+    def reset(self, which: Int[Tensor, "m"]) -> "Moments":
+        """Copies with the moments and steps of the chosen Gaussians set to zero."""
         out = Moments(
             {k: v.clone() for k, v in self.first.items()},
             {k: v.clone() for k, v in self.second.items()},
@@ -51,7 +51,7 @@ class Moments:
         return out
 
     def padded(self, field: str, columns: int) -> "Moments":
-        """The second axis of one field's moments grown to `columns` with zeros."""
+        """Copies with the second axis of one field's moments padded with zeros to `columns`."""
 
         def grow(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
             old = tensors[field]
@@ -63,7 +63,7 @@ class Moments:
 
 
 def no_moments(tensors: dict[str, Tensor], count: int) -> Moments:
-    """Moments of tensors that have not moved yet, for `count` Gaussians."""
+    """Zero moments for tensors of `count` Gaussians."""
     device = next(iter(tensors.values())).device
     return Moments(
         {k: torch.zeros_like(v) for k, v in tensors.items()},
@@ -80,7 +80,18 @@ def step(
     rates: dict[str, Float[Tensor, "c"]],
     visible: Bool[Tensor, "n"],
 ) -> bool:
-    """Move `values` and `moments` in place where `visible`; False where a gradient was not finite (that row stays)."""
+    """Update `values` and `moments` in place where `visible`.
+
+    Args:
+        values: Fields by name, (n, ..).
+        gradients: Of the loss, shaped as `values`.
+        moments: Of the same fields.
+        rates: Learning rate of each column of each field, flattened over the axes after the first.
+        visible: Gaussians to update.
+
+    Returns:
+        False where a gradient was not finite; the rows with such gradients stay unchanged.
+    """
     moments.steps[visible] += 1
     update = _step_numba if visible.device.type == "cpu" else _step_torch
     n = len(visible)
@@ -155,7 +166,7 @@ def _update_rows(values, gradients, moments, counts, rates):
 
 
 def _step_torch(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bool[Tensor, "n"]) -> bool:
-    """The same on any device, in torch operations."""
+    """The same update in torch operations, for any device."""
     finite = True
     seen = torch.nonzero(visible).flatten()
     for value, gradient, first, second, rate in zip(*rows, rates, strict=True):

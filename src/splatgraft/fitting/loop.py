@@ -1,7 +1,7 @@
-"""The loop that fits Gaussians to images: render, loss, gradient, sparse Adam. Knows nothing about captures or files.
+"""The loop that fits Gaussians to images: render, loss, gradient, sparse Adam.
 
-Everything that step i does follows from the state after step i - 1, the seed and i, so a run that was killed and
-resumed ends bit for bit where an uninterrupted one ends.
+Step i depends only on the state after step i - 1, the seed and i, so that a run resumed from a checkpoint gives the
+same bits as an uninterrupted one.
 """
 
 import math
@@ -17,19 +17,19 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import adam
+from splatgraft.fitting.learning_rates import LearningRates
 from splatgraft.fitting.photometric import l1_dssim
-from splatgraft.fitting.rates import Rates
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 Loss = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], Float[Tensor, ""]]
-"""Of the rendered and the wanted image."""
+"""From the rendered and the target image to a scalar."""
 
 _REPORT_EVERY = 10
+"""Steps."""
 _CHECKPOINT_SECONDS = 30.0
 
 
-@runtime_checkable
 @runtime_checkable
 class Views(Protocol):
     """The images to fit."""
@@ -39,13 +39,13 @@ class Views(Protocol):
         ...
 
     def at(self, index: int, done: float) -> tuple[Cameras, Float[Tensor, "h w 3"]]:
-        """One camera and the image it should see, after the share `done` in [0, 1] of all steps."""
+        """One camera and its target image, after the share `done` in [0, 1] of all steps."""
         ...
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """`Views` that stay the same throughout."""
+class FixedViews:
+    """`Views` that do not depend on the progress."""
 
     cameras: Cameras
     """One per image; sizes may differ."""
@@ -63,23 +63,23 @@ class Pictures:
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How long, how fast and by what measure to fit."""
+    """Length, learning rates and loss of a fit."""
 
     iterations: int
     """Steps; each sees one view."""
-    rates: Rates
-    """Learning rates; fields with rate 0 stay as they are."""
+    rates: LearningRates
+    """Learning rates; fields with rate 0 are not fitted."""
     loss: Loss = l1_dssim
-    """What to make small."""
+    """Loss to minimise."""
     seed: int = 0
-    """Of the order of views, and whatever the control draws."""
+    """Of the order of views."""
     rendering: RenderOptions = field(default_factory=RenderOptions)
     """Background, low-pass and near plane."""
 
 
 @dataclass(frozen=True)
 class FitState:
-    """All that the next step depends on, beside options and views."""
+    """Everything besides options and views that the next step depends on."""
 
     iteration: int
     """Steps done."""
@@ -88,32 +88,32 @@ class FitState:
     moments: adam.Moments
     """Of the fields that are fitted."""
     memory: dict[str, Tensor] = field(default_factory=dict)
-    """What the control keeps between steps."""
+    """Tensors that the control stores between steps."""
 
-    def choose(self, which: Tensor) -> "FitState":
-        """The state of the chosen Gaussians alone (indices or mask); `memory` is emptied."""
+    def select(self, which: Tensor) -> "FitState":
+        """The state of the chosen Gaussians (indices or mask) with an empty `memory`."""
         return replace(self, gaussians=self.gaussians.select(which), moments=self.moments.select(which), memory={})
 
 
 @dataclass(frozen=True)
 class Step:
-    """What the last step saw, for the control."""
+    """The last step, as the control sees it."""
 
     camera: Cameras
     """The view's camera."""
     visible: Bool[Tensor, "n"]
-    """Gaussians that the view reaches."""
+    """Gaussians in the view."""
     gradients: dict[str, Tensor]
     """Of the loss, by field."""
     rate_of_means: float
-    """World units."""
+    """Learning rate of the centres in this step, world units."""
 
 
 Control = Callable[[FitState, Step], FitState]
-"""Called after every step; may add, move and remove Gaussians, and keep tensors in `memory`."""
+"""Called after every step; may add, change and remove Gaussians, and store tensors in `memory`."""
 
 
-def keep(state: FitState, step: Step) -> FitState:
+def leave_unchanged(state: FitState, step: Step) -> FitState:
     """The `Control` that changes nothing."""
     return state
 
@@ -123,13 +123,22 @@ def fit(
     views: Views,
     *,
     options: FitOptions,
-    control: Control = keep,
+    control: Control = leave_unchanged,
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
-    """The Gaussians whose chosen fields make renders of `views` look like their images.
+    """Fit the fields of `gaussians` whose learning rate is above 0 to the images of `views`.
 
-    Raises: ValueError where there is no view, or where loss or gradients stop being finite.
+    Args:
+        gaussians: Start of the fit; stays unchanged.
+        views: Cameras and target images.
+        options: Length, rates and loss.
+        control: Called after every step, as for density control.
+        progress: Called every ten steps.
+        checkpoint: Where the state is saved every 30 seconds, and from which a run is resumed.
+
+    Raises:
+        ValueError: Where there is no view, or where loss or gradients are not finite.
     """
     if len(views) == 0:
         raise ValueError("fit: expected at least one view, found none")
@@ -173,7 +182,7 @@ def _diverged(state: FitState, found: str) -> ValueError:
 
 
 def _view_of(iteration: int, count: int, seed: int) -> int:
-    """Every view once per round, each round in its own random order."""
+    """The view of an iteration: each pass visits all views in an order that depends on seed and pass only."""
     generator = torch.Generator().manual_seed((seed * 1_000_003 + iteration // count) % 2**62)
     return int(torch.randperm(count, generator=generator)[iteration % count])
 

@@ -1,7 +1,7 @@
-"""Perceptual losses between two images: windowed Fourier magnitude, LPIPS with VGG. Knows nothing about Gaussians.
+"""Perceptual losses between two images: L1 of windowed Fourier magnitudes, and LPIPS with VGG-16 (Zhang 2018).
 
-Every loss takes an image and a target, sRGB in [0, 1], and gives a scalar that is 0 where they are equal; the gradient
-flows to the image alone. Nothing is downloaded: LPIPS reads weights that are already on the disk.
+Every loss takes an image and a target, sRGB in [0, 1], and returns a scalar that is 0 where they are equal; the
+gradient flows to the image only. Nothing is downloaded: LPIPS reads weights from the disk.
 """
 
 import math
@@ -37,9 +37,9 @@ def windowed_fourier(
 ) -> Float[Tensor, ""]:
     """L1 between the Fourier magnitudes of overlapping Hann windows, plus `l1_weight` L1 between the pixels.
 
-    Windows of `window_px` every half window, all channels. The magnitudes forget where in the window an edge lies, so
-    that views that disagree by a pixel still ask for one sharp edge instead of the average of two. They are scaled so
-    that independent noise gives them the standard deviation that it has in the pixels.
+    Windows of `window_px` every half window, all channels. Magnitudes do not depend on where in the window an edge
+    lies, so that views that disagree by a pixel favour one sharp edge over the average of two. They are scaled so that
+    independent noise has the same standard deviation in them as in the pixels.
     """
     window, multiplicity = _hann(window_px, image.dtype, image.device)
     magnitude = _magnitudes(image, window)

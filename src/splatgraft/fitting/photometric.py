@@ -1,7 +1,7 @@
-"""The photometric loss of 3DGS, L1 with D-SSIM, with a fused gradient for the CPU. Knows nothing about Gaussians.
+"""The photometric loss of 3DGS, L1 with D-SSIM (Kerbl et al. 2023, Eq. 7), with a fused gradient on the CPU.
 
-Fused: four 11-tap separable filters forward and three back over rows of interleaved channels. Loops name few arrays,
-or planes of one array at constant distances, because only then does the compiler see that they do not overlap.
+The kernel applies four 11-tap separable filters forward and three backward to rows of interleaved channels. Its loops
+use few arrays, or planes of one array at constant distances, because only then can the compiler rule out aliasing.
 """
 
 from typing import no_type_check
@@ -173,7 +173,7 @@ def _gradient_of_row(out, spread, row, pair, scales):
 def _loss_and_gradient(x, y, weight):
     """Loss and its gradient for images as rows of three interleaved channels.
 
-    Bands of rows are independent; within one, what is filtered lives in rings of eleven rows and stays in the cache.
+    Bands of rows are independent; within a band, filtered rows are held in ring buffers of eleven rows in the cache.
     """
     h, width = x.shape
     rows, columns = h - 10, width - _EDGE

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 from splatgraft.harmonization.compact.factory import make_compact
 from splatgraft.harmonization.flux.factory import make_flux
-from splatgraft.harmonization.identity import IdentityHarmonizer
 from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize
+from splatgraft.harmonization.identity import IdentityHarmonizer
 from splatgraft.harmonization.inputs import render_views
 from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
 from splatgraft.harmonization.options import HarmonizerOptions

@@ -1,4 +1,4 @@
-"""Reconstruction of a 3DGS scene from posed images. Knows nothing about files."""
+"""Reconstruction of a 3DGS scene from posed images (3D Gaussian Splatting, Kerbl et al. 2023)."""
 
 from splatgraft.reconstruction.memory import predict_memory
 from splatgraft.reconstruction.options import ReconstructOptions

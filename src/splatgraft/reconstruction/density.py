@@ -1,4 +1,4 @@
-"""Where Gaussians are split and removed while a scene is fitted, under a hard budget. Knows no images and no losses.
+"""Density control: where Gaussians are split and removed while a scene is fitted, under a hard budget.
 
 As in Taming 3DGS (Mallick et al. 2024, Sec. 4.2) the number follows a schedule up to the budget, and the Gaussians that
 score highest are the ones to split, so that time and memory are known beforehand; the score is 3DGS's own, the mean
@@ -18,42 +18,56 @@ from torch import Tensor
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.fitting import FitState, Step
 
-DEAD_OPACITY = 0.005
-"""Below it a Gaussian is removed (3DGS, Sec. 5)."""
-_SHIFT = 0.5
-"""Of the children from the parent's centre, in its longest standard deviation."""
-_CHILD_LONG = math.log(math.sqrt(1 - _SHIFT**2))
-"""Keeps the variance along the long axis: shift^2 + child^2 = 1."""
-_CHILD_SHORT = math.log(0.85)
-_CHILD_OPACITY = 0.6
-_LARGEST = 0.5
-"""Standard deviation, as a share of the distance to the nearest camera."""
+
+@dataclass(frozen=True)
+class SplitOptions:
+    """How a Gaussian is split, and when one is removed or limited; set by hand where no source is named."""
+
+    dead_opacity: float = 0.005
+    """Opacity below which a Gaussian is removed (3DGS, Sec. 5)."""
+    shift: float = 0.5
+    """Distance of the children from the parent's centre, in the parent's longest standard deviation."""
+    short_scale: float = 0.85
+    """Width of a child across the split axis, over the parent's."""
+    opacity: float = 0.6
+    """Opacity of a child over the parent's."""
+    least_opacity: float = 1.2
+    """Least opacity of a child, over `dead_opacity`."""
+    largest: float = 0.5
+    """Bound on the standard deviation, over the distance to the nearest camera."""
+
+    @property
+    def long_scale(self) -> float:
+        """Width of a child along the split axis, over the parent's; keeps the variance: shift^2 + long_scale^2 = 1."""
+        return math.sqrt(1 - self.shift**2)
 
 
 @dataclass(frozen=True)
-class Density:
-    """When to look, and how many Gaussians there may be."""
+class DensityControl:
+    """Schedule of the density control, as a `Control` of the fit."""
 
     budget: int
     """Never exceeded."""
     first_count: int
-    """Number at the start; the number allowed rises linearly from it to the budget."""
+    """Number at the start; the allowed number rises linearly from it to the budget."""
     every: int
-    """Steps between two looks."""
+    """Steps between two densifications."""
     full_at: int
     """Step at which the budget may be reached."""
     stop: int
     """Step after which nothing is added or removed."""
     camera_centers: Float[Tensor, "v 3"]
-    """World units; bound how large a Gaussian may be."""
+    """World units; their distance bounds the scale of a Gaussian."""
+    split: SplitOptions = SplitOptions()
+    """How Gaussians are split, removed and limited."""
 
     def allowed(self, iteration: int) -> int:
-        """How many Gaussians there may be after `iteration` steps."""
+        """Number of Gaussians allowed after `iteration` steps."""
         share = min(1.0, iteration / max(self.full_at, 1))
         return min(self.budget, int(self.first_count + max(self.budget - self.first_count, 0) * share))
 
-    def after(self, state: FitState, step: Step) -> FitState:
-        """Add the step's gradient to the score, and at every look remove the dead and split the highest."""
+    def update(self, state: FitState, step: Step) -> FitState:
+        """Add the step's gradient to the scores; when due, remove transparent Gaussians and split the highest."""
         if state.iteration > self.stop:
             return replace(state, memory={}) if state.memory else state
         score, seen = (state.memory.get(k, torch.zeros_like(state.gaussians.opacity_logits)) for k in ("score", "seen"))
@@ -62,44 +76,45 @@ class Density:
         if state.iteration % self.every:
             return replace(state, memory=memory)
         score = memory["score"] / memory["seen"].clamp_min(1)
-        return self._bounded(self._look(state, score, memory["seen"] > 0))
+        return self._limit_scales(self._densify(state, score, memory["seen"] > 0))
 
-    def _look(self, state: FitState, score: Float[Tensor, "n"], seen: Bool[Tensor, "n"]) -> FitState:
-        alive = state.gaussians.opacities > DEAD_OPACITY
+    def _densify(self, state: FitState, score: Float[Tensor, "n"], seen: Bool[Tensor, "n"]) -> FitState:
+        alive = state.gaussians.opacities > self.split.dead_opacity
         parents_wanted = min(max(self.allowed(state.iteration) - int(alive.sum()), 0), int((alive & seen).sum()))
         parents = torch.where(alive & seen, score, -1.0).topk(parents_wanted).indices.sort().values
         stays = alive.clone()
         stays[parents] = False
         kept = torch.nonzero(stays).flatten()
-        out = state.choose(torch.cat([kept, parents, parents]))
-        children = split(state.gaussians.select(parents))
+        out = state.select(torch.cat([kept, parents, parents]))
+        children = split(state.gaussians.select(parents), self.split)
         fresh = torch.arange(len(kept), out.gaussians.count, device=kept.device)
         return replace(
             out,
             gaussians=concatenate([state.gaussians.select(kept), children]),
-            moments=out.moments.forget(fresh),
+            moments=out.moments.reset(fresh),
         )
 
-    def _bounded(self, state: FitState) -> FitState:
-        """Scales cut to a share of the distance to the nearest camera, so that none grows without end."""
+    def _limit_scales(self, state: FitState) -> FitState:
+        """Scales bounded by a share of the distance to the nearest camera."""
         means = state.gaussians.means
         nearest = torch.full_like(means[:, 0], torch.inf)
         for center in self.camera_centers:
             nearest = torch.minimum(nearest, (means - center).norm(dim=1))
-        bound = (_LARGEST * nearest).clamp_min(1e-6).log()[:, None]
+        bound = (self.split.largest * nearest).clamp_min(1e-6).log()[:, None]
         log_scales = torch.minimum(state.gaussians.log_scales, bound)
         return replace(state, gaussians=replace(state.gaussians, log_scales=log_scales))
 
 
-def split(parents: Gaussians) -> Gaussians:
+def split(parents: Gaussians, options: SplitOptions = SplitOptions()) -> Gaussians:
     """Two children of each parent, side by side along its longest axis: first one of each, then the other."""
     n = parents.count
     rows = torch.arange(n, device=parents.device)
     axis = parents.log_scales.argmax(1)
-    shift = _SHIFT * parents.scales[rows, axis, None] * parents.rotations[rows, :, axis]
-    log_scales = parents.log_scales + _CHILD_SHORT
-    log_scales[rows, axis] = parents.log_scales[rows, axis] + _CHILD_LONG
-    opacity = (_CHILD_OPACITY * parents.opacities).clamp_min(1.2 * DEAD_OPACITY)
+    shift = options.shift * parents.scales[rows, axis, None] * parents.rotations[rows, :, axis]
+    log_scales = parents.log_scales + math.log(options.short_scale)
+    log_scales[rows, axis] = parents.log_scales[rows, axis] + math.log(options.long_scale)
+    least = options.least_opacity * options.dead_opacity
+    opacity = (options.opacity * parents.opacities).clamp_min(least)
     child = replace(parents, log_scales=log_scales, opacity_logits=opacity.logit())
     return concatenate([replace(child, means=parents.means + side * shift) for side in (1.0, -1.0)])
 

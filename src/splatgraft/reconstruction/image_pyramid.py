@@ -1,4 +1,4 @@
-"""The photographs of a capture as 8-bit pyramids, served coarse first. Knows nothing about Gaussians."""
+"""8-bit image pyramids of a capture's photographs: the first steps of a fit use the coarse levels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.runtime.progress import Progress
 
 _SMALLEST = 32
-"""Least side of a reduced image, pixels: below it the 11-pixel window of SSIM sees most of the image at once."""
+"""Least side of a reduced image, pixels: below it the 11-pixel window of SSIM covers most of the image."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Level:
     """All photographs at one size."""
 
     until: float
-    """Share of the steps after which the next level is served."""
+    """Share of the steps after which the next level is used."""
     cameras: tuple[Cameras, ...]
     """One batch of 1 per photograph, at the level's size."""
     images: tuple[UInt8[Tensor, "_ _ 3"], ...]
@@ -30,7 +30,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """`fitting.Views` of photographs, small at first."""
+    """`fitting.Views` of photographs, from coarse to fine."""
 
     levels: tuple[Level, ...]
     """From coarse to fine."""
@@ -40,7 +40,7 @@ class Pyramid:
         return len(self.levels[0].images)
 
     def at(self, index: int, done: float) -> tuple[Cameras, Float[Tensor, "h w 3"]]:
-        """Camera and photograph `index` at the size due after the share `done` of all steps."""
+        """Camera and photograph `index` at the level for the share `done` of all steps."""
         level = next((level for level in self.levels if done < level.until), self.levels[-1])
         return level.cameras[index], level.images[index].float() / 255
 
@@ -48,7 +48,7 @@ class Pyramid:
 def read_pyramid(
     capture: PosedImages, schedule: Sequence[tuple[float, float]], *, device: str, progress: Progress
 ) -> Pyramid:
-    """Read every photograph once; `schedule` holds (factor, until) from coarse to fine."""
+    """Read every photograph once into all levels; `schedule` has (factor, until) per level, from coarse to fine."""
     cameras: list[list[Cameras]] = [[] for _ in schedule]
     images: list[list[Tensor]] = [[] for _ in schedule]
     for i in range(len(capture)):

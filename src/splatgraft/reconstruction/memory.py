@@ -1,4 +1,4 @@
-"""How much memory a reconstruction takes, and how much there is. Knows nothing about how it is done."""
+"""Predicts the peak memory of a reconstruction from its options, and reads how much is available."""
 
 import os
 from pathlib import Path
@@ -12,15 +12,15 @@ from splatgraft.reconstruction.options import ReconstructOptions
 _BASE = 450 * 2**20
 """Python, torch and compiled kernels, resident."""
 _COPIES = 6
-"""Of every field: value, gradient, two moments, and two while Gaussians are rearranged."""
+"""Copies of every field: value, gradient, two moments, and two while Gaussians are rearranged."""
 _BYTES_PER_PIXEL = 160
-"""Of the largest view while it is rendered and compared: planes of colour, transmittance, loss and their gradients."""
+"""For the largest view while it is rendered and compared: colour, transmittance, loss and their gradients."""
 _BYTES_PER_GAUSSIAN = 1500
 """Projections, tile lists and their gradients."""
 
 
 def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
-    """Peak bytes of the process that calls `reconstruct`, an upper estimate.
+    """Upper estimate of the peak memory of the process that calls `reconstruct`, bytes.
 
     Measured on the CPU with bands up to degree 3: 20k Gaussians at 352x248 took 492 MiB (534 predicted), 200k 974
     (1035), 40k at 640x426 568 (626).
@@ -39,9 +39,10 @@ def _file_pixels(capture: PosedImages) -> float:
 
 
 def require_memory(capture: PosedImages, options: ReconstructOptions) -> None:
-    """Return where the prediction fits what is free.
+    """Check the predicted memory against the available memory.
 
-    Raises: ValueError that names the options to lower where it does not.
+    Raises:
+        ValueError: Where too little is available; names the options to lower.
     """
     needed, free = predict_memory(capture, options), available_memory(options.device)
     if free is not None and needed > free:
@@ -52,7 +53,7 @@ def require_memory(capture: PosedImages, options: ReconstructOptions) -> None:
 
 
 def available_memory(device: str) -> int | None:
-    """Bytes that can be taken without swapping on `device`; None where the system does not say."""
+    """Bytes available on `device` without swapping; None where the system does not report them."""
     if device.startswith("cuda"):
         return torch.cuda.mem_get_info(torch.device(device))[0]
     found = [value for value in (_meminfo_available(), _control_group_free()) if value is not None]
@@ -73,7 +74,7 @@ def _meminfo_available() -> int | None:
 
 
 def _control_group_free() -> int | None:
-    """What a container's limit leaves (cgroup v2)."""
+    """Bytes left under a container's memory limit (cgroup v2)."""
     limit, used = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
     if not (limit.exists() and used.exists()) or limit.read_text().strip() == "max":
         return None

@@ -1,4 +1,4 @@
-"""What a user may choose about a reconstruction, and what each quality stands for. Does none of the work."""
+"""Options of a reconstruction, and the presets of each quality."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -26,7 +26,7 @@ _PRESETS: dict[str, _Preset] = {
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """Length, size and seed of a reconstruction; what is None follows from the quality."""
+    """Length, size and seed of a reconstruction; None takes the value of the quality."""
 
     quality: Quality = "standard"
     """`draft`: 1000 steps, 25k Gaussians; `standard`: 3000, 40k; `full`: 30000, 1M, the published schedule (GPU)."""
@@ -66,16 +66,16 @@ class ReconstructOptions:
 
     @property
     def all_iterations(self) -> int:
-        """Steps, by choice or by quality."""
+        """Number of steps, given or of the quality."""
         return _PRESETS[self.quality].iterations if self.iterations is None else self.iterations
 
     @property
     def most_gaussians(self) -> int:
-        """The budget, by choice or by quality."""
+        """The budget, given or of the quality."""
         return _PRESETS[self.quality].budget if self.budget is None else self.budget
 
     def served(self, capture: PosedImages) -> PosedImages:
-        """The capture at the size at which it is fitted."""
+        """The capture, resampled to the size at which it is fitted."""
         if self.resolution is not None:
             return capture.resized(self.resolution)
         longest = int(capture.cameras.sizes.max()) if len(capture) else 1

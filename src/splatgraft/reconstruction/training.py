@@ -1,9 +1,9 @@
-"""Reconstruction of a scene: where it starts, its schedules, the fit. Knows nothing about files or rendering.
+"""Reconstruction of a scene: initial Gaussians, schedules of learning rates and density, and the fit.
 
-Rates are 3DGS's published ones for 30000 steps. A shorter run takes larger ones and starts from more opaque Gaussians.
-Measured on a room of 36 views at 352x248, 25k Gaussians, 1000 steps, held-out PSNR: published rates 25.2 dB, twice
-26.7, four times 27.5, four times with initial opacity 0.5 and rates that fall at the end 27.8, and with rates other
-than the centres' eight times 28.1 (a bunch of bananas, 16 photographs: 29.0 and 29.1).
+Learning rates are 3DGS's published ones for 30000 steps. A shorter run takes larger ones and starts from more opaque
+Gaussians. Measured on a room of 36 views at 352x248, 25k Gaussians, 1000 steps, held-out PSNR: published rates
+25.2 dB, twice 26.7, four times 27.5, four times with initial opacity 0.5 and rates that fall at the end 27.8, and with
+rates other than the centres' eight times 28.1 (a bunch of bananas, 16 photographs: 29.0 and 29.1).
 """
 
 from dataclasses import dataclass, replace
@@ -13,34 +13,66 @@ import torch
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.fitting import FitOptions, FitState, Rates, Step, fit
-from splatgraft.reconstruction.density import Density
+from splatgraft.fitting import FitOptions, FitState, LearningRates, Step, fit
+from splatgraft.reconstruction.density import DensityControl
 from splatgraft.reconstruction.image_pyramid import read_pyramid
-from splatgraft.reconstruction.initial import from_points, random_points, scene_extent
+from splatgraft.reconstruction.initialization import from_points, random_points, scene_extent
 from splatgraft.reconstruction.memory import require_memory
 from splatgraft.reconstruction.options import ReconstructOptions
 from splatgraft.rendering import RenderOptions
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
-PUBLISHED_ITERATIONS = 30_000
-_FEWEST_POINTS = 100
-_PUBLISHED_OPACITY, _SHORT_RUN_OPACITY = 0.1, 0.5
-_COARSE_TO_FINE = ((0.5, 0.3), (0.7071, 0.6), (1.0, 1.0))
-_AS_IT_IS = ((1.0, 1.0),)
+
+@dataclass(frozen=True)
+class ScheduleOptions:
+    """Schedules of a reconstruction; 3DGS's for 30000 steps, shorter runs by the measurements above."""
+
+    published_iterations: int = 30_000
+    """Steps for which the published values hold (3DGS)."""
+    fewest_points: int = 100
+    """Sparse points below which a run starts from random points."""
+    published_opacity: float = 0.1
+    """Opacity at the start of a run of the published length or longer (3DGS)."""
+    short_run_opacity: float = 0.5
+    """Opacity at the start of a shorter run."""
+    coarse_to_fine: tuple[tuple[float, float], ...] = ((0.5, 0.3), (0.7071, 0.6), (1.0, 1.0))
+    """Factor on the image size, and share of the steps until which it is used."""
+    band_share: int = 30
+    """All steps over the steps between two bands of colour."""
+    densify_every: int = 100
+    """Most steps between two densifications (3DGS)."""
+    densifications: int = 20
+    """Least number of densification intervals in a run."""
+    full_at: float = 0.6
+    """Share of the steps after which the budget may be reached."""
+    stop_at: float = 0.8
+    """Share of the steps after which Gaussians are neither split nor removed."""
+    means_power: float = 0.5
+    """Exponent of the published length over the run's, the factor on the rate of the centres."""
+    most_means: float = 4.0
+    """Bound on that factor."""
+    others_power: float = 0.6
+    """The same exponent for all other rates."""
+    most_others: float = 8.0
+    """Bound on that factor."""
+    short_run_final: float = 0.1
+    """Last rate over the first, for all but the centres, in a shorter run."""
 
 
 def reconstruct(
     capture: PosedImages,
     options: ReconstructOptions = ReconstructOptions(),
     *,
+    schedule: ScheduleOptions = ScheduleOptions(),
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
-    """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023; density control after 3DGS-MCMC).
+    """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023; density control after Taming 3DGS).
 
     Args:
         capture: Posed images; sparse points are the start where there are at least 100.
         options: Length, size, resolution and seed.
+        schedule: Learning rates and density over the run.
         progress: Called with steps done, steps in all and a short text.
         checkpoint: Where the state is saved, and from where a run that was stopped continues.
 
@@ -56,15 +88,17 @@ def reconstruct(
     if len(capture) < 2:
         raise ValueError(f"reconstruct: expected at least 2 views to fit, found {len(capture)}")
     capture = options.served(capture)
-    start = _start(capture, options, progress).to(options.device)
-    schedule = _COARSE_TO_FINE if options.coarse_to_fine else _AS_IT_IS
-    views = read_pyramid(capture, schedule, device=options.device, progress=progress)
+    start = _start(capture, options, schedule, progress).to(options.device)
+    levels = schedule.coarse_to_fine if options.coarse_to_fine else ((1.0, 1.0),)
+    views = read_pyramid(capture, levels, device=options.device, progress=progress)
     control = _Control(
-        options.sh_degree, max(1, options.all_iterations // 30), _density(options, start.count, capture.cameras)
+        options.sh_degree,
+        max(1, options.all_iterations // schedule.band_share),
+        _density(options, schedule, start.count, capture.cameras),
     )
     fit_options = FitOptions(
         iterations=options.all_iterations,
-        rates=_rates(capture.cameras, options.all_iterations),
+        rates=_rates(capture.cameras, options.all_iterations, schedule),
         seed=options.seed,
         rendering=RenderOptions(background=options.background),
     )
@@ -74,14 +108,14 @@ def reconstruct(
 
 @dataclass(frozen=True)
 class _Control:
-    """What happens between the steps: the density, and one more band of colour every `band_every` steps."""
+    """The `Control` of the fit: density, and one more band of colour every `band_every` steps."""
 
     sh_degree: int
     band_every: int
-    density: Density
+    density: DensityControl
 
     def __call__(self, state: FitState, step: Step) -> FitState:
-        state = self.density.after(state, step)
+        state = self.density.update(state, step)
         degree = min(self.sh_degree, state.iteration // self.band_every)
         if degree <= state.gaussians.sh_degree:
             return state
@@ -89,42 +123,49 @@ class _Control:
         return replace(state, gaussians=wider, moments=state.moments.padded("sh", wider.sh.shape[1]))
 
 
-def _start(capture: PosedImages, options: ReconstructOptions, progress: Progress) -> Gaussians:
+def _start(
+    capture: PosedImages, options: ReconstructOptions, schedule: ScheduleOptions, progress: Progress
+) -> Gaussians:
     points, colors = capture.points, capture.point_colors
-    if len(points) < _FEWEST_POINTS:
+    if len(points) < schedule.fewest_points:
         count = max(options.most_gaussians // 4, 1)
         found = f"{len(points)} sparse points" if len(points) else "no sparse points"
         progress(0, options.all_iterations, f"{found}: starting from {count} random ones where the cameras look")
         points = random_points(capture.cameras, count=count, seed=options.seed)
         colors = torch.rand(count, 3, generator=torch.Generator().manual_seed(options.seed))
-    opacity = _PUBLISHED_OPACITY if options.all_iterations >= PUBLISHED_ITERATIONS else _SHORT_RUN_OPACITY
+    short = options.all_iterations < schedule.published_iterations
+    opacity = schedule.short_run_opacity if short else schedule.published_opacity
     start = from_points(points, colors, count=options.most_gaussians, seed=options.seed)
     return replace(start, opacity_logits=torch.full_like(start.opacity_logits, opacity).logit())
 
 
-def _density(options: ReconstructOptions, first_count: int, cameras: Cameras) -> Density:
+def _density(
+    options: ReconstructOptions, schedule: ScheduleOptions, first_count: int, cameras: Cameras
+) -> DensityControl:
     n = options.all_iterations
-    return Density(
+    return DensityControl(
         budget=options.most_gaussians,
         first_count=first_count,
-        every=max(1, min(100, n // 20)),
-        full_at=int(0.6 * n),
-        stop=int(0.8 * n),
+        every=max(1, min(schedule.densify_every, n // schedule.densifications)),
+        full_at=int(schedule.full_at * n),
+        stop=int(schedule.stop_at * n),
         camera_centers=cameras.centers.to(options.device),
     )
 
 
-def _rates(cameras: Cameras, iterations: int) -> Rates:
+def _rates(cameras: Cameras, iterations: int, schedule: ScheduleOptions) -> LearningRates:
+    """3DGS's published rates, higher for shorter runs."""
     extent = scene_extent(cameras)
-    shorter = max(1.0, PUBLISHED_ITERATIONS / iterations)
-    farther, faster = min(4.0, shorter**0.5), min(8.0, shorter**0.6)
-    return Rates(
-        means=1.6e-4 * extent * farther,
-        means_final=1.6e-6 * extent * farther,
-        log_scales=0.005 * faster,
-        quaternions=0.001 * faster,
-        opacity_logits=0.025 * faster,
-        sh=0.0025 * faster,
-        sh_higher=0.0025 / 20 * faster,
-        final=0.1 if shorter > 1 else 1.0,
+    shorter = max(1.0, schedule.published_iterations / iterations)
+    means_factor = min(schedule.most_means, shorter**schedule.means_power)
+    factor = min(schedule.most_others, shorter**schedule.others_power)
+    return LearningRates(
+        means=1.6e-4 * extent * means_factor,
+        means_final=1.6e-6 * extent * means_factor,
+        log_scales=0.005 * factor,
+        quaternions=0.001 * factor,
+        opacity_logits=0.025 * factor,
+        sh=0.0025 * factor,
+        sh_higher=0.0025 / 20 * factor,
+        final=schedule.short_run_final if shorter > 1 else 1.0,
     )

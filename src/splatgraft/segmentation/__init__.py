@@ -1,4 +1,4 @@
-"""Segment: masks of images become the Gaussians of an object. Knows nothing about files, and how scenes are made."""
+"""Segment: from object masks of a capture's images to the Gaussians of the object."""
 
 from splatgraft.segmentation.birefnet import BiRefNet, load_birefnet
 from splatgraft.segmentation.box import Box, default_box
@@ -7,7 +7,7 @@ from splatgraft.segmentation.lift import LiftOptions, lift_masks
 from splatgraft.segmentation.segment import Segmentation, segment
 from splatgraft.segmentation.selection import Keep, SelectOptions, select_object
 from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
-from splatgraft.segmentation.user_corrections import corrected, with_correction
+from splatgraft.segmentation.user_corrections import add_correction, apply_corrections
 
 __all__ = [
     "BiRefNet",
@@ -18,7 +18,8 @@ __all__ = [
     "Segmentation",
     "SelectOptions",
     "SolidifyOptions",
-    "corrected",
+    "add_correction",
+    "apply_corrections",
     "default_box",
     "grabcut_masks",
     "lift_masks",
@@ -27,5 +28,4 @@ __all__ = [
     "segment",
     "select_object",
     "solidify_object",
-    "with_correction",
 ]

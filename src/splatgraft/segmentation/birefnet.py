@@ -1,4 +1,4 @@
-"""Object masks by BiRefNet through onnxruntime (its only importer). Knows nothing about cameras or Gaussians."""
+"""Object masks of single images by the network BiRefNet (Zheng et al. 2024), run by onnxruntime."""
 
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -20,15 +20,15 @@ _STD = torch.tensor([0.229, 0.224, 0.225])
 
 @dataclass(frozen=True)
 class BiRefNet:
-    """A loaded network: one picture in, the mask of its foreground out."""
+    """A loaded network that finds the foreground of an image."""
 
     session: Any
     """An onnxruntime.InferenceSession with one input (1, 3, side, side) and logits or probabilities out."""
     side: int
-    """Width and height that the network wants, pixels."""
+    """Width and height of the network's input, pixels."""
 
     def mask(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-        """How much of each pixel is foreground, in [0, 1]."""
+        """Share of each pixel that is foreground, in [0, 1]."""
         square = (resize(image, self.side, self.side) - _MEAN) / _STD
         given = {self.session.get_inputs()[0].name: square.permute(2, 0, 1)[None].contiguous().numpy()}
         # the last output is the finest where a network gives several
@@ -40,9 +40,14 @@ class BiRefNet:
 
 
 def load_birefnet(weights: Path | str = DEFAULT_REPOSITORY, *, threads: int = 2) -> BiRefNet:
-    """The network from an .onnx file, or from a repository on the Hugging Face hub (downloaded once; no code runs).
+    """Load the network.
 
-    Raises: ValueError where a package is missing, or the file is no such network.
+    Args:
+        weights: An .onnx file, or a repository on the Hugging Face hub, downloaded once; none of its code runs.
+        threads: CPU threads.
+
+    Raises:
+        ValueError: Where a package is missing, or the file is no such network.
     """
     _require("onnxruntime")
     import onnxruntime
@@ -77,7 +82,7 @@ def _from_hub(repository: str) -> Path:
 
     try:
         return Path(huggingface_hub.hf_hub_download(repository, _FILE))
-    except Exception as error:  # network, missing repository, missing file: all are the user's to mend
+    except Exception as error:  # network, repository or file is missing: a user error in each case
         raise ValueError(
             f"{repository}: expected to download {_FILE} from the hub, found {type(error).__name__}; "
             "give the path of an .onnx file, or use grabcut"

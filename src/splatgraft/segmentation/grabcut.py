@@ -1,7 +1,8 @@
-"""Object masks of posed images from a 3D box, by GrabCut (OpenCV). Knows nothing about files or networks.
+"""Object masks of posed images from a 3D box, by GrabCut (Rother et al. 2004; OpenCV).
 
-One picture alone tells object from surroundings by colour only. Here the 3D box limits it, sparse points inside it
-say where the object certainly is, and a second pass starts from what all views agree on, carried through the scene.
+GrabCut separates object and surroundings of a single image by colour. Here the projected 3D box bounds the object and
+the convex hull of the projected sparse points initialises it. A second pass starts from the masks of all views, lifted
+to the Gaussians and rendered back into each view.
 """
 
 from collections.abc import Sequence
@@ -24,15 +25,19 @@ from splatgraft.segmentation.lift import lift_masks
 
 @dataclass(frozen=True)
 class GrabcutOptions:
-    """How object and surroundings are told apart."""
+    """How object and surroundings are separated; values set by hand."""
 
     iterations: int = 5
-    """Rounds of fitting colours and cutting per picture."""
+    """GrabCut iterations per image."""
     lightness: float = 0.5
-    """Weight of lightness beside colour: below 1, a shadow looks more like the ground it falls on."""
+    """Weight of lightness against colour: below 1, a shadow looks more like the ground on which it lies."""
     certain: float = 0.9
-    """In the second pass: where the views agree at least so much, the object is taken for certain (and below one
-    minus it, the surroundings)."""
+    """Lifted mask value in the second pass from which a pixel is certainly object; below 1 - `certain` it is certainly
+    surroundings."""
+    speck: int = 50
+    """The largest part of the mask over the largest part that is removed, by area."""
+    hole: int = 1000
+    """The mask over the largest hole that is filled, by area."""
 
 
 def grabcut_masks(
@@ -44,9 +49,18 @@ def grabcut_masks(
     *,
     progress: Progress = silent,
 ) -> list[Float[Tensor, "_ _"]]:
-    """A mask, 0 or 1, of what stands in `box`, for each image; `points` are the capture's sparse ones.
+    """A mask, 0 or 1, of the object in `box`, for each image.
 
-    Raises: ValueError where a camera does not see the box, or fewer than 4 points lie in it.
+    Args:
+        images: sRGB in [0, 1], one per camera.
+        cameras: Of the images.
+        box: Contains the object, world units.
+        points: Sparse points of the capture, world units.
+        options: Of GrabCut.
+        progress: Called per image.
+
+    Raises:
+        ValueError: Where a camera does not see the box, or fewer than 4 points lie in it.
     """
     inside = points[box.contains(points)]
     if len(inside) < 4:
@@ -54,7 +68,7 @@ def grabcut_masks(
     masks = []
     for index, (image, camera) in enumerate(zip(images, cameras, strict=True)):
         progress(index, len(images), "cutting masks")
-        masks.append(_cut(image, _prior_of_box(camera, box, inside), options))
+        masks.append(_cut(image, _prior_from_box(camera, box, inside), options))
     progress(len(images), len(images), "cutting masks")
     return masks
 
@@ -68,18 +82,18 @@ def refine_masks(
     *,
     progress: Progress = silent,
 ) -> list[Float[Tensor, "_ _"]]:
-    """The masks cut again, each from what all agree on: lifted to `gaussians` and blended back into its view."""
+    """The masks cut again, each from the masks of all views, lifted to `gaussians` and blended into its view."""
     feature = lift_masks(gaussians, cameras, masks)[:, None]
     refined = []
     for index, (image, camera) in enumerate(zip(images, cameras, strict=True)):
         progress(index, len(images), "refining masks")
-        agreed = view_operator(gaussians, camera, RenderOptions()).blend(feature)[..., 0].cpu().numpy()
-        refined.append(_cut(image, _prior_of_agreement(agreed, options.certain), options))
+        lifted = view_operator(gaussians, camera, RenderOptions()).blend(feature)[..., 0].cpu().numpy()
+        refined.append(_cut(image, _prior_from_lifted(lifted, options.certain), options))
     progress(len(images), len(images), "refining masks")
     return refined
 
 
-def _prior_of_box(camera: Cameras, box: Box, inside: Float[Tensor, "k 3"]) -> UInt8[np.ndarray, "h w"]:
+def _prior_from_box(camera: Cameras, box: Box, inside: Float[Tensor, "k 3"]) -> UInt8[np.ndarray, "h w"]:
     width, height = camera.width, camera.height
     corners = _project(camera, box.corners.to(inside))
     outline = np.zeros((height, width), np.uint8)
@@ -108,11 +122,11 @@ def _project(camera: Cameras, points: Float[Tensor, "k 3"]) -> Float[np.ndarray,
     return (pixels[:, :2] / pixels[:, 2:]).double().cpu().numpy()
 
 
-def _prior_of_agreement(agreed: Float[np.ndarray, "h w"], certain: float) -> UInt8[np.ndarray, "h w"]:
-    prior = np.full(agreed.shape, cv2.GC_BGD, np.uint8)
-    prior[agreed > 1 - certain] = cv2.GC_PR_BGD
-    prior[agreed > 0.5] = cv2.GC_PR_FGD
-    prior[agreed > certain] = cv2.GC_FGD
+def _prior_from_lifted(lifted: Float[np.ndarray, "h w"], certain: float) -> UInt8[np.ndarray, "h w"]:
+    prior = np.full(lifted.shape, cv2.GC_BGD, np.uint8)
+    prior[lifted > 1 - certain] = cv2.GC_PR_BGD
+    prior[lifted > 0.5] = cv2.GC_PR_FGD
+    prior[lifted > certain] = cv2.GC_FGD
     return prior
 
 
@@ -123,23 +137,23 @@ def _cut(
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
     lab[..., 0] = np.round(options.lightness * lab[..., 0].astype(np.float32)).astype(np.uint8)
     labels = prior.copy()
-    certain_sides = ((prior == cv2.GC_FGD) | (prior == cv2.GC_PR_FGD)).any(), (prior % 2 == 0).any()
-    if not all(certain_sides):
-        # nothing to tell apart: all object or none of it
+    has_object, has_surroundings = ((prior == cv2.GC_FGD) | (prior == cv2.GC_PR_FGD)).any(), (prior % 2 == 0).any()
+    if not (has_object and has_surroundings):
+        # nothing to separate: all object or none of it
         return torch.from_numpy((prior % 2).astype(np.float32))
     cv2.setRNGSeed(0)
-    nowhere = (0, 0, 0, 0)  # the rectangle, which starting from a mask leaves aside
-    cv2.grabCut(lab, labels, nowhere, np.zeros((1, 65)), np.zeros((1, 65)), options.iterations, cv2.GC_INIT_WITH_MASK)
-    return torch.from_numpy(_largest_blob((labels % 2).astype(np.uint8)))
+    unused = (0, 0, 0, 0)  # the rectangle, which GC_INIT_WITH_MASK ignores
+    cv2.grabCut(lab, labels, unused, np.zeros((1, 65)), np.zeros((1, 65)), options.iterations, cv2.GC_INIT_WITH_MASK)
+    return torch.from_numpy(_without_specks((labels % 2).astype(np.uint8), options))
 
 
-def _largest_blob(mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Crumbs under a fiftieth of the largest blob fall away, and holes under a thousandth of the object are filled."""
+def _without_specks(mask: UInt8[np.ndarray, "h w"], options: GrabcutOptions) -> Float[np.ndarray, "h w"]:
+    """The mask without small separate parts and small holes."""
     for value in (1, 0):
         count, labels, stats, _ = cv2.connectedComponentsWithStats((mask == value).astype(np.uint8), connectivity=4)
         if count > 1:
             areas = stats[1:, cv2.CC_STAT_AREA]
-            limit = areas.max() / 50 if value == 1 else int((mask == 1).sum()) / 1000
+            limit = areas.max() / options.speck if value == 1 else int((mask == 1).sum()) / options.hole
             small = np.flatnonzero(areas < limit) + 1
             mask = np.where(np.isin(labels, small), 1 - value, mask).astype(np.uint8)
     return mask.astype(np.float32)

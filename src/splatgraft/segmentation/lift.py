@@ -1,8 +1,8 @@
-"""Lifts 2D masks to one number per Gaussian. Knows nothing about where masks come from or what is done with the number.
+"""Lifts 2D masks to one mask value per Gaussian.
 
-A view's mask is modelled as the blend of the numbers, W f. The closed form is the weighted average W^T m / W^T 1
-(FlashSplat, ECCV 2024, for one bit; Splat Feature Solver, ICLR 2026, for any feature): what a Gaussian contributes to,
-it inherits. The paper's way (section 3.1) trains a logit per Gaussian with binary cross-entropy on its blend.
+A view's mask m is modelled as the blend W f of the values f. The closed form is the weighted average W^T m / W^T 1
+(FlashSplat, ECCV 2024, for one bit; Splat Feature Solver, ICLR 2026, for any feature). The paper's method
+(section 3.1) trains a logit per Gaussian with binary cross-entropy on its blend.
 """
 
 from collections.abc import Sequence
@@ -19,15 +19,15 @@ from splatgraft.rendering import RenderOptions, ViewOperator, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
 _SEEN = 1e-3
-"""Least sum of blending weights over all pixels of all views that counts as seen, pixels."""
+"""Sum of blending weights over all pixels of all views, pixels, above which a Gaussian counts as seen."""
 
 
 @dataclass(frozen=True)
 class LiftOptions:
-    """How masks become a number per Gaussian."""
+    """How masks become a value per Gaussian."""
 
     method: Literal["closed_form", "bce"] = "closed_form"
-    """The weighted average, or the paper's training, which starts from it."""
+    """The weighted average, or the paper's training, which starts from the weighted average."""
     iterations: int = 10_000
     """Steps of `bce`, one view each."""
     learning_rate: float = 0.05
@@ -89,14 +89,14 @@ def _closed_form(
     total = torch.zeros(gaussians.count, 2, device=gaussians.device)
     for index, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
         progress(index, len(masks), "lifting masks")
-        # one view's lists at a time, so that memory does not grow with the number of views
+        # one view's tile lists at a time, so that memory does not grow with the number of views
         total += _sums_of_view(view_operator(gaussians, camera, RenderOptions()), mask.to(gaussians.device))
     progress(len(masks), len(masks), "lifting masks")
     return _ratio(total[:, 0], total[:, 1])
 
 
 def _sums_of_view(operator: ViewOperator, mask: Float[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
-    """Blending weight inside the mask, and all of it."""
+    """Blending weight of each Gaussian inside the mask and in the whole view."""
     return operator.blend_transpose(torch.stack([mask, torch.ones_like(mask)], -1))
 
 

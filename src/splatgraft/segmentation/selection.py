@@ -1,4 +1,4 @@
-"""Decides which Gaussians are the object, from a number per Gaussian. Knows nothing about masks."""
+"""Selects the Gaussians of an object: by mask value, 3D box and connected component."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -15,8 +15,6 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.segmentation.box import Box
 
 Keep = Literal["substantial", "largest", "all"]
-_NEIGHBOURS = 16
-_SUBSTANTIAL = 0.05
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,11 @@ class SelectOptions:
     box: Box | None = None
     """Where centres must lie, world units."""
     keep: Keep = "substantial"
-    """Which pieces stay: those with at least a twentieth of the largest one's opacity, the largest alone, or all."""
+    """Which connected components stay: those of at least `substantial`, the largest one, or all."""
+    substantial: float = 0.05
+    """Summed opacity of a component over the largest one's; set by hand."""
+    neighbours: int = 16
+    """Nearest Gaussians that are tested for contact with each Gaussian."""
 
 
 def select_object(
@@ -59,30 +61,30 @@ def select_object(
             raise ValueError("object: expected some of its Gaussians inside the box, found all outside")
     if options.keep == "all":
         return chosen
-    mass = mass_of_piece(gaussians.select(chosen))
-    least = mass.max() * (_SUBSTANTIAL if options.keep == "substantial" else 1)
+    opacity = component_opacity(gaussians.select(chosen), options.neighbours)
+    least = opacity.max() * (options.substantial if options.keep == "substantial" else 1)
     kept = torch.zeros_like(chosen)
-    kept[torch.nonzero(chosen)[:, 0][mass >= least]] = True
+    kept[torch.nonzero(chosen)[:, 0][opacity >= least]] = True
     return kept
 
 
-def mass_of_piece(gaussians: Gaussians) -> Float[Tensor, "n"]:
-    """For each Gaussian the sum of opacities of the connected piece it is in; two touch if their 2-sigma spheres do.
+def component_opacity(gaussians: Gaussians, neighbours: int = 16) -> Float[Tensor, "n"]:
+    """For each Gaussian the sum of opacities of its connected component; two touch if their 2-sigma spheres do.
 
-    Only the 16 nearest of each are asked, which is where touching ones are.
+    Only the `neighbours` nearest of each are tested for contact.
     """
     n = gaussians.count
     if n <= 1:
         return gaussians.opacities.detach()
     means = gaussians.means.detach().double().cpu().numpy()
-    # the middle scale: a needle reaches far along one axis only
+    # the median scale: a needle is long along one axis only
     radii = 2 * gaussians.scales.detach().double().cpu().numpy().clip(1e-12)
     radii = np.median(radii, axis=1)
-    distance, neighbour = KDTree(means).query(means, k=min(_NEIGHBOURS + 1, n))
+    distance, neighbour = KDTree(means).query(means, k=min(neighbours + 1, n))
     neighbour = np.asarray(neighbour)
     near = distance <= radii[:, None] + radii[neighbour]
     rows = np.broadcast_to(np.arange(n)[:, None], near.shape)[near]
     graph = coo_array((np.ones(len(rows), bool), (rows, neighbour[near])), shape=(n, n))
     _, label = connected_components(graph, directed=False)
-    mass = np.bincount(label, weights=gaussians.opacities.detach().double().cpu().numpy())
-    return torch.from_numpy(mass[label]).to(gaussians.means)
+    opacity = np.bincount(label, weights=gaussians.opacities.detach().double().cpu().numpy())
+    return torch.from_numpy(opacity[label]).to(gaussians.means)

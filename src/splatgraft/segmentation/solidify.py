@@ -1,8 +1,8 @@
-"""Makes an extracted object look whole where its scene is gone. Knows nothing about files and how it was chosen.
+"""Makes an extracted object opaque: fits it alone to its masked photographs over random backgrounds.
 
-In its own capture an object may be half transparent and still look right, since what shines through was fitted along
-with it; at its outline it may rely on neighbours to hide what sticks out. Cut out and put elsewhere, both show. Here
-the object alone is fitted to its masked photographs over random backgrounds, which only a solid object can match.
+In its own capture an object may be half transparent and still look right, since the Gaussians behind it were fitted
+together with it; at its outline, neighbouring Gaussians may hide those that stick out. Both become visible in another
+scene. Only an opaque object inside its mask matches the photographs over every background.
 """
 
 from collections.abc import Sequence
@@ -17,12 +17,10 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.progress import Progress, silent
 
-_MARGIN_PX = 12
-
 
 @dataclass(frozen=True)
 class SolidifyOptions:
-    """How long and how freely the object may change."""
+    """Length and learning rates of the fit; values set by hand."""
 
     iterations: int = 400
     """Steps, one view each."""
@@ -33,14 +31,20 @@ class SolidifyOptions:
     scale_rate: float = 0.005
     """Of Adam, natural logarithm per step."""
     position_rate: float = 2e-4
-    """Of Adam, parts of the object's radius per step."""
+    """Of Adam, per step, over the object's radius."""
+    rotation_ratio: float = 0.2
+    """Learning rate of the quaternions over that of the scales."""
+    occluder_distance: float = 0.25
+    """Distance in front of the object, over its extent, from which something else occludes it."""
+    margin_px: int = 12
+    """Border of the image windows around the object."""
     seed: int = 0
-    """Of views and backgrounds."""
+    """Of the views and backgrounds drawn."""
 
 
 @dataclass(frozen=True)
-class _Sight:
-    """One view, cut down to where the object is."""
+class _CroppedView:
+    """One view, cropped to the object."""
 
     camera: Cameras
     image: Float[Tensor, "h w 3"]
@@ -76,12 +80,12 @@ def solidify_object(
         ValueError: All masks are empty.
     """
     chosen = scene.select(selection)
-    sights = [
-        sight
+    views = [
+        view
         for camera, (image, mask) in zip(cameras, photographs, strict=True)
-        if (sight := _sight(scene, selection, camera, image, mask)) is not None
+        if (view := _cropped_view(scene, selection, camera, image, mask, options)) is not None
     ]
-    if not sights:
+    if not views:
         raise ValueError("object: expected a mask with some of it inside, found all empty")
     radius = float((chosen.means - chosen.means.mean(0)).norm(dim=1).quantile(0.9))
     leaves = {
@@ -94,7 +98,7 @@ def solidify_object(
         [
             {"params": [leaves["means"]], "lr": options.position_rate * radius},
             {"params": [leaves["log_scales"]], "lr": options.scale_rate},
-            {"params": [leaves["quaternions"]], "lr": 0.2 * options.scale_rate},
+            {"params": [leaves["quaternions"]], "lr": options.rotation_ratio * options.scale_rate},
             {"params": [leaves["opacity_logits"]], "lr": options.opacity_rate},
             {"params": [base], "lr": options.color_rate},
             {"params": [higher], "lr": options.color_rate / 20},
@@ -103,12 +107,12 @@ def solidify_object(
     )
     generator = torch.Generator().manual_seed(options.seed)
     for step in range(options.iterations):
-        sight = sights[int(torch.randint(len(sights), (1,), generator=generator))]
+        view = views[int(torch.randint(len(views), (1,), generator=generator))]
         background = torch.rand(3, generator=generator)
         fitted = replace(chosen, **leaves, sh=torch.cat([base, higher], 1))
-        drawn = render(fitted, sight.camera, options=RenderOptions(background=tuple(background.tolist()))).color
-        wanted = sight.mask * sight.image + (1 - sight.mask) * background.to(sight.image)
-        loss = (sight.weight * (drawn[0] - wanted).abs()).mean()
+        drawn = render(fitted, view.camera, options=RenderOptions(background=tuple(background.tolist()))).color
+        target = view.mask * view.image + (1 - view.mask) * background.to(view.image)
+        loss = (view.weight * (drawn[0] - target).abs()).mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
@@ -122,32 +126,32 @@ def solidify_object(
     )
 
 
-def _sight(
+def _cropped_view(
     scene: Gaussians,
     selection: Bool[Tensor, "n"],
     camera: Cameras,
     image: Float[Tensor, "h w 3"],
     mask: Float[Tensor, "h w"],
-) -> _Sight | None:
-    """None where the mask is empty."""
+    options: SolidifyOptions,
+) -> _CroppedView | None:
+    """The view cropped to where the object shows; None where the mask is empty."""
     chosen = scene.select(selection)
-    serialized = render(chosen, camera, outputs=frozenset({"depth"}))
+    object_alone = render(chosen, camera, outputs=frozenset({"depth"}))
     rest = render(scene.select(~selection), camera, outputs=frozenset({"depth"}))
     extent = float((chosen.means.quantile(0.95, dim=0) - chosen.means.quantile(0.05, dim=0)).norm())
-    before = (rest.depth[0] < serialized.depth[0] - 0.25 * extent) & (rest.alpha[0] > 0.5)
-    hidden = before & (serialized.alpha[0] > 0.5) & (mask.to(before.device) < 0.5)
-    shown = (mask > 0.5) | ((serialized.alpha[0] > 0.05) & ~hidden).to(mask.device)
+    in_front = rest.depth[0] < object_alone.depth[0] - options.occluder_distance * extent
+    occluded = in_front & (rest.alpha[0] > 0.5)
+    hidden = occluded & (object_alone.alpha[0] > 0.5) & (mask.to(occluded.device) < 0.5)
+    shown = (mask > 0.5) | ((object_alone.alpha[0] > 0.05) & ~hidden).to(mask.device)
     if not bool((mask > 0.5).any()):
         return None
     rows, columns = torch.nonzero(shown.any(1))[:, 0], torch.nonzero(shown.any(0))[:, 0]
-    top, left = max(int(rows[0]) - _MARGIN_PX, 0), max(int(columns[0]) - _MARGIN_PX, 0)
-    bottom = min(int(rows[-1]) + 1 + _MARGIN_PX, image.shape[0])
-    right = min(int(columns[-1]) + 1 + _MARGIN_PX, image.shape[1])
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[0, :2, 2] -= torch.tensor([left, top]).to(intrinsics)
+    top, left = max(int(rows[0]) - options.margin_px, 0), max(int(columns[0]) - options.margin_px, 0)
+    bottom = min(int(rows[-1]) + 1 + options.margin_px, image.shape[0])
+    right = min(int(columns[-1]) + 1 + options.margin_px, image.shape[1])
     device = scene.device
-    return _Sight(
-        camera=replace(camera, intrinsics=intrinsics, sizes=torch.tensor([[right - left, bottom - top]])),
+    return _CroppedView(
+        camera=camera.cropped([(left, top, right, bottom)]),
         image=image[top:bottom, left:right].to(device),
         mask=mask[top:bottom, left:right, None].to(device),
         weight=(~hidden[top:bottom, left:right, None]).float(),

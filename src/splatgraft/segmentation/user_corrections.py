@@ -1,14 +1,19 @@
-"""A person's corrections of a selection. Knows nothing about how either was made."""
+"""Corrections that a user makes to a selection of Gaussians: added and removed ones."""
 
 import torch
 from jaxtyping import Bool, Int8
 from torch import Tensor
 
 
-def corrected(lifted: Bool[Tensor, "n"], corrections: Int8[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
-    """The selection after corrections: 1 adds, -1 removes, 0 leaves what the masks gave.
+def apply_corrections(lifted: Bool[Tensor, "n"], corrections: Int8[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
+    """The selection with the user's corrections.
 
-    Raises: ValueError where there is not one correction per Gaussian.
+    Args:
+        lifted: The selection from the masks.
+        corrections: 1 adds a Gaussian, -1 removes it, 0 leaves it; None changes nothing.
+
+    Raises:
+        ValueError: Where there is not one correction per Gaussian.
     """
     if corrections is None:
         return lifted
@@ -21,9 +26,9 @@ def corrected(lifted: Bool[Tensor, "n"], corrections: Int8[Tensor, "n"] | None) 
     return (lifted | (corrections > 0)) & ~(corrections < 0)
 
 
-def with_correction(
+def add_correction(
     corrections: Int8[Tensor, "n"] | None, touched: Bool[Tensor, "n"], *, add: bool
 ) -> Int8[Tensor, "n"]:
-    """Corrections after one more stroke; the last stroke over a Gaussian counts."""
+    """The corrections after one more stroke over the `touched` Gaussians; the last stroke over a Gaussian counts."""
     before = torch.zeros(len(touched), dtype=torch.int8) if corrections is None else corrections
     return torch.where(touched, torch.tensor(1 if add else -1, dtype=torch.int8), before)

@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from splatgraft.capture import (
-    LookOptions,
     PoseOptions,
+    VirtualCameraOptions,
     extract_frames,
-    find_viewpoints,
-    photographed,
+    place_virtual_cameras,
     pose_photos,
     read_pose_report,
+    render_pictures,
     write_pose_report,
 )
 from splatgraft.core.images import list_images, write_image
@@ -34,7 +34,7 @@ class Capture:
     accept_doubtful: bool = False
     """Whether `run` goes on with poses that are not plausible; without it, it stops after this step."""
     options: PoseOptions = field(default_factory=PoseOptions)
-    look: LookOptions = field(default_factory=LookOptions)
+    look: VirtualCameraOptions = field(default_factory=VirtualCameraOptions)
 
     def inputs(self) -> Inputs:
         """The photos, or the video, or the scene, or the files of the posed capture."""
@@ -66,12 +66,12 @@ class Capture:
     def _pictures(self, folder: Path, context: Context) -> PosedImages:
         """Pictures of a scene that came without photographs."""
         scene = read_gaussians(self.capture)
-        found = find_viewpoints(scene, self.look, progress=context.progress)
+        found = place_virtual_cameras(scene, self.look, progress=context.progress)
         for sentence in found.report:
             context.console.say(f"{self.capture}: {sentence}")
         (folder / "images").mkdir()
         paths = {name: folder / "images" / f"{name}.png" for name in found.cameras.names}
-        photographed(
+        render_pictures(
             scene, found, write=lambda name, picture: write_image(paths[name], picture), progress=context.progress
         )
         return PosedImages(

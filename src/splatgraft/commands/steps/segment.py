@@ -25,7 +25,7 @@ from splatgraft.segmentation import (
     LiftOptions,
     SelectOptions,
     SolidifyOptions,
-    corrected,
+    apply_corrections,
     lift_masks,
     select_object,
     solidify_object,
@@ -85,7 +85,7 @@ class Segment:
             feature = lift_masks(scene, cameras, read_masks(views), self.options, progress=context.progress)
         selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=self.keep))
         if self.corrections is not None:
-            selection = corrected(selection, read_corrections(self.corrections))
+            selection = apply_corrections(selection, read_corrections(self.corrections))
         context.console.say(f"object: {int(selection.sum()):,} of {scene.count:,} Gaussians")
         chosen = scene.select(selection)
         if self.solidify and views is not None:

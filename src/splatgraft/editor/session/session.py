@@ -23,7 +23,7 @@ from splatgraft.editor.session.scene_cache import SceneCache
 from splatgraft.editor.session.state_store import StateStore
 from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.project.layout import Side
-from splatgraft.segmentation import Box, corrected, with_correction
+from splatgraft.segmentation import Box, add_correction, apply_corrections
 
 EDITOR_FOLDER = ".editor"
 
@@ -192,7 +192,7 @@ class Session:
             segmented = torch.zeros(scene.count, dtype=torch.bool) if box is None else box.contains(scene.means)
         # corrections of another reconstruction do not apply
         fits = corrections is None or len(corrections) == scene.count
-        return corrected(segmented, corrections) if fits else segmented
+        return apply_corrections(segmented, corrections) if fits else segmented
 
     def box(self) -> Box | None:
         """The box around the object, in the source's world."""
@@ -208,7 +208,7 @@ class Session:
         corrections = self.state.corrections
         if corrections is not None and len(corrections) != len(flags):
             corrections = None  # of another reconstruction
-        self.change(replace(self.state, corrections=with_correction(corrections, flags, add=add)))
+        self.change(replace(self.state, corrections=add_correction(corrections, flags, add=add)))
 
     # the objects in the target
 

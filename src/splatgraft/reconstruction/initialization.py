@@ -1,4 +1,4 @@
-"""Gaussians to start from: one per sparse point, or random ones where the cameras look. Knows no images."""
+"""Initial Gaussians of a reconstruction: one per sparse point (3DGS), and random points where the cameras look."""
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 
 _CANDIDATES = 200_000
+"""Random points drawn at a time."""
 
 
 def scene_extent(cameras: Cameras) -> float:
@@ -21,10 +22,13 @@ def scene_extent(cameras: Cameras) -> float:
 
 
 def from_points(points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"], *, count: int, seed: int) -> Gaussians:
-    """Round Gaussians at `points`, as wide as the root mean square distance to the three nearest others;
-    opacity one half.
+    """Isotropic Gaussians of opacity one half at the points, as wide as the rms distance to the three nearest points.
 
-    At most `count` of them, drawn at random without repetition.
+    Args:
+        points: World units.
+        colors: sRGB in [0, 1].
+        count: Largest number of Gaussians; of more points, so many are drawn at random.
+        seed: Of the draw.
     """
     if len(points) > count:
         order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))[:count]
@@ -34,7 +38,7 @@ def from_points(points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"], *, c
     neighbours = min(4, n)
     distances = KDTree(array).query(array, k=neighbours)[0].reshape(n, -1)[:, 1:] if n > 1 else np.full((n, 1), 1.0)
     spacing = np.sqrt((distances**2).mean(1))
-    # a stray point far from all others would start as a cloud that covers every image
+    # an isolated point would start as a Gaussian that covers every image
     spacing = spacing.clip(max(1e-7, 1e-3 * float(np.median(spacing))), 10 * float(np.median(spacing)) + 1e-7)
     log_scales = torch.from_numpy(np.log(spacing)).float()[:, None].repeat(1, 3)
     return Gaussians(
@@ -47,10 +51,10 @@ def from_points(points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"], *, c
 
 
 def random_points(cameras: Cameras, *, count: int, seed: int) -> Float[Tensor, "m 3"]:
-    """`count` points, uniform in the part of the world that the most cameras share; all lie in front of a camera.
+    """`count` points, uniform in the volume that most cameras see; each lies in front of a camera.
 
-    The volume searched is a ball around the point nearest to all optical axes, as large as the cameras are far from
-    it. Points that more than half as many cameras see as the best-seen point are kept.
+    They are drawn in a sphere around the point nearest to all optical axes, with the cameras' mean distance as radius;
+    a point stays if more than half as many cameras see it as see the best-seen point.
     """
     generator = torch.Generator().manual_seed(seed)
     centers, forward = cameras.centers.double().cpu(), cameras.world_from_camera[:, :3, 2].double().cpu()
@@ -70,7 +74,7 @@ def random_points(cameras: Cameras, *, count: int, seed: int) -> Float[Tensor, "
 
 
 def _nearest_to_axes(centers: Float[Tensor, "v 3"], forward: Float[Tensor, "v 3"]) -> Float[Tensor, "3"]:
-    """The point that minimises the squared distances to all optical axes; parallel axes are cut at one extent."""
+    """Least-squares intersection of the optical axes, with a weak prior in front of the cameras for parallel axes."""
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
     spread = max(float((centers - centers.mean(0)).norm(dim=1).max()), 1e-3)
     prior = (centers + 2 * spread * forward).mean(0)

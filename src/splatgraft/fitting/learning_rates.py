@@ -1,4 +1,4 @@
-"""Learning rates of the fields of Gaussians, and how they fall. Knows nothing about the optimiser that uses them."""
+"""Learning rates of the fields of Gaussians, and their schedules over a fit."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ from splatgraft.core.spherical_harmonics import coefficient_count
 
 
 @dataclass(frozen=True)
-class Rates:
-    """Step size of Adam for each field; a field whose rate is 0 is frozen and costs no gradient."""
+class LearningRates:
+    """Learning rate of Adam for each field; a field with rate 0 is frozen and no gradient is computed for it."""
 
     means: float = 0.0
     """World units per step at the start."""
@@ -28,7 +28,7 @@ class Rates:
     sh_higher: float = 0.0
     """Bands 1 to 3; 3DGS takes a twentieth of band 0."""
     final: float = 1.0
-    """What is left at the end of every rate but that of the means; it falls along half a cosine in the last third."""
+    """Factor on all rates but that of the means at the end; reached along half a cosine in the last third."""
 
     def active(self) -> tuple[str, ...]:
         """Names of the fields that are fitted."""
@@ -46,7 +46,7 @@ class Rates:
         return self.means * (self.means_final / self.means) ** done if self.means_final > 0 else self.means
 
     def at(self, field: str, done: float, columns: int) -> Float[Tensor, "c"]:
-        """Rate of each of the `columns` numbers that `field` has per Gaussian, after the share `done` of all steps."""
+        """Rate of each of the `columns` values of `field` per Gaussian, after the share `done` of all steps."""
         if field == "means":
             return torch.full((columns,), self.means_at(done))
         late = min(max(3 * done - 2, 0.0), 1.0)

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from splatgraft.capture import LookOptions, find_viewpoints, photographed
-from splatgraft.capture.virtual_cameras import dense_part, find_up
+from splatgraft.capture import VirtualCameraOptions, place_virtual_cameras, render_pictures
+from splatgraft.capture.virtual_cameras import dense_part, estimate_scene_up
 from splatgraft.core.capture_orientation import estimate_up, focus_point
 from splatgraft.core.gaussians import Gaussians, concatenate
 
@@ -33,7 +33,7 @@ def table(seed: int = 0) -> torch.Tensor:
 
 def turned_up(rotation: torch.Tensor) -> tuple[torch.Tensor, str]:
     points = table() @ rotation.T
-    return find_up(points, *dense_part(points))
+    return estimate_scene_up(points, *dense_part(points))
 
 
 def test_the_dense_part_is_the_table_not_the_cloud() -> None:
@@ -57,13 +57,13 @@ def test_up_is_the_side_on_which_things_stand(angle: float) -> None:
 
 def test_cameras_go_round_the_dense_part_upright_and_see_it() -> None:
     scene = blobs(table())
-    found = find_viewpoints(scene, LookOptions(views=12))
+    found = place_virtual_cameras(scene, VirtualCameraOptions(views=12))
     centre, radius = dense_part(scene.means)
     assert torch.allclose(focus_point(found.cameras), centre, atol=1e-3 * radius)  # float32 lines through one point
     assert torch.allclose(estimate_up(found.cameras), torch.tensor([0.0, 0.0, 1.0]), atol=0.05)
     assert bool((found.cameras.centers[:, 2] > centre[2]).all())
     seen: list[float] = []
-    photographed(scene, found, write=lambda name, picture: seen.append(float(picture.mean())))
+    render_pictures(scene, found, write=lambda name, picture: seen.append(float(picture.mean())))
     assert len(seen) == len(found.cameras)
     assert min(seen) > 0.1
 
@@ -72,9 +72,9 @@ def test_a_wall_is_not_looked_at_from_behind() -> None:
     y, z = torch.meshgrid(torch.linspace(-4, 4, 60), torch.linspace(-1, 6, 50), indexing="ij")
     wall = blobs(torch.stack([torch.full_like(y, 1.0), y, z], -1).reshape(-1, 3), 0.1)
     scene = concatenate([blobs(torch.cat([table()[:2800]] * 3)), wall])
-    options = LookOptions(views=16, up=(0.0, 0.0, 1.0))
-    found = find_viewpoints(scene, options)
-    open_side = find_viewpoints(blobs(torch.cat([table()[:2800]] * 3)), options)
+    options = VirtualCameraOptions(views=16, up=(0.0, 0.0, 1.0))
+    found = place_virtual_cameras(scene, options)
+    open_side = place_virtual_cameras(blobs(torch.cat([table()[:2800]] * 3)), options)
     assert bool((open_side.cameras.centers[:, 0] > 1.0).any())
     assert not bool((found.cameras.centers[:, 0] > 1.0).any())
     assert any("as given" in sentence for sentence in found.report)
@@ -89,20 +89,20 @@ def room() -> Gaussians:
 
 
 def test_a_room_is_looked_at_from_within_where_one_says_so_and_is_told_to_be_hollow() -> None:
-    around = find_viewpoints(room(), LookOptions(views=8, up=(0.0, 0.0, 1.0)))
+    around = place_virtual_cameras(room(), VirtualCameraOptions(views=8, up=(0.0, 0.0, 1.0)))
     assert any("look = within" in sentence for sentence in around.report)
-    within = find_viewpoints(room(), LookOptions(views=8, up=(0.0, 0.0, 1.0), look="within"))
+    within = place_virtual_cameras(room(), VirtualCameraOptions(views=8, up=(0.0, 0.0, 1.0), look="within"))
     assert len(within.cameras) == 8
     assert float(within.cameras.centers.abs().max()) < 0.9
     # in all directions, on the whole slightly down
     forward = within.cameras.world_from_camera[:, :3, 2]
     assert float(forward[:, :2].mean(0).norm()) < 0.05
     assert float(forward[:, 2].mean()) < 0
-    assert not any("hollow" in s for s in find_viewpoints(blobs(table()), LookOptions(views=8)).report)
+    assert not any("hollow" in s for s in place_virtual_cameras(blobs(table()), VirtualCameraOptions(views=8)).report)
 
 
 def test_a_scene_that_shows_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 20 solid"):
-        find_viewpoints(blobs(table()[:10]), LookOptions())
+        place_virtual_cameras(blobs(table()[:10]), VirtualCameraOptions())
     with pytest.raises(ValueError, match="expected a direction"):
-        LookOptions(up=(0.0, 0.0, 0.0))
+        VirtualCameraOptions(up=(0.0, 0.0, 0.0))

@@ -3,7 +3,7 @@
 import torch
 
 from splatgraft.core import cameras as camera_values
-from splatgraft.reconstruction.initial import from_points, random_points, scene_extent
+from splatgraft.reconstruction.initialization import from_points, random_points, scene_extent
 
 
 def orbit(count: int = 12, distance: float = 4.0) -> camera_values.Cameras:
