@@ -21,7 +21,7 @@ class LoopOptions:
     clip: float = 1.0
     """Largest norm of the gradient; 0 does not clip."""
     ema: float = 0.0
-    """Decay of an averaged copy of the weights, which is then what is kept; 0 for none."""
+    """Decay of the moving average of the weights, which is then the result; 0 for none."""
     optimizer: Literal["adam", "adam8bit"] = "adam"
     """adam8bit needs bitsandbytes."""
     precision: Literal["no", "bf16", "fp16"] = "bf16"
@@ -33,11 +33,11 @@ class LoopOptions:
     validation_pairs: int = 8
     """Pairs per validation."""
     seed: int = 0
-    """Order, noise and initial values follow from it."""
+    """Of the order of pairs, the noise and initial values."""
     tensorboard: bool = False
     """Also write for TensorBoard; needs the package tensorboard."""
     cpu: bool = False
-    """Train on the CPU even where there is a GPU."""
+    """Train on the CPU even if a GPU is available."""
 
     def rate_at(self, step: int) -> float:
         """Learning rate at a step, counted from 0."""

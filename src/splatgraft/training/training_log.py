@@ -85,12 +85,12 @@ def truncate_log(path: Path, step: int) -> None:
     """Remove the entries after `step`, which a resumed run will write again."""
     if not path.is_file():
         return
-    kept = []
+    remaining = []
     for line in path.read_text().splitlines():
         try:
             if json.loads(line)["step"] <= step:
-                kept.append(line)
+                remaining.append(line)
         except (ValueError, KeyError, TypeError):
             continue  # an incomplete line of a killed run
     with atomic_write(path) as stream:
-        stream.write("".join(f"{line}\n" for line in kept).encode())
+        stream.write("".join(f"{line}\n" for line in remaining).encode())

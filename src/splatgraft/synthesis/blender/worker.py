@@ -59,7 +59,7 @@ def _show(take, job, things, worlds):
 
 
 def _exposure(job, take, cameras):
-    """Exposure factor of the take's group, computed from quick renders and kept in the job's folder."""
+    """Exposure factor of the take's group, computed from quick renders and stored in exposure.json."""
     path = os.path.join(job["out"], "exposure.json")
     known = {}
     if os.path.exists(path):
@@ -138,8 +138,8 @@ def main(path):
         if take.get("probe"):
             exposure = _exposure(job, take, cameras)
             world = take.get("world") or job["scene"]["world"]
-            shown = job["scene"] if take["scene"] else {**job["scene"], "lamps": []}
-            panorama, suns = light_probe.measure(shown, world, take["probe"], scene_things)
+            rendered = job["scene"] if take["scene"] else {**job["scene"], "lamps": []}
+            panorama, suns = light_probe.measure(rendered, world, take["probe"], scene_things)
             passes.write_npy(os.path.join(folder, "0000.npy"), (panorama * exposure).astype(np.float32))
             for sun in suns:
                 sun["irradiance"] = [value * exposure for value in sun["irradiance"]]

@@ -88,7 +88,7 @@ def _by_index(path: Path) -> list[Photograph]:
         for number, row in enumerate(reader, 2):
             files = [path.parent / (row[name] or "?") for name in COLUMNS[:3]]
             if absent := next((file for file in files if not file.is_file()), None):
-                raise ValueError(f"{path}, line {number}: expected files that are there, found no {absent}")
+                raise ValueError(f"{path}, line {number}: expected existing files, found no {absent}")
             image, mask, background = files
             found.append(Photograph(image, mask, background, row["object"], row["scene"]))
     return found

@@ -105,8 +105,8 @@ class RelitPairs:
         mask, relit = read_mask(folder / "mask.png"), read_rgb(folder / f"relit_{light}.png")
         for name, picture in (("background", background), ("mask", mask), (f"relit_{light}", relit)):
             if picture.shape[:2] != target.shape[:2]:
-                wanted, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
-                raise ValueError(f"{folder / name}.png: expected {wanted} pixels as target.png, found {found}")
+                expected, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
+                raise ValueError(f"{folder / name}.png: expected {expected} pixels as target.png, found {found}")
         return TrainingPair(
             composite(match_statistics(relit, target, mask), background, mask), target, background, mask
         )
