@@ -34,10 +34,10 @@ HARMONIZERS: dict[str, Callable[[HarmonizerOptions], Harmonizer]] = {
 
 
 def make_harmonizer(name: str, options: HarmonizerOptions | None = None) -> Harmonizer:
-    """Make the harmoniser called `name`, a key of `HARMONIZERS`.
+    """The harmoniser called `name`.
 
-    Raises:
-        ValueError: the name is unknown, or weights or packages of the harmoniser are missing.
+    Raises: ValueError where there is none of that name (the message lists those there are), or where its weights or
+    packages are missing.
     """
     if name not in HARMONIZERS:
         raise ValueError(f"harmonizer: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
