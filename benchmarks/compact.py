@@ -1,6 +1,6 @@
-"""Time of the compact harmoniser on a CPU: `python benchmarks/compact.py`; random pictures, the shipped weights' sizes.
+"""Time of the compact harmoniser on a CPU, with random images and weights: `python benchmarks/compact.py`.
 
-Prints core-seconds a view at 704x496, and the network's share of them.
+Prints the core-seconds per view at 704x496, and those of the network alone.
 """
 
 import time
@@ -31,15 +31,15 @@ def main() -> None:
     began = time.process_time()
     for _ in range(VIEWS):
         harmonizer.harmonize(view)
-    whole = (time.process_time() - began) / VIEWS
+    seconds = (time.process_time() - began) / VIEWS
     channels = torch.rand(1, 16, 176, 256)
     began = time.process_time()
     with torch.no_grad():
         for _ in range(VIEWS):
             network(channels)
-    alone = (time.process_time() - began) / VIEWS
+    network_seconds = (time.process_time() - began) / VIEWS
     parameters = sum(p.numel() for p in network.parameters())
-    print(f"parameters={parameters / 1e6:.2f}M core_seconds={whole:.3f} network_core_seconds={alone:.3f}")
+    print(f"parameters={parameters / 1e6:.2f}M core_seconds={seconds:.3f} network_core_seconds={network_seconds:.3f}")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Time and memory of the harmoniser `flux` against stock diffusers on one card, per view and per part.
 
 `python benchmarks/harmonize.py` on a machine with a GPU and `pip install 'splatgraft[flux,text]'`; random weights of
-the real size (nothing is downloaded), 704x496. `--tiny` runs the same code on a few thousand parameters, on the CPU:
-its times say nothing about the real model.
+the real size (nothing is downloaded), 704x496. `--tiny` runs the same code with a few thousand parameters on the CPU;
+its times are not those of the real model.
 
 stock    both text encoders for each view's prompt, the transformer as it is, one view at a time
 ours     no text encoder, modulations from a table, projections fused, --batch views at once
@@ -43,7 +43,7 @@ TOKENS = 256
 
 
 def random_network(kind: Any, settings: dict[str, Any], device: torch.device, dtype: torch.dtype) -> Any:
-    """A network of random weights, made where it will lie: 24 GB need not pass through the CPU."""
+    """Make a network with random weights directly on the device, so that 24 GB need not pass through the CPU."""
     torch.manual_seed(0)
     with torch.device(device):
         default = torch.get_default_dtype()
@@ -55,7 +55,7 @@ def random_network(kind: Any, settings: dict[str, Any], device: torch.device, dt
 
 
 def text_encoders(device: torch.device, tiny: bool) -> Callable[[], None] | None:
-    """One pass of T5 (XXL) and CLIP (L) over the empty prompt's tokens; None where transformers is missing."""
+    """Make a function that runs T5 (XXL) and CLIP (L) once; None where transformers is not installed."""
     try:
         import transformers
     except ModuleNotFoundError:
@@ -82,7 +82,7 @@ def text_encoders(device: torch.device, tiny: bool) -> Callable[[], None] | None
 
 
 def seconds(work: Callable[[], object], device: torch.device, repeats: int) -> float:
-    """Median after two runs that warm up."""
+    """Median time of `work` after two warm-up runs."""
     times = []
     for i in range(repeats + 2):
         begin = time.perf_counter()
@@ -95,7 +95,7 @@ def seconds(work: Callable[[], object], device: torch.device, repeats: int) -> f
 
 
 def parts(network: FluxNetwork, batch: int, size: tuple[int, int], repeats: int) -> dict[str, float]:
-    """Seconds a view of encoding, the four steps and decoding; and of the whole with what lies between."""
+    """Seconds per view of encoding, the four sampling steps, decoding, and the whole harmonisation."""
     (width, height), device = size, network.device
     pictures = torch.rand(2 * batch, 3, height, width)
     padded = pad_by_reflection(pictures).to(device)
@@ -127,39 +127,40 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--size", default="704x496")
     parser.add_argument("--no-compile", action="store_true")
-    asked = parser.parse_args()
-    if not asked.tiny and not torch.cuda.is_available():
-        raise SystemExit("expected a CUDA device, found none; --tiny tries the code on the CPU")
-    device = torch.device("cpu" if asked.tiny else "cuda")
-    dtype = torch.float32 if asked.tiny else torch.bfloat16
-    width, height = map(int, asked.size.split("x"))
-    card = "cpu, tiny model" if asked.tiny else torch.cuda.get_device_name(device)
+    options = parser.parse_args()
+    if not options.tiny and not torch.cuda.is_available():
+        raise SystemExit("expected a CUDA device, found none; --tiny runs on the CPU")
+    device = torch.device("cpu" if options.tiny else "cuda")
+    dtype = torch.float32 if options.tiny else torch.bfloat16
+    width, height = map(int, options.size.split("x"))
+    card = "cpu, tiny model" if options.tiny else torch.cuda.get_device_name(device)
 
-    transformer = random_network(flux_transformer_class(), TINY if asked.tiny else REAL, device, dtype)
-    settings = TINY_AUTOENCODER if asked.tiny else AUTOENCODER
+    transformer = random_network(flux_transformer_class(), TINY if options.tiny else REAL, device, dtype)
+    settings = TINY_AUTOENCODER if options.tiny else AUTOENCODER
     autoencoder = Autoencoder(random_network(autoencoder_class(), settings, device, dtype))
     prompt = PromptEmbedding(torch.randn(TOKENS, 4096), torch.randn(768)).to(device, dtype)
     network = FluxNetwork(transformer, autoencoder, prompt, "image-mask", device, dtype)
     rows: dict[str, dict[str, float]] = {}
 
-    stock = parts(network, 1, (width, height), asked.repeats)
-    encode_text = text_encoders(device, asked.tiny)
+    stock = parts(network, 1, (width, height), options.repeats)
+    encode_text = text_encoders(device, options.tiny)
     if encode_text is None:
         print("transformers is not installed: stock is timed without its text encoders")
     else:
-        stock["text"] = seconds(encode_text, device, asked.repeats)
+        stock["text"] = seconds(encode_text, device, options.repeats)
         stock["whole"] += stock["text"]
     rows["stock"] = stock
 
     bake(transformer, prompt, schnell_levels()[:-1])
     fuse_projections(transformer)
-    rows["ours, one view at a time"] = parts(network, 1, (width, height), asked.repeats)
-    rows[f"ours, {asked.batch} views at once"] = parts(network, asked.batch, (width, height), asked.repeats)
-    if not asked.no_compile and not asked.tiny:
+    rows["ours, one view at a time"] = parts(network, 1, (width, height), options.repeats)
+    rows[f"ours, {options.batch} views at once"] = parts(network, options.batch, (width, height), options.repeats)
+    if not options.no_compile and not options.tiny:
         transformer.compile_repeated_blocks()
-        rows[f"compiled, {asked.batch} views at once"] = parts(network, asked.batch, (width, height), asked.repeats)
+        compiled = parts(network, options.batch, (width, height), options.repeats)
+        rows[f"compiled, {options.batch} views at once"] = compiled
 
-    print(f"{card}, torch {torch.__version__}, {asked.size}, seconds a view\n")
+    print(f"{card}, torch {torch.__version__}, {options.size}, seconds a view\n")
     columns = ("text", "encode", "steps", "decode", "whole")
     print(f"| | {' | '.join(columns)} |\n| --- |{' --- |' * len(columns)}")
     for name, row in rows.items():

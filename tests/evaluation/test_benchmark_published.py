@@ -1,4 +1,4 @@
-"""Other people's ground truth: found where its layout says, and what is missing is named."""
+"""Published data sets: scenes are found by the layout, and missing folders are named."""
 
 import huggingface_hub
 import pytest

@@ -1,4 +1,4 @@
-"""Regions follow the ground truth alone; metrics say zero where nothing is wrong; nothing missing is filled in."""
+"""Regions follow the ground truth alone; metrics are ideal for the truth itself; missing values stay missing."""
 
 import json
 

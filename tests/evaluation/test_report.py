@@ -1,4 +1,4 @@
-"""The report is one folder that needs nothing else, says what is missing, and escapes what users wrote."""
+"""The report works from its folder alone, names missing metrics, and escapes user text."""
 
 import re
 from html.parser import HTMLParser

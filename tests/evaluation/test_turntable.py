@@ -1,4 +1,4 @@
-"""The turntable closes, looks at the object and stays among the captured cameras."""
+"""The turntable is a closed path that looks at the object and stays within the captured viewpoints."""
 
 import math
 

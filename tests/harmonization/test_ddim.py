@@ -1,4 +1,4 @@
-"""The schedule of Stable Diffusion and DDIM: against diffusers, and back to the clean picture from the true answer."""
+"""DDIM and the schedule of Stable Diffusion: compared with diffusers, and exact for the true prediction."""
 
 import pytest
 import torch

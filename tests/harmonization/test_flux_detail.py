@@ -1,4 +1,4 @@
-"""Detail and strength: the composite's pixels come back under the model's light, its materials can be held."""
+"""Post-processing of FLUX: the composite's detail is restored, and changes of material are limited."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The harmoniser `flux` on tiny models in the real folder layouts: what loads, what is refused, what comes out."""
+"""The harmoniser `flux` on tiny models in the real folder layouts: loading, refusals, results."""
 
 import json
 from dataclasses import replace
@@ -119,7 +119,7 @@ def test_weights_kept_in_eight_bits_give_about_the_same(tmp_path):
     folder = flux_folder(tmp_path / "image-mask", WIDE)
     said = []
     image = make_harmonizer("flux", options(folder, precision="fp8", say=said.append)).harmonize(view()).image
-    assert "flux: fp8 on cpu, as asked" in said
+    assert "flux: fp8 on cpu, as requested" in said
     full = make_harmonizer("flux", options(folder)).harmonize(view()).image
     # float8_e4m3 has 3 bits of mantissa: products are off by some percent
     assert (image - full).abs().mean() < 0.05

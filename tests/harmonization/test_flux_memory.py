@@ -1,4 +1,4 @@
-"""Memory: what fits is chosen, what does not is said; predictions have the numbers of the real model."""
+"""Memory: the best precision that fits is chosen, and estimates agree with measured activations."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The command `harmonize` with a network: killed and gone on with, in batches, split over processes and over Ray."""
+"""The command `harmonize` with a network: resumed after a kill, in batches, split over processes and over Ray."""
 
 from dataclasses import replace
 from pathlib import Path

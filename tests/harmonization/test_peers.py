@@ -1,4 +1,4 @@
-"""Peers: each works where its parts are there (stand-ins of them), and says in one line what is missing where not."""
+"""Harmonisers by other authors: each works with stand-ins of its parts, and names missing parts in one line."""
 
 import base64
 import io

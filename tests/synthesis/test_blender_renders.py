@@ -1,4 +1,4 @@
-"""Tiny renders by Blender itself: Eq. 2, masks and depth against poses, the shadow's side, faults, kills, the probe.
+"""Tiny renders by Blender: Eq. 2, masks and depth against poses, shadows, defects, interruptions, the light probe.
 
 Blender lives in an environment of its own (`make blender`), named by SPLATGRAFT_BLENDER_PYTHON; `.ci/run` sets it.
 """
@@ -66,7 +66,7 @@ def pair_folder(tmp_path_factory):
     return rendered(job, out / pairs.job_folder_name(job))
 
 
-def test_the_interpreter_is_told_by_its_version_and_another_is_refused():
+def test_an_interpreter_without_bpy_is_refused():
     assert check_blender(PYTHON).startswith("4.")
     with pytest.raises(ValueError, match="expected a Python with bpy"):
         check_blender(Path("/bin/false"))
@@ -101,10 +101,10 @@ def test_a_spoilt_render_is_caught_and_named(pair_folder, damage):
             cv2.imwrite(str(path), np.zeros((TINY.height, TINY.width, 3), np.uint8))
         else:
             cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
-        fault = pairs.find_defect(sample)
-        assert fault is not None
-        assert str(pair_folder) in fault
-        assert "expected" in fault
+        defect = pairs.find_defect(sample)
+        assert defect is not None
+        assert str(pair_folder) in defect
+        assert "expected" in defect
     finally:
         path.write_bytes(sound)
 

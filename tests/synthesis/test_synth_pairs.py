@@ -1,4 +1,4 @@
-"""Training pairs: Eq. 2 exactly, the relit object's statistics, the manifest, and the check that finds bad renders."""
+"""Training pairs: Eq. 2, the relit object's statistics, the manifest, and the detection of defective renders."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Synthetic scenes are determined by their seeds, varied, and leave room for the object and the cameras."""
+"""Synthetic scenes are determined by their seeds, differ between seeds, and have room for object and cameras."""
 
 import json
 import math
@@ -84,7 +84,7 @@ def rendered_in_name(job, out):
         mark.touch()
 
 
-def test_turns_of_one_object_share_what_does_not_show_it(tmp_path):
+def test_rotations_of_one_object_share_the_takes_without_it(tmp_path):
     size = benchmark.BenchmarkSize(RenderSize(64, 48, 2), 8)
     first, other = benchmark.ROTATIONS[0], benchmark.ROTATIONS[1]
     assert other in benchmark.scenes_with_shared_renders(first)
@@ -100,7 +100,7 @@ def test_turns_of_one_object_share_what_does_not_show_it(tmp_path):
     assert same.is_done(tmp_path / "same")
 
 
-def test_half_a_take_and_another_scenes_are_not_taken_over(tmp_path):
+def test_incomplete_takes_and_those_of_other_scenes_are_not_copied(tmp_path):
     size = benchmark.BenchmarkSize(RenderSize(64, 48, 2), 8)
     target, turned = (benchmark.plan(which, size)[0] for which in benchmark.ROTATIONS[:2])
     stranger = benchmark.plan(benchmark.SCENES[1], size)[0]

@@ -1,4 +1,4 @@
-"""A folder of pairs without Blender: a grey ball on a plane under a sun and even light, in closed form."""
+"""Writes rendered pairs without Blender: a grey ball on a plane under a sun and uniform light, in closed form."""
 
 import json
 import math
@@ -22,7 +22,7 @@ def sun(azimuth, height=0.8):
 
 
 def shaded(points, normals, albedo, light, *, ball):
-    """Linear radiance: albedo / pi times irradiance; the ball blocks the sun, and its share of the even light."""
+    """Linear radiance: albedo / pi times irradiance; the ball blocks the sun and part of the uniform light."""
     towards = torch.tensor(light["direction"])
     cosine = (normals @ towards).clamp_min(0)
     away = CENTER - points
@@ -87,7 +87,7 @@ def _pictures(pose, now, others):
     def on_ground(ball):
         return torch.where(ground_there[..., None], shaded(ground, up, GROUND, now, ball=ball), sky)
 
-    def alone(light):
+    def object_alone(light):
         picture = srgb_from_linear(shaded(body, facing, BODY, light, ball=False))
         return torch.cat([picture, inside[..., None].float()], -1)
 
@@ -101,8 +101,8 @@ def _pictures(pose, now, others):
         "object0 depth": depth,
         "object0 normal": torch.where(on, facing, up) * 0.5 + 0.5,
         "object0 albedo": srgb_from_linear(torch.where(on, BODY, GROUND)),
-        "object0_light0": alone(others[0]),
-        "object0_light1": alone(others[1]),
+        "object0_light0": object_alone(others[0]),
+        "object0_light1": object_alone(others[1]),
     }
 
 

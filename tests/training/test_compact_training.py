@@ -1,4 +1,4 @@
-"""Training of the compact harmoniser: priors fit their light, wrong lights in bounds, resumed to the bit, learns."""
+"""Training of the compact harmoniser: priors, perturbed lights, resuming bit for bit, and learning."""
 
 import math
 import random
@@ -59,13 +59,13 @@ def test_under_the_true_light_the_prior_removes_most_of_the_error(rendered, tmp_
     for index in range(4):
         view, truth = pairs.read(index)
         pasted, prior = region_errors(view.composite, truth, view), region_errors(view.prior(), truth, view)
-        # what is left: normals spoilt by 12 degrees on purpose, edges of a shadow a few pixels wide, and the light that
-        # the ball throws back, which the closed form leaves out
+        # what is left: normals with errors of 12 degrees, edges of a shadow a few pixels wide, and the light that
+        # the ball reflects, which the closed form leaves out
         assert prior.object < 0.4 * pasted.object
         assert prior.shadow < 0.6 * pasted.shadow
 
 
-def test_wrong_lights_stay_within_their_bounds_and_differ():
+def test_perturbed_lights_stay_within_their_bounds_and_differ():
     light = Light((LightSource((0.6, 0.0, 0.8), (3.0, 2.0, 1.0), name="sun"),), fit_ambient(torch.ones(3)))
     found = [perturb_light(light, random.Random(i)) for i in range(400)]
     kept = [one.sources[0] for one in found if one.sources]
@@ -77,9 +77,9 @@ def test_wrong_lights_stay_within_their_bounds_and_differ():
     ratios = [s.irradiance[0] / 3.0 for s in kept]
     assert max(ratios) < 4 * math.exp(1.4) * 1.3
     assert max(ratios) > 2
-    # doubt is honest: where more is said, more is perturb_light
-    doubts = np.array([s.uncertainty_deg for s in kept])
-    assert np.mean(np.array(angles)[doubts > 12]) > 2 * np.mean(np.array(angles)[doubts < 8])
+    # the uncertainty is calibrated: larger errors where it is larger
+    uncertainties = np.array([s.uncertainty_deg for s in kept])
+    assert np.mean(np.array(angles)[uncertainties > 12]) > 2 * np.mean(np.array(angles)[uncertainties < 8])
 
 
 def test_priors_that_are_there_are_kept(rendered):
@@ -131,7 +131,7 @@ def test_a_run_that_is_killed_ends_as_one_that_was_not(rendered, tmp_path):
         train_compact(replace(run("cut"), loop=other))
 
 
-def test_it_learns_what_it_is_shown(rendered, tmp_path):
+def test_it_learns_its_training_pairs(rendered, tmp_path):
     pairs = pairs_of(rendered)
     loop = replace(QUICK, steps=200, batch=4, rate=3e-3, ema=0.9, save_every=1000, validate_every=1000)
     size, state = train_compact(CompactTraining(pairs, loop, tmp_path, torch.device("cpu"), silent, silent))

@@ -1,4 +1,4 @@
-"""Sources: pairs as the paper composes them, scenes held out, choices balanced, generators that go on; relighters."""
+"""Sources of training pairs: composites as in the paper, held-out scenes, balanced choices, resuming; relighters."""
 
 import json
 import stat
@@ -144,7 +144,7 @@ def test_inflated_normals_point_outwards():
     assert normal[20, 30, 2] > 0.95
 
 
-def test_the_stand_in_shades_the_side_that_light_comes_from_and_says_what_it_is(tmp_path):
+def test_the_silhouette_relighter_shades_the_lit_side_and_is_named_in_records(tmp_path):
     y, x = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
     mask = (((x - 30) ** 2 + (y - 20) ** 2) < 15**2).float()
     draft = RelightingInput("ball", torch.full((40, 60, 3), 0.5), mask)
@@ -157,7 +157,7 @@ def test_the_stand_in_shades_the_side_that_light_comes_from_and_says_what_it_is(
     assert "not DiffusionRenderer" in SilhouetteRelighter().name
 
 
-def test_a_generator_goes_on_where_it_was_killed_and_notes_what_is_unfit(tmp_path):
+def test_a_killed_generation_resumes_and_unsuitable_samples_are_recorded(tmp_path):
     made = []
     samples = {name: sample for name, sample in shipped_samples(4)}
 
@@ -224,7 +224,7 @@ def test_a_dataset_of_another_layout_is_one_line(tmp_path):
     with pytest.raises(ValueError, match=r"index.csv: expected the columns .*, found no background"):
         read_orida(root)
     (root / "index.csv").write_text("image,mask,background,object,scene\na.jpg,b.png,c.png,o,s\n")
-    with pytest.raises(ValueError, match=r"index.csv, line 2: expected files that are there, found no .*a.jpg"):
+    with pytest.raises(ValueError, match=r"index.csv, line 2: expected existing files, found no .*a.jpg"):
         read_orida(root)
     (root / "index.csv").unlink()
     next(root.glob("*/*/masks/*.png")).unlink()

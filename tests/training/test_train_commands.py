@@ -1,4 +1,4 @@
-"""The commands `train` and `synth generated`: from words to a model, on tiny ones; many processes as one."""
+"""The commands `train` and `synth generated` on tiny models; several processes train as one."""
 
 import json
 import subprocess
@@ -79,7 +79,7 @@ def test_two_processes_train_as_one(tmp_path):
     assert torch.allclose(one, two, rtol=1e-4)
 
 
-def test_painted_pictures_become_pairs(tmp_path, monkeypatch, capsys):
+def test_generated_images_become_pairs(tmp_path, monkeypatch, capsys):
     samples = [sample for _, sample in shipped_samples(3)]
 
     class Pipeline:

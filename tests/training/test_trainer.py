@@ -100,7 +100,7 @@ def test_a_killed_training_goes_on_to_the_same_curve_and_weights(tmp_path, optio
         train(training(tmp_path, "killed", loop, progress=killed_at(5), **options))
     said = []
     again = train(training(tmp_path, "killed", loop, say=said.append, **options))
-    assert "goes on from step 4" in said
+    assert "resumed from step 4" in said
     assert read_losses(tmp_path / "killed" / LOG_FILE) == read_losses(tmp_path / "whole" / LOG_FILE)
     name = "lora.safetensors" if options else "transformer/diffusion_pytorch_model.safetensors"
     assert (model / name).read_bytes() == (again / name).read_bytes()

@@ -1,4 +1,4 @@
-"""Evaluate: pictures become numbers and a page that explains them. Knows nothing about scenes or how they were made."""
+"""Evaluation of rendered views: metrics against ground truth, pictures, and the HTML report."""
 
 from splatgraft.evaluation.evaluate import evaluate, true_views
 from splatgraft.evaluation.light_change import change_map, describe_change

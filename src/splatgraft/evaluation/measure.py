@@ -1,4 +1,4 @@
-"""Numbers for pictures against ground truth, per view and over views. Knows nothing about scenes, files or methods."""
+"""Image metrics against ground truth, per view and as means over views."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,17 +14,19 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 """A distance between two sRGB images (h, w, 3), such as LPIPS."""
 
 SMALLEST_REGION = 25
-"""Pixels under which a region of a view says nothing and is left out of the mean."""
+"""Pixels; smaller regions of a view are left out of the means. Set by hand."""
+_SSIM_BORDER = 5
+"""Pixels: SSIM's window reaches over the image border there."""
 
 
 @dataclass(frozen=True)
 class ComparedView:
-    """One view of copy-paste and result beside the truth."""
+    """Copy-paste, result and ground truth of one view."""
 
     name: str
     """The view's name."""
     held_out: bool
-    """Whether no step before has seen a picture of this view."""
+    """Whether no step before the evaluation used a picture of this view."""
     copy_paste: Float[Tensor, "h w 3"]
     """The composite before any light transfer, sRGB in [0, 1]."""
     result: Float[Tensor, "h w 3"]
@@ -43,20 +45,28 @@ def compare(
     background: Float[Tensor, "h w 3"],
     perceptual: Perceptual | None = None,
 ) -> dict[str, float]:
-    """All metrics of one image; nan where a region of the view is too small to speak.
+    """Compute all metrics of one image.
 
-    `background` is a render of the scene without the object, so that errors of reconstruction cancel in
-    `shadow_ratio_rmse` and `rest_*_change`. Without `perceptual` there is no "lpips".
+    Args:
+        image: sRGB in [0, 1].
+        truth: the ground truth.
+        regions: of the view, see `find_regions`.
+        background: render of the scene without the object, sRGB in [0, 1]; reconstruction errors that it shares with
+            `image` cancel in `shadow_ratio_rmse` and `rest_*_change`.
+        perceptual: adds "lpips".
+
+    Returns:
+        Metric to value; nan where a region of the view has fewer than `SMALLEST_REGION` pixels.
     """
     similarity = ssim_map(image, truth.image).mean(-1)
-    inner = (slice(5, -5), slice(5, -5))
+    inner = (slice(_SSIM_BORDER, -_SSIM_BORDER), slice(_SSIM_BORDER, -_SSIM_BORDER))
     out = {"psnr": float(psnr(image, truth.image)), "ssim": float(similarity.mean())}
     for name in ("object", "shadow", "rest"):
         region = getattr(regions, name)
-        speaks = int(region.sum()) >= SMALLEST_REGION
-        out[f"{name}_psnr"] = float(psnr(image, truth.image, region)) if speaks else math.nan
-        speaks = int(region[inner].sum()) >= SMALLEST_REGION
-        out[f"{name}_ssim"] = float(similarity[region[inner]].mean()) if speaks else math.nan
+        large_enough = int(region.sum()) >= SMALLEST_REGION
+        out[f"{name}_psnr"] = float(psnr(image, truth.image, region)) if large_enough else math.nan
+        large_enough = int(region[inner].sum()) >= SMALLEST_REGION
+        out[f"{name}_ssim"] = float(similarity[region[inner]].mean()) if large_enough else math.nan
     out["shadow_ratio_rmse"] = math.nan
     if int(regions.shadow.sum()) >= SMALLEST_REGION:
         error = luminance_ratio(image, background) - luminance_ratio(truth.image, truth.background)
@@ -70,11 +80,16 @@ def compare(
 
 
 def measure(views: Sequence[ComparedView], perceptual: Perceptual | None = None) -> dict:
-    """The content of metrics.json: copy-paste and result side by side; nothing in it is nan, missing is null.
+    """Compute the content of metrics.json; missing values are None.
 
-    `copy_paste` and `result` hold the means over held-out views, or over all where none is held out (`views` says
-    which); `all_views` holds both over every view; `per_view` holds every number. `rest_max_change` is a maximum over
-    views, the rest are means over the views that speak.
+    Args:
+        views: at least one.
+        perceptual: adds "lpips".
+
+    Returns:
+        `copy_paste` and `result`: means over held-out views, or over all where none is held out (`views` names which).
+        `all_views`: the same over every view. `per_view`: every value. `rest_max_change` is a maximum over views; the
+        other metrics are means over the views where they are defined.
     """
     rows = [_row(view, perceptual) for view in views]
     held_out = [row for row in rows if row["held_out"]]

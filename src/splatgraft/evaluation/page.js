@@ -8,8 +8,8 @@
   const chosen = { left: labels[0], right: labels[Math.min(1, labels.length - 1)], view: 0 };
   const thumbs = [...document.querySelectorAll(".thumb")];
   // a link such as index.html#8 opens that view
-  const asked = Number.parseInt(location.hash.slice(1), 10);
-  if (asked >= 0 && asked < views.length) chosen.view = asked;
+  const linked = Number.parseInt(location.hash.slice(1), 10);
+  if (linked >= 0 && linked < views.length) chosen.view = linked;
 
   const show = () => {
     const view = views[chosen.view];
@@ -22,8 +22,8 @@
         button.setAttribute("aria-pressed", String(button.textContent === label));
     }
     compare.style.aspectRatio = view.width + "/" + view.height;
-    const seen = view.held_out ? "held out: seen by no step" : "seen by the steps before";
-    get("caption").textContent = view.name + " \u00b7 " + seen;
+    const use = view.held_out ? "held out: used by no step" : "used by earlier steps";
+    get("caption").textContent = view.name + " \u00b7 " + use;
     thumbs.forEach((thumb, i) => thumb.setAttribute("aria-current", String(i === chosen.view)));
   };
   for (const side of ["left", "right"])

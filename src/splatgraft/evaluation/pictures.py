@@ -1,4 +1,4 @@
-"""Pictures for people: side by side with labels, and animations as GIF or WebP. Knows nothing about scenes."""
+"""Pictures for reports: labelled images side by side, and animations as GIF or WebP."""
 
 import io
 import math
@@ -17,7 +17,7 @@ _GAP_PX = 6
 
 
 def side_by_side(images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str]) -> Float[Tensor, "h _ 3"]:
-    """Images of one height in a row with thin white gaps, each with its label in the lower left corner."""
+    """Join images of one height in a row with thin white gaps, each with its label in the lower left corner."""
     height = images[0].shape[0]
     gap = torch.ones(height, max(2, height * _GAP_PX // 480), 3)
     parts: list[Tensor] = []
@@ -29,9 +29,16 @@ def side_by_side(images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str]
 def write_animation(
     path: Path, frames: Sequence[Float[Tensor, "h w 3"]], *, fps: float = 20.0, max_bytes: int = 6_000_000
 ) -> None:
-    """A looping .gif (one palette of 256 colours, dithered) or .webp; frames shrink until the file fits `max_bytes`.
+    """Write a looping .gif (one palette of 256 colours, dithered) or .webp.
 
-    Raises: ValueError for another suffix, or no frames.
+    Args:
+        path: the file; its suffix selects the format.
+        frames: sRGB in [0, 1], all of one size.
+        fps: frames per second.
+        max_bytes: frames are scaled down until the file is no larger.
+
+    Raises:
+        ValueError: another suffix, or no frames.
     """
     if path.suffix not in (".gif", ".webp") or not frames:
         raise ValueError(f"{path}: expected .gif or .webp and at least one frame, found {len(frames)} frames")
@@ -39,7 +46,7 @@ def write_animation(
     pictures = [_pil(frame) for frame in frames]
     data = encode(pictures, fps)
     while len(data) > max_bytes and pictures[0].width > 16:
-        # bytes go with area; 0.95 leaves room, so that one or two rounds are enough
+        # the size in bytes is about proportional to the area; 0.95 leaves a margin, so that one or two rounds suffice
         factor = 0.95 * math.sqrt(max_bytes / len(data))
         size = (max(16, int(pictures[0].width * factor)), max(1, int(pictures[0].height * factor)))
         pictures = [picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures]
@@ -71,14 +78,14 @@ def _labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3
 
 
 def _gif(pictures: Sequence[Image.Image], fps: float) -> bytes:
-    # one palette for all frames, from a spread of them: colours do not flicker and the file is smaller
-    spread = pictures[:: max(1, len(pictures) // 8)]
-    sheet = Image.new("RGB", (spread[0].width, spread[0].height * len(spread)))
-    for i, picture in enumerate(spread):
+    # one palette for all frames, from several of them: no flicker, and a smaller file
+    samples = pictures[:: max(1, len(pictures) // 8)]
+    sheet = Image.new("RGB", (samples[0].width, samples[0].height * len(samples)))
+    for i, picture in enumerate(samples):
         sheet.paste(picture, (0, i * picture.height))
     palette = sheet.quantize(256, method=Image.Quantize.MEDIANCUT)
     frames = [picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for picture in pictures]
-    # GIF counts in hundredths of a second
+    # GIF stores durations in hundredths of a second
     return _animated(frames, "GIF", duration=max(2, round(100 / fps)) * 10, optimize=False, disposal=1)
 
 

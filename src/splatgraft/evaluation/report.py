@@ -1,4 +1,4 @@
-"""The report as a folder: index.html and the pictures beside it, nothing from elsewhere. Takes no measurement."""
+"""Writes the evaluation report: a folder with index.html and its pictures that works offline."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,50 +17,50 @@ from splatgraft.runtime.atomic_file import atomic_write
 
 @dataclass(frozen=True)
 class ReportView:
-    """One view's pictures, of one size."""
+    """The pictures of one view, all of one size."""
 
     name: str
     """The view's name."""
     held_out: bool
-    """Whether no step before has seen a picture of this view."""
+    """Whether no step before the evaluation used a picture of this view."""
     pictures: Mapping[str, Float[Tensor, "h w 3"]]
-    """Label to sRGB picture, e.g. "Copy-paste", "Result"; the first two are what the slider shows first."""
+    """Label to sRGB image, e.g. "Copy-paste", "Result"; the slider first shows the first two."""
 
 
 @dataclass(frozen=True)
 class StepTime:
-    """What one step took."""
+    """The duration of one step."""
 
     name: str
     """The command's name."""
     seconds: float
     """Wall-clock time."""
     note: str = ""
-    """A few words, such as "41k Gaussians, 27.4 dB held out"."""
+    """A short remark, such as "41k Gaussians, 27.4 dB held out"."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that the page says in words and numbers."""
+    """The texts and metrics of the page."""
 
     title: str
     """One line."""
     subtitle: str
-    """One sentence on what went where."""
+    """One sentence on object and target."""
     metrics: dict | None = None
-    """The content of metrics.json as `measure` makes it; None where there is no ground truth."""
+    """The content of metrics.json, see `measure`; None without ground truth."""
     changes: Mapping[str, float] = field(default_factory=dict)
-    """`describe_change` averaged over views, shown where there is no ground truth."""
+    """`describe_change` averaged over views, shown without ground truth."""
     not_measured: Mapping[str, str] = field(default_factory=dict)
-    """Metric name to the reason why it is missing, e.g. {"lpips": "no weights at ..."}."""
+    """Missing metric to the reason, e.g. {"lpips": "no weights at ..."}."""
     light: str = ""
-    """What the light transfer says about itself; lines become paragraphs."""
+    """Description of the light transfer; each line becomes a paragraph."""
     steps: tuple[StepTime, ...] = ()
-    """In the order in which they ran."""
+    """In the order of execution."""
     machine: str = ""
-    """What the times were taken on."""
+    """The machine on which the times were measured."""
     limits: tuple[str, ...] = ()
-    """What a reader must know before trusting the result, one sentence each."""
+    """Limitations of the result, one sentence each."""
 
 
 def write_report(
@@ -70,9 +70,16 @@ def write_report(
     views: Iterable[ReportView],
     turntable: Sequence[Float[Tensor, "h w 3"]] = (),
 ) -> Path:
-    """Write `folder`/index.html and its pictures; gives the page's path. Views are taken one at a time.
+    """Write index.html and its pictures, and metrics.json where there are metrics.
 
-    Where `report.metrics` is there, metrics.json is written beside the page.
+    Args:
+        folder: of the report.
+        report: texts and metrics.
+        views: consumed one at a time, so that they need not all be in memory.
+        turntable: frames of the animation; none where empty.
+
+    Returns:
+        The path of index.html.
     """
     (folder / "views").mkdir(parents=True, exist_ok=True)
     files = []

@@ -1,4 +1,4 @@
-"""The report's HTML, as one string. Knows words and layout; looks and behaviour are in page.css and page.js."""
+"""The HTML of the evaluation report; style and scripts are in page.css and page.js."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -10,18 +10,25 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from splatgraft.evaluation.report import Report, StepTime
 
-# name, unit, format, whether more is better, what it says
+# key in metrics.json, title, unit, format, whether higher is better, explanation
 _METRICS = (
-    ("psnr", "Whole image", "PSNR, dB", "{:.2f}", True, "Pixel error over all of the picture."),
-    ("ssim", "Structure", "SSIM", "{:.4f}", True, "Agreement of local contrast and texture over all of the picture."),
-    ("lpips", "Perception", "LPIPS", "{:.4f}", False, "Distance between what a trained network sees in both."),
+    ("psnr", "Whole image", "PSNR, dB", "{:.2f}", True, "Pixel error over the whole image."),
+    ("ssim", "Structure", "SSIM", "{:.4f}", True, "Agreement of local contrast and texture over the whole image."),
+    (
+        "lpips",
+        "Perception",
+        "LPIPS",
+        "{:.4f}",
+        False,
+        "Distance between the features that a trained network computes from both images.",
+    ),
     (
         "object_psnr",
         "Object",
         "PSNR, dB",
         "{:.2f}",
         True,
-        "Only pixels that the object covers: is it lit as it should be?",
+        "Only pixels that the object covers.",
     ),
     (
         "shadow_psnr",
@@ -37,39 +44,49 @@ _METRICS = (
         "RMSE",
         "{:.4f}",
         False,
-        "Light left in the shadow over light before, against the same ratio in the truth.",
+        "Error of the ratio of light with the object to light without it, inside the true shadow.",
     ),
-    ("rest_psnr", "The rest", "PSNR, dB", "{:.2f}", True, "Pixels that the true object leaves untouched."),
+    ("rest_psnr", "The rest", "PSNR, dB", "{:.2f}", True, "Only pixels that the true object does not change."),
     (
         "rest_max_change",
         "Change of the rest, worst pixel",
         "0 to 1",
         "{:.4f}",
         False,
-        "Nothing happens there in the truth, so nothing should here.",
+        "Difference from the scene without the object where the truth has none; 0 is ideal.",
     ),
-    ("rest_mean_change", "Change of the rest, mean", "0 to 1", "{:.5f}", False, "The same, averaged."),
+    ("rest_mean_change", "Change of the rest, mean", "0 to 1", "{:.5f}", False, "The same, mean over pixels."),
 )
 _CHANGES = (
-    ("object_brightness", "Brightness of the object", "{:.2f} x", "Linear light, over copy-paste."),
+    (
+        "object_brightness",
+        "Brightness of the object",
+        "{:.2f} x",
+        "Linear light on the object, relative to copy-paste.",
+    ),
     (
         "darkened_fraction",
         "Surroundings darkened",
         "{:.1%}",
-        "Pixels beside the object that lost over 5% of their light.",
+        "Share of pixels off the object that lost more than 5% of their light.",
     ),
-    ("brightened_fraction", "Surroundings brightened", "{:.1%}", "Pixels beside the object that gained over 5%."),
+    (
+        "brightened_fraction",
+        "Surroundings brightened",
+        "{:.1%}",
+        "Share of pixels off the object that gained more than 5%.",
+    ),
 )
 
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """Where one view's pictures lie, relative to the page."""
+    """The picture files of one view, relative to the page."""
 
     name: str
     """The view's name."""
     held_out: bool
-    """Whether it was kept from every step before."""
+    """Whether no step before the evaluation used a picture of this view."""
     files: Mapping[str, str]
     """Label to file."""
     width: int
@@ -79,20 +96,20 @@ class ViewFiles:
 
 
 def page_html(report: "Report", views: Sequence[ViewFiles], *, turntable: str | None) -> str:
-    """The whole page."""
+    """Format the page; `turntable` is the animation's file relative to the page."""
     sections = [
         viewer(views) if views else "",
         _turntable(turntable) if turntable else "",
         _numbers(report),
         _prose("Light", "light", report.light.splitlines()),
         _steps(report.steps, report.machine),
-        _list("What to know before trusting this", report.limits),
+        _list("Limitations", report.limits),
     ]
     return html_page(report.title, report.subtitle, "".join(sections), views=views)
 
 
 def html_page(title: str, subtitle: str, sections: str, *, views: Sequence[ViewFiles]) -> str:
-    """A page around HTML `sections`, with looks and behaviour inside; `views` is what a `viewer` on it shows."""
+    """Format a page with style and scripts around HTML `sections`; `views` are those that its `viewer` shows."""
     here = files("splatgraft.evaluation")
     data = json.dumps([{**asdict(view), "files": dict(view.files)} for view in views]).replace("<", "\\u003c")
     return f"""<!doctype html>
@@ -111,8 +128,7 @@ def html_page(title: str, subtitle: str, sections: str, *, views: Sequence[ViewF
 </header>
 <main>
 {sections}</main>
-<footer>Made by splatgraft. This page and the files beside it are all there is; it loads nothing
-from elsewhere.</footer>
+<footer>Made by splatgraft. The page needs only the files in its folder; it loads nothing from the network.</footer>
 <script type="application/json" id="views">{data}</script>
 <script>
 {(here / "page.js").read_text(encoding="utf-8")}</script>
@@ -122,7 +138,7 @@ from elsewhere.</footer>
 
 
 def viewer(views: Sequence[ViewFiles]) -> str:
-    """Two pictures of one view with a slider between them, and thumbnails of all views."""
+    """Format two pictures of one view with a slider between them, and thumbnails of all views."""
     first = views[0]
     labels = list(first.files)
     left, right = labels[0], labels[min(1, len(labels) - 1)]
@@ -151,8 +167,7 @@ def viewer(views: Sequence[ViewFiles]) -> str:
 def _turntable(file: str) -> str:
     return f"""<section><h2>Around the object</h2>
 <figure><img class="turntable" src="{escape(file)}" alt="The result seen from a path between the captured cameras">
-<figcaption>The result from viewpoints between the captured ones; no step has seen these
-pictures.</figcaption>
+<figcaption>The result from viewpoints between the captured ones; none of them was used by any step.</figcaption>
 </figure></section>
 """
 
@@ -166,20 +181,20 @@ def _numbers(report: "Report") -> str:
         )
         table = f'<div class="scroll"><table><tbody>{rows}</tbody></table></div>' if rows else ""
         return f"""<section><h2>Numbers</h2>
-<p>These captures come without ground truth, so no number here can say how right the light is. What can be said is what
+<p>These captures come without ground truth, so the light's correctness cannot be measured. The numbers describe what
 the transfer changed.</p>{table}</section>
 """
     metrics = report.metrics
     rows = "".join(_metric_row(metrics, row, report.not_measured) for row in _METRICS)
     held_out = metrics["views"] == "held out"
-    said = "that no step has seen" if held_out else "(none was held out: steps before have seen them)"
+    which = "that no step has used" if held_out else "(none is held out; earlier steps have used them)"
     return f"""<section><h2>Numbers</h2>
-<p>Against ground truth, mean over {metrics["view_count"]} views {said}. Copy-paste is the object as it was captured,
-put in place with no light transfer.</p>
+<p>Against ground truth, mean over {metrics["view_count"]} views {which}. Copy-paste is the object as it was captured,
+put in place without light transfer.</p>
 <div class="scroll"><table><thead><tr><th scope="col">What</th><th scope="col">Copy-paste</th>
 <th scope="col">Result</th><th scope="col">Change</th></tr></thead><tbody>{rows}</tbody></table></div>
-<p class="quiet">PSNR and SSIM: higher is better. LPIPS, RMSE and change: lower is better. All views and every single
-number are in <a href="metrics.json">metrics.json</a>.</p></section>
+<p class="quiet">PSNR and SSIM: higher is better. LPIPS, RMSE and change: lower is better. The numbers of every view are
+in <a href="metrics.json">metrics.json</a>.</p></section>
 """
 
 
@@ -188,16 +203,16 @@ def _metric_row(metrics: dict, row: tuple[str, str, str, str, bool, str], reason
     head = f'<tr><th scope="row">{title} <em>{unit}</em><small>{words}</small></th>'
     before, after = metrics["copy_paste"].get(name), metrics["result"].get(name)
     if before is None and after is None:
-        asked = name in metrics["result"]
-        why = reasons.get(name, "no view has such a region" if asked else "it was not asked for")
-        return f'{head}<td colspan="3" class="missing">not measured: {escape(why)}</td></tr>'
+        computed = name in metrics["result"]
+        reason = reasons.get(name, "no view has such a region" if computed else "it was not requested")
+        return f'{head}<td colspan="3" class="missing">not measured: {escape(reason)}</td></tr>'
     cells = "".join(f"<td>{'-' if value is None else form.format(value)}</td>" for value in (before, after))
     if before is None or after is None:
         return f"{head}{cells}<td></td></tr>"
     change = form.replace("{:", "{:+").format(after - before)
-    same = float(change) == 0
-    kind = "same" if same else "better" if (after > before) == more_is_better else "worse"
-    word = "no change" if same else f"{change} {kind}"
+    unchanged = float(change) == 0
+    kind = "same" if unchanged else "better" if (after > before) == more_is_better else "worse"
+    word = "no change" if unchanged else f"{change} {kind}"
     return f'{head}{cells}<td><span class="chip {kind}">{word}</span></td></tr>'
 
 
@@ -218,7 +233,7 @@ def _steps(steps: "Sequence[StepTime]", machine: str) -> str:
     )
     total = _duration(sum(step.seconds for step in steps))
     where = f" on {escape(machine)}" if machine else ""
-    return f"""<section><h2>Time</h2><p>{total} in all{where}.</p>
+    return f"""<section><h2>Time</h2><p>{total} in total{where}.</p>
 <div class="scroll"><table class="steps"><tbody>{rows}</tbody></table></div></section>
 """
 

@@ -1,4 +1,4 @@
-"""Cameras on a smooth path around an object, no further out than the capture went. Knows nothing about pictures."""
+"""Cameras on a smooth path around an object, within the range of the captured viewpoints."""
 
 import math
 from dataclasses import dataclass
@@ -9,19 +9,19 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 
-_SMOOTHING = math.radians(20)
-
 
 @dataclass(frozen=True)
 class TurntableOptions:
-    """How the camera goes round."""
+    """Options of the camera path; numbers set by hand."""
 
     frames: int = 60
-    """Pictures in one loop."""
+    """Frames in one loop."""
     zoom: float = 1.25
-    """Focal length over the captured cameras' median: the object is nearer the middle than in the capture."""
+    """Focal length over the median of the captured cameras."""
     full_circle_gap_deg: float = 75.0
-    """Where no captured camera stands over a wider angle than this, the path is an arc, there and back."""
+    """With a wider angle than this without captured cameras, the path is an arc that is traversed back and forth."""
+    smoothing_deg: float = 20.0
+    """Standard deviation of the weights, in angle, by which captured distances and heights are averaged."""
 
 
 def turntable_cameras(
@@ -31,10 +31,19 @@ def turntable_cameras(
     up: Float[Tensor, "3"],
     options: TurntableOptions = TurntableOptions(),
 ) -> Cameras:
-    """A closed path around `center` that looks at it from where captured cameras stood, seen as angle about `up`.
+    """Make a closed path of cameras around `center` that look at it.
 
-    Distance and height at an angle are means of the captured ones, weighted by nearness in angle, so the path stays
-    between captured viewpoints. Size and intrinsics follow the first camera and the median focal length.
+    Distance and height at an azimuth are means of the captured ones, weighted by nearness in azimuth, so that the path
+    stays between captured viewpoints.
+
+    Args:
+        cameras: the captured ones.
+        center: point to look at, world units.
+        up: the vertical direction.
+        options: of the path.
+
+    Returns:
+        Cameras with the size of the first captured one and the median focal length times `options.zoom`.
     """
     up = torch.nn.functional.normalize(up.double(), dim=0)
     across, along = _horizontal_axes(up)
@@ -42,9 +51,9 @@ def turntable_cameras(
     x, y, height = offset @ across, offset @ along, offset @ up
     distance, azimuth = torch.hypot(x, y), torch.atan2(y, x)
     path = _loop_of_angles(azimuth, options)
-    turn = torch.remainder(path[:, None] - azimuth[None] + math.pi, 2 * math.pi) - math.pi
-    # log weights: far from every camera the nearest one decides, and nothing underflows
-    weights = torch.softmax(-0.5 * (turn / _SMOOTHING) ** 2, dim=1)
+    difference = torch.remainder(path[:, None] - azimuth[None] + math.pi, 2 * math.pi) - math.pi
+    # softmax of log weights: no underflow far from all cameras, where the nearest one decides
+    weights = torch.softmax(-0.5 * (difference / math.radians(options.smoothing_deg)) ** 2, dim=1)
     ring, level = weights @ distance, weights @ height
     eyes = center.double() + (ring * path.cos())[:, None] * across + (ring * path.sin())[:, None] * along
     eyes = eyes + level[:, None] * up
@@ -63,7 +72,7 @@ def _loop_of_angles(azimuth: Float[Tensor, "v"], options: TurntableOptions) -> F
         return ordered[0] + 2 * math.pi * phase
     start = ordered[(widest + 1) % len(ordered)]
     arc = 2 * math.pi - float(gaps[widest])
-    # a cosine slows down at both ends, as a hand would
+    # a cosine, so that the motion slows down at both ends
     return start + arc * (1 - (2 * math.pi * phase).cos()) / 2
 
 

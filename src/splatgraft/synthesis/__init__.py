@@ -1,1 +1,1 @@
-"""Synthetic ground truth: scenes from a seed, training pairs and benchmark scenes rendered with Blender Cycles."""
+"""Synthetic scenes with ground truth, rendered by Blender: training pairs and the benchmark."""

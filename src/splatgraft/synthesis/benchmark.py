@@ -1,10 +1,10 @@
-"""Nine benchmark scenes with ground truth (paper, Sec. 6), planned as render jobs and gathered as captures.
+"""Nine benchmark scenes with ground truth (paper, Sec. 6): six indoor, three outdoor.
 
-Six indoor, three outdoor. `<out>/<scene>/` holds `source/` (the object on a stage in its own light), `target/` (the
-scene without it), `ground_truth/` (the scene with it, from the target's cameras), all captures with transforms.json;
-`placement.json`; `probe.npy` and `suns.json`, the true light at the object's place. The object stands at one place in
-both worlds, turned about the vertical by the pose's angle, so that the placement is known exactly. Knows nothing about
-transfers.
+Each scene is rendered by two jobs and then laid out as captures in `<out>/<scene>/`: `source/` (the object on a
+pedestal in another light), `target/` (the scene without it), `ground_truth/` (the scene with it, from the target's
+cameras), all with transforms.json; `placement.json`; `probe.npy` and `suns.json`, the true light at the object's place.
+Source and target have the object at the same coordinates, rotated about the vertical by the pose's angle, so that the
+placement is known exactly.
 """
 
 import json
@@ -34,20 +34,20 @@ from splatgraft.synthesis.palette import Palette
 from splatgraft.synthesis.scene import Material, Part, Place, Scene, World
 
 POSES_DEG = (0.0, 120.0, 240.0)
-"""P0, P1, P2: the object's turns in the illumination-consistency scenes (paper, Table 2)."""
+"""P0, P1, P2: the object's rotations in the illumination-consistency scenes (paper, Table 2)."""
 
 
 @dataclass(frozen=True)
 class BenchmarkScene:
-    """One scene of the benchmark, by its seeds."""
+    """The seeds of one benchmark scene."""
 
     name: str
     kind: str
     seed: int
-    """Of the scene; none is used for training pairs."""
+    """Of the scene; differs from all seeds of training pairs."""
     object_seed: int
     pose_deg: float = 0.0
-    """The object's turn about the vertical between source and target."""
+    """The object's rotation about the vertical between source and target."""
 
 
 SCENES: tuple[BenchmarkScene, ...] = (
@@ -69,7 +69,7 @@ ROTATIONS: tuple[BenchmarkScene, ...] = tuple(
 
 
 def scenes_with_shared_renders(which: BenchmarkScene) -> tuple[BenchmarkScene, ...]:
-    """The other scenes of the same place and object: they differ in the turn of the object only, and share views."""
+    """List the other scenes with the same seeds: only the object's rotation differs, and they share renders."""
     return tuple(
         other
         for other in (*SCENES, *ROTATIONS)
@@ -79,16 +79,17 @@ def scenes_with_shared_renders(which: BenchmarkScene) -> tuple[BenchmarkScene, .
 
 @dataclass(frozen=True)
 class BenchmarkSize:
-    """How large the benchmark is rendered."""
+    """Size and number of the benchmark's views."""
 
     render: RenderSize
     views: int
 
     @staticmethod
     def named(name: str) -> "BenchmarkSize":
-        """`small`: 352x248, 40 views; `paper`: 704x496, 200 views.
+        """Look up a size: `small` (352x248, 40 views) or `paper` (704x496, 200 views).
 
-        Raises: ValueError where the name is neither.
+        Raises:
+            ValueError: the name is neither.
         """
         if name == "small":
             return BenchmarkSize(RenderSize.small(), 40)
@@ -98,13 +99,13 @@ class BenchmarkSize:
 
 
 def pedestal_scene(seed: int, place: Place) -> Scene:
-    """A pedestal under an environment map with some things around: where the object was captured."""
+    """Make the scene where the object is captured: a pedestal among furniture under an environment map."""
     rng = random.Random(f"stage-{seed}")
     palette = Palette(rng)
     x, y, z = place.location
     top = max(0.5, 3.2 * place.radius)
-    cloth = replace(palette.stone(), roughness=0.7, scale=2.0)
-    pedestal = Part("cylinder", (top, top, 0.4), (x, y, z - 0.2), cloth, bevel=0.02)
+    pedestal_material = replace(palette.stone(), roughness=0.7, scale=2.0)
+    pedestal = Part("cylinder", (top, top, 0.4), (x, y, z - 0.2), pedestal_material, bevel=0.02)
     ground = furniture.box((14, 14, 0.1), (x, y, z - 0.45), Material("tiles", (0.3, 0.29, 0.27), (0.2, 0.2, 0.2), 0.7))
     parts = [pedestal, ground]
     for i in range(5):
@@ -130,34 +131,34 @@ def pedestal_scene(seed: int, place: Place) -> Scene:
 
 
 def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
-    """The job in the target scene (target, ground truth, light probe) and the job on the stage (source)."""
+    """Plan the job in the target scene (target, ground truth, light probe) and the job on the pedestal (source)."""
     scene = make_scene(which.kind, which.seed)
     place = scene.places[0]
-    made = objects.make(which.object_seed, place)
-    height = max(part.location[2] + part.size[2] / 2 for part in made)
+    parts = objects.make(which.object_seed, place)
+    height = max(part.location[2] + part.size[2] / 2 for part in parts)
     yaw = random.Random(f"yaw-{which.seed}").uniform(0, 6.283)
-    there = objects.standing_at(made, place.location, yaw)
-    turned = objects.standing_at(made, place.location, yaw + math.radians(which.pose_deg))
-    seen: tuple[str, ...] = ("color", "mask", "depth")
+    source_parts = objects.standing_at(parts, place.location, yaw)
+    target_parts = objects.standing_at(parts, place.location, yaw + math.radians(which.pose_deg))
+    object_passes: tuple[str, ...] = ("color", "mask", "depth")
     provenance = {"scene": which.name, "pose_deg": str(which.pose_deg), "licence": "own render"}
     target = Job(
         scene=scene,
-        objects={"object": turned},
+        objects={"object": target_parts},
         cameras=capture_cameras(scene, place, height, size.views, which.seed),
         takes=(
             Take("target", scene=True, passes=("color", "depth")),
-            Take("ground_truth", scene=True, object="object", passes=seen),
+            Take("ground_truth", scene=True, object="object", passes=object_passes),
             Take("light", scene=True, probe=(place.location[0], place.location[1], place.location[2] + height / 2)),
         ),
         size=size.render,
         provenance=provenance,
     )
-    own = pedestal_scene(which.object_seed, place)
+    pedestal = pedestal_scene(which.object_seed, place)
     source = Job(
-        scene=own,
-        objects={"object": there},
-        cameras=capture_cameras(own, place, height, size.views, which.object_seed),
-        takes=(Take("source", scene=True, object="object", passes=seen),),
+        scene=pedestal,
+        objects={"object": source_parts},
+        cameras=capture_cameras(pedestal, place, height, size.views, which.object_seed),
+        takes=(Take("source", scene=True, object="object", passes=object_passes),),
         size=size.render,
         provenance=provenance,
     )
@@ -165,7 +166,7 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
 
 
 def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
-    """The cameras of a rendered job: Blender's poses look along -z with y up, ours along +z with y down."""
+    """Read the cameras of a rendered job and convert them from OpenGL to OpenCV axes."""
     found = json.loads((out / "cameras.json").read_text())
     poses = torch.tensor(found["poses"], dtype=torch.float64)
     poses[:, :3, 1:3] *= -1
@@ -179,9 +180,17 @@ def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
 def sparse_points(
     folder: Path, cameras: Cameras, *, count: int = 20_000, noise: float = 0.002, seed: int = 0
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Noisy surface points as structure from motion would give: seeded pixels lifted by their depth.
+    """Sample noisy surface points, as structure from motion would reconstruct, by lifting random pixels by their depth.
 
-    `noise` is the standard deviation as a share of the depth. Points of the sky are left out.
+    Args:
+        folder: a rendered take with depth.
+        cameras: of the take.
+        count: number of points over all cameras, at most.
+        noise: standard deviation of the depth, as a share of it.
+        seed: of the sampling.
+
+    Returns:
+        Positions in metres and sRGB colours; the sky has no points.
     """
     generator = np.random.default_rng(seed)
     points, colors = [], []
@@ -202,7 +211,7 @@ def sparse_points(
 
 
 def _gather(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
-    """Lay one take out as a capture: images/, a folder a pass, transforms.json, points.ply."""
+    """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply."""
     count = len(json.loads((rendered / "cameras.json").read_text())["poses"])
     stems = tuple(f"{i:04d}" for i in range(count))
     for folder, suffix, ending in _PASS_FILES:
@@ -217,11 +226,17 @@ def _gather(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], po
     write_capture(out, PosedImages(image_paths, cameras, found, colors, mask_paths))
 
 
+_CLIPPED, _MAX_CLIPPED = 0.995, 0.6
+"""sRGB value from which a channel counts as clipped, and largest share of them in a sound picture; set by hand."""
+_MIN_MEAN, _MIN_DEVIATION = 0.02, 0.01
+"""Smallest mean and deviation of a sound picture, sRGB; set by hand."""
+_MIN_COVERED, _MAX_COVERED = 0.001, 0.7
+"""Share of a picture that the object covers; set by hand."""
 _PASS_FILES = (("images", ".png", ".png"), ("masks", "_mask.png", ".png"), ("depth", "_depth.npy", ".npy"))
 
 
 def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out: Path) -> None:
-    """Lay out one rendered scene as captures with its placement and what is known of its light."""
+    """Write one rendered scene as captures, with its placement and its true light."""
     _gather(source_render, "source", out / "source", passes=("images", "masks"), points=True)
     _gather(target_render, "target", out / "target", passes=("images",), points=True)
     _gather(target_render, "ground_truth", out / "ground_truth", passes=("images", "masks", "depth"), points=False)
@@ -239,15 +254,15 @@ def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out:
 
 
 def find_defect(folder: Path) -> str | None:
-    """What is wrong with a gathered scene, in a line, or None: missing, broken, black, burnt out, no object in it."""
+    """Describe the first defect of a scene in one line, or None: a missing, broken, black, clipped or empty picture."""
     try:
         truth, target = read_capture(folder / "ground_truth"), read_capture(folder / "target")
         source = read_capture(folder / "source")
         for capture, masked in ((truth, True), (target, False), (source, True)):
             for index in range(len(capture)):
-                wrong = _find_view_defect(capture, index, masked=masked)
-                if wrong:
-                    return wrong
+                defect = _find_view_defect(capture, index, masked=masked)
+                if defect:
+                    return defect
     except ValueError as error:
         return str(error)
     return None
@@ -255,14 +270,14 @@ def find_defect(folder: Path) -> str | None:
 
 def _find_view_defect(capture: PosedImages, index: int, *, masked: bool) -> str | None:
     path, image = capture.image_paths[index], capture.image(index)
-    mean, deviation, burnt = float(image.mean()), float(image.std()), float((image > 0.995).float().mean())
-    if mean < 0.02 or deviation < 0.01 or burnt > 0.6:
+    mean, deviation, clipped = float(image.mean()), float(image.std()), float((image > _CLIPPED).float().mean())
+    if mean < _MIN_MEAN or deviation < _MIN_DEVIATION or clipped > _MAX_CLIPPED:
         return (
-            f"{path}: expected a lit picture, found mean {mean:.3f}, deviation {deviation:.3f}, {burnt:.0%} burnt out"
+            f"{path}: expected a lit picture, found mean {mean:.3f}, deviation {deviation:.3f}, {clipped:.0%} clipped"
         )
     mask = capture.mask(index) if masked else None
     if masked and mask is None:
         return f"{path}: expected a mask beside it, found none"
-    if mask is not None and not 0.001 <= float(mask.mean()) <= 0.7:
+    if mask is not None and not _MIN_COVERED <= float(mask.mean()) <= _MAX_COVERED:
         return f"{capture.mask_paths[index]}: expected a mask of 0.1% to 70%, found {float(mask.mean()):.2%}"
     return None

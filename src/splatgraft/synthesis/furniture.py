@@ -1,4 +1,4 @@
-"""Furniture as parts, each standing on the floor at the origin with its front towards -y. Knows nothing about rooms."""
+"""Random pieces of furniture as parts; each stands on the floor at the origin with its front towards -y."""
 
 import math
 import random
@@ -11,7 +11,7 @@ Parts = tuple[Part, ...]
 
 
 def placed(parts: Parts, location: Vector, yaw: Number) -> Parts:
-    """Parts turned about z and moved."""
+    """Rotate parts about z by `yaw` radians, then move them."""
     return tuple(
         replace(
             part,
@@ -23,7 +23,7 @@ def placed(parts: Parts, location: Vector, yaw: Number) -> Parts:
 
 
 def box(size: Vector, location: Vector, material: Material, bevel: Number = 0.004) -> Part:
-    """A box with slightly rounded edges; no real edge is sharp."""
+    """A box with slightly rounded edges."""
     return Part(shape="box", size=size, location=location, material=material, bevel=bevel)
 
 
@@ -231,7 +231,7 @@ def picture(rng: random.Random, palette: Palette) -> Parts:
 
 
 def tabletop(rng: random.Random, palette: Palette, top: Part) -> Parts:
-    """A few small things near the edge of a table's top, in the frame of its upper side, the middle left free."""
+    """A few small objects near the edge of a table's top, on z = 0; the middle stays free."""
     parts: list[Part] = []
     width, depth = top.size[:2]
     for _ in range(rng.randint(1, 4)):

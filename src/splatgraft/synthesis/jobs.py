@@ -1,4 +1,4 @@
-"""Render jobs: what to render, and rendering it in a Blender process. Knows not what a job is for."""
+"""Render jobs: their description, and rendering them in a Blender process."""
 
 import json
 import shutil
@@ -19,21 +19,22 @@ _WORKER = Path(__file__).parent / "blender" / "worker.py"
 
 @dataclass(frozen=True)
 class RenderSize:
-    """How large and how clean pictures are."""
+    """Size and sampling of pictures."""
 
     width: int = 704
     height: int = 496
     samples: int = 128
+    """Light paths per pixel."""
 
     @staticmethod
     def small() -> "RenderSize":
-        """A quarter of the paper's pixels, 16 samples and the denoiser."""
+        """A quarter of the paper's pixels, with 16 samples."""
         return RenderSize(width=352, height=248, samples=16)
 
 
 @dataclass(frozen=True)
 class SurfaceSampling:
-    """Points on surfaces, evenly by area, within a ball."""
+    """Sampling of points on surfaces, uniform by area, within a sphere; metres."""
 
     count: int
     center: Vector
@@ -42,40 +43,41 @@ class SurfaceSampling:
 
 @dataclass(frozen=True)
 class Take:
-    """One set of pictures of a job, from all its cameras or some."""
+    """One set of pictures of a job, from all or some of its cameras."""
 
     name: str
-    """Its folder's name."""
+    """Of its folder."""
     scene: bool
-    """Whether the scene is there; without it the background is transparent."""
+    """Whether the scene is rendered; without it the background is transparent."""
     object: str = ""
-    """Which object is there; none where empty."""
+    """The object that is rendered; none where empty."""
     passes: tuple[Pass, ...] = ("color",)
     exposure_group: str = "scene"
-    """Takes of one group share one exposure, found from the first of them."""
+    """Takes of one group share one exposure, computed from the first of them."""
     world: World | None = None
-    """Another world than the scene's."""
+    """Replaces the scene's world."""
     cameras: tuple[int, ...] | None = None
+    """Indices of cameras; all where None."""
     stops: float = 0.0
-    """Exposure on top of the group's, in photographic stops."""
+    """Added to the group's exposure, photographic stops."""
     probe: Vector | None = None
-    """Instead of pictures: the light that arrives at this point, `0000.npy` (64, 128, 3) and `suns.json`.
+    """Instead of pictures: the light at this point, `0000.npy` (64, 128, 3) and `suns.json`.
 
-    The panorama is linear light, scaled as the pictures are: row 0 is straight up, the middle column +x, and columns
-    run to the right seen from inside; small suns are left out of it and listed by themselves."""
+    The panorama is linear light at the exposure of the pictures: row 0 is straight up, the middle column +x, and
+    columns run to the right as seen from inside. Suns are left out of it and listed in `suns.json`."""
     surface: SurfaceSampling | None = None
-    """Instead of pictures: points on the object, or on the scene where none is named, `0000.npy` (n, 6): position and
-    outward normal, world axes."""
+    """Instead of pictures: points on the object, or on the scene where no object is named, `0000.npy` (n, 6): position
+    and outward normal, world axes."""
 
     @property
     def is_pictures(self) -> bool:
-        """Whether it is rendered from cameras."""
+        """Whether the take is rendered from cameras."""
         return self.probe is None and self.surface is None
 
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that one Blender process renders."""
+    """The description of what one Blender process renders."""
 
     scene: Scene
     objects: dict[str, tuple[Part, ...]]
@@ -84,17 +86,17 @@ class Job:
     size: RenderSize
     seed: int = 0
     provenance: dict[str, str] = field(default_factory=dict)
-    """Seeds, kinds and licences, kept with the pictures."""
+    """Seeds, kinds and licences, written beside the pictures."""
 
     def files(self, out: Path) -> Iterator[Path]:
-        """The marks that say which pictures are done, one for each take and camera."""
+        """List the files that mark finished pictures, one per take and camera."""
         for take in self.takes:
-            every = range(len(self.cameras)) if take.is_pictures else (0,)
-            for i in every if take.cameras is None else take.cameras:
+            all_cameras = range(len(self.cameras)) if take.is_pictures else (0,)
+            for i in all_cameras if take.cameras is None else take.cameras:
                 yield out / take.name / f"{i:04d}.done"
 
     def is_done(self, out: Path) -> bool:
-        """Whether nothing is left to render."""
+        """Whether everything is rendered."""
         return all(path.exists() for path in self.files(out))
 
 
@@ -108,9 +110,15 @@ def _description(job: Job, out: Path) -> str:
 
 
 def render_job(job: Job, out: Path, blender_python: Path) -> None:
-    """Render what `out` still lacks; safe to repeat, and to kill.
+    """Render what is missing in `out`; can be interrupted and repeated.
 
-    Raises: ValueError where Blender fails, with its last words and the log's place.
+    Args:
+        job: what to render.
+        out: receives the pictures, job.json and render.log.
+        blender_python: a Python with bpy.
+
+    Raises:
+        ValueError: Blender fails; the message has its last error line.
     """
     if job.is_done(out):
         return
@@ -127,37 +135,38 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
         raise ValueError(f"{log}: expected Blender to render every picture, found exit code {code}: {said}")
 
 
-def copy_shared_takes(job: Job, out: Path, elder: Job, elder_out: Path) -> None:
-    """Copy from `elder_out` the whole takes that `job` would render just the same; what `out` has stays.
+def copy_shared_takes(job: Job, out: Path, other: Job, other_out: Path) -> None:
+    """Copy from `other_out` the complete takes that `job` would render identically; existing files of `out` stay.
 
-    The first take decides the exposure, so where that is not shared, nothing is.
+    The first take determines the exposure: unless it is shared, nothing is copied.
     """
-    alike = (elder.scene, elder.cameras, elder.size, elder.seed) == (job.scene, job.cameras, job.size, job.seed)
+    same_setup = (other.scene, other.cameras, other.size, other.seed) == (job.scene, job.cameras, job.size, job.seed)
     shared = [
         take
         for take in job.takes
-        if alike
-        and take in elder.takes
-        and job.objects.get(take.object) == elder.objects.get(take.object)
-        and replace(elder, takes=(take,)).is_done(elder_out)
+        if same_setup
+        and take in other.takes
+        and job.objects.get(take.object) == other.objects.get(take.object)
+        and replace(other, takes=(take,)).is_done(other_out)
     ]
     if job.takes[0] not in shared:
         return
     out.mkdir(parents=True, exist_ok=True)
     for name in ("cameras.json", "exposure.json"):
-        shutil.copyfile(elder_out / name, out / name)
+        shutil.copyfile(other_out / name, out / name)
     for take in shared:
-        # marks last: killed here, the pictures without one are rendered again
-        for path in sorted((elder_out / take.name).iterdir(), key=lambda path: path.suffix == ".done"):
+        # .done files last: after an interruption, pictures without one are rendered again
+        for path in sorted((other_out / take.name).iterdir(), key=lambda path: path.suffix == ".done"):
             (out / take.name).mkdir(exist_ok=True)
             if not (out / take.name / path.name).exists():
                 shutil.copyfile(path, out / take.name / path.name)
 
 
 def check_blender(blender_python: Path) -> str:
-    """Blender's version in that interpreter.
+    """Return Blender's version in that interpreter.
 
-    Raises: ValueError where it has no bpy.
+    Raises:
+        ValueError: it has no bpy.
     """
     command = [str(blender_python), "-c", "import bpy; print('version', bpy.app.version_string)"]
     try:
@@ -175,5 +184,5 @@ def check_blender(blender_python: Path) -> str:
 
 
 def render_tasks(jobs: Sequence[tuple[Job, Path]], blender_python: Path) -> list[Task]:
-    """One task a job, for `run_tasks`."""
+    """Make one task per job, for `run_tasks`."""
     return [Task(out.name, partial(render_job, job, out, blender_python)) for job, out in jobs]

@@ -1,4 +1,4 @@
-"""Objects to insert, from a seed: turned, extruded, blobby, assembled, of many materials. They stand on z = 0."""
+"""Random objects to insert: turned, extruded and blob shapes, also stacked, of many materials; they stand on z = 0."""
 
 import math
 import random
@@ -10,7 +10,7 @@ from splatgraft.synthesis.scene import Material, Number, Part, Pattern, Place, S
 
 
 def _profile(rng: random.Random) -> tuple[tuple[float, float], ...]:
-    """A smooth vase-like outline, closed at the bottom, open at the top."""
+    """A smooth vase-like profile, closed at the bottom, open at the top."""
     waves = [(rng.uniform(0.05, 0.28), rng.uniform(1, 5), rng.uniform(0, 6.3)) for _ in range(3)]
     radii = [0.6 + sum(a * math.sin(f * i / 12 * math.pi + p) for a, f, p in waves) for i in range(13)]
     radii = [max(0.18, r) for r in radii]
@@ -33,7 +33,7 @@ def _outline(rng: random.Random) -> tuple[tuple[float, float], ...]:
 
 
 def _surface(rng: random.Random, palette: Palette) -> Material:
-    """Any material that an object may have: metal, gloss, matt, pattern."""
+    """A random material: metal, glossy, matt or patterned."""
     kind = rng.choice(["metal", "glossy", "matt", "pattern", "pattern", "wood", "stone"])
     a, b = tone(rng, rng.random(), (0.15, 0.85), (0.25, 0.9)), tone(rng, rng.random(), (0.1, 0.7), (0.3, 0.95))
     if kind == "metal":
@@ -78,9 +78,9 @@ def _handle(rng: random.Random, palette: Palette, width: Number, height: Number)
 
 
 def make(seed: int, place: Place) -> tuple[Part, ...]:
-    """An object of one to three stacked pieces, perhaps with a handle, that fits `place`, standing at the origin.
+    """Make an object of one to three stacked pieces, possibly with a handle, standing at the origin.
 
-    The same seed and place give the same object.
+    Its size fits `place`. The same seed and place give the same object.
     """
     rng = random.Random(f"object-{seed}")
     palette = Palette(rng)
@@ -102,7 +102,7 @@ def make(seed: int, place: Place) -> tuple[Part, ...]:
 
 
 def from_file(path: Path, place: Place) -> tuple[Part, ...]:
-    """A model file, scaled to fit `place`."""
+    """Make an object from a model file, scaled to fit `place`; it stands at the origin."""
     height = min(place.height * 0.6, 0.5)
     size = (1.9 * place.radius, 1.9 * place.radius, height)
     any_material = Material("plain", (0.5, 0.5, 0.5))
@@ -110,7 +110,7 @@ def from_file(path: Path, place: Place) -> tuple[Part, ...]:
 
 
 def standing_at(parts: tuple[Part, ...], location: Vector, yaw: Number) -> tuple[Part, ...]:
-    """The object turned about the vertical and put down at `location`."""
+    """Rotate the object about the vertical by `yaw` radians and move it from the origin to `location`."""
     return tuple(
         replace(
             p,

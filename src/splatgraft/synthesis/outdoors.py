@@ -1,4 +1,4 @@
-"""Outdoor places from a seed: terraces, gardens, squares, under a Nishita sky or an environment map."""
+"""Random outdoor places: terraces, gardens and squares under a Nishita sky or an environment map."""
 
 import math
 import random
@@ -21,6 +21,7 @@ SUPPLIED_MAPS = (
     "interior.exr",
     "night.exr",
 )
+"""Environment maps that come with Blender."""
 
 
 def _tree(rng: random.Random) -> Parts:
@@ -52,7 +53,7 @@ def _hedge(rng: random.Random) -> Parts:
 
 
 def _meadow(rng: random.Random, lawn: Color) -> Parts:
-    """Tufts of grass around the middle, in a few shapes that repeat, paler than the ground between them."""
+    """Tufts of grass around the centre, of four shapes, paler than the ground."""
     paler = (min(0.7, lawn[0] * 1.9), min(0.8, lawn[1] * 1.8), min(0.5, lawn[2] * 1.6))
     blade = Material("plain", paler, lawn, 0.6)
     seeds = [rng.randrange(10**6) for _ in range(4)]
@@ -97,7 +98,7 @@ def _support(rng: random.Random, palette: Palette) -> tuple[Parts, Place]:
 
 
 def outdoor(seed: int, kind: Outdoor) -> Scene:
-    """An outdoor place with the sun where the sky says; the same seed and kind give the same place."""
+    """Make an outdoor place; the same seed and kind give the same place."""
     rng = random.Random(f"{kind}-{seed}")
     palette = Palette(rng)
     paving = Material(

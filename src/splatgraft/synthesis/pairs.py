@@ -1,14 +1,14 @@
-"""Training pairs (paper, Sec. 4.1 and 4.2): planned as render jobs, read back as composites. Knows no network.
+"""Training pairs (paper, Sec. 4.1 and 4.2): planned as render jobs, and read as composite and target.
 
-One folder a scene and camera arc, `<out>/<scene>_<arc>/`:
+One folder per scene and camera arc, `<out>/<scene>_<arc>/`:
 
     job.json, cameras.json, exposure.json    what was rendered, poses (OpenGL axes), exposures
-    background/0000.png ...                  the scene without any object, 8-bit sRGB, one file a camera
+    background/0000.png ...                  the scene without any object, 8-bit sRGB, one file per camera
     object0/0000.png, _mask, _depth, _normal, _albedo    with object 0: the consistent target and its passes
     object0_light0/0000.png                  object 0 alone under another environment map, RGBA, straight alpha
-    object0_light0_probe/0000.npy, suns.json    that light around the object, linear (64, 128, 3), and its small suns
-    place_probe/0000.npy, suns.json          the scene's light where the objects stand, in the units of its pictures
-    scene_surface/0000.npy, object0_surface/    points on what is there, (n, 6): position and outward normal
+    object0_light0_probe/0000.npy, suns.json    that light around the object, linear (64, 128, 3), and its suns
+    place_probe/0000.npy, suns.json          the scene's light at the objects' place, at the exposure of its pictures
+    scene_surface/0000.npy, object0_surface/    points on surfaces, (n, 6): position and outward normal
 
 `mask` is soft coverage (cryptomatte); `depth` is a float16 .npy along the optical axis in metres, 0 for the sky;
 `normal` is 0.5 + 0.5 n in world axes; `albedo` is the diffuse colour, sRGB.
@@ -33,14 +33,18 @@ from splatgraft.synthesis.outdoors import OUTDOORS, SUPPLIED_MAPS, outdoor
 from splatgraft.synthesis.rooms import INTERIORS, interior
 from splatgraft.synthesis.scene import Scene, World
 
-_OBJECT_POINTS, _SCENE_POINTS, _NEAR = 12_000, 100_000, 8.0
+_OBJECT_POINTS, _SCENE_POINTS = 12_000, 100_000
+"""Sampled points per object and per scene."""
+_SURFACE_RADIUS = 8.0
+"""Metres around the object within which surface points are sampled."""
 KINDS: tuple[str, ...] = (*INTERIORS, *OUTDOORS)
 
 
 def make_scene(kind: str, seed: int) -> Scene:
-    """The scene of a kind and a seed.
+    """Make the scene of a kind and a seed.
 
-    Raises: ValueError where the kind is unknown.
+    Raises:
+        ValueError: the kind is unknown.
     """
     if kind in INTERIORS:
         return interior(seed, kind)
@@ -51,11 +55,11 @@ def make_scene(kind: str, seed: int) -> Scene:
 
 @dataclass(frozen=True)
 class PairPlan:
-    """How many of what; samples = scenes x 5 cameras x objects x lights."""
+    """Options of a set of pairs; there are scenes x 5 cameras x objects x lights pairs."""
 
     scenes: int = 60
     objects: int = 2
-    """Per scene; backgrounds are rendered once for all."""
+    """Per scene; the background is rendered once for all."""
     lights: int = 3
     """Environment maps per object."""
     seed: int = 0
@@ -64,13 +68,14 @@ class PairPlan:
     maps: tuple[str, ...] = SUPPLIED_MAPS
     """Environment maps: files, or names of those that come with Blender."""
     models: tuple[str, ...] = ()
-    """Model files that take turns with generated objects."""
+    """Model files, used for about half of the objects."""
 
 
 def plan(options: PairPlan, number: int) -> Job:
-    """The job of scene `number`, determined by it and the seed alone.
+    """Plan the job of scene `number`, determined by it and the seed.
 
-    Raises: ValueError where the scene leaves no room for an arc of cameras.
+    Raises:
+        ValueError: the scene leaves no room for an arc of cameras.
     """
     rng = random.Random(f"pairs-{options.seed}-{number}")
     kind = options.kinds[number % len(options.kinds)]
@@ -79,11 +84,11 @@ def plan(options: PairPlan, number: int) -> Job:
     things, heights = {}, []
     for i in range(options.objects):
         if options.models and rng.random() < 0.5:
-            made = objects.from_file(Path(rng.choice(options.models)), place)
+            parts = objects.from_file(Path(rng.choice(options.models)), place)
         else:
-            made = objects.make(rng.randrange(2**31), place)
-        heights.append(max(part.location[2] + part.size[2] / 2 for part in made))
-        things[f"object{i}"] = objects.standing_at(made, place.location, rng.uniform(0, 6.283))
+            parts = objects.make(rng.randrange(2**31), place)
+        heights.append(max(part.location[2] + part.size[2] / 2 for part in parts))
+        things[f"object{i}"] = objects.standing_at(parts, place.location, rng.uniform(0, 6.283))
     middle = (place.location[0], place.location[1], place.location[2] + 0.5 * max(heights))
     takes = [Take("background", scene=True)]
     for name in things:
@@ -94,23 +99,28 @@ def plan(options: PairPlan, number: int) -> Job:
             takes.append(Take(alone, scene=False, object=name, world=world, exposure_group=alone))
             takes.append(Take(f"{alone}_probe", scene=False, world=world, exposure_group=alone, probe=middle))
         takes.append(
-            Take(f"{name}_surface", scene=False, object=name, surface=SurfaceSampling(_OBJECT_POINTS, middle, _NEAR))
+            Take(
+                f"{name}_surface",
+                scene=False,
+                object=name,
+                surface=SurfaceSampling(_OBJECT_POINTS, middle, _SURFACE_RADIUS),
+            )
         )
     takes.append(Take("place_probe", scene=True, probe=middle))
-    takes.append(Take("scene_surface", scene=True, surface=SurfaceSampling(_SCENE_POINTS, middle, _NEAR)))
+    takes.append(Take("scene_surface", scene=True, surface=SurfaceSampling(_SCENE_POINTS, middle, _SURFACE_RADIUS)))
     cameras = camera_arc(scene, place, max(heights), number)
     provenance = {"kind": kind, "seed": str(options.seed), "number": str(number), "licence": "own render"}
     return Job(scene, things, cameras, tuple(takes), options.size, number, provenance)
 
 
 def job_folder_name(job: Job) -> str:
-    """The job's folder name."""
+    """Name of the job's folder."""
     return f"{job.scene.name}_{job.seed:05d}"
 
 
 @dataclass(frozen=True)
 class PairSample:
-    """One training pair on disk: which folder, camera, object and light."""
+    """One training pair on disk, by folder, camera, object and light."""
 
     folder: Path
     camera: int
@@ -118,7 +128,7 @@ class PairSample:
     light: str
 
     def path(self, take: str, kind: str = "") -> Path:
-        """The file of a take's pass for this camera."""
+        """Path of a take's pass for this camera."""
         suffix = ".npy" if kind == "depth" else ".png"
         return self.folder / take / f"{self.camera:04d}{'_' + kind if kind else ''}{suffix}"
 
@@ -128,9 +138,9 @@ class Pair:
     """One training pair in memory, sRGB in [0, 1]."""
 
     composite: Float[Tensor, "h w 3"]
-    """Inconsistent input (paper, Eq. 2)."""
+    """The object in the light of another place, pasted onto the background (paper, Eq. 2)."""
     target: Float[Tensor, "h w 3"]
-    """Consistent output."""
+    """The scene rendered with the object."""
     background: Float[Tensor, "h w 3"]
     mask: Float[Tensor, "h w"]
     depth: Float[Tensor, "h w"]
@@ -143,7 +153,13 @@ class Pair:
 def match_statistics(
     relit: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """The relit object with the mean and standard deviation, per channel, of the object in the scene (Sec. 4.2)."""
+    """Shift and scale the relit object to the mean and deviation per channel of the object in the scene (Sec. 4.2).
+
+    Args:
+        relit: the object in another light, sRGB.
+        target: the object in the scene, sRGB.
+        mask: weights of the statistics, in [0, 1].
+    """
     weight = mask[..., None] / mask.sum().clamp_min(1e-6)
 
     def moments(image: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
@@ -162,9 +178,10 @@ def composite(
 
 
 def load_pair(sample: PairSample) -> Pair:
-    """Read one pair; the composite is made here, so that no combination is stored twice.
+    """Read one pair and compute its composite.
 
-    Raises: ValueError where a file is missing or broken.
+    Raises:
+        ValueError: a file is missing or broken.
     """
     target, background = read_rgb(sample.path(sample.object)), read_rgb(sample.path("background"))
     mask = read_rgb(sample.path(sample.object, "mask"))[..., 0]
@@ -187,9 +204,10 @@ def load_pair(sample: PairSample) -> Pair:
 
 
 def samples_in(folder: Path) -> list[PairSample]:
-    """All pairs that a rendered folder holds, by its job.json.
+    """List all pairs of a rendered folder by its job.json.
 
-    Raises: ValueError where job.json is missing or broken.
+    Raises:
+        ValueError: job.json is missing or broken.
     """
     path = folder / "job.json"
     try:
@@ -202,53 +220,68 @@ def samples_in(folder: Path) -> list[PairSample]:
 
 
 def find_defect(sample: PairSample) -> str | None:
-    """What is wrong with a pair, in a line, or None: missing, broken, empty, black, burnt out or unrelated."""
+    """Describe the first defect of a pair in one line, or None: a missing, broken, empty, black or clipped picture."""
     try:
         pair = load_pair(sample)
         relit = read_rgb(sample.path(f"{sample.object}_{sample.light}"))
     except ValueError as error:
         return str(error)
     luma, inside = pair.target.mean(-1), pair.mask > 0.5
-    covered, burnt = float(inside.float().mean()), float((luma > 0.995).float().mean())
+    covered, clipped = float(inside.float().mean()), float((luma > 0.995).float().mean())
     mean, deviation = float(luma.mean()), float(luma.std())
     far = torch.nn.functional.max_pool2d(pair.mask[None, None], 31, 1, 15)[0, 0] < 0.01
-    apart = float((pair.target - pair.background)[far].abs().median()) if bool(far.any()) else 0.0
+    difference = float((pair.target - pair.background)[far].abs().median()) if bool(far.any()) else 0.0
     lit = float(relit[inside].mean()) if covered else 0.0
     target = sample.path(sample.object)
+    # thresholds set by hand on rendered pairs
     checks = (
         (0.002 <= covered <= 0.7, sample.path(sample.object, "mask"), "a mask of 0.2% to 70%", f"{covered:.2%}"),
         (mean > 0.02 and deviation > 0.01, target, "a lit picture", f"mean {mean:.3f}, deviation {deviation:.3f}"),
-        (burnt <= 0.4, target, "at most 40% burnt out", f"{burnt:.0%}"),
+        (clipped <= 0.4, target, "at most 40% clipped", f"{clipped:.0%}"),
         (lit > 0.01, sample.path(f"{sample.object}_{sample.light}"), "a lit object", f"mean {lit:.3f}"),
-        (apart <= 0.08, sample.path("background"), "the scene of the target", f"a median difference of {apart:.3f}"),
+        (
+            difference <= 0.08,
+            sample.path("background"),
+            "the target's scene",
+            f"a median difference of {difference:.3f}",
+        ),
     )
     return next(
-        (f"{path}: expected {wanted}, found {found}" for sound, path, wanted, found in checks if not sound), None
+        (f"{path}: expected {expected}, found {found}" for sound, path, expected, found in checks if not sound), None
     )
 
 
 def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
-    """Check every pair and write manifest.jsonl with the sound ones; returns their number and the others' faults."""
-    faults, lines = [], []
+    """Check every pair and write manifest.jsonl.
+
+    Args:
+        out: folder of the manifest.
+        folders: rendered folders in it.
+
+    Returns:
+        The number of sound pairs, and the defects of the others.
+    """
+    defects, lines = [], []
     for folder in folders:
         provenance = json.loads((folder / "job.json").read_text()).get("provenance", {})
         for sample in samples_in(folder):
-            wrong = find_defect(sample)
-            if wrong:
-                faults.append(wrong)
+            defect = find_defect(sample)
+            if defect:
+                defects.append(defect)
                 continue
             entry = {"folder": folder.name, "camera": sample.camera, "object": sample.object, "light": sample.light}
             lines.append(json.dumps({**entry, **provenance}))
     partial = out / "manifest.jsonl.partial"
     partial.write_text("\n".join(lines) + "\n" if lines else "")
     partial.replace(out / "manifest.jsonl")
-    return len(lines), faults
+    return len(lines), defects
 
 
 def read_manifest(out: Path) -> list[PairSample]:
-    """The sound pairs of a folder of pairs.
+    """Read the sound pairs of a folder.
 
-    Raises: ValueError where the manifest is missing or a line is broken.
+    Raises:
+        ValueError: the manifest is missing or a line is broken.
     """
     path = out / "manifest.jsonl"
     if not path.is_file():

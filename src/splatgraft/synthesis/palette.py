@@ -1,4 +1,4 @@
-"""Seeded choice of colours and materials that go together. Knows nothing about shapes or rooms."""
+"""Random colours and materials of a place, drawn around a few shared hues."""
 
 import colorsys
 import random
@@ -7,7 +7,7 @@ from splatgraft.synthesis.scene import Color, Material, Number, Pattern
 
 
 def linear(red: Number, green: Number, blue: Number) -> Color:
-    """Linear RGB of sRGB values in [0, 1]."""
+    """Convert sRGB values in [0, 1] to linear RGB."""
 
     def one(value: Number) -> float:
         return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
@@ -16,7 +16,7 @@ def linear(red: Number, green: Number, blue: Number) -> Color:
 
 
 def tone(rng: random.Random, hue: Number, saturation: tuple[float, float], value: tuple[float, float]) -> Color:
-    """A colour near a hue (in turns), with saturation and value drawn from ranges (sRGB HSV)."""
+    """Draw a colour near a hue (in turns), with saturation and value from ranges (HSV of sRGB)."""
     shifted = (hue + rng.gauss(0, 0.02)) % 1.0
     return linear(*colorsys.hsv_to_rgb(shifted, rng.uniform(*saturation), rng.uniform(*value)))
 
@@ -25,7 +25,7 @@ class Palette:
     """The materials of one place: woods, walls, cloth and accents that share a few hues."""
 
     def __init__(self, rng: random.Random):
-        """Draw the hues that everything shares."""
+        """Draw the shared hues."""
         self._rng = rng
         self.accent_hue = rng.random()
         self.second_hue = (self.accent_hue + rng.choice([0.08, 0.33, 0.5, 0.6])) % 1.0
@@ -132,5 +132,5 @@ class Palette:
         return Material(pattern="plain", color=color, second=color, roughness=0.18, coat=0.7)
 
     def anything(self) -> Material:
-        """Any of the above that a small thing may be made of."""
+        """Any material of a small object."""
         return self._rng.choice([self.wood, self.paint, self.metal, self.ceramic, self.stone, self.cloth])()

@@ -1,4 +1,4 @@
-"""Furnished interiors from a seed: five kinds of room, seeded layout, light by window, sun and lamps."""
+"""Random furnished interiors: five kinds of room, lit by window, sun and lamps."""
 
 import math
 import random
@@ -16,40 +16,40 @@ INTERIORS: tuple[Interior, ...] = ("living_room", "kitchen", "office", "bathroom
 
 @dataclass(frozen=True)
 class _Shell:
-    """The empty room: extent and where the window is."""
+    """Size of the room and position of its window, metres."""
 
     width: Number
     depth: Number
     height: Number
     window_center: Number
-    """Along x on the far wall (+y)."""
+    """Along x, on the wall at +y."""
     window_width: Number
     sill: Number
     window_height: Number
 
 
-class _Floor:
-    """What already stands where, as rectangles, so that nothing stands inside another."""
+class _FloorPlan:
+    """The occupied rectangles of the floor."""
 
     def __init__(self, shell: _Shell):
-        self._taken: list[tuple[float, float, float, float]] = []
+        self._occupied: list[tuple[float, float, float, float]] = []
         self._shell = shell
 
-    def take(self, x: Number, y: Number, width: Number, depth: Number, margin: Number = 0.05) -> bool:
-        """Claim a rectangle; False, and nothing claimed, where it is not free or leaves the room."""
+    def occupy(self, x: Number, y: Number, width: Number, depth: Number, margin: Number = 0.05) -> bool:
+        """Occupy a rectangle; False, and unchanged, where it is not free or leaves the room."""
         low_x, high_x, low_y, high_y = x - width / 2, x + width / 2, y - depth / 2, y + depth / 2
         half_w, half_d = self._shell.width / 2, self._shell.depth / 2
         if low_x < -half_w or high_x > half_w or low_y < -half_d or high_y > half_d:
             return False
-        for a, b, c, d in self._taken:
+        for a, b, c, d in self._occupied:
             if low_x - margin < b and high_x + margin > a and low_y - margin < d and high_y + margin > c:
                 return False
-        self._taken.append((low_x, high_x, low_y, high_y))
+        self._occupied.append((low_x, high_x, low_y, high_y))
         return True
 
     def boxes(self, first: Number, others: Number) -> tuple[tuple[Vector, Vector], ...]:
-        """All claimed rectangles as boxes from the floor: the first claimed of one height, the others of another."""
-        return tuple(((a, c, 0.0), (b, d, others if i else first)) for i, (a, b, c, d) in enumerate(self._taken))
+        """All occupied rectangles as boxes on the floor: the first one of height `first`, the others of `others`."""
+        return tuple(((a, c, 0.0), (b, d, others if i else first)) for i, (a, b, c, d) in enumerate(self._occupied))
 
 
 def _walls(rng: random.Random, palette: Palette, shell: _Shell, kind: str) -> Parts:
@@ -94,7 +94,7 @@ def _walls(rng: random.Random, palette: Palette, shell: _Shell, kind: str) -> Pa
 
 
 def _centre(rng: random.Random, palette: Palette, kind: Interior) -> tuple[Parts, Place, tuple[float, float]]:
-    """The support surface that the object is put on, near the middle of the room, and its footprint."""
+    """The support of the object near the middle of the room, its place, and its footprint."""
     if kind == "bedroom" and rng.random() < 0.5:
         rug = Part("box", (1.7, 1.3, 0.015), (0, 0, 0.008), palette.rug(), bevel=0.005)
         return (rug,), Place((0, 0, 0.016), 0.5, 1.6), (0.9, 0.9)
@@ -116,8 +116,8 @@ def _centre(rng: random.Random, palette: Palette, kind: Interior) -> tuple[Parts
     return (*parts, *small), Place((0, 0, height), min(width, depth) * 0.3, 1.2), (width, depth)
 
 
-def _against_walls(rng: random.Random, palette: Palette, kind: Interior, shell: _Shell, floor: _Floor) -> Parts:
-    big = {
+def _against_walls(rng: random.Random, palette: Palette, kind: Interior, shell: _Shell, floor: _FloorPlan) -> Parts:
+    main = {
         "living_room": [lambda: (furniture.sofa(rng, palette, rng.uniform(1.6, 2.3)), 2.3, 0.95)],
         "kitchen": [lambda: (furniture.counter(rng, palette, 2.2), 2.25, 0.68)],
         "office": [lambda: (furniture.shelf(rng, palette, 1.1), 1.15, 0.4)],
@@ -127,7 +127,7 @@ def _against_walls(rng: random.Random, palette: Palette, kind: Interior, shell: 
         ],
         "bedroom": [lambda: (furniture.bed(rng, palette), 1.6, 2.15)],
     }
-    extra = [
+    others = [
         lambda: (furniture.shelf(rng, palette, rng.uniform(0.6, 1.1), rng.uniform(0.9, 2.0)), 1.15, 0.4),
         lambda: (furniture.cabinet(rng, palette, rng.uniform(0.6, 1.4), rng.uniform(0.5, 1.1)), 1.45, 0.55),
         lambda: (furniture.plant(rng, palette, rng.uniform(0.6, 1.3)), 0.6, 0.6),
@@ -135,7 +135,7 @@ def _against_walls(rng: random.Random, palette: Palette, kind: Interior, shell: 
         lambda: (furniture.cabinet(rng, palette, 0.5, 0.5, 0.4), 0.55, 0.5),
     ]
     parts: list[Part] = []
-    makers = big[kind] + [rng.choice(extra) for _ in range(rng.randint(3, 6))]
+    makers = main[kind] + [rng.choice(others) for _ in range(rng.randint(3, 6))]
     for make in makers:
         made, wide, deep = make()
         for _ in range(12):
@@ -149,14 +149,14 @@ def _against_walls(rng: random.Random, palette: Palette, kind: Interior, shell: 
                 y = (1 if side == "far" else -1) * ((shell.depth - across) / 2 - gap)
             else:
                 x = (1 if side == "right" else -1) * ((shell.width - along) / 2 - gap)
-            if floor.take(x, y, along, across):
+            if floor.occupy(x, y, along, across):
                 parts += placed(made, (x, y, 0), yaw)
                 break
     return tuple(parts)
 
 
 def _daylight(rng: random.Random, shell: _Shell, notes: dict[str, str]) -> tuple[tuple[Lamp, ...], World]:
-    """Sky and perhaps sun through the window, a portal's worth of soft light, sometimes night with lamps only."""
+    """Sky and possibly sun through the window with an area light in front of it; in the evening only a dark sky."""
     middle = (shell.window_center, shell.depth / 2 + 0.25, shell.sill + shell.window_height / 2)
     mood = rng.choice(["sun", "sun", "sun", "overcast", "evening"])
     lamps: list[Lamp] = []
@@ -193,7 +193,7 @@ def _daylight(rng: random.Random, shell: _Shell, notes: dict[str, str]) -> tuple
 
 
 def interior(seed: int, kind: Interior) -> Scene:
-    """A furnished room; the same seed and kind give the same room."""
+    """Make a furnished room; the same seed and kind give the same room."""
     rng = random.Random(f"{kind}-{seed}")
     palette = Palette(rng)
     wide, deep = (
@@ -214,31 +214,31 @@ def interior(seed: int, kind: Interior) -> Scene:
         window_height=rng.uniform(1.0, height - sill - 0.25),
     )
     notes: dict[str, str] = {}
-    floor = _Floor(shell)
+    floor = _FloorPlan(shell)
     centre_parts, place, footprint = _centre(rng, palette, kind)
     yaw = rng.choice([0.0, math.pi / 2]) + rng.gauss(0, 0.08)
     offset = (rng.uniform(-0.3, 0.3), rng.uniform(-0.4, 0.4), 0.0)
     reach = max(footprint)
-    floor.take(offset[0], offset[1], reach, reach)
+    floor.occupy(offset[0], offset[1], reach, reach)
     parts = [*_walls(rng, palette, shell, kind), *placed(centre_parts, offset, yaw)]
     if kind in ("living_room", "bedroom") and rng.random() < 0.7 and place.location[2] > 0.1:
         size = (rng.uniform(1.6, 2.4), rng.uniform(1.3, 1.9), 0.014)
         parts.append(Part("box", size, (offset[0], offset[1], 0.007), palette.rug(), (0, 0, yaw), bevel=0.004))
     parts += _against_walls(rng, palette, kind, shell, floor)
     lamps, world = _daylight(rng, shell, notes)
-    lit = list(lamps)
+    all_lamps = list(lamps)
     if notes["mood"] == "evening" or rng.random() < 0.35:
         made, lamp = furniture.floor_lamp(rng, palette)
         corner = (rng.choice([-1, 1]) * (shell.width / 2 - 0.4), -shell.depth / 2 + 0.45, 0.0)
-        if floor.take(corner[0], corner[1], 0.4, 0.4):
+        if floor.occupy(corner[0], corner[1], 0.4, 0.4):
             parts += placed(made, corner, 0)
-            lit.append(replace(lamp, location=add(lamp.location, corner)))
+            all_lamps.append(replace(lamp, location=add(lamp.location, corner)))
     if notes["mood"] == "evening":
         spot = (rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8), shell.height - 0.06)
         warm = (1.0, 0.82, 0.62)
         shade = Material("plain", warm, warm, 0.6, emission=4.0)
         parts.append(Part("cylinder", (0.34, 0.34, 0.06), (spot[0], spot[1], shell.height - 0.03), shade))
-        lit.append(
+        all_lamps.append(
             Lamp("area", warm, rng.uniform(45, 90), (spot[0], spot[1], shell.height - 0.08), (0, 0, -1), 0.32, 0.32)
         )
         notes["lamp_location"] = " ".join(f"{c:.3f}" for c in spot)
@@ -250,18 +250,18 @@ def interior(seed: int, kind: Interior) -> Scene:
             (side * (shell.width / 2 - 0.02), place_y, rng.uniform(1.45, 1.75)),
             -side * math.pi / 2,
         )
-    stand = add(place.location, offset)
+    location = add(place.location, offset)
     return Scene(
         name=f"{kind}_{seed:04d}",
         kind=kind,
         parts=tuple(parts),
-        lamps=tuple(lit),
+        lamps=tuple(all_lamps),
         world=world,
-        places=(replace(place, location=stand),),
+        places=(replace(place, location=location),),
         bounds=(
             (-shell.width / 2 + 0.25, -shell.depth / 2 + 0.25, 0.35),
             (shell.width / 2 - 0.25, shell.depth / 2 - 0.25, shell.height - 0.3),
         ),
-        obstacles=floor.boxes(stand[2] + 0.06, 2.0),
+        obstacles=floor.boxes(location[2] + 0.06, 2.0),
         notes=notes,
     )

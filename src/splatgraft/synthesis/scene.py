@@ -1,7 +1,7 @@
-"""The values that describe a synthetic scene: parts, materials, lamps, sky, cameras. Knows nothing about Blender.
+"""The description of a synthetic scene: parts, materials, lamps, sky, cameras.
 
-Everything is plain data (numbers, strings, tuples), in metres, z up, so that a scene is a small JSON file that a
-renderer in another interpreter can read. Colours are linear RGB.
+All values are plain data (numbers, strings, tuples), in metres with z up, so that a scene is a small JSON file that
+Blender's interpreter can read. Colours are linear RGB.
 """
 
 import json
@@ -38,7 +38,7 @@ Shape = Literal[
 
 @dataclass(frozen=True)
 class Material:
-    """A principled surface with one procedural pattern of two colours."""
+    """A principled BSDF with one procedural pattern of two colours."""
 
     pattern: Pattern
     color: Color
@@ -47,22 +47,22 @@ class Material:
     roughness: Number = 0.5
     metallic: Number = 0.0
     scale: Number = 1.0
-    """Pattern repeats per metre, in the pattern's own sense."""
+    """Frequency of the pattern, relative to the pattern's default."""
     bump: Number = 0.0
-    """Height of the bump, 0 to 1."""
+    """Strength of the bump map, 0 to 1."""
     coat: Number = 0.0
     """Clear coat, 0 to 1."""
     emission: Number = 0.0
-    """Radiance in watts per square metre and steradian; 0 does not shine."""
+    """Emitted radiance, watts per square metre and steradian."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """One mesh: a shape with its size, place and material."""
+    """One mesh: a shape with its size, location and material."""
 
     shape: Shape
     size: Vector
-    """Extent along the own axes, metres; a turned or extruded shape scales its unit profile by it."""
+    """Extent along the local axes, metres; turned and extruded shapes scale their unit profile by it."""
     location: Vector
     """Centre of the shape's bounding box."""
     material: Material
@@ -73,14 +73,14 @@ class Part:
     bevel: Number = 0.0
     """Width of rounded edges, metres."""
     seed: int = 0
-    """For shapes and patterns with own randomness."""
+    """Of shapes with random details."""
     path: str = ""
     """model: a .glb, .gltf, .obj or .blend file."""
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A light source that is no surface of the room."""
+    """A light source without geometry."""
 
     kind: Literal["sun", "area", "point", "spot"]
     color: Color
@@ -88,16 +88,16 @@ class Lamp:
     """sun: W/m^2; else W."""
     location: Vector = (0.0, 0.0, 0.0)
     direction: Vector = (0.0, 0.0, -1.0)
-    """Where the light travels; not used by `point`."""
+    """Direction in which the light travels; not used by `point`."""
     size: Number = 0.1
     """area: side in metres; point and spot: radius in metres; sun: angular diameter in radians."""
     height: Number = 0.0
-    """area: the other side where it is no square, metres."""
+    """area: the other side of a rectangle, metres; 0 for a square."""
 
 
 @dataclass(frozen=True)
 class World:
-    """What surrounds the scene."""
+    """The environment light."""
 
     kind: Literal["color", "sky", "environment"]
     color: Color = (0.0, 0.0, 0.0)
@@ -105,7 +105,7 @@ class World:
     sun_elevation: Number = 0.8
     """sky: radians above the horizon."""
     sun_azimuth: Number = 0.0
-    """sky: radians from +x towards +y, where the sun stands."""
+    """sky: azimuth of the sun, radians from +x towards +y."""
     sun_size: Number = 0.0095
     """sky: angular diameter, radians."""
     haze: Number = 1.0
@@ -118,7 +118,7 @@ class World:
 
 @dataclass(frozen=True)
 class Place:
-    """A spot on a support surface where an object may stand."""
+    """A place for an object on a support surface."""
 
     location: Vector
     radius: Number
@@ -129,7 +129,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole that looks from one point at another, z up in the picture."""
+    """A pinhole camera that looks from one point at another, with z up in the image."""
 
     location: Vector
     target: Vector
@@ -139,7 +139,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Scene:
-    """A whole scene; `places[0]` is the one that the object takes."""
+    """A whole scene; the object is put at `places[0]`."""
 
     name: str
     kind: str
@@ -148,19 +148,19 @@ class Scene:
     world: World
     places: tuple[Place, ...]
     bounds: tuple[Vector, Vector]
-    """Lowest and highest corner of where a camera may stand."""
+    """Lowest and highest corner of the cameras' positions."""
     obstacles: tuple[tuple[Vector, Vector], ...] = ()
-    """Boxes that cameras keep out of."""
+    """Boxes without cameras inside."""
     notes: dict[str, str] = field(default_factory=dict)
-    """The true light in words and numbers, for the benchmark's `light.json`."""
+    """Description of the true light, for the benchmark's `scene.json`."""
 
     def to_json(self) -> str:
-        """The scene as a JSON text that `blender/` can read without this package."""
+        """The scene as JSON, which `blender/` reads without this package."""
         return json.dumps(asdict(self), indent=1)
 
 
 def rotate_z(point: Vector, angle: Number) -> Vector:
-    """`point` turned about the z axis."""
+    """Rotate `point` about the z axis, radians."""
     c, s = math.cos(angle), math.sin(angle)
     return (c * point[0] - s * point[1], s * point[0] + c * point[1], point[2])
 

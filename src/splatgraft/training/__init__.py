@@ -1,1 +1,1 @@
-"""Training of image models on pairs; stands above the stages, whose networks it trains. Knows no commands."""
+"""Training of image models on pairs of composites and targets."""

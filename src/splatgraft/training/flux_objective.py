@@ -1,4 +1,4 @@
-"""Training FLUX to harmonise: rectified flow matching on the velocity (paper, Sec. 4). Knows no loop and no data."""
+"""Training of FLUX as a harmoniser: rectified flow matching on the velocity (paper, Sec. 4, Eq. 1)."""
 
 import shutil
 from collections.abc import Sequence
@@ -21,11 +21,12 @@ from splatgraft.training.objective import Latents
 from splatgraft.training.sources.pair_source import Role
 
 Times = Literal["uniform", "logit-normal", "schnell"]
+"""Distribution of the noise levels: uniform, logit-normal (Esser et al. 2024), or only schnell's four levels."""
 
 
 @dataclass(frozen=True)
 class FluxTraining:
-    """What is trained of FLUX."""
+    """Options of the training of FLUX."""
 
     base: str
     """Folder or hub id with transformer/, vae/ and empty_prompt.safetensors."""
@@ -35,25 +36,27 @@ class FluxTraining:
     """Rank; 0 trains all weights."""
     times: Times = "uniform"
     checkpointing: bool = True
-    """Compute activations twice instead of keeping them."""
+    """Recompute activations in the backward pass instead of keeping them."""
     half: bool = False
-    """Keep what does not learn in bfloat16."""
+    """Keep frozen weights in bfloat16; only with `lora`."""
     seed: int = 0
+    """Of the low-rank matrices' initial values."""
 
 
 class FluxObjective:
-    """A FLUX transformer with room for composite and condition."""
+    """A FLUX transformer conditioned on the composite and a second image."""
 
-    shown: Role = "target"
+    output_role: Role = "target"
 
-    def __init__(self, wanted: FluxTraining, say: Any) -> None:
-        """Load the base and make room.
+    def __init__(self, options: FluxTraining, say: Any) -> None:
+        """Load the base model and widen its first layer where needed.
 
-        Raises: ValueError where a folder is of another kind or broken.
+        Raises:
+            ValueError: a folder is of another kind or broken.
         """
-        folder = local_folder(wanted.base, say)
+        folder = local_folder(options.base, say)
         checked = FluxFolder.open(folder)
-        self._wanted, self._folder = wanted, folder
+        self._options = options
         config = checked.config
         self._prompt_path = find_part(PROMPT_FILE, folder)
         self.prompt = read_prompt(
@@ -63,45 +66,46 @@ class FluxObjective:
         )
         self.autoencoder = load_autoencoder(find_part("vae", folder))
         self.autoencoder.network.eval().requires_grad_(False)
-        dtype = torch.bfloat16 if wanted.half and wanted.lora else torch.float32
+        dtype = torch.bfloat16 if options.half and options.lora else torch.float32
         self.network = load_transformer(checked, dtype=dtype)
         if checked.inputs == 1:
-            widen_transformer(self.network, wanted.first_layer)
+            widen_transformer(self.network, options.first_layer)
         else:
-            checked.variant(wanted.condition)
-        if wanted.lora:
-            say(f"lora: {add_lora(self.network, wanted.lora, seed=wanted.seed)} layers of rank {wanted.lora} learn")
+            checked.variant(options.condition)
+        if options.lora:
+            count = add_lora(self.network, options.lora, seed=options.seed)
+            say(f"lora: {count} layers of rank {options.lora} are trained")
             self.network.x_embedder.float()
         else:
             self.network.requires_grad_(True)
-        if wanted.checkpointing:
+        if options.checkpointing:
             self.network.enable_gradient_checkpointing()
-        condition: Role = "mask" if wanted.condition == "image-mask" else "background"
+        condition: Role = "mask" if options.condition == "image-mask" else "background"
         self.roles: tuple[Role, ...] = ("target", "composite", condition)
 
-    def encode(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
-        """Latents of pictures."""
-        return self.autoencoder.encode(pictures)
+    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
+        """Encode sRGB images in [0, 1] to latents."""
+        return self.autoencoder.encode(images)
 
     def to(self, device: Any) -> None:
-        """Autoencoder and prompt to a device."""
+        """Move autoencoder and prompt to a device."""
         self.autoencoder.network.to(device)
         self.prompt = self.prompt.to(torch.device(device), torch.float32)
 
     def loss(self, network: nn.Module, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
-        """|| v(z_t, z_comp, z_mask, c, t) - (eps - z_0) ||^2, the mean (paper, Eq. 1)."""
+        """Mean of || v(z_t, z_comp, z_mask, c, t) - (eps - z_0) ||^2 (paper, Eq. 1)."""
         clean = latents["target"]
         levels, eps = [], []
         for seed in seeds:
             generator = torch.Generator().manual_seed(seed)
-            levels.append(_level(self._wanted.times, generator))
+            levels.append(_level(self._options.times, generator))
             eps.append(torch.randn(clean.shape[1:], generator=generator))
         level, drawn = torch.stack(levels).to(clean.device), torch.stack(eps).to(clean.device)
         joined = torch.cat([noisy(clean, drawn, level), self._conditions(latents)], 1)
         return ((velocity(network, joined, level, self.prompt).float() - (drawn - clean)) ** 2).mean()
 
     def predict(self, network: nn.Module, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
-        """Harmonised pictures, in schnell's four steps."""
+        """Harmonise by schnell's four steps."""
         conditions = self._conditions(latents)
         b, device = conditions.shape[0], conditions.device
         size = tuple(latents["composite"].shape[1:])
@@ -113,12 +117,18 @@ class FluxObjective:
         return self.autoencoder.decode(sample(step, start, schnell_levels()))
 
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
-        """Write a folder that `harmonize --method flux --weights` takes, or lora.safetensors that its --lora takes."""
+        """Write a folder for `harmonize --method flux --weights`, or lora.safetensors for its --lora."""
         folder.mkdir(parents=True, exist_ok=True)
-        about = {"variant": self._wanted.condition, "base": self._wanted.base, "first_layer": self._wanted.first_layer}
-        write_description(folder, about)
-        if self._wanted.lora:
-            write_lora(folder / "lora.safetensors", state, {"rank": str(self._wanted.lora), "base": self._wanted.base})
+        description = {
+            "variant": self._options.condition,
+            "base": self._options.base,
+            "first_layer": self._options.first_layer,
+        }
+        write_description(folder, description)
+        if self._options.lora:
+            write_lora(
+                folder / "lora.safetensors", state, {"rank": str(self._options.lora), "base": self._options.base}
+            )
             return
         self.network.save_pretrained(folder / "transformer", state_dict=state)
         self.autoencoder.network.save_pretrained(folder / "vae")
@@ -129,7 +139,7 @@ class FluxObjective:
 
 
 def _level(times: Times, generator: torch.Generator) -> Float[Tensor, ""]:
-    """A noise level in (0, 1]."""
+    """Draw a noise level in (0, 1]."""
     if times == "logit-normal":
         return torch.randn((), generator=generator).sigmoid()
     if times == "schnell":

@@ -1,4 +1,4 @@
-"""Latents of training pictures, encoded once and kept on disk. Knows nothing about what is trained on them."""
+"""A disk cache of the latents of training images."""
 
 import hashlib
 import os
@@ -14,63 +14,75 @@ from splatgraft.harmonization.flux.weights.tensor_file import read_tensors, writ
 from splatgraft.training.sources.pair_source import PairReference, Role, crop_pair_to_size
 
 Encode = Callable[[Tensor], Tensor]
-"""Pictures (b 3 h w) in [0, 1] to latents."""
+"""Images (b 3 h w), sRGB in [0, 1], to latents."""
 
 
 @dataclass(frozen=True)
 class LoadedPair:
-    """What of one pair was read: latents where they were kept, else pictures."""
+    """What was read of one pair, by role."""
 
     latents: dict[str, Tensor]
+    """Latents that were in the cache."""
     pictures: dict[str, Tensor]
+    """Images (3 h w) whose latents were not in the cache."""
     paths: dict[str, Path]
+    """Cache file of each role."""
 
 
 class LatentCache:
-    """Latents by picture, of one autoencoder at one size, rounded to bfloat16 whether kept or fresh."""
+    """Latents by image, of one autoencoder at one size; rounded to bfloat16, also when they are newly encoded."""
 
     def __init__(self, folder: Path, encode: Encode, *, width: int, height: int, autoencoder: str) -> None:
-        """`autoencoder` names the weights: another one has other latents."""
-        self._folder, self._encode = folder, encode
-        self._size, self._job = (width, height), f"{autoencoder}|{width}x{height}"
+        """Use the cache in `folder`.
 
-    def load(self, drawn: PairReference, roles: Sequence[Role]) -> LoadedPair:
-        """What is kept of a pair's pictures, and the pictures of what is not.
-
-        Raises: ValueError where a file is missing or broken.
+        Args:
+            folder: the cache.
+            encode: the autoencoder.
+            width: of the images, pixels.
+            height: of the images, pixels.
+            autoencoder: identifies its weights; part of the cache key.
         """
-        paths = {role: self._path(drawn.source.key(drawn.index, role)) for role in roles}
+        self._folder, self._encode = folder, encode
+        self._size, self._key_prefix = (width, height), f"{autoencoder}|{width}x{height}"
+
+    def load(self, reference: PairReference, roles: Sequence[Role]) -> LoadedPair:
+        """Read a pair's cached latents, and the images whose latents are missing.
+
+        Raises:
+            ValueError: a file is missing or broken.
+        """
+        paths = {role: self._path(reference.source.key(reference.index, role)) for role in roles}
         latents = {role: read_tensors(path)["latents"] for role, path in paths.items() if path.is_file()}
         missing = [role for role in roles if role not in latents]
         pictures: dict[str, Tensor] = {}
         if missing:
-            pair = crop_pair_to_size(drawn.source.read(drawn.index), *self._size)
+            pair = crop_pair_to_size(reference.source.read(reference.index), *self._size)
             pictures = {role: pair.picture(role).permute(2, 0, 1) for role in missing}
         return LoadedPair(latents, pictures, paths)
 
     def encode_missing(
         self, loaded: Sequence[LoadedPair], roles: Sequence[Role]
     ) -> dict[str, Float[Tensor, "b c h w"]]:
-        """Latents of several pairs by role; what was missing is encoded and kept."""
+        """Batch the latents of several pairs by role; missing ones are encoded and written to the cache."""
         batch: dict[str, list[Tensor]] = {role: [] for role in roles}
         for item in loaded:
             for role in roles:
                 latents = item.latents.get(role)
                 if latents is None:
-                    # one at a time: a batch would be rounded otherwise, and a run could not go on to the bit
+                    # one at a time: batches are rounded differently, and a resumed run would not be bit-identical
                     latents = self._encode(item.pictures[role][None])[0].to("cpu", torch.bfloat16)
-                    _keep(item.paths[role], latents)
+                    _write_latents(item.paths[role], latents)
                 batch[role].append(latents.float())
         return {role: torch.stack(latents) for role, latents in batch.items()}
 
     def _path(self, key: str) -> Path:
-        name = hashlib.sha256(f"{self._job}|{key}".encode()).hexdigest()
+        name = hashlib.sha256(f"{self._key_prefix}|{key}".encode()).hexdigest()
         return self._folder / name[:2] / f"{name}.safetensors"
 
 
-def _keep(path: Path, latents: Float[Tensor, "c h w"]) -> None:
-    """Write under a name of this process first: several may encode the same picture at once."""
+def _write_latents(path: Path, latents: Float[Tensor, "c h w"]) -> None:
+    """Write to a temporary name of this process first: several processes may encode the same image at once."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    own = path.with_name(f"{path.stem}-{os.getpid()}.safetensors")
-    write_tensors(own, {"latents": latents})
-    os.replace(own, path)
+    temporary = path.with_name(f"{path.stem}-{os.getpid()}.safetensors")
+    write_tensors(temporary, {"latents": latents})
+    os.replace(temporary, path)

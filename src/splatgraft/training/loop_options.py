@@ -1,4 +1,4 @@
-"""How long and how a training runs. Knows no network and no data."""
+"""Options of the training loop: length, optimiser, precision, and intervals of saving and validation."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,7 +6,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """Length, optimiser, precision and rhythm of a training."""
+    """Options of the training loop."""
 
     steps: int = 50_000
     """Optimiser steps."""
@@ -21,7 +21,7 @@ class LoopOptions:
     clip: float = 1.0
     """Largest norm of the gradient; 0 does not clip."""
     ema: float = 0.0
-    """Decay of an averaged copy of the weights, which is then what is kept; 0 for none."""
+    """Decay of the moving average of the weights, which is then the result; 0 for none."""
     optimizer: Literal["adam", "adam8bit"] = "adam"
     """adam8bit needs bitsandbytes."""
     precision: Literal["no", "bf16", "fp16"] = "bf16"
@@ -33,30 +33,37 @@ class LoopOptions:
     validation_pairs: int = 8
     """Pairs per validation."""
     seed: int = 0
-    """Order, noise and initial values follow from it."""
+    """Of the order of pairs, the noise and initial values."""
     tensorboard: bool = False
     """Also write for TensorBoard; needs the package tensorboard."""
     cpu: bool = False
-    """Train on the CPU even where there is a GPU."""
+    """Train on the CPU even if a GPU is available."""
 
     def rate_at(self, step: int) -> float:
-        """Learning rate of a step, counted from 0."""
+        """Learning rate at a step, counted from 0."""
         return self.rate * min(1.0, (step + 1) / self.warm_up) if self.warm_up else self.rate
 
     def check(self, processes: int) -> int:
-        """Pairs per process and pass.
+        """Check the options.
 
-        Raises: ValueError where the numbers make no training.
+        Args:
+            processes: number of training processes.
+
+        Returns:
+            Pairs per process and pass.
+
+        Raises:
+            ValueError: an option is out of range, or the batch cannot be divided evenly.
         """
         for name in ("steps", "batch", "accumulate", "save_every", "validate_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')}: expected at least 1, found {getattr(self, name)}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"--ema: expected a decay from 0 to below 1, found {self.ema}")
-        parts = processes * self.accumulate
-        if self.batch % parts:
+        passes = processes * self.accumulate
+        if self.batch % passes:
             raise ValueError(
-                f"--batch: expected a multiple of {parts} ({processes} processes x --accumulate {self.accumulate}), "
+                f"--batch: expected a multiple of {passes} ({processes} processes x --accumulate {self.accumulate}), "
                 f"found {self.batch}"
             )
-        return self.batch // parts
+        return self.batch // passes

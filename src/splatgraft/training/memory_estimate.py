@@ -1,32 +1,38 @@
-"""Memory that a training takes, per option, before it begins. Pure arithmetic; knows no network but its numbers."""
+"""Estimates the memory that a training will need on each device, from the network's size and the options."""
 
 from dataclasses import dataclass, replace
 
-_PER_BLOCK = 54
-"""Bytes a token and channel that a block keeps; tests/harmonize/test_flux_memory.py measures them."""
+_BYTES_PER_BLOCK = 54
+"""Activations that a block keeps for its backward pass under autocast, bytes per token and channel; measured by
+tests/harmonization/test_flux_memory.py."""
+_BYTES_PER_CHECKPOINT = 2
+"""The same for a block that is computed again in the backward pass."""
+_RESERVED_BYTES = 1 << 30
+"""For the CUDA context, kernels and fragmentation. An estimate."""
 
 
 @dataclass(frozen=True)
 class TransformerSize:
-    """Of a transformer and of what it is given."""
+    """Size of a transformer and of its input."""
 
     parameters: int
     blocks: int
     width: int
-    """Of a token."""
+    """Channels of a token."""
     tokens: int
-    """Of one picture, text included."""
+    """Per image, text included."""
     adapted: int = 0
-    """Sum of inputs and outputs of all adapted layers: parameters of an adaptation of rank 1."""
+    """Sum of inputs and outputs of all adapted layers: the parameters of a low-rank adaptation of rank 1."""
 
 
 @dataclass(frozen=True)
 class MemoryOptions:
-    """Options that decide."""
+    """Training options that change the memory."""
 
     pairs: int
     """Per process and pass."""
     lora: int = 0
+    """Rank; 0 trains all weights."""
     adam8bit: bool = False
     ema: bool = False
     checkpointing: bool = True
@@ -37,41 +43,42 @@ class MemoryOptions:
 
 
 def training_bytes(size: TransformerSize, options: MemoryOptions) -> int:
-    """Bytes on each device: weights, gradients, optimiser, average, activations.
+    """Estimate the bytes on each device: weights, gradients, optimiser, moving average, activations.
 
-    Learning weights are float32 (4), their gradients too (4), Adam's two moments (8, or 2 in 8 bits), an average (4),
-    and a copy in 16 bits (2) that autocast keeps through a pass; what does not learn is bfloat16 (2). Measured on
-    FLUX's blocks under autocast: a block keeps 54 bytes a token and channel for its backward pass, or 2 where it is
-    computed again; twice that in 32 bits.
+    A trainable parameter takes 4 bytes (float32), its gradient 4, Adam's two moments 8 (or 2 in 8 bits), the moving
+    average 4, and the 16-bit copy that autocast keeps through a pass 2; a frozen parameter takes 2 (bfloat16).
+    Activations in 32 bits take twice those in 16 bits.
     """
-    learning = options.lora * size.adapted if options.lora else size.parameters
+    trained = options.lora * size.adapted if options.lora else size.parameters
     frozen = size.parameters if options.lora else 0
     each = 8 + (2 if options.adam8bit else 8) + (4 if options.ema else 0) + (2 if options.half else 0)
     activations = activation_bytes(size, options)
-    return (learning * each + frozen * 2) // options.shards + activations + (1 << 30)
+    return (trained * each + frozen * 2) // options.shards + activations + _RESERVED_BYTES
 
 
 def activation_bytes(size: TransformerSize, options: MemoryOptions) -> int:
-    """What of it the backward pass needs."""
-    per_token = 2 * size.blocks + _PER_BLOCK if options.checkpointing else _PER_BLOCK * size.blocks
+    """Estimate the bytes of the activations kept for the backward pass."""
+    kept_blocks = _BYTES_PER_BLOCK * size.blocks
+    per_token = _BYTES_PER_CHECKPOINT * size.blocks + _BYTES_PER_BLOCK if options.checkpointing else kept_blocks
     return options.pairs * size.tokens * size.width * per_token * (1 if options.half else 2)
 
 
 def memory_table(size: TransformerSize, options: MemoryOptions) -> list[str]:
-    """A line for each way to train, the chosen one marked."""
-    ways = {
+    """Format one line per combination of weights and optimiser; the chosen one is marked by an asterisk."""
+    combinations = {
         "all weights, adam": (0, False),
         "all weights, adam8bit": (0, True),
         f"lora of rank {options.lora or 64}": (options.lora or 64, options.adam8bit),
     }
     lines = []
-    for name, (lora, small) in ways.items():
-        way = replace(options, lora=lora, adam8bit=small)
-        again = replace(way, checkpointing=not options.checkpointing)
+    for name, (lora, small) in combinations.items():
+        variant = replace(options, lora=lora, adam8bit=small)
+        chosen_bytes = training_bytes(size, variant)
+        other_bytes = training_bytes(size, replace(variant, checkpointing=not options.checkpointing))
         chosen = lora == options.lora and small == options.adam8bit
         words = ("with", "without") if options.checkpointing else ("without", "with")
         lines.append(
-            f"{'* ' if chosen else '  '}{name}: {training_bytes(size, way) / 1e9:.0f} GB a device {words[0]} "
-            f"checkpointing, {training_bytes(size, again) / 1e9:.0f} {words[1]}"
+            f"{'* ' if chosen else '  '}{name}: {chosen_bytes / 1e9:.0f} GB a device {words[0]} checkpointing, "
+            f"{other_bytes / 1e9:.0f} {words[1]}"
         )
     return lines

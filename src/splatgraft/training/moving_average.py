@@ -1,4 +1,4 @@
-"""An exponential moving average of what learns. Knows nothing about loops."""
+"""Exponential moving average of a network's trainable parameters."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -8,38 +8,38 @@ from torch import Tensor, nn
 
 
 class MovingAverage:
-    """A float32 copy of the learning parameters that follows them slowly."""
+    """A float32 moving average of the trainable parameters."""
 
     def __init__(self, network: nn.Module, decay: float) -> None:
-        """Begin at the weights as they are."""
+        """Start from the current weights; `decay` in [0, 1)."""
         self._decay = decay
         self._parameters = {name: p for name, p in network.named_parameters() if p.requires_grad}
-        self.shadow = {name: p.detach().float().clone() for name, p in self._parameters.items()}
+        self._averages = {name: p.detach().float().clone() for name, p in self._parameters.items()}
 
     @torch.no_grad()
     def update(self) -> None:
-        """One step towards the weights as they are now."""
+        """Move by 1 - decay towards the current weights."""
         for name, parameter in self._parameters.items():
-            self.shadow[name].lerp_(parameter.detach().float(), 1 - self._decay)
+            self._averages[name].lerp_(parameter.detach().float(), 1 - self._decay)
 
     @contextmanager
     def applied(self) -> Generator[None]:
-        """The network with the averaged weights."""
-        kept = {name: p.detach().clone() for name, p in self._parameters.items()}
-        self._set(self.shadow)
+        """Put the averages into the network within the context."""
+        current = {name: p.detach().clone() for name, p in self._parameters.items()}
+        self._set(self._averages)
         try:
             yield
         finally:
-            self._set(kept)
+            self._set(current)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """For the state from which a run goes on."""
-        return self.shadow
+        """The averages by parameter name."""
+        return self._averages
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from there."""
+        """Restore what `state_dict` returned."""
         for name, tensor in state.items():
-            self.shadow[name].copy_(tensor)
+            self._averages[name].copy_(tensor)
 
     @torch.no_grad()
     def _set(self, values: dict[str, Tensor]) -> None:

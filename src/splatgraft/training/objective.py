@@ -1,4 +1,4 @@
-"""What a training is of: a network, its loss, what it shows and how it is kept. Knows no loop and no files' names."""
+"""The protocol of training objectives: a network with its loss, predictions and file format."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,36 +10,42 @@ from torch import Tensor, nn
 from splatgraft.training.sources.pair_source import Role
 
 Latents = Mapping[str, Tensor]
-"""By role, (b c h w) each."""
+"""Latents (b c h w) by role."""
 
 
 @runtime_checkable
 class Objective(Protocol):
-    """One network and what it learns."""
+    """A network and the task that it is trained for."""
 
     network: Any
-    """A torch module; what does not learn has requires_grad off."""
+    """A torch module; frozen parameters have requires_grad off."""
     roles: tuple[Role, ...]
-    """Pictures of a pair that it is given."""
-    shown: Role
-    """The picture that it learns to make."""
+    """Images of a pair that the loss needs."""
+    output_role: Role
+    """The image that the network learns to generate."""
 
-    def encode(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
-        """Latents of pictures, in [0, 1]."""
+    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
+        """Encode sRGB images in [0, 1] to latents."""
         ...
 
     def to(self, device: Any) -> None:
-        """Bring all that does not learn to a device."""
+        """Move the frozen parts to a device."""
         ...
 
     def loss(self, network: nn.Module, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
-        """Of a batch, with the noise of these seeds; `network` is the one that the loop has wrapped."""
+        """Compute the loss of a batch.
+
+        Args:
+            network: `self.network` as wrapped by the loop.
+            latents: of the batch, for all `roles`.
+            seeds: of the noise, one per pair.
+        """
         ...
 
     def predict(self, network: nn.Module, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
-        """What the network now makes of a batch."""
+        """Generate the images of a batch, sRGB in [0, 1]."""
         ...
 
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
-        """Write the network with these weights, so that it can be used."""
+        """Write the network with the weights `state` in the format that inference loads."""
         ...

@@ -1,4 +1,4 @@
-"""Adam, or Adam with states of 8 bits (the only importer of bitsandbytes). Knows no network."""
+"""Adam, or Adam with 8-bit states (the only module that imports bitsandbytes)."""
 
 from collections.abc import Iterable
 from importlib.util import find_spec
@@ -8,9 +8,15 @@ from torch import nn
 
 
 def make_optimizer(kind: str, parameters: Iterable[nn.Parameter], rate: float) -> torch.optim.Optimizer:
-    """Adam on those parameters, as published (no weight decay).
+    """Make Adam without weight decay.
 
-    Raises: ValueError where adam8bit is asked for and bitsandbytes is missing.
+    Args:
+        kind: adam or adam8bit.
+        parameters: what is trained.
+        rate: learning rate.
+
+    Raises:
+        ValueError: adam8bit is requested and bitsandbytes is not installed.
     """
     if kind == "adam":
         return torch.optim.Adam(list(parameters), lr=rate)

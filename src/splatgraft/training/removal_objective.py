@@ -1,6 +1,6 @@
-"""Training Stable Diffusion 2 to take objects out of pictures, with their shadows (paper, Sec. 4.2 and 4.3).
+"""Training of Stable Diffusion 2 for object removal, shadows included (paper, Sec. 4.2 and 4.3).
 
-The latents of picture and mask join the noisy latent in the UNet's first layer; v-prediction. Knows no loop.
+The UNet's first layer takes the latents of image and mask beside the noisy latent; it predicts the velocity.
 """
 
 import shutil
@@ -24,19 +24,27 @@ from splatgraft.training.objective import Latents
 from splatgraft.training.sources.pair_source import Role
 
 CONDITIONS = 2
+"""Images that condition the network: the image with the object, and the mask."""
 _SAMPLING_STEPS = 20
+"""DDIM steps of a prediction, set by hand."""
 
 
 class RemovalObjective:
-    """A UNet that is given a picture with an object and where it is, and makes the picture without."""
+    """A UNet that generates the image without the object from the image with it and the object's mask."""
 
     roles: tuple[Role, ...] = ("background", "target", "mask")
-    shown: Role = "background"
+    output_role: Role = "background"
 
     def __init__(self, base: str, say: Any, *, checkpointing: bool = True) -> None:
-        """Load Stable Diffusion 2, or a removal network of ours to go on from.
+        """Load Stable Diffusion 2, or a removal network to continue from.
 
-        Raises: ValueError where a folder is of another kind or broken.
+        Args:
+            base: folder or hub id with unet/, vae/ and empty_prompt.safetensors.
+            say: receives messages on downloads.
+            checkpointing: recompute activations in the backward pass instead of keeping them.
+
+        Raises:
+            ValueError: a folder is of another kind or broken.
         """
         folder = local_folder(base, say)
         config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
@@ -67,17 +75,17 @@ class RemovalObjective:
             self.network.enable_gradient_checkpointing()
         self._schedule = NoiseSchedule.stable_diffusion()
 
-    def encode(self, pictures: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
-        """Latents of pictures."""
-        return self.autoencoder.encode(pictures)
+    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
+        """Encode sRGB images in [0, 1] to latents."""
+        return self.autoencoder.encode(images)
 
     def to(self, device: Any) -> None:
-        """Autoencoder and prompt to a device."""
+        """Move autoencoder and prompt to a device."""
         self.autoencoder.network.to(device)
         self.tokens = self.tokens.to(device)
 
     def loss(self, network: nn.Module, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
-        """Mean square error of the velocity."""
+        """Mean squared error of the velocity."""
         clean = latents["background"]
         steps, eps = [], []
         for seed in seeds:
@@ -85,28 +93,29 @@ class RemovalObjective:
             steps.append(torch.randint(1000, (), generator=generator))
             eps.append(torch.randn(clean.shape[1:], generator=generator))
         step, drawn = torch.stack(steps).to(clean.device), torch.stack(eps).to(clean.device)
-        told = self._told(network, self._schedule.noisy(clean, drawn, step), latents, step)
-        return ((told.float() - self._schedule.velocity(clean, drawn, step)) ** 2).mean()
+        predicted = self._velocity(network, self._schedule.noisy(clean, drawn, step), latents, step)
+        return ((predicted.float() - self._schedule.velocity(clean, drawn, step)) ** 2).mean()
 
     def predict(self, network: nn.Module, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
-        """Pictures without the object."""
-        given = latents["target"]
-        start = noise(tuple(given.shape[1:]), seed).to(given.device).expand(given.shape[0], -1, -1, -1)  # pyright: ignore
+        """Generate the images without the object."""
+        target = latents["target"]
+        size = tuple(target.shape[1:])
+        start = noise(size, seed).to(target.device).expand(target.shape[0], -1, -1, -1)  # pyright: ignore
 
-        def at(z: Tensor, step: int) -> Tensor:
-            return self._told(network, z, latents, torch.full((z.shape[0],), step, device=z.device))
+        def velocity_at(z: Tensor, step: int) -> Tensor:
+            return self._velocity(network, z, latents, torch.full((z.shape[0],), step, device=z.device))
 
-        made = ddim(at, start, self._schedule, steps=_SAMPLING_STEPS, predicts="velocity")
-        return self.autoencoder.decode(made)
+        clean = ddim(velocity_at, start, self._schedule, steps=_SAMPLING_STEPS, predicts="velocity")
+        return self.autoencoder.decode(clean)
 
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
-        """Write unet/, vae/ and the prompt."""
+        """Write unet/, vae/ and the prompt embeddings."""
         folder.mkdir(parents=True, exist_ok=True)
         self.network.save_pretrained(folder / "unet", state_dict=state)
         self.autoencoder.network.save_pretrained(folder / "vae")
         shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
 
-    def _told(
+    def _velocity(
         self, network: nn.Module, noisy: Float[Tensor, "b c h w"], latents: Latents, step: Tensor
     ) -> Float[Tensor, "b c h w"]:
         joined = torch.cat([noisy, latents["target"], latents["mask"]], 1)

@@ -1,13 +1,13 @@
-"""The loop: one process or many through accelerate (its only importer), killed anywhere, gone on with to the bit.
+"""The training loop, on one process or several through accelerate; a killed run resumes bit for bit.
 
-Which pairs a step takes and what noise they get follows from the seed and the step alone: so a state holds weights,
-optimiser and average, and the number of processes may change between two runs. Knows neither networks nor data.
+The pairs of a step and their noise follow from the seed and the step alone. A saved state therefore holds only weights,
+optimiser and moving average, and the number of processes may change between runs.
 """
 
 import json
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,89 +31,93 @@ MODEL_FOLDER = "model"
 _STATES = "states"
 _JOB_FILE = "job.json"
 _KEPT_STATES = 2
+_READERS = 4
 
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """All that one run is given."""
+    """Everything that one run needs."""
 
     objective: Objective
     mixture: Mixture
     held_out: Mixture | None
-    """Pairs to validate on; none where there is one scene."""
+    """Pairs for validation; None where no scene is held out."""
     cache: LatentCache
     loop: LoopOptions
     folder: Path
-    """Gets states/, model/, validation/, log.jsonl."""
+    """Receives states/, model/, validation/ and log.jsonl."""
     say: Callable[[str], None]
     progress: Progress
 
     def fingerprint(self) -> dict[str, Any]:
-        """What must be the same for a state to be gone on from."""
-        own = ("batch", "rate", "warm_up", "clip", "ema", "optimizer", "precision", "seed")
-        data = [[source.name, len(indices)] for source, indices in zip(*self._data(), strict=True)]
-        return {name: getattr(self.loop, name) for name in own} | {"data": data}
-
-    def _data(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        return self.mixture.sources, self.mixture.indices
+        """Options and data that must be equal for a state to be resumed."""
+        names = ("batch", "rate", "warm_up", "clip", "ema", "optimizer", "precision", "seed")
+        sources = zip(self.mixture.sources, self.mixture.indices, strict=True)
+        data = [[source.name, len(indices)] for source, indices in sources]
+        return {name: getattr(self.loop, name) for name in names} | {"data": data}
 
 
 def train(run: TrainingRun) -> Path:
-    """Train to the last step; returns the folder of the model.
+    """Train to the last step, resuming from the folder's last state.
 
-    Raises: ValueError where the loss is no number, memory does not do, or an earlier run was another one.
+    Returns:
+        The folder of the model.
+
+    Raises:
+        ValueError: the loss is not finite, memory does not suffice, or the folder's state is of another training.
     """
-    with ThreadPoolExecutor(4) as readers:
-        loop = _Loop(run, readers)
+    with ThreadPoolExecutor(_READERS) as readers:
+        loop = _RunningLoop(run, readers)
         try:
             return loop.run()
         except torch.OutOfMemoryError as error:
             raise ValueError(
-                f"training: expected memory for {loop.each} pairs a pass, found too little at step {loop.step}; the "
-                "last state is kept: try --accumulate, --optimizer adam8bit or --lora"
+                f"training: expected memory for {loop.pairs_per_pass} pairs a pass, found too little at step "
+                f"{loop.step}; the last state is kept: try --accumulate, --optimizer adam8bit or --lora"
             ) from error
 
 
-class _Loop:
-    """What lives while a run runs."""
+class _RunningLoop:
+    """The state of a running training."""
 
     def __init__(self, run: TrainingRun, readers: ThreadPoolExecutor) -> None:
         from accelerate import Accelerator
 
-        self._training, self._readers, loop = run, readers, run.loop
+        self._run, self._readers, loop = run, readers, run.loop
         self._accelerator = Accelerator(
             mixed_precision=loop.precision, gradient_accumulation_steps=loop.accumulate, cpu=loop.cpu
         )
-        self.each = loop.check(self._accelerator.num_processes)
+        self.pairs_per_pass = loop.check(self._accelerator.num_processes)
         self.step = 0
         self._sharded = str(self._accelerator.distributed_type).endswith(("FSDP", "DEEPSPEED"))
         if self._sharded and loop.ema:
             raise ValueError("--ema: expected 0 with FSDP or DeepSpeed, whose parts cannot be averaged here")
         if (plugin := getattr(self._accelerator.state, "deepspeed_plugin", None)) is not None:
-            plugin.deepspeed_config["train_micro_batch_size_per_gpu"] = self.each
+            plugin.deepspeed_config["train_micro_batch_size_per_gpu"] = self.pairs_per_pass
         network = run.objective.network.train()
-        self._learning = {name for name, p in network.named_parameters() if p.requires_grad}
+        self._trained = {name for name, p in network.named_parameters() if p.requires_grad}
         optimizer = make_optimizer(loop.optimizer, [p for p in network.parameters() if p.requires_grad], loop.rate)
         run.objective.to(self._accelerator.device)
         self._average = MovingAverage(network, loop.ema) if loop.ema else None
         self._network, self._optimizer = self._accelerator.prepare(network, optimizer)
         if self._average:
             self._accelerator.register_for_checkpointing(self._average)
-        if len(self._learning) < len(list(network.named_parameters())) and not self._sharded:
-            self._accelerator.register_save_state_pre_hook(self._keep_what_learns)
-            self._accelerator.register_load_state_pre_hook(self._load_what_learns)
+        if len(self._trained) < len(list(network.named_parameters())) and not self._sharded:
+            self._accelerator.register_save_state_pre_hook(self._save_trained_parameters)
+            self._accelerator.register_load_state_pre_hook(self._load_trained_parameters)
 
     def run(self) -> Path:
-        """All steps that are left."""
-        run, loop = self._training, self._training.loop
+        """Run all remaining steps and write the model."""
+        run, loop = self._run, self._run.loop
         self._resume()
         log = TrainingLog(run.folder, loop.tensorboard) if self._accelerator.is_main_process else None
-        ahead = self._begin_reading(self.step)
+        next_batches = self._begin_reading(self.step)
         began, first = time.monotonic(), self.step
         for step in range(self.step, loop.steps):
             self.step = step
-            batches, ahead = ahead, self._begin_reading(step + 1) if step + 1 < loop.steps else []
-            loss = self._one_step(step, [[future.result() for future in part] for part in batches])
+            batches = next_batches
+            next_batches = self._begin_reading(step + 1) if step + 1 < loop.steps else []
+            loss = self._train_step(step, [[future.result() for future in batch] for batch in batches])
             self.step = step + 1
             if log:
                 log.add(self.step, loss, loop.rate_at(step))
@@ -127,15 +131,15 @@ class _Loop:
             log.close()
         return self._finish()
 
-    def _one_step(self, step: int, parts: list[list[LoadedPair]]) -> float:
-        run, loop, accelerator = self._training, self._training.loop, self._accelerator
+    def _train_step(self, step: int, batches: list[list[LoadedPair]]) -> float:
+        run, loop, accelerator = self._run, self._run.loop, self._accelerator
         total = torch.zeros((), device=accelerator.device)
         for group in self._optimizer.param_groups:
             group["lr"] = loop.rate_at(step)
-        for part, loaded in enumerate(parts):
+        for number, loaded in enumerate(batches):
             latents = run.cache.encode_missing(loaded, run.objective.roles)
             latents = {role: tensor.to(accelerator.device) for role, tensor in latents.items()}
-            seeds = [sample_seed(loop.seed, position) for position in self._positions(step, part)]
+            seeds = [sample_seed(loop.seed, position) for position in self._positions(step, number)]
             with accelerator.accumulate(self._network):
                 loss = run.objective.loss(self._network, latents, seeds)
                 accelerator.backward(loss)
@@ -153,23 +157,23 @@ class _Loop:
             self._average.update()
         return value
 
-    def _positions(self, step: int, part: int) -> range:
-        """Places in the order that this process takes in a pass."""
-        begin = step * self._training.loop.batch
-        begin += (part * self._accelerator.num_processes + self._accelerator.process_index) * self.each
-        return range(begin, begin + self.each)
+    def _positions(self, step: int, number: int) -> range:
+        """Positions in the order of the mixture that this process takes in pass `number` of a step."""
+        begin = step * self._run.loop.batch
+        begin += (number * self._accelerator.num_processes + self._accelerator.process_index) * self.pairs_per_pass
+        return range(begin, begin + self.pairs_per_pass)
 
     def _begin_reading(self, step: int) -> list[list[Any]]:
-        run = self._training
+        run = self._run
 
         def read(position: int) -> LoadedPair:
             return run.cache.load(run.mixture.draw(position), run.objective.roles)
 
-        parts = range(run.loop.accumulate)
-        return [[self._readers.submit(read, at) for at in self._positions(step, part)] for part in parts]
+        passes = range(run.loop.accumulate)
+        return [[self._readers.submit(read, at) for at in self._positions(step, number)] for number in passes]
 
     def _save(self) -> None:
-        folder = self._training.folder / _STATES / f"{self.step:08d}"
+        folder = self._run.folder / _STATES / f"{self.step:08d}"
         partial = folder.with_name(f".{folder.name}.partial")
         if self._accelerator.is_main_process:
             shutil.rmtree(partial, ignore_errors=True)
@@ -179,60 +183,60 @@ class _Loop:
         self._accelerator.wait_for_everyone()
         if self._accelerator.is_main_process:
             with atomic_write(partial / _JOB_FILE) as stream:
-                stream.write(json.dumps(self._training.fingerprint()).encode())
+                stream.write(json.dumps(self._run.fingerprint()).encode())
             shutil.rmtree(folder, ignore_errors=True)
             partial.rename(folder)
-            for old in _states(self._training.folder)[:-_KEPT_STATES]:
+            for old in _states(self._run.folder)[:-_KEPT_STATES]:
                 shutil.rmtree(old)
         self._accelerator.wait_for_everyone()
 
     def _resume(self) -> None:
-        run, states = self._training, _states(self._training.folder)
+        run, states = self._run, _states(self._run.folder)
         if self._accelerator.is_main_process:
             truncate_log(run.folder / LOG_FILE, int(states[-1].name) if states else 0)
         if not states:
             return
         path = states[-1] / _JOB_FILE
         try:
-            before = json.loads(path.read_text())
+            saved = json.loads(path.read_text())
         except (OSError, ValueError) as error:
             raise ValueError(f"{path}: expected the description of a training, found {error}") from error
-        now = json.loads(json.dumps(run.fingerprint()))
-        if other := [name for name in now if before.get(name) != now[name]]:
+        current = json.loads(json.dumps(run.fingerprint()))
+        if changed := [name for name in current if saved.get(name) != current[name]]:
             raise ValueError(
-                f"{run.folder}: expected the same training to go on with, found {other[0]} {before.get(other[0])} "
-                f"instead of {now[other[0]]}; name another folder"
+                f"{run.folder}: expected the same training to go on with, found {changed[0]} "
+                f"{saved.get(changed[0])} instead of {current[changed[0]]}; name another folder"
             )
         self._accelerator.load_state(str(states[-1]))
         self.step = int(states[-1].name)
-        run.say(f"goes on from step {self.step}")
+        run.say(f"resumed from step {self.step}")
 
     def _validate(self, log: TrainingLog | None) -> None:
-        run = self._training
+        run = self._run
         mixture = run.held_out or run.mixture
-        asked = ValidationRun(
+        validation = ValidationRun(
             run.objective,
             mixture.all()[: run.loop.validation_pairs],
             run.cache,
             self._accelerator.device,
             run.loop.seed,
         )
-        if not asked.pairs:
+        if not validation.pairs:
             return
         self._network.eval()
         if self._average:
             with self._average.applied():
-                found, sheet = validate(asked, self._network)
+                result, sheet = validate(validation, self._network)
         else:
-            found, sheet = validate(asked, self._network)
+            result, sheet = validate(validation, self._network)
         self._network.train()
         if log:
-            label = "held out" if run.held_out else "trained on: no scene is held out"
-            run.say(f"step {self.step}: {found.sentence} ({label})")
-            log.add_validation(self.step, found.numbers, sheet)
+            label = "held out" if run.held_out else "training pairs: no scene is held out"
+            run.say(f"step {self.step}: {result.sentence} ({label})")
+            log.add_validation(self.step, result.metrics, sheet)
 
     def _finish(self) -> Path:
-        run, folder = self._training, self._training.folder / MODEL_FOLDER
+        run, folder = self._run, self._run.folder / MODEL_FOLDER
         if self._average:
             with self._average.applied():
                 state = self._weights()
@@ -247,11 +251,11 @@ class _Loop:
         state: Any = self._accelerator.get_state_dict(self._network)
         return {name: tensor.detach().cpu().clone() for name, tensor in state.items()}
 
-    def _keep_what_learns(self, models: list[Any], weights: list[Any], output: str) -> None:
+    def _save_trained_parameters(self, models: list[Any], weights: list[Any], output: str) -> None:
         for i, state in enumerate(weights):
-            weights[i] = {name: tensor for name, tensor in state.items() if name in self._learning}
+            weights[i] = {name: tensor for name, tensor in state.items() if name in self._trained}
 
-    def _load_what_learns(self, models: list[Any], folder: str) -> None:
+    def _load_trained_parameters(self, models: list[Any], folder: str) -> None:
         from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
 
         while models:
@@ -260,12 +264,12 @@ class _Loop:
 
 
 def _states(folder: Path) -> list[Path]:
-    """Whole states, oldest first."""
+    """Complete states, oldest first."""
     return sorted(path for path in (folder / _STATES).glob("[0-9]*") if (path / _JOB_FILE).is_file())
 
 
 def process_counts(*, cpu: bool) -> tuple[int, int]:
-    """Processes that accelerate runs, and how many of them share one copy of the weights."""
+    """Number of processes that accelerate runs, and how many of them share one copy of the weights."""
     from accelerate import PartialState
 
     state = PartialState(cpu=cpu)
@@ -274,7 +278,7 @@ def process_counts(*, cpu: bool) -> tuple[int, int]:
 
 
 def is_first_process(*, cpu: bool) -> bool:
-    """Whether this is the process that writes."""
+    """Whether this is the process that writes files and messages."""
     from accelerate import PartialState
 
     return PartialState(cpu=cpu).is_main_process

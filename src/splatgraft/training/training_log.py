@@ -1,4 +1,4 @@
-"""The log of a training: a line of JSON a step, validation pictures, TensorBoard where asked. Knows no training."""
+"""The log of a training run: one line of JSON per step, validation images, and optionally TensorBoard."""
 
 import json
 from importlib.util import find_spec
@@ -13,18 +13,20 @@ from splatgraft.runtime.atomic_file import atomic_write
 
 LOG_FILE = "log.jsonl"
 VALIDATION_FOLDER = "validation"
+_SMOOTHING_STEPS = 50
 
 
 class TrainingLog:
-    """Open for writing while a training runs."""
+    """The open log of a running training."""
 
     def __init__(self, folder: Path, tensorboard: bool) -> None:
         """Append to the folder's log.
 
-        Raises: ValueError where TensorBoard is asked for and missing.
+        Raises:
+            ValueError: TensorBoard is requested and not installed.
         """
         self.smooth = float("nan")
-        """The loss, averaged over some 50 steps."""
+        """Exponential moving average of the loss over about 50 steps; nan before the first."""
         self._folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         (folder / VALIDATION_FOLDER).mkdir(exist_ok=True)
@@ -40,23 +42,23 @@ class TrainingLog:
             self._board = SummaryWriter(str(folder / "tensorboard"))
 
     def add(self, step: int, loss: float, rate: float) -> None:
-        """One step."""
-        self.smooth = loss if self.smooth != self.smooth else self.smooth + (loss - self.smooth) / 50
+        """Log one step."""
+        self.smooth = loss if self.smooth != self.smooth else self.smooth + (loss - self.smooth) / _SMOOTHING_STEPS
         self._write({"step": step, "loss": loss, "rate": rate})
         if self._board:
             self._board.add_scalar("loss", loss, step)
 
-    def add_validation(self, step: int, numbers: dict[str, float], sheet: Float[Tensor, "h w 3"]) -> None:
-        """Figures of a validation and its picture."""
-        self._write({"step": step, "validation": numbers})
+    def add_validation(self, step: int, metrics: dict[str, float], sheet: Float[Tensor, "h w 3"]) -> None:
+        """Log the metrics of a validation and write its contact sheet."""
+        self._write({"step": step, "validation": metrics})
         write_image(self._folder / VALIDATION_FOLDER / f"{step:08d}.png", sheet)
         if self._board:
-            for name, number in numbers.items():
-                self._board.add_scalar(f"validation/{name}", number, step)
+            for name, value in metrics.items():
+                self._board.add_scalar(f"validation/{name}", value, step)
             self._board.add_image("validation", sheet.clamp(0, 1), step, dataformats="HWC")
 
     def close(self) -> None:
-        """Flush and close."""
+        """Close the log."""
         self._log.close()
         if self._board:
             self._board.close()
@@ -67,9 +69,10 @@ class TrainingLog:
 
 
 def read_losses(path: Path) -> list[float]:
-    """The loss of each step, in order.
+    """Read the loss of each step, in order.
 
-    Raises: ValueError where the log is missing or broken.
+    Raises:
+        ValueError: the log is missing or broken.
     """
     try:
         entries = [json.loads(line) for line in path.read_text().splitlines()]
@@ -79,15 +82,15 @@ def read_losses(path: Path) -> list[float]:
 
 
 def truncate_log(path: Path, step: int) -> None:
-    """Forget what was logged after `step`: it is done again."""
+    """Remove the entries after `step`, which a resumed run will write again."""
     if not path.is_file():
         return
-    kept = []
+    remaining = []
     for line in path.read_text().splitlines():
         try:
             if json.loads(line)["step"] <= step:
-                kept.append(line)
+                remaining.append(line)
         except (ValueError, KeyError, TypeError):
-            continue  # a line that a kill cut in two
+            continue  # an incomplete line of a killed run
     with atomic_write(path) as stream:
-        stream.write("".join(f"{line}\n" for line in kept).encode())
+        stream.write("".join(f"{line}\n" for line in remaining).encode())

@@ -1,4 +1,4 @@
-"""What a network makes of some pairs: figures, and a sheet of pictures to look at. Knows no loop and no files."""
+"""Validation of a training objective on pairs: metrics, and a contact sheet of input, prediction and target."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from splatgraft.training.sources.pair_source import PairReference, TrainingPair,
 
 @dataclass(frozen=True)
 class ValidationRun:
-    """What is asked."""
+    """The pairs to validate on, and all that a prediction needs."""
 
     objective: Objective
     pairs: Sequence[PairReference]
@@ -28,38 +28,40 @@ class ValidationRun:
 class ValidationResult:
     """Means over the pairs."""
 
-    numbers: dict[str, float]
-    """psnr, ssim, psnr_object, and psnr_input: that of the network's input, which it must beat."""
+    metrics: dict[str, float]
+    """psnr, ssim, psnr_object and psnr_input (the PSNR of the network's input, for comparison); dB but for ssim."""
 
     @property
     def sentence(self) -> str:
-        """For the person who waits."""
-        n = self.numbers
-        whole = f"PSNR {n['psnr']:.2f} dB (input {n['psnr_input']:.2f})"
-        return f"{whole}, object {n['psnr_object']:.2f}, SSIM {n['ssim']:.3f}"
+        """The metrics in one line of text."""
+        m = self.metrics
+        whole = f"PSNR {m['psnr']:.2f} dB (input {m['psnr_input']:.2f})"
+        return f"{whole}, object {m['psnr_object']:.2f}, SSIM {m['ssim']:.3f}"
 
 
 @torch.no_grad()
-def validate(asked: ValidationRun, network: nn.Module) -> tuple[ValidationResult, Float[Tensor, "h w 3"]]:
-    """Figures and a sheet: per pair its input, what the network made, what it should be."""
+def validate(run: ValidationRun, network: nn.Module) -> tuple[ValidationResult, Float[Tensor, "h w 3"]]:
+    """Compute the metrics, and a contact sheet with one row per pair: input, prediction, target."""
     rows, totals = [], {"psnr": 0.0, "ssim": 0.0, "psnr_object": 0.0, "psnr_input": 0.0}
-    objective = asked.objective
-    for drawn in asked.pairs:
-        loaded = asked.cache.load(drawn, objective.roles)
-        latents = asked.cache.encode_missing([loaded], objective.roles)
-        latents = {role: tensor.to(asked.device) for role, tensor in latents.items()}
-        made = objective.predict(network, latents, asked.seed)[0].permute(1, 2, 0).float().cpu()
-        pair = crop_pair_to_size(drawn.source.read(drawn.index), made.shape[1], made.shape[0])
-        wanted, given = pair.picture(objective.shown), _input(pair, objective)
+    objective = run.objective
+    for reference in run.pairs:
+        loaded = run.cache.load(reference, objective.roles)
+        latents = run.cache.encode_missing([loaded], objective.roles)
+        latents = {role: tensor.to(run.device) for role, tensor in latents.items()}
+        predicted = objective.predict(network, latents, run.seed)[0].permute(1, 2, 0).float().cpu()
+        pair = crop_pair_to_size(reference.source.read(reference.index), predicted.shape[1], predicted.shape[0])
+        target, source = pair.picture(objective.output_role), _input(pair, objective)
         inside = pair.mask > 0.5
-        totals["psnr"] += float(psnr(made, wanted))
-        totals["ssim"] += float(ssim(made, wanted))
-        totals["psnr_object"] += float(psnr(made, wanted, inside)) if bool(inside.any()) else float(psnr(made, wanted))
-        totals["psnr_input"] += float(psnr(given, wanted))
-        rows.append(torch.cat([given, made, wanted], 1))
-    numbers = {name: round(total / len(asked.pairs), 4) for name, total in totals.items()}
-    return ValidationResult(numbers), torch.cat(rows, 0)
+        totals["psnr"] += float(psnr(predicted, target))
+        totals["ssim"] += float(ssim(predicted, target))
+        totals["psnr_object"] += (
+            float(psnr(predicted, target, inside)) if bool(inside.any()) else float(psnr(predicted, target))
+        )
+        totals["psnr_input"] += float(psnr(source, target))
+        rows.append(torch.cat([source, predicted, target], 1))
+    metrics = {name: round(total / len(run.pairs), 4) for name, total in totals.items()}
+    return ValidationResult(metrics), torch.cat(rows, 0)
 
 
 def _input(pair: TrainingPair, objective: Objective) -> Float[Tensor, "h w 3"]:
-    return pair.composite if objective.shown == "target" else pair.target
+    return pair.composite if objective.output_role == "target" else pair.target

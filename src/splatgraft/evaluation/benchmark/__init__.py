@@ -1,1 +1,1 @@
-"""Measurements over benchmark scenes: per-view metrics, tables, image statistics, published data sets."""
+"""Benchmark measurements: per-view metrics, statistics of image sets, tables, and published data sets."""

@@ -1,7 +1,7 @@
-"""FID and KID of sets of pictures, by Inception features of a kept library. Knows no methods, scenes or regions.
+"""FID and KID of sets of images, from the Inception features of torch-fidelity (those of the published FID).
 
-The features are torch-fidelity's (that of the published FID); the library needs a torchvision that fits torch, so it
-is no extra of this package. Its weights are read from a given folder, never downloaded.
+torch-fidelity needs a torchvision that fits torch and is therefore no optional dependency of this package. Its weights
+are read from a given folder, never downloaded.
 """
 
 import math
@@ -15,14 +15,19 @@ from torch import Tensor
 
 INCEPTION_FILE = "weights-inception-2015-12-05-6726825d.pth"
 Features = Callable[[Sequence[Float[Tensor, "h w 3"]]], Float[np.ndarray, "n d"]]
-"""From pictures, sRGB in [0, 1], to one row of features each."""
+"""Images, sRGB in [0, 1], to one row of features each."""
 _KID_SUBSETS, _KID_SIZE = 100, 50
+"""Random subsets of KID, and images per subset."""
 
 
 def inception_features(folder: Path | None) -> Features:
-    """The 2048 features of the published FID, with weights from `folder`, by default torch hub's cache.
+    """Load the network that computes the 2048 features of the published FID.
 
-    Raises: ValueError where the weights or the library are missing, with a line that says which.
+    Args:
+        folder: holds the weights; torch hub's cache where None.
+
+    Raises:
+        ValueError: the weights or the library are missing.
     """
     path = (Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder) / INCEPTION_FILE
     if not path.is_file():
@@ -45,35 +50,35 @@ def inception_features(folder: Path | None) -> Features:
     return features
 
 
-def frechet_distance(found: Float[np.ndarray, "n d"], wanted: Float[np.ndarray, "m d"]) -> float:
-    """FID (Heusel 2017, Eq. 6): distance of the Gaussians that have the sets' means and covariances; nan for under two.
+def frechet_distance(found: Float[np.ndarray, "n d"], reference: Float[np.ndarray, "m d"]) -> float:
+    """FID (Heusel et al. 2017, Eq. 6): distance between the Gaussians with the sets' means and covariances.
 
-    With fewer pictures than features it is biased upwards: compare only sets of one size.
+    It is biased upwards with fewer images than features: compare only sets of equal size. nan for fewer than two.
     """
-    if min(len(found), len(wanted)) < 2:
+    if min(len(found), len(reference)) < 2:
         return math.nan
-    difference = found.mean(0) - wanted.mean(0)
-    a, b = found - found.mean(0), wanted - wanted.mean(0)
+    difference = found.mean(0) - reference.mean(0)
+    a, b = found - found.mean(0), reference - reference.mean(0)
     a, b = a / math.sqrt(len(a) - 1), b / math.sqrt(len(b) - 1)
-    # the trace of the root of the product of covariances is the nuclear norm of this small matrix
+    # the trace of the square root of the covariances' product equals the nuclear norm of this smaller matrix
     root = np.linalg.norm(a @ b.T, ord="nuc")
     return float(difference @ difference + (a**2).sum() + (b**2).sum() - 2 * root)
 
 
-def kernel_distance(found: Float[np.ndarray, "n d"], wanted: Float[np.ndarray, "m d"], *, seed: int = 0) -> float:
-    """KID (Binkowski 2018): unbiased squared maximum mean discrepancy with kernel (x.y / d + 1)^3; nan for under two.
+def kernel_distance(found: Float[np.ndarray, "n d"], reference: Float[np.ndarray, "m d"], *, seed: int = 0) -> float:
+    """KID (Binkowski et al. 2018): unbiased squared maximum mean discrepancy with the kernel (x.y / d + 1)^3.
 
-    The mean over 100 random subsets of 50 pictures, or of all where there are fewer (then one subset).
+    The mean over 100 random subsets of 50 images, or one set of all where there are fewer; nan for fewer than two.
     """
-    size = min(len(found), len(wanted), _KID_SIZE)
+    size = min(len(found), len(reference), _KID_SIZE)
     if size < 2:
         return math.nan
     generator = np.random.default_rng(seed)
-    subsets = 1 if size == len(found) == len(wanted) else _KID_SUBSETS
+    subsets = 1 if size == len(found) == len(reference) else _KID_SUBSETS
     values = []
     for _ in range(subsets):
         x = found[generator.choice(len(found), size, replace=False)]
-        y = wanted[generator.choice(len(wanted), size, replace=False)]
+        y = reference[generator.choice(len(reference), size, replace=False)]
         within = [(_kernel(z, z).sum() - np.trace(_kernel(z, z))) / (size * (size - 1)) for z in (x, y)]
         values.append(sum(within) - 2 * _kernel(x, y).mean())
     return float(np.mean(values))

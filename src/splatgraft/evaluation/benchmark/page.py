@@ -1,4 +1,4 @@
-"""The benchmark's page: a slider between any two methods, and every table. Looks and behaviour are those of page.py."""
+"""The HTML page of a benchmark: a slider between any two methods, and all tables; style as in report_page.py."""
 
 from collections.abc import Sequence
 from html import escape
@@ -8,14 +8,14 @@ from splatgraft.evaluation.report_page import ViewFiles, html_page, viewer
 
 
 def benchmark_html(benchmark: Benchmark, views: Sequence[ViewFiles]) -> str:
-    """The whole page; pictures are beside it."""
+    """Format the page; the files of `views` are relative to it."""
     notes = [*benchmark.notes, *benchmark.not_run]
     notes += [f"Not measured: {name}: {reason}" for name, reason in benchmark.not_measured.items()]
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)
     sections = [
         viewer(views) if views else "",
         *(_section(table) for table in tables(benchmark)),
-        f"<section><h2>What to know before trusting this</h2><ul>{items}</ul></section>\n",
+        f"<section><h2>Limitations</h2><ul>{items}</ul></section>\n",
     ]
     scenes = len(benchmark.scenes)
     count = f"{len(benchmark.methods)} methods on {scenes} scene{'s' if scenes != 1 else ''}"

@@ -1,8 +1,7 @@
-"""Other people's ground truth: the authors' data set and SynCom, downloaded on request. Knows no methods.
+"""Published data sets with ground truth: the authors' data set and SynCom, downloaded on request.
 
-Written against the documented names of folders; the data could not be fetched where this was written, so nothing here
-was ever run on it. What is inside a scene's folder is therefore searched for among the usual names, all listed here,
-and what is not found is said by name. Nothing is guessed beyond that.
+Untested on the data itself: the layout follows the documented folder names. Folders inside a scene are searched by the
+usual names listed here, and an error names those that are not found.
 """
 
 from dataclasses import dataclass
@@ -13,22 +12,22 @@ from splatgraft.formats import read_capture
 
 @dataclass(frozen=True)
 class PublishedLayout:
-    """Where things lie in one published data set."""
+    """The folder layout of one published data set."""
 
     repository: str
     """On Hugging Face."""
     parts: tuple[str, ...]
     """Folders that hold one folder per scene, relative to the data set."""
     source: tuple[str, ...] = ("source", "object", "src")
-    """Names that the capture of the object may have in a scene's folder."""
+    """Possible folder names of the capture of the object, in a scene's folder."""
     target: tuple[str, ...] = ("target", "background", "scene", "tgt")
-    """Names that the capture without the object may have."""
+    """Possible folder names of the capture without the object."""
     truth: tuple[str, ...] = ("ground_truth", "gt", "harmonized", "composite_gt")
-    """Names that the capture with the object may have."""
+    """Possible folder names of the capture with the object."""
     masks: tuple[str, ...] = ("masks", "mask")
-    """Names of the folder of object masks in the truth."""
+    """Possible names of the folder of object masks in the truth."""
     results: str = ""
-    """Folder with one folder of pictures per method, where the authors publish theirs."""
+    """Folder with the authors' own results, one folder of pictures per method; empty where there is none."""
 
 
 DOT3D = PublishedLayout(
@@ -49,15 +48,22 @@ class PublishedScene:
     source: Path
     """The capture of the object."""
     target: Path
-    """The capture of the place without it."""
+    """The capture of the target without the object."""
     truth: Path | None
-    """The capture with it; None where the scene is real and has none."""
+    """The capture with the object; None for real scenes, which have none."""
 
 
 def download(layout: PublishedLayout, folder: Path, *, parts: tuple[str, ...] | None = None) -> Path:
-    """Fetch the parts of a data set from Hugging Face into `folder`; what is there already is kept.
+    """Download parts of a data set from Hugging Face into `folder`; existing files are kept.
 
-    Raises: ModuleNotFoundError where huggingface_hub is missing; ValueError where the data set cannot be reached.
+    Args:
+        layout: of the data set.
+        folder: receives the files.
+        parts: folders to download; those of `layout` where None.
+
+    Raises:
+        ModuleNotFoundError: huggingface_hub is not installed.
+        ValueError: the data set cannot be reached.
     """
     import huggingface_hub
 
@@ -76,9 +82,10 @@ def download(layout: PublishedLayout, folder: Path, *, parts: tuple[str, ...] | 
 
 
 def find_scenes(layout: PublishedLayout, folder: Path) -> list[PublishedScene]:
-    """All scenes that a downloaded data set holds.
+    """List all scenes of a downloaded data set.
 
-    Raises: ValueError where none is found, or a scene lacks its source or target, with what was looked for.
+    Raises:
+        ValueError: none is found, or a scene lacks its source or target.
     """
     found = []
     for part in layout.parts:
@@ -87,8 +94,8 @@ def find_scenes(layout: PublishedLayout, folder: Path) -> list[PublishedScene]:
             if any((scene / name).is_dir() for name in (*layout.source, *layout.target)):
                 found.append(_scene(layout, scene))
     if not found:
-        looked = ", ".join(f"{part or '.'}/SCENE/{{{','.join(layout.source)}}}" for part in layout.parts)
-        raise ValueError(f"{folder}: expected {layout.repository} with {looked}; found no such folder")
+        expected = ", ".join(f"{part or '.'}/SCENE/{{{','.join(layout.source)}}}" for part in layout.parts)
+        raise ValueError(f"{folder}: expected {layout.repository} with {expected}; found no such folder")
     return found
 
 
@@ -105,9 +112,13 @@ def _scene(layout: PublishedLayout, scene: Path) -> PublishedScene:
 
 
 def method_pictures(layout: PublishedLayout, folder: Path) -> dict[str, Path]:
-    """The authors' own results: method to the folder that holds one folder of pictures per scene.
+    """Find the authors' own results.
 
-    Raises: ValueError where the data set has none.
+    Returns:
+        Method to the folder that holds one folder of pictures per scene.
+
+    Raises:
+        ValueError: the data set has none.
     """
     base = folder / layout.results
     methods = sorted(path for path in base.iterdir() if path.is_dir()) if layout.results and base.is_dir() else []

@@ -1,4 +1,4 @@
-"""Rows of numbers per scene and method become means, intervals and Markdown. Takes no measurement, reads no file."""
+"""Means, bootstrap intervals and Markdown tables of benchmark results per scene and method."""
 
 import math
 import re
@@ -10,6 +10,7 @@ import numpy as np
 from splatgraft.evaluation.benchmark.view_metrics import REGIONS
 
 _RESAMPLES = 10_000
+"""Of the bootstrap."""
 _FORMATS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}", "fid": "{:.1f}", "kid": "{:.4f}"}
 _LESS_IS_BETTER = ("lpips", "fid", "kid", "shadow_ratio_rmse", "disagreement", "rest_mean_change", "rest_max_change")
 
@@ -23,23 +24,23 @@ class Row:
     method: str
     """The method's name."""
     values: Mapping[str, float | None]
-    """Metric to its mean over held-out views; None where it could not be taken."""
+    """Metric to its mean over held-out views; None where it could not be measured."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Step to wall-clock seconds."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """All that was measured."""
+    """All results of a benchmark."""
 
     rows: tuple[Row, ...]
-    """One per scene and method that ran."""
+    """One per scene and completed method."""
     not_run: tuple[str, ...]
-    """Sentences on methods that could not run."""
+    """One sentence per method that could not run."""
     not_measured: Mapping[str, str]
-    """Metrics ("lpips", "fid and kid") to the reason why its columns are empty."""
+    """Metrics ("lpips", "fid and kid") to the reason why their columns are empty."""
     notes: tuple[str, ...]
-    """What a reader must know: machine, sizes, counts of views, commit, command."""
+    """Conditions of the measurement: machine, sizes, numbers of views, commit, command."""
     pooled: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     """Method to FID and KID over the held-out views of all its scenes."""
 
@@ -56,28 +57,28 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class Summary:
-    """A mean over scenes."""
+    """A mean over scenes with its bootstrap interval."""
 
     mean: float
-    """Over scenes, each counted once."""
+    """Over scenes with equal weights."""
     low: float
-    """2.5% of the bootstrap over scenes."""
+    """2.5th percentile."""
     high: float
-    """97.5%."""
+    """97.5th percentile."""
     scenes: int
-    """How many spoke."""
+    """Scenes that have a value."""
 
 
 def metric_names() -> tuple[str, ...]:
-    """All columns, in the order of the tables."""
+    """Names of all metrics, in the order of the tables."""
     by_region = [f"{metric}_{region}" for region in REGIONS for metric in ("psnr", "ssim", "lpips", "fid", "kid")]
     return (*by_region, "shadow_ratio_rmse", "disagreement", "rest_mean_change", "rest_max_change")
 
 
 def summarize(values: Sequence[float | None], *, seed: int = 0) -> Summary | None:
-    """Mean over scenes with a 95% percentile bootstrap interval (Efron 1979); None where no scene speaks.
+    """Mean over scenes with a 95% percentile bootstrap interval (Efron 1979); None where no scene has a value.
 
-    With few scenes the interval is narrow by construction; one scene has none, both ends are its value.
+    The interval is too narrow for few scenes; for one scene both ends are its value.
     """
     known = np.array([value for value in values if value is not None and math.isfinite(value)])
     if not len(known):
@@ -88,7 +89,7 @@ def summarize(values: Sequence[float | None], *, seed: int = 0) -> Summary | Non
 
 
 def summaries(benchmark: Benchmark) -> dict[str, dict[str, Summary | None]]:
-    """Method to metric to mean over scenes; FID and KID are over the pictures of all scenes, without an interval."""
+    """Summarise each metric by method; FID and KID are over the images of all scenes and have no interval."""
     out: dict[str, dict[str, Summary | None]] = {}
     for method in benchmark.methods:
         rows = [row for row in benchmark.rows if row.method == method]
@@ -99,7 +100,7 @@ def summaries(benchmark: Benchmark) -> dict[str, dict[str, Summary | None]]:
 
 
 def as_json(benchmark: Benchmark) -> dict:
-    """Everything as plain JSON."""
+    """Convert everything to plain JSON values."""
     means = {
         method: {name: None if s is None else vars(s) for name, s in metrics.items()}
         for method, metrics in summaries(benchmark).items()
@@ -115,7 +116,7 @@ def as_json(benchmark: Benchmark) -> dict:
 
 @dataclass(frozen=True)
 class Table:
-    """One table of text, for Markdown and HTML alike."""
+    """A table of text, for Markdown and HTML."""
 
     title: str
     head: tuple[str, ...]
@@ -123,7 +124,7 @@ class Table:
 
 
 def tables(benchmark: Benchmark) -> list[Table]:
-    """Means by region, light, cost, and every scene by itself."""
+    """Make the tables: metrics by region, light, poses, time, and PSNR by scene."""
     means = summaries(benchmark)
     out = [_region_table(means, region, benchmark) for region in REGIONS]
     other = ("shadow_ratio_rmse", "disagreement", "rest_mean_change")
@@ -143,7 +144,7 @@ def tables(benchmark: Benchmark) -> list[Table]:
 
 
 def markdown(benchmark: Benchmark) -> str:
-    """All tables and what must be known about them."""
+    """Format all tables and notes as Markdown."""
     parts = []
     for table in tables(benchmark):
         lines = ["| " + " | ".join(cells) + " |" for cells in (table.head, *table.rows)]
@@ -172,7 +173,7 @@ def _region_table(means: dict[str, dict[str, Summary | None]], region: str, benc
 
 
 def _pose_tables(benchmark: Benchmark) -> list[Table]:
-    """The same scenes with the object at several rotations, means by pose (paper, illumination consistency)."""
+    """Means by pose over scenes with the object at several rotations (paper, illumination consistency)."""
     poses: dict[str, list[str]] = {}
     for scene in benchmark.scenes:
         if match := re.fullmatch(r".+_(p\d)", scene):

@@ -1,4 +1,4 @@
-"""Numbers of one method in one view and between neighbouring views. Knows no methods, files or scenes."""
+"""Metrics of one method in one view, and of its consistency between neighbouring views."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,9 +12,10 @@ from splatgraft.evaluation.measure import SMALLEST_REGION, Perceptual, compare
 from splatgraft.evaluation.regions import Regions, Truth, find_regions
 
 REGIONS = ("whole", "object", "shadow", "rest")
-"""What every metric is taken over; `shadow` is the band that the true object darkens by more than 5%."""
+"""Regions of every metric; `shadow` is the band that the true object darkens by more than 5%."""
 _SAME_SURFACE = 0.02
-"""Relative difference of depth under which two views see the same point: 16-bit depth and slanted surfaces."""
+"""Relative difference of depth below which two views see the same point; allows for 16-bit depth and slanted surfaces.
+Set by hand."""
 
 
 def measure_view(
@@ -24,10 +25,16 @@ def measure_view(
     background: Float[Tensor, "h w 3"],
     perceptual: Perceptual | None = None,
 ) -> dict[str, float]:
-    """PSNR, SSIM and LPIPS of every region, and the error of the shadow's strength; nan where a region says nothing.
+    """Compute PSNR, SSIM and LPIPS of every region, and the error of the shadow's strength.
 
-    Keys are `psnr_whole`, `lpips_shadow`, ... A region's LPIPS is that of the truth with the region's pixels taken from
-    `image`, so that nothing else counts. `background` is the method's own picture without the object.
+    Args:
+        image: the method's result, sRGB in [0, 1].
+        truth: the ground truth.
+        background: the method's render without the object, sRGB in [0, 1].
+        perceptual: adds LPIPS. That of a region compares the truth with a copy that has the region's pixels of `image`.
+
+    Returns:
+        Keys such as `psnr_whole`, `lpips_shadow` to values; nan where a region is too small.
     """
     regions = find_regions(truth)
     plain = compare(image, truth, regions=regions, background=background)
@@ -45,7 +52,7 @@ def measure_view(
 def only_region(
     image: Float[Tensor, "h w 3"], truth: Truth, regions: Regions, name: str
 ) -> Float[Tensor, "h w 3"] | None:
-    """The truth with one region's pixels taken from `image`; None where the region is too small to speak."""
+    """The truth with one region's pixels replaced by those of `image`; None where the region is too small."""
     if name == "whole":
         return image
     region: Bool[Tensor, "h w"] = getattr(regions, name)
@@ -59,29 +66,36 @@ def warp(
     cameras: Cameras,
     into_depth: Float[Tensor, "h w"],
 ) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """The picture of the second of two cameras as the first would see it, and where both see the same point.
+    """Warp the second camera's image into the first camera's view.
 
-    `depth` is the second camera's, `into_depth` the first's, along the optical axis, 0 where there is nothing.
+    Args:
+        image: of the second camera.
+        depth: of the second camera, along the optical axis; 0 where nothing is hit.
+        cameras: the two cameras.
+        into_depth: depth of the first camera.
+
+    Returns:
+        The warped image, and the pixels where both cameras see the same point.
     """
     first, second = cameras[0], cameras[1]
     h, w = into_depth.shape
     rows, columns = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
     rays = torch.stack([columns, rows, torch.ones_like(rows)], -1) @ torch.linalg.inv(first.intrinsics[0]).T
     points = rays * into_depth[..., None]
-    moved = torch.linalg.inv(second.world_from_camera[0]) @ first.world_from_camera[0]
-    points = points @ moved[:3, :3].T + moved[:3, 3]
+    second_from_first = torch.linalg.inv(second.world_from_camera[0]) @ first.world_from_camera[0]
+    points = points @ second_from_first[:3, :3].T + second_from_first[:3, 3]
     z = points[..., 2]
-    there = (into_depth > 0) & (z > 1e-6)
-    pixels = (points @ second.intrinsics[0].T)[..., :2] / torch.where(there, z, torch.ones_like(z))[..., None]
+    valid = (into_depth > 0) & (z > 1e-6)
+    pixels = (points @ second.intrinsics[0].T)[..., :2] / torch.where(valid, z, torch.ones_like(z))[..., None]
     size = torch.tensor([image.shape[1], image.shape[0]], dtype=torch.float32)
     inside = ((pixels > 1) & (pixels < size - 1)).all(-1)
     grid = (pixels / size * 2 - 1)[None]
     stacked = torch.cat([image, depth[..., None]], -1).permute(2, 0, 1)[None]
-    seen = torch.nn.functional.grid_sample(stacked[:, :3], grid, align_corners=False)[0].permute(1, 2, 0)
-    # depth is not mixed across edges
+    warped = torch.nn.functional.grid_sample(stacked[:, :3], grid, align_corners=False)[0].permute(1, 2, 0)
+    # nearest, so that depths on both sides of an edge are not averaged
     found = torch.nn.functional.grid_sample(stacked[:, 3:], grid, mode="nearest", align_corners=False)[0, 0]
-    same = there & inside & ((found - z).abs() < _SAME_SURFACE * z)
-    return seen, same
+    same = valid & inside & ((found - z).abs() < _SAME_SURFACE * z)
+    return warped, same
 
 
 def disagreement(
@@ -90,19 +104,27 @@ def disagreement(
     masks: Sequence[Float[Tensor, "h w"]],
     cameras: Cameras,
 ) -> float | None:
-    """RMSE in sRGB between neighbouring views on and around the object, one warped into the other by the true depth.
+    """RMSE in sRGB between consecutive views, near the object, after warping by the true depth.
 
-    Neighbours are views that follow one another; around is within a quarter of the picture's width. None where no
-    neighbours have pictures. Real gloss differs between views too: compare with what the truth itself gives.
+    True gloss differs between views too, so compare with the value of the ground truth.
+
+    Args:
+        images: of a method, by index of the view.
+        depths: true depth of all views.
+        masks: coverage by the object of all views; pixels within an eighth of the image's width of it are compared.
+        cameras: of all views.
+
+    Returns:
+        None where no consecutive views have images.
     """
     squares, count = 0.0, 0
     for i in sorted(images):
         if i + 1 not in images:
             continue
-        seen, same = warp(images[i + 1], depths[i + 1], cameras=cameras[[i, i + 1]], into_depth=depths[i])
+        warped, same = warp(images[i + 1], depths[i + 1], cameras=cameras[[i, i + 1]], into_depth=depths[i])
         reach = images[i].shape[1] // 8 * 2 + 1
         near = torch.nn.functional.max_pool2d(masks[i][None, None], reach, 1, reach // 2)[0, 0] > 0.5
         region = same & near
-        squares += float(((seen - images[i])[region] ** 2).sum())
+        squares += float(((warped - images[i])[region] ** 2).sum())
         count += 3 * int(region.sum())
     return math.sqrt(squares / count) if count >= 3 * SMALLEST_REGION else None

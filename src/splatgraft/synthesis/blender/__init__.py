@@ -1,1 +1,1 @@
-"""Code that runs inside Blender's Python (bpy and numpy only) and is started as a process of its own."""
+"""Code that runs in Blender's Python interpreter (bpy and numpy only), in a process of its own."""

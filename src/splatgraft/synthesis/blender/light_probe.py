@@ -1,33 +1,35 @@
-"""The true light at a point: a panorama of what shines there, and the suns. Runs inside Blender; knows no objects."""
+"""Measures the true light at a point: a panorama of its environment, and the suns. Runs inside Blender."""
 
 import math
 
 import bpy
-import contents
 import numpy as np
 import passes
+import scene_builder
 from mathutils import Vector
 
 WIDTH, HEIGHT = 128, 64
 _SAMPLES = 64
+"""Light paths per pixel of the panorama."""
 _SUN_PIXELS = 24
+"""Width of the image from which the sky's sun is measured."""
 
 
 def measure(scene, world, point, things):
-    """Radiance (64, 128, 3) around `point` without suns, and the suns that reach it; Blender's units.
+    """Render the radiance (64, 128, 3) around `point` without suns, and list the suns that reach it; Blender's units.
 
-    Row 0 looks up, the middle column along +x, columns run to the right seen from inside (towards -y).
+    Row 0 looks up, the middle column along +x; columns run to the right as seen from inside (towards -y).
     """
     cycles, layer = bpy.context.scene.cycles, bpy.context.scene
-    shown = [thing for thing in things if thing.type == "LIGHT"]
-    for thing in shown:
+    lamps = [thing for thing in things if thing.type == "LIGHT"]
+    for thing in lamps:
         thing.visible_camera = True
-    layer.world = contents.make_world({**world, "sun_disc": False})
+    layer.world = scene_builder.make_world({**world, "sun_disc": False})
     layer.render.resolution_x, layer.render.resolution_y = WIDTH, HEIGHT
-    layer.render.film_transparent = False  # or the world would be left out
+    layer.render.film_transparent = False  # otherwise the world is not rendered
     cycles.samples = _SAMPLES
     panorama = passes.render(_panoramic(point), ["color"])["color"][..., :3].astype(np.float64)
-    for thing in shown:
+    for thing in lamps:
         thing.visible_camera = False
     suns = [_lamp_sun(lamp) for lamp in scene["lamps"] if lamp["kind"] == "sun"]
     if world["kind"] == "sky":
@@ -53,13 +55,13 @@ def _lamp_sun(lamp):
 
 
 def _sky_sun(world, things):
-    """The disc of the Nishita sky, measured through a narrow camera with the disc and without it."""
+    """The sun of the Nishita sky, measured by a narrow camera with and without the sun's disc."""
     flat = math.cos(world["sun_elevation"])
     towards = Vector(
         (flat * math.cos(world["sun_azimuth"]), flat * math.sin(world["sun_azimuth"]), math.sin(world["sun_elevation"]))
     )
     angle = 2.0 * world["sun_size"]
-    camera = contents.add_camera(
+    camera = scene_builder.add_camera(
         {"location": (0, 0, 0), "target": tuple(towards), "field_of_view": angle}, "towards the sun"
     )
     hidden = [thing.hide_render for thing in things]
@@ -68,20 +70,20 @@ def _sky_sun(world, things):
     scene = bpy.context.scene
     scene.render.resolution_x = scene.render.resolution_y = _SUN_PIXELS
     scene.cycles.use_denoising = False
-    seen = []
+    images = []
     for disc in (True, False):
-        scene.world = contents.make_world({**world, "sun_disc": disc})
-        seen.append(passes.render(camera, ["color"])["color"][..., :3].astype(np.float64))
+        scene.world = scene_builder.make_world({**world, "sun_disc": disc})
+        images.append(passes.render(camera, ["color"])["color"][..., :3].astype(np.float64))
     scene.cycles.use_denoising = True
     for thing, value in zip(things, hidden, strict=True):
         thing.hide_render = value
     solid_angle = (2 * math.tan(angle / 2) / _SUN_PIXELS) ** 2
-    irradiance = np.maximum(seen[0] - seen[1], 0).sum((0, 1)) * solid_angle
+    irradiance = np.maximum(images[0] - images[1], 0).sum((0, 1)) * solid_angle
     return {"direction": list(towards), "irradiance": irradiance.tolist(), "angular_radius": 0.5 * world["sun_size"]}
 
 
 def _reaches(point, direction):
-    """Whether nothing that is rendered stands between the point and the sun; the object around the point is not."""
+    """Whether no rendered mesh blocks the sun; objects are hidden from rendering while the light is measured."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     start, towards = Vector(point), Vector(direction).normalized()
     while True:

@@ -1,10 +1,10 @@
-"""Shader node trees for the patterns of `synth.scene.Material`. Runs inside Blender; knows nothing about scenes."""
+"""Shader node trees for the patterns of `synthesis.scene.Material`. Runs inside Blender."""
 
 import bpy
 
 
 class _Tree:
-    """A material's node tree with the few calls that patterns need."""
+    """A material's node tree with shorthands for the nodes of patterns."""
 
     def __init__(self, name):
         self.material = bpy.data.materials.new(name)
@@ -182,7 +182,7 @@ _PATTERNS = {
 
 
 def make(name, m):
-    """A Blender material from the JSON form of `synth.scene.Material`."""
+    """Make a Blender material from the JSON form of `synthesis.scene.Material`."""
     tree = _Tree(name)
     color, height, gloss = _PATTERNS[m["pattern"]](tree, m, _opaque(m["color"]), _opaque(m["second"]))
     surface = tree.surface

@@ -1,4 +1,4 @@
-"""Renders one view with its passes, and writes pictures. Runs inside Blender; knows nothing about what is shown."""
+"""Renders one view with its passes, and writes images. Runs inside Blender."""
 
 import os
 import struct
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def write_png(path, array):
-    """8-bit grey, RGB or RGBA from values in [0, 1]; the file appears whole or not at all."""
+    """Write an 8-bit grey, RGB or RGBA image from values in [0, 1], atomically."""
     values = np.clip(np.rint(np.nan_to_num(array) * 255), 0, 255).astype(np.uint8)
     h, w = values.shape[:2]
     channels = 1 if values.ndim == 2 else values.shape[2]
@@ -28,7 +28,7 @@ def write_png(path, array):
 
 
 def write_npy(path, array):
-    """A numpy array; the file appears whole or not at all."""
+    """Write a numpy array, atomically."""
     partial = path + ".partial"
     with open(partial, "wb") as out:
         np.save(out, array)
@@ -36,13 +36,13 @@ def write_npy(path, array):
 
 
 def srgb(linear):
-    """Display-referred values (IEC 61966-2-1) of linear light."""
+    """Convert linear light to sRGB (IEC 61966-2-1)."""
     linear = np.maximum(linear, 0)
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def configure(width, height, samples, seed):
-    """Cycles on the CPU with the denoiser, plain sRGB without a film curve."""
+    """Set up Cycles on the CPU with the denoiser, and plain sRGB without a tone curve."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.device = "CPU"
@@ -61,8 +61,8 @@ def configure(width, height, samples, seed):
     layer.use_pass_cryptomatte_object = True
 
 
-def _outputs(folder, wanted, matte):
-    """A compositor tree that writes the wanted passes as EXR files into `folder`."""
+def _outputs(folder, names, matte):
+    """Make a compositor tree that writes the passes as EXR files into `folder`."""
     scene = bpy.context.scene
     scene.use_nodes = True
     tree = scene.node_tree
@@ -72,10 +72,10 @@ def _outputs(folder, wanted, matte):
     out.base_path = folder
     out.format.file_format, out.format.color_depth, out.format.color_mode = "OPEN_EXR", "32", "RGBA"
     out.file_slots.clear()
-    for name in wanted:
+    for name in names:
         out.file_slots.new(name)
     sockets = {"color": "Image", "depth": "Depth", "normal": "Normal", "albedo": "DiffCol"}
-    for name in wanted:
+    for name in names:
         if name == "mask":
             crypto = tree.nodes.new("CompositorNodeCryptomatteV2")
             crypto.source = "RENDER"
@@ -86,15 +86,15 @@ def _outputs(folder, wanted, matte):
             tree.links.new(layers.outputs[sockets[name]], out.inputs[name])
 
 
-def render(camera, wanted, matte=()):
-    """Pass arrays by name for one camera: color (linear RGBA), depth, normal, albedo, mask."""
+def render(camera, names, matte=()):
+    """Render one camera; returns arrays by pass: color (linear RGBA), depth, normal, albedo, mask."""
     scene = bpy.context.scene
     scene.camera = camera
     with tempfile.TemporaryDirectory() as folder:
-        _outputs(folder, wanted, matte)
+        _outputs(folder, names, matte)
         bpy.ops.render.render(write_still=False)
         found = {}
-        for name in wanted:
+        for name in names:
             path = os.path.join(folder, next(f for f in os.listdir(folder) if f.startswith(name)))
             image = bpy.data.images.load(path)
             image.colorspace_settings.name = "Non-Color"

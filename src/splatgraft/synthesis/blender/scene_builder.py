@@ -1,4 +1,4 @@
-"""Builds a scene of `synth.scene` (its JSON form) in Blender. Runs inside Blender; knows nothing about passes."""
+"""Builds a scene in Blender from the JSON form of `synthesis.scene.Scene`. Runs inside Blender."""
 
 import json
 import math
@@ -8,12 +8,12 @@ from itertools import pairwise
 
 import bmesh
 import bpy
-import materials  # beside this file: the worker puts its own folder on the path
+import materials  # found in this folder, which the worker puts on the path
 from mathutils import Euler, Matrix, Vector, noise
 
 
 def clear():
-    """An empty Blender with factory settings."""
+    """Reset Blender to factory settings without objects."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
@@ -42,7 +42,7 @@ def _box(part):
 
 
 def _cushion(part):
-    """A box with swollen faces and a little seeded unevenness."""
+    """A box with bulging faces and a little seeded noise."""
 
     def fill(built):
         bmesh.ops.create_cube(built, size=1.0)
@@ -71,7 +71,7 @@ def _round(part):
 
 
 def _turned(part):
-    """A profile of (radius, height) spun about z; both in units of half the width and of the height."""
+    """A surface of revolution about z; the profile's radii are in units of half the width, heights of the height."""
 
     def fill(built):
         points = [Vector((r * 0.5, 0, h - 0.5)) for r, h in part["profile"]]
@@ -96,7 +96,7 @@ def _extruded(part):
 
 
 def _blob(part):
-    """A sphere pushed in and out by seeded noise: stones, heads, bushes."""
+    """A sphere displaced by seeded noise."""
 
     def fill(built):
         bmesh.ops.create_icosphere(built, subdivisions=4, radius=0.5)
@@ -131,7 +131,7 @@ def _torus(part):
 
 
 def _tuft(part):
-    """Leaves: many bent blades that rise from the bottom centre."""
+    """Many bent blades that rise from the bottom centre."""
     rng = random.Random(part["seed"])
 
     def fill(built):
@@ -158,7 +158,7 @@ def _tuft(part):
 
 
 def _foliage(part):
-    """A crown or a bush: many small leaves, most of them near the outside of an uneven ellipsoid."""
+    """Many small leaves, most of them near the surface of an uneven ellipsoid."""
     rng = random.Random(part["seed"])
 
     def fill(built):
@@ -192,7 +192,7 @@ _SMOOTH = {"cushion", "cylinder", "sphere", "turned", "blob", "torus", "tuft"}
 
 
 def _model(part):
-    """Everything in a model file, scaled into the part's box and standing on its floor."""
+    """All meshes of a model file, scaled to fit the part's box and standing on its bottom."""
     before = set(bpy.data.objects)
     if not os.path.isfile(part["path"]):
         raise ValueError(f"{part['path']}: expected a model file, found none")
@@ -218,9 +218,9 @@ def _model(part):
     high = Vector(max(c[i] for c in corners) for i in range(3))
     scale = min(part["size"][i] / max(high[i] - low[i], 1e-6) for i in range(3))
     place = Matrix.LocRotScale(Vector(part["location"]), Euler(part["rotation"]), Vector((scale,) * 3))
-    # what is wider than tall does not fill its box, and stands on the box's floor
-    sunk = Vector((0, 0, (part["size"][2] / scale - (high[2] - low[2])) / 2))
-    matrix = place @ Matrix.Translation(-(low + high) / 2 - sunk)
+    # a model that is wider than tall does not fill its box, and stands on the box's bottom
+    lowered = Vector((0, 0, (part["size"][2] / scale - (high[2] - low[2])) / 2))
+    matrix = place @ Matrix.Translation(-(low + high) / 2 - lowered)
     worlds = {o: o.matrix_world.copy() for o in meshes}
     for thing in meshes:
         thing.parent = None
@@ -229,9 +229,9 @@ def _model(part):
 
 
 def add_part(part, name, meshes):
-    """One part as Blender objects; the list is longer than 1 for a model of several meshes.
+    """Add one part; returns its Blender objects, several for a model of several meshes.
 
-    `meshes` remembers what was built: equal parts share their geometry and material.
+    `meshes` caches geometry and materials, so that equal parts share them.
     """
     if part["shape"] == "model":
         return _model(part)
@@ -248,7 +248,7 @@ def add_part(part, name, meshes):
     if part["bevel"] > 0 and part["shape"] in ("box", "extruded", "cylinder"):
         bevel = thing.modifiers.new("bevel", "BEVEL")
         bevel.width, bevel.segments, bevel.limit_method = part["bevel"], 3, "ANGLE"
-    # a boulder far away needs no second level: fifty of them would take gigabytes
+    # large shapes are not subdivided: fifty of them would take gigabytes
     if part["shape"] in ("turned", "blob") and max(part["size"]) < 0.8:
         smooth = thing.modifiers.new("smooth", "SUBSURF")
         smooth.levels = smooth.render_levels = 1
@@ -264,15 +264,15 @@ def _smooth(thing, part):
             polygon.use_smooth = len(polygon.vertices) == 4
 
 
-def _material(described, name, known):
-    key = json.dumps(described, sort_keys=True)
-    if key not in known:
-        known[key] = materials.make(name, described)
-    return known[key]
+def _material(description, name, cache):
+    key = json.dumps(description, sort_keys=True)
+    if key not in cache:
+        cache[key] = materials.make(name, description)
+    return cache[key]
 
 
 def add_lamp(lamp, name):
-    """One lamp."""
+    """Add one lamp."""
     data = bpy.data.lights.new(name, lamp["kind"].upper())
     data.color, data.energy = lamp["color"], lamp["power"]
     if lamp["kind"] == "sun":
@@ -292,14 +292,14 @@ def add_lamp(lamp, name):
 
 
 def environment_path(name):
-    """A path as it is, or the file of that name among the maps that come with Blender."""
+    """Resolve a map: an existing path, or the name of a map that comes with Blender."""
     if os.path.isabs(name) or os.path.exists(name):
         return name
     return os.path.join(bpy.utils.system_resource("DATAFILES"), "studiolights", "world", name)
 
 
 def make_world(world):
-    """A Blender world from the JSON form of `synth.scene.World`."""
+    """Make a Blender world from the JSON form of `synthesis.scene.World`."""
     made = bpy.data.worlds.new("world")
     made.use_nodes = True
     nodes, links = made.node_tree.nodes, made.node_tree.links
@@ -325,7 +325,7 @@ def make_world(world):
 
 
 def add_camera(camera, name):
-    """One camera; the pose is the object's matrix_world, OpenGL axes."""
+    """Add one camera; its pose is the object's matrix_world, OpenGL axes."""
     data = bpy.data.cameras.new(name)
     data.sensor_fit, data.angle = "HORIZONTAL", camera["field_of_view"]
     data.clip_start, data.clip_end = 0.01, 1000.0

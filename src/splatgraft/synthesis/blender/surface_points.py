@@ -1,13 +1,14 @@
-"""Points on the surfaces of things, evenly by area. Runs inside Blender; renders nothing."""
+"""Samples points on meshes, uniformly by area. Runs inside Blender."""
 
 import bpy
 import numpy as np
 
-_TURNS = 60
+_MAX_ROUNDS = 60
+"""Rounds of rejection sampling."""
 
 
-def points(things, wanted, seed):
-    """(n, 6): positions and outward normals in the world, metres; `wanted` has count, center and radius."""
+def sample_points(things, sampling, seed):
+    """Sample positions and outward normals (n, 6) in the world, metres; `sampling` has count, center and radius."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     corners = [
         found for thing in things if thing.type == "MESH" for found in _triangles(thing.evaluated_get(depsgraph))
@@ -16,25 +17,25 @@ def points(things, wanted, seed):
         return np.zeros((0, 6), np.float32)
     triangles = np.concatenate(corners)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    center, radius = np.array(wanted["center"]), wanted["radius"]
-    # what lies wholly beyond the ball is not drawn from
+    center, radius = np.array(sampling["center"]), sampling["radius"]
+    # triangles wholly outside the sphere are excluded
     low, high = triangles.min(1), triangles.max(1)
     near = np.linalg.norm(np.clip(center, low, high) - center, axis=1) < radius
     area = np.linalg.norm(across, axis=1) * near
     if not area.any():
         return np.zeros((0, 6), np.float32)
-    rng, found, left = np.random.default_rng(seed), [], wanted["count"]
-    for _ in range(_TURNS):
-        chosen = rng.choice(len(area), wanted["count"], p=area / area.sum())
-        drawn = _drawn(rng, triangles[chosen], across[chosen] / area[chosen, None])
-        found.append(drawn[np.linalg.norm(drawn[:, :3] - center, axis=1) < radius][:left])
+    rng, found, left = np.random.default_rng(seed), [], sampling["count"]
+    for _ in range(_MAX_ROUNDS):
+        chosen = rng.choice(len(area), sampling["count"], p=area / area.sum())
+        points = _points_in(rng, triangles[chosen], across[chosen] / area[chosen, None])
+        found.append(points[np.linalg.norm(points[:, :3] - center, axis=1) < radius][:left])
         left -= len(found[-1])
         if not left:
             break
     return np.concatenate(found).astype(np.float32)
 
 
-def _drawn(rng, triangles, normals):
+def _points_in(rng, triangles, normals):
     u, v = rng.random((2, len(triangles), 1))
     folded = u + v > 1
     u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
@@ -43,7 +44,7 @@ def _drawn(rng, triangles, normals):
 
 
 def _triangles(thing):
-    """(t, 3, 3) corners in the world, of a mesh with its modifiers."""
+    """Corners (t, 3, 3) in the world, of an evaluated mesh."""
     mesh = thing.to_mesh()
     mesh.calc_loop_triangles()
     vertices = np.empty(3 * len(mesh.vertices))

@@ -1,8 +1,7 @@
-"""One render job in a process of its own: `python worker.py job.json`. Needs bpy and numpy only.
+"""Renders one job: `python worker.py job.json`, in a Python with bpy and numpy.
 
-A job names a scene, objects, cameras and takes; a take says whether the scene is there, which object, under which
-world, and which passes to write. A file that exists is not rendered again, so a killed job goes on where it was.
-Knows nothing about what the takes are for.
+A job has a scene, objects, cameras and takes. A take selects scene or object, the world, and the passes to write. A
+picture with a .done file is not rendered again, so an interrupted job can be resumed.
 """
 
 import json
@@ -14,28 +13,33 @@ import time
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
 import bpy
-import contents
+import light_probe
 import numpy as np
 import passes
-import probe
-import surface
+import scene_builder
+import surface_points
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
+"""Rec. 709."""
+_MID_GREY = 0.22
+"""Linear value to which the exposure brings the geometric mean of luminance; set by hand."""
+_HIGHLIGHT = 1.3
+"""Largest linear value of the 97th percentile of luminance after exposure; set by hand."""
 
 
 def _populate(job):
-    contents.clear()
+    scene_builder.clear()
     scene_things, objects, meshes = [], {}, {}
     for i, part in enumerate(job["scene"]["parts"]):
-        scene_things += contents.add_part(part, f"part{i:03d}", meshes)
+        scene_things += scene_builder.add_part(part, f"part{i:03d}", meshes)
     for i, lamp in enumerate(job["scene"]["lamps"]):
-        scene_things.append(contents.add_lamp(lamp, f"lamp{i:02d}"))
+        scene_things.append(scene_builder.add_lamp(lamp, f"lamp{i:02d}"))
     for key, parts in job["objects"].items():
-        things = [thing for part in parts for thing in contents.add_part(part, key, meshes)]
+        things = [thing for part in parts for thing in scene_builder.add_part(part, key, meshes)]
         for i, thing in enumerate(things):
             thing.name = f"{key}_{i:03d}"
         objects[key] = things
-    cameras = [contents.add_camera(camera, f"camera{i:04d}") for i, camera in enumerate(job["cameras"])]
+    cameras = [scene_builder.add_camera(camera, f"camera{i:04d}") for i, camera in enumerate(job["cameras"])]
     bpy.context.view_layer.update()
     return scene_things, objects, cameras
 
@@ -49,13 +53,13 @@ def _show(take, job, things, worlds):
             thing.hide_render = key != take["object"]
     key = json.dumps(take.get("world") or job["scene"]["world"], sort_keys=True)
     if key not in worlds:
-        worlds[key] = contents.make_world(json.loads(key))
+        worlds[key] = scene_builder.make_world(json.loads(key))
     bpy.context.scene.world = worlds[key]
     bpy.context.scene.render.film_transparent = not take["scene"]
 
 
 def _exposure(job, take, cameras):
-    """Factor that brings the middle of the picture to a photograph's brightness, kept in the job's folder."""
+    """Exposure factor of the take's group, computed from quick renders and stored in exposure.json."""
     path = os.path.join(job["out"], "exposure.json")
     known = {}
     if os.path.exists(path):
@@ -64,7 +68,7 @@ def _exposure(job, take, cameras):
     group = take["exposure_group"]
     if group not in known:
         scene = bpy.context.scene
-        full = scene.render.resolution_percentage, scene.cycles.samples
+        settings = scene.render.resolution_percentage, scene.cycles.samples
         scene.render.resolution_percentage, scene.cycles.samples = 25, 12
         levels = []
         for camera in cameras[:: max(1, len(cameras) // 3)]:
@@ -72,10 +76,10 @@ def _exposure(job, take, cameras):
             luma = (color[..., :3] * _LUMA).sum(-1)[color[..., 3] > 0.5]
             if luma.size:
                 levels.append((np.exp(np.log(luma + 1e-4).mean()), np.quantile(luma, 0.97)))
-        scene.render.resolution_percentage, scene.cycles.samples = full
+        scene.render.resolution_percentage, scene.cycles.samples = settings
         mean, high = np.mean(levels, 0) if levels else (0.18, 1.0)
-        # the mean goes to a mid grey, but no more than three per cent of pixels may clip hard
-        known[group] = float(min(0.22 / max(mean, 1e-4), 1.3 / max(high, 1e-4)))
+        # mid grey for the mean, but less where more than three per cent of the pixels would clip
+        known[group] = float(min(_MID_GREY / max(mean, 1e-4), _HIGHLIGHT / max(high, 1e-4)))
         with open(path + ".partial", "w") as out:
             json.dump(known, out)
         os.replace(path + ".partial", path)
@@ -110,7 +114,7 @@ def _done(folder, index, seconds):
 
 
 def main(path):
-    """Render what the job at `path` still lacks."""
+    """Render what is missing of the job at `path`."""
     with open(path) as source:
         job = json.load(source)
     os.makedirs(job["out"], exist_ok=True)
@@ -134,8 +138,8 @@ def main(path):
         if take.get("probe"):
             exposure = _exposure(job, take, cameras)
             world = take.get("world") or job["scene"]["world"]
-            shown = job["scene"] if take["scene"] else {**job["scene"], "lamps": []}
-            panorama, suns = probe.measure(shown, world, take["probe"], scene_things)
+            rendered = job["scene"] if take["scene"] else {**job["scene"], "lamps": []}
+            panorama, suns = light_probe.measure(rendered, world, take["probe"], scene_things)
             passes.write_npy(os.path.join(folder, "0000.npy"), (panorama * exposure).astype(np.float32))
             for sun in suns:
                 sun["irradiance"] = [value * exposure for value in sun["irradiance"]]
@@ -147,7 +151,8 @@ def main(path):
         if take.get("surface"):
             things = objects[take["object"]] if take["object"] else scene_things
             passes.write_npy(
-                os.path.join(folder, "0000.npy"), surface.points(things, take["surface"], job.get("seed", 0))
+                os.path.join(folder, "0000.npy"),
+                surface_points.sample_points(things, take["surface"], job.get("seed", 0)),
             )
             _done(folder, 0, 0.0)
             continue

@@ -1,1 +1,1 @@
-"""Training of the compact harmoniser: data, deliberately wrong priors, losses, loop. Knows no command line."""
+"""Training of the compact harmoniser: pairs, light-transfer priors under perturbed lights, losses and loop."""

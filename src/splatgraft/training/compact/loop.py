@@ -1,6 +1,7 @@
-"""The loop of the compact harmoniser: one process, killed anywhere, gone on with to the bit. Knows no files of pairs.
+"""The training loop of the compact harmoniser, on one process; a killed run resumes bit for bit.
 
-What a step is given follows from the seed and the step alone. A state holds weights, optimiser and average.
+The pairs of a step and their augmentation follow from the seed and the step alone. A saved state holds weights,
+optimiser and moving average.
 """
 
 import json
@@ -27,20 +28,26 @@ from splatgraft.training.moving_average import MovingAverage
 from splatgraft.training.training_log import LOG_FILE, TrainingLog, truncate_log
 
 STATE_FILE = "state.pt"
+_BETAS = (0.9, 0.99)
+"""Of AdamW."""
+_MAX_GRADIENT_NORM = 1.0
+_FINAL_RATE = 0.02
+"""Learning rate at the last step over the largest."""
+_SHEET_ROWS = 12
 
 
 @dataclass(frozen=True)
 class CompactLoopOptions:
-    """Length and rhythm."""
+    """Options of the training loop."""
 
     steps: int = 2000
     batch: int = 8
     rate: float = 1e-3
-    """Of AdamW; rises over the first hundredth, falls as a cosine."""
+    """Learning rate of AdamW; rises over the first hundredth of the steps, then falls as a cosine."""
     decay: float = 0.05
-    """Of weights."""
+    """Weight decay."""
     ema: float = 0.998
-    """Decay of the averaged weights, which are what is kept."""
+    """Decay of the averaged weights, which are the result."""
     size: tuple[int, int] = (128, 192)
     """Height and width of a training view, multiples of 16."""
     seed: int = 0
@@ -48,31 +55,35 @@ class CompactLoopOptions:
     validate_every: int = 500
     validation_pairs: int = 96
     bf16: bool = False
-    """Compute the network in bfloat16; half the time where the processor knows it."""
+    """Compute the network in bfloat16; halves the time on processors that support it."""
     threads: int = 0
-    """Of torch; 0 leaves it as it is."""
+    """Threads of torch; 0 keeps its default."""
     network: CompactSize = field(default_factory=CompactSize)
 
 
 @dataclass(frozen=True)
 class CompactTraining:
-    """All that one run is given."""
+    """Everything that one run needs."""
 
     pairs: CompactPairs
     loop: CompactLoopOptions
     folder: Path
-    """Gets state.pt, log.jsonl, validation/."""
+    """Receives state.pt, log.jsonl and validation/."""
     device: torch.device
     say: Callable[[str], None]
     progress: Progress
     begin: dict[str, Tensor] | None = None
-    """Weights to begin from; random ones where not given."""
+    """Initial weights; random where None."""
 
 
 def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]:
-    """Train to the last step; the averaged weights.
+    """Train to the last step, resuming from the folder's state.
 
-    Raises: ValueError where the loss is no number, or the folder holds another training.
+    Returns:
+        The network's size and its averaged weights.
+
+    Raises:
+        ValueError: the loss is not finite, or the folder holds another training.
     """
     loop = run.loop
     if loop.threads:
@@ -84,18 +95,18 @@ def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]
     decayed = [p for p in network.parameters() if p.ndim > 1]
     others = [p for p in network.parameters() if p.ndim <= 1]
     groups = [{"params": decayed, "weight_decay": loop.decay}, {"params": others, "weight_decay": 0.0}]
-    optimizer = torch.optim.AdamW(groups, lr=loop.rate, betas=(0.9, 0.99))
+    optimizer = torch.optim.AdamW(groups, lr=loop.rate, betas=_BETAS)
     average = MovingAverage(network, loop.ema)
     first = _resumed(run, network, optimizer, average)
     truncate_log(run.folder / LOG_FILE, first)
-    with closing(TrainingLog(run.folder, tensorboard=False)) as curve:
+    with closing(TrainingLog(run.folder, tensorboard=False)) as log:
         for step in range(first, loop.steps):
             for group in optimizer.param_groups:
                 group["lr"] = loop.rate * _schedule(step, loop.steps)
-            loss = _one_step(run, network, step)
+            loss = _batch_loss(run, network, step)
             optimizer.zero_grad()
             loss.backward()
-            torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            torch.nn.utils.clip_grad_norm_(network.parameters(), _MAX_GRADIENT_NORM)
             optimizer.step()
             average.update()
             value = float(loss.detach())
@@ -103,15 +114,15 @@ def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]
                 raise ValueError(
                     f"training: expected a finite loss at step {step + 1}, found {value}; the last state is kept"
                 )
-            curve.add(step + 1, value, optimizer.param_groups[0]["lr"])
-            run.progress(step + 1, loop.steps, f"loss {curve.smooth:.4f}")
+            log.add(step + 1, value, optimizer.param_groups[0]["lr"])
+            run.progress(step + 1, loop.steps, f"loss {log.smooth:.4f}")
             last = step + 1 == loop.steps
             if last or (step + 1) % loop.validate_every == 0:
                 with average.applied():
-                    numbers, sheet = validate_compact(run, network)
-                words = ", ".join(f"{name} {value:.4f}" for name, value in numbers.items())
+                    metrics, sheet = validate_compact(run, network)
+                words = ", ".join(f"{name} {value:.4f}" for name, value in metrics.items())
                 run.say(f"step {step + 1}, held out: {words}")
-                curve.add_validation(step + 1, numbers, sheet)
+                log.add_validation(step + 1, metrics, sheet)
             if last or (step + 1) % loop.save_every == 0:
                 _save(run, network, optimizer, average, step + 1)
     with average.applied():
@@ -120,15 +131,15 @@ def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]
 
 def _schedule(step: int, steps: int) -> float:
     rise = min(1.0, (step + 1) / max(1, steps // 100))
-    return rise * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * step / steps)))
+    return rise * (_FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps)))
 
 
-def _one_step(run: CompactTraining, network: CompactNetwork, step: int) -> Tensor:
+def _batch_loss(run: CompactTraining, network: CompactNetwork, step: int) -> Tensor:
     pairs, loop = run.pairs, run.loop
     views, truths = [], []
     for position in range(step * loop.batch, (step + 1) * loop.batch):
-        turn, place = divmod(position, len(pairs.training))
-        order = torch.randperm(len(pairs.training), generator=torch.Generator().manual_seed(loop.seed * 7919 + turn))
+        epoch, place = divmod(position, len(pairs.training))
+        order = torch.randperm(len(pairs.training), generator=torch.Generator().manual_seed(loop.seed * 7919 + epoch))
         name = f"compact-{loop.seed}-{position}"
         variant = random.Random(name).randrange(pairs.variants)
         view, truth = pairs.read(pairs.training[int(order[place])], variant)
@@ -143,7 +154,10 @@ def _one_step(run: CompactTraining, network: CompactNetwork, step: int) -> Tenso
 
 @torch.no_grad()
 def validate_compact(run: CompactTraining, network: CompactNetwork) -> tuple[dict[str, float], Tensor]:
-    """Errors on the families held out, of the network and of the prior, and a sheet: pasted, prior, ours, truth."""
+    """Errors by region on the held-out pairs, of the network and of the prior, and a contact sheet.
+
+    A row of the sheet shows the composite, the prior, the network's result and the ground truth.
+    """
     pairs, loop = run.pairs, run.loop
     chosen = pairs.validation or pairs.training
     chosen = chosen[:: max(1, len(chosen) // loop.validation_pairs)][: loop.validation_pairs]
@@ -154,24 +168,24 @@ def validate_compact(run: CompactTraining, network: CompactNetwork) -> tuple[dic
         view, truth = augment(view, truth, loop.size, f"validation-{number}")
         view, truth = view.to(run.device), truth.to(run.device)
         output = network(view.channels())
-        _, found, before = compact_loss(view, output, truth)
+        _, errors, prior_errors = compact_loss(view, output, truth)
         for region in ("object", "shadow", "rest"):
-            for who, errors in (("", found), ("_prior", before)):
-                key = f"{region}{who}"
-                totals[key] = totals.get(key, 0.0) + float(getattr(errors, region).mean()) / len(chosen)
-        if number < 12:
+            for suffix, regions in (("", errors), ("_prior", prior_errors)):
+                key = f"{region}{suffix}"
+                totals[key] = totals.get(key, 0.0) + float(getattr(regions, region).mean()) / len(chosen)
+        if number < _SHEET_ROWS:
             pictures = (view.composite, view.prior(), apply_output(view, output), truth)
-            line = [srgb_from_linear(p[0].clamp(0, 1)).permute(1, 2, 0).cpu() for p in pictures]
-            rows.append(torch.cat(line, 1))
+            images = [srgb_from_linear(p[0].clamp(0, 1)).permute(1, 2, 0).cpu() for p in pictures]
+            rows.append(torch.cat(images, 1))
     return totals, torch.cat(rows)
 
 
 def _fingerprint(run: CompactTraining) -> dict[str, Any]:
-    own = asdict(run.loop)
+    options = asdict(run.loop)
     for name in ("save_every", "validate_every", "validation_pairs", "threads"):
-        own.pop(name)
+        options.pop(name)
     begin = 0.0 if run.begin is None else sum(float(tensor.double().abs().sum()) for tensor in run.begin.values())
-    return json.loads(json.dumps(own | {"pairs": run.pairs.fingerprint(), "begin": begin}))
+    return json.loads(json.dumps(options | {"pairs": run.pairs.fingerprint(), "begin": begin}))
 
 
 def _save(run: CompactTraining, network: CompactNetwork, optimizer: Any, average: MovingAverage, step: int) -> None:
@@ -191,14 +205,14 @@ def _resumed(run: CompactTraining, network: CompactNetwork, optimizer: Any, aver
     if not path.is_file():
         return 0
     state = torch.load(path, map_location=run.device, weights_only=True)
-    before, now = json.loads(state["job"]), _fingerprint(run)
-    if other := [name for name in now if before.get(name) != now[name]]:
+    saved, current = json.loads(state["job"]), _fingerprint(run)
+    if changed := [name for name in current if saved.get(name) != current[name]]:
         raise ValueError(
-            f"{path}: expected the same training to go on with, found {other[0]} {before.get(other[0])} instead of "
-            f"{now[other[0]]}; name another folder"
+            f"{path}: expected the same training to go on with, found {changed[0]} {saved.get(changed[0])} instead "
+            f"of {current[changed[0]]}; name another folder"
         )
     network.load_state_dict(state["network"])
     optimizer.load_state_dict(state["optimizer"])
     average.load_state_dict(state["average"])
-    run.say(f"goes on from step {state['step']}")
+    run.say(f"resumed from step {state['step']}")
     return int(state["step"])

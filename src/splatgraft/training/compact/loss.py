@@ -1,4 +1,4 @@
-"""What the compact network is asked to make small: log ratios by region, gradients, and doing worse than the prior."""
+"""The compact network's loss: errors by region, squared errors, gradients, and being worse than the prior."""
 
 from dataclasses import dataclass
 
@@ -9,14 +9,47 @@ from torch import Tensor
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.harmonization.compact.features import CompactInput, CompactOutput, apply_output
 
-_LIFT = 0.01
-_SHADOW = 0.95
-"""Truth over background below which a pixel is in the shadow."""
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Weights and thresholds, set by hand."""
+
+    ratio_offset: float = 0.01
+    """Linear light added to both sides of a ratio."""
+    shadow_ratio: float = 0.95
+    """Truth over background below which a pixel is in shadow."""
+    max_outside_coverage: float = 0.02
+    """Coverage by the object below which a pixel is off the object."""
+    min_area: float = 0.003
+    """Share of the image added to a region's area in its mean, so that small regions count less."""
+    object_and_shadow: float = 0.6
+    """Weight of the absolute errors of object and shadow."""
+    rest: float = 4.0
+    """Weight of the absolute error elsewhere."""
+    srgb: float = 2.0
+    """Weight of the sRGB difference in the absolute error."""
+    log: float = 0.3
+    """Weight of the log difference in the absolute error."""
+    squared_object: float = 4.0
+    """Weight of the squared sRGB error of the object."""
+    squared_shadow: float = 2.0
+    """Weight of the squared error of the light ratio in the shadow."""
+    gradients: float = 0.5
+    """Weight of the error of gradients."""
+    uncertainty: float = 0.02
+    """Weight of the likelihood of the expected error."""
+    max_light: float = 4.0
+    """Linear light to which the image is clipped where the truth is not clipped."""
+    clipped_truth: float = 0.99
+    """Linear light from which the truth counts as clipped."""
+
+
+SETTINGS = LossSettings()
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean errors of every picture of a batch (b,), per region."""
+    """Mean error of each image of a batch, by region."""
 
     object: Float[Tensor, "b"]
     shadow: Float[Tensor, "b"]
@@ -24,67 +57,82 @@ class Errors:
 
 
 def regions(view: CompactInput, truth: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights (b 1 h w) of the object, of the shadow band and of the rest."""
-    ratio = (truth.mean(1, keepdim=True) + _LIFT) / (view.background.mean(1, keepdim=True) + _LIFT)
-    off = (view.mask < 0.02).to(truth)
-    shadow = off * (ratio < _SHADOW)
-    return view.mask, shadow, off - shadow
+    """Weights (b 1 h w) of the object, of its shadow and of the rest."""
+    offset = SETTINGS.ratio_offset
+    ratio = (truth.mean(1, keepdim=True) + offset) / (view.background.mean(1, keepdim=True) + offset)
+    outside = (view.mask < SETTINGS.max_outside_coverage).to(truth)
+    shadow = outside * (ratio < SETTINGS.shadow_ratio)
+    return view.mask, shadow, outside - shadow
 
 
 def region_errors(image: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"], view: CompactInput) -> Errors:
-    """sRGB and log error of `image`, linear, averaged over each region."""
-    apart = _apart(image, truth)
+    """Average the sRGB and log errors of `image` over each region; images are linear light."""
+    error = _absolute_error(image, truth)
     object_, shadow, rest = regions(view, truth)
-    return Errors(_mean(apart, object_), _mean(apart, shadow), _mean(apart, rest))
+    return Errors(_mean(error, object_), _mean(error, shadow), _mean(error, rest))
 
 
 def compact_loss(
     view: CompactInput, output: CompactOutput, truth: Float[Tensor, "b 3 h w"]
 ) -> tuple[Tensor, Errors, Errors]:
-    """The loss, the errors of the output, and those of the prior."""
+    """Compute the loss.
+
+    Args:
+        view: the network's input.
+        output: its prediction.
+        truth: the ground truth, linear light.
+
+    Returns:
+        The loss, the errors of the harmonised view, and the errors of the prior.
+    """
     image = apply_output(view, output)
-    found, before = region_errors(image, truth, view), region_errors(view.prior(), truth, view)
-    loss = 0.6 * (found.object + found.shadow) + 4 * found.rest
+    errors, prior_errors = region_errors(image, truth, view), region_errors(view.prior(), truth, view)
+    loss = SETTINGS.object_and_shadow * (errors.object + errors.shadow) + SETTINGS.rest * errors.rest
     for name in ("object", "shadow", "rest"):
-        loss = loss + (getattr(found, name) - getattr(before, name)).clamp_min(0)
-    loss = loss + _squares(image, truth, view) + 0.5 * _gradients(image, truth, view)
-    return loss.mean() + 0.02 * _doubt(image.detach(), truth, output), found, before
+        loss = loss + (getattr(errors, name) - getattr(prior_errors, name)).clamp_min(0)
+    loss = loss + _squared_errors(image, truth, view) + SETTINGS.gradients * _gradient_errors(image, truth, view)
+    likelihood = _error_likelihood(image.detach(), truth, output)
+    return loss.mean() + SETTINGS.uncertainty * likelihood, errors, prior_errors
 
 
-def _apart(image: Tensor, truth: Tensor) -> Float[Tensor, "b 1 h w"]:
-    seen = _seen(image, truth)
-    srgb = (srgb_from_linear(seen) - srgb_from_linear(truth.clamp(1e-6, 1))).abs()
-    log = ((seen + _LIFT) / (truth + _LIFT)).log().abs()
-    return (2 * srgb + 0.3 * log).mean(1, keepdim=True)
+def _absolute_error(image: Tensor, truth: Tensor) -> Float[Tensor, "b 1 h w"]:
+    clipped, offset = _clipped(image, truth), SETTINGS.ratio_offset
+    srgb = (srgb_from_linear(clipped) - srgb_from_linear(truth.clamp(1e-6, 1))).abs()
+    log = ((clipped + offset) / (truth + offset)).log().abs()
+    return (SETTINGS.srgb * srgb + SETTINGS.log * log).mean(1, keepdim=True)
 
 
-def _seen(image: Tensor, truth: Tensor) -> Tensor:
-    """The image as a camera would see it where the truth is burnt out; elsewhere too much light stays too much."""
-    return torch.where(truth < 0.99, image.clamp_max(4), image.clamp_max(1)).clamp_min(1e-6)
+def _clipped(image: Tensor, truth: Tensor) -> Tensor:
+    """Clip the image to 1 where the truth is clipped; elsewhere excess light stays an error."""
+    unclipped = truth < SETTINGS.clipped_truth
+    return torch.where(unclipped, image.clamp_max(SETTINGS.max_light), image.clamp_max(1)).clamp_min(1e-6)
 
 
-def _squares(image: Tensor, truth: Tensor, view: CompactInput) -> Float[Tensor, "b"]:
-    """Squared errors, which ask for the mean of what may be: of sRGB on the object, of light over before in shadows.
+def _squared_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[Tensor, "b"]:
+    """Squared errors: of sRGB on the object, of the ratio to the background in shadows.
 
-    Absolute errors ask for the median, and the median of an unsure shadow is none at all.
+    Their minimum is the mean of the possible results. That of absolute errors is the median, which is no shadow where a
+    shadow is less likely than not.
     """
     object_, shadow, _ = regions(view, truth)
-    seen = _seen(image, truth)
-    apart = (srgb_from_linear(seen) - srgb_from_linear(truth.clamp(1e-6, 1))) ** 2
-    ratio = ((seen - truth) / (view.background + 2 * _LIFT)).clamp(-2, 2) ** 2
-    return 4 * _mean(apart.mean(1, keepdim=True), object_) + 2 * _mean(ratio.mean(1, keepdim=True), shadow)
+    clipped = _clipped(image, truth)
+    srgb = (srgb_from_linear(clipped) - srgb_from_linear(truth.clamp(1e-6, 1))) ** 2
+    ratio = ((clipped - truth) / (view.background + 2 * SETTINGS.ratio_offset)).clamp(-2, 2) ** 2
+    on_object = SETTINGS.squared_object * _mean(srgb.mean(1, keepdim=True), object_)
+    return on_object + SETTINGS.squared_shadow * _mean(ratio.mean(1, keepdim=True), shadow)
 
 
 def _mean(values: Tensor, weight: Tensor) -> Float[Tensor, "b"]:
-    """Mean over a region of each picture; small regions count less than their share."""
+    """Mean over a region of each image; small regions count less than their share."""
     area = weight.sum((1, 2, 3))
-    whole = values.shape[-1] * values.shape[-2]
-    return (values * weight).sum((1, 2, 3)) / (area + 0.003 * whole)
+    image_area = values.shape[-1] * values.shape[-2]
+    return (values * weight).sum((1, 2, 3)) / (area + SETTINGS.min_area * image_area)
 
 
-def _gradients(image: Tensor, truth: Tensor, view: CompactInput) -> Float[Tensor, "b"]:
-    """Edges of light: differences of the log ratio between neighbours, near the object."""
-    ratio = ((_seen(image, truth) + _LIFT) / (truth + _LIFT)).log().clamp(-2, 2)
+def _gradient_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[Tensor, "b"]:
+    """Differences of the log ratio between neighbouring pixels, on the object and in its shadow."""
+    offset = SETTINGS.ratio_offset
+    ratio = ((_clipped(image, truth) + offset) / (truth + offset)).log().clamp(-2, 2)
     object_, shadow, _ = regions(view, truth)
     weight = (object_ + shadow).clamp_max(1)
     across = _mean((ratio[..., 1:] - ratio[..., :-1]).abs().mean(1, keepdim=True), weight[..., 1:])
@@ -92,8 +140,8 @@ def _gradients(image: Tensor, truth: Tensor, view: CompactInput) -> Float[Tensor
     return across + down
 
 
-def _doubt(image: Tensor, truth: Tensor, output: CompactOutput) -> Tensor:
-    """Laplace likelihood of the error; teaches only how large it is."""
+def _error_likelihood(image: Tensor, truth: Tensor, output: CompactOutput) -> Tensor:
+    """Negative log likelihood of the error under a Laplace distribution; trains only the expected error."""
     error = (
         (srgb_from_linear(image.clamp(1e-6, 1)) - srgb_from_linear(truth.clamp(1e-6, 1))).abs().mean(1, keepdim=True)
     )

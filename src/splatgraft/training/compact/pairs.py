@@ -1,4 +1,4 @@
-"""Rendered pairs with their priors, wholly in memory, and the views that are cut from them. Knows no network."""
+"""Rendered pairs with their light-transfer priors, held in memory, for training the compact harmoniser."""
 
 import json
 from collections.abc import Sequence
@@ -22,19 +22,19 @@ _LINEAR = linear_from_srgb(torch.arange(256) / 255)
 
 @dataclass(frozen=True)
 class HeldOutOptions:
-    """Families that are never trained on."""
+    """Pairs that are held out of the training, by family."""
 
     materials: tuple[str, ...] = ("brick",)
-    """Patterns: pairs whose object has one."""
+    """Material patterns: pairs whose object has one."""
     lights: tuple[str, ...] = ("interior.exr",)
-    """Environment maps: pairs whose object was lit by one."""
+    """Environment maps: pairs whose object was captured under one."""
     every: int = 12
-    """Every so manyth scene is held out whole; 0 for none."""
+    """Every so manyth scene is held out; 0 for none."""
 
 
 @dataclass(frozen=True)
 class PairEntry:
-    """One pair, where its arrays are."""
+    """One pair: keys of its arrays."""
 
     folder: str
     object: str
@@ -44,14 +44,21 @@ class PairEntry:
 
 
 class CompactPairs:
-    """All pairs of a folder that have priors, decoded once."""
+    """All pairs of a folder that have priors, decoded."""
 
     def __init__(
         self, pairs: Path, priors: Sequence[Path], held_out: HeldOutOptions, progress: Progress = silent
     ) -> None:
-        """Read them all, with the priors of every folder in `priors`; some 0.6 MB each at 240x160.
+        """Read all pairs; about 0.6 MB each at 240x160.
 
-        Raises: ValueError where the manifest or a picture is missing or broken, or no pair has a prior.
+        Args:
+            pairs: folder that `splatgraft synth pairs` rendered.
+            priors: folders of `write_priors`, one per variant of the perturbed lights.
+            held_out: which pairs are held out.
+            progress: called after each scene.
+
+        Raises:
+            ValueError: the manifest or an image is missing or broken, or no pair has a prior.
         """
         self._arrays: dict[tuple[str, str, int], np.ndarray] = {}
         self._prior_confidence: dict[tuple[str, str], float] = {}
@@ -60,13 +67,13 @@ class CompactPairs:
         samples = read_manifest(pairs)
         folders = sorted({sample.folder for sample in samples})
         for number, folder in enumerate(folders):
-            kept_back = held_out.every > 0 and number % held_out.every == held_out.every - 1
+            scene_held_out = held_out.every > 0 and number % held_out.every == held_out.every - 1
             paths = [found / f"{folder.name}.npz" for found in priors]
             if all(path.is_file() for path in paths):
                 own = [sample for sample in samples if sample.folder == folder]
                 for variant, path in enumerate(paths):
                     self._read_priors(path, own, variant)
-                self._read_folder(folder, own, None if kept_back else held_out)
+                self._read_folder(folder, own, None if scene_held_out else held_out)
             progress(number + 1, len(folders), folder.name)
         if not self.entries:
             raise ValueError(f"{', '.join(map(str, priors))}: expected priors of the pairs in {pairs}, found none")
@@ -74,11 +81,17 @@ class CompactPairs:
         self.validation = [i for i, entry in enumerate(self.entries) if entry.held_out]
 
     def fingerprint(self) -> dict[str, int]:
-        """What must be the same for a training to be gone on with."""
+        """Counts that must be equal for a training to be resumed."""
         return {"training": len(self.training), "validation": len(self.validation), "variants": self.variants}
 
     def read(self, index: int, variant: int = 0) -> tuple[CompactInput, Float[Tensor, "1 3 h w"]]:
-        """A pair at full size with one of its priors, composite not normalised, and its truth in linear light."""
+        """Read a pair at full size with one of its priors.
+
+        The composite's object keeps the exposure of its own light; it is not normalised as in the paper.
+
+        Returns:
+            The network's input and the ground truth in linear light.
+        """
         entry = self.entries[index]
 
         def array(take: str) -> Tensor:
@@ -92,17 +105,17 @@ class CompactPairs:
         composite = linear_from_srgb(covered * relit[..., :3] + (1 - covered) * array("background").float() / 255)
         depth = array(f"{entry.object} depth").float()
         view = CompactInput(
-            composite=_first(composite),
-            background=_first(background),
+            composite=_channels_first(composite),
+            background=_channels_first(background),
             mask=covered[..., 0][None, None],
-            log_ratio=_first(array(f"{entry.object}_{entry.light} {variant}").float()),
+            log_ratio=_channels_first(array(f"{entry.object}_{entry.light} {variant}").float()),
             depth=relative_depth(depth, mask)[None, None],
-            normal=_first(array(f"{entry.object} normal").float() / 127),
+            normal=_channels_first(array(f"{entry.object} normal").float() / 127),
             prior_confidence=torch.tensor(
                 [self._prior_confidence[entry.folder, f"{entry.object}_{entry.light} {variant}"]]
             ),
         )
-        return view, _first(target)
+        return view, _channels_first(target)
 
     def _read_priors(self, path: Path, samples: Sequence[PairSample], variant: int) -> None:
         with np.load(path, allow_pickle=False) as arrays:
@@ -116,7 +129,7 @@ class CompactPairs:
             self._prior_confidence[sample.folder.name, key] = float(found[f"{take}_trust"])
 
     def _read_folder(self, folder: Path, samples: Sequence[PairSample], held_out: HeldOutOptions | None) -> None:
-        """`held_out`: families; None where the whole folder is."""
+        """Read the images of a scene; `held_out` is None where the whole scene is held out."""
         job = json.loads((folder / "job.json").read_text())
         count = len(job["cameras"])
         cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(count)))
@@ -124,32 +137,31 @@ class CompactPairs:
         for sample in samples:
             patterns = {part["material"]["pattern"] for part in job["objects"][sample.object]}
             light = worlds[f"{sample.object}_{sample.light}"]
-            kept_back = held_out is None or bool(patterns & set(held_out.materials)) or light in held_out.lights
-            self.entries.append(PairEntry(folder.name, sample.object, sample.light, sample.camera, kept_back))
-            self._read_pictures(sample, cameras.camera_from_world[sample.camera, :3, :3].numpy())
+            pair_held_out = held_out is None or bool(patterns & set(held_out.materials)) or light in held_out.lights
+            self.entries.append(PairEntry(folder.name, sample.object, sample.light, sample.camera, pair_held_out))
+            self._read_images(sample, cameras.camera_from_world[sample.camera, :3, :3].numpy())
 
-    def _read_pictures(self, sample: PairSample, camera_from_world: np.ndarray) -> None:
+    def _read_images(self, sample: PairSample, camera_from_world: np.ndarray) -> None:
         name, i = sample.folder.name, sample.camera
-        wanted = ((sample.object, ""), ("background", ""), (f"{sample.object}_{sample.light}", ""))
-        for take, _ in wanted:
-            self._arrays.setdefault((name, take, i), _picture(sample.path(take)))
+        for take in (sample.object, "background", f"{sample.object}_{sample.light}"):
+            self._arrays.setdefault((name, take, i), _read_image(sample.path(take)))
         if (name, f"{sample.object} mask", i) in self._arrays:
             return
-        mask = _picture(sample.path(sample.object, "mask"))
+        mask = _read_image(sample.path(sample.object, "mask"))
         self._arrays[name, f"{sample.object} mask", i] = mask if mask.ndim == 2 else mask[..., 0]
         depth = np.load(sample.path(sample.object, "depth"), allow_pickle=False)
         self._arrays[name, f"{sample.object} depth", i] = depth
-        normal = _picture(sample.path(sample.object, "normal")).astype(np.float32) / 127.5 - 1
+        normal = _read_image(sample.path(sample.object, "normal")).astype(np.float32) / 127.5 - 1
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
-        turned = np.where((depth > 0)[..., None], normal / np.maximum(length, 1e-3), 0) @ camera_from_world.T
-        self._arrays[name, f"{sample.object} normal", i] = np.round(127 * turned).astype(np.int8)
+        in_camera = np.where((depth > 0)[..., None], normal / np.maximum(length, 1e-3), 0) @ camera_from_world.T
+        self._arrays[name, f"{sample.object} normal", i] = np.round(127 * in_camera).astype(np.int8)
 
 
-def _first(picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 3 h w"]:
-    return picture.permute(2, 0, 1)[None]
+def _channels_first(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 3 h w"]:
+    return image.permute(2, 0, 1)[None]
 
 
-def _picture(path: Path) -> np.ndarray:
+def _read_image(path: Path) -> np.ndarray:
     found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if found is None:
         raise ValueError(f"{path}: expected a picture, found none that can be read")

@@ -1,6 +1,6 @@
-"""The light transfer's opinion on a rendered pair, under lights made wrong on purpose: log ratios per pixel.
+"""Light-transfer priors of rendered pairs under perturbed lights: the log ratio of each pixel's colour.
 
-The same functions as in a transfer are asked, at the pixels' own points. Knows no network.
+The light transfer's own functions compute the ratios, at the surface points of the pixels.
 """
 
 import json
@@ -38,26 +38,53 @@ from splatgraft.synthesis.pairs import samples_in
 from splatgraft.training.compact.light_perturbation import perturb_light
 from splatgraft.training.compact.rendered_surfaces import SurfacePixels, read_pixels, read_surfels, surfels
 
-_REACH = 8.0  # as RelightOptions
 _GRAY = torch.tensor([0.5, 0.5, 0.5])
-_LIFT = 0.004  # metres above a pixel's point, against its own surfels
-_NOISE_DEG = 12.0
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """Numbers of the priors."""
+
+    reach: float = 8.0
+    """Extent of the scene's shadow maps in radii of the object, as in `RelightOptions`."""
+    region_margin: float = 1.2
+    """Radius of the region of occluders over `reach`. Set by hand."""
+    offset_m: float = 0.004
+    """Metres by which a point is raised along its normal, against self-shadowing by its own surfels. Set by hand."""
+    normal_noise_deg: float = 12.0
+    """Error of normals, as on Gaussians. Set by hand."""
+    noise_px: int = 10
+    """Pixels over which the errors of normals are alike. Set by hand."""
+    min_coverage: float = 0.02
+    """Coverage from which a pixel gets the object's ratio, and below one minus which it gets the scene's."""
+
+
+SETTINGS = PriorSettings()
 
 
 @dataclass(frozen=True)
 class PairPrior:
-    """What light transfer says of all views of an object under one light."""
+    """The light transfer's result for all views of an object captured under one light."""
 
     log_ratio: Float[Tensor, "v h w 3"]
     """Natural logarithm of the factor on linear colours."""
     prior_confidence: float
-    """In the light at the new place, see `trust_in`."""
+    """Confidence in the target light, see `light_confidence`."""
 
 
 def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Progress = silent) -> None:
-    """Make the priors that `out` lacks of all objects and lights of rendered folders, one file each folder.
+    """Compute the priors of all objects and lights of rendered folders, one .npz file per folder.
 
-    Raises: ValueError where a folder lacks something.
+    Files that exist are kept.
+
+    Args:
+        folders: rendered scenes.
+        out: folder for the files.
+        seed: of the perturbed lights.
+        progress: called after each folder.
+
+    Raises:
+        ValueError: a folder lacks a file.
     """
     out.mkdir(parents=True, exist_ok=True)
     for number, folder in enumerate(folders):
@@ -76,9 +103,10 @@ def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Pro
 
 
 def read_light(folder: Path) -> Light:
-    """The light that a probe take measured.
+    """Read the light that a probe take measured.
 
-    Raises: ValueError where it is missing or broken.
+    Raises:
+        ValueError: it is missing or broken.
     """
     try:
         panorama = torch.from_numpy(np.load(folder / "0000.npy", allow_pickle=False)).float()
@@ -89,76 +117,95 @@ def read_light(folder: Path) -> Light:
 
 
 def light_transfer_priors(folder: Path, object_: str, lights: list[str], *, seed: int) -> list[PairPrior]:
-    """One prior per light of an object in a folder of pairs.
+    """Compute one prior per light of an object.
 
-    Raises: ValueError where the folder lacks something.
+    Args:
+        folder: a rendered scene.
+        object_: name of the object.
+        lights: names of the lights under which it was rendered alone.
+        seed: of the perturbed lights.
+
+    Raises:
+        ValueError: the folder lacks a file.
     """
     count = len(json.loads((folder / "cameras.json").read_text())["poses"])
     cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(count)))
     pixels = read_pixels(folder, object_, cameras)
-    body = read_surfels(folder, object_, _GRAY)
-    scene = read_surfels(folder, "scene", _GRAY)
-    place = read_light(folder / "place_probe")
-    found = []
+    object_surfels = read_surfels(folder, object_, _GRAY)
+    scene_surfels = read_surfels(folder, "scene", _GRAY)
+    light_at_place = read_light(folder / "place_probe")
+    priors = []
     for light in lights:
         rng = random.Random(f"prior-{seed}-{folder.name}-{object_}-{light}")
-        now, then = perturb_light(place, rng), perturb_light(read_light(folder / f"{object_}_{light}_probe"), rng)
+        target_light = perturb_light(light_at_place, rng)
+        source_light = perturb_light(read_light(folder / f"{object_}_{light}_probe"), rng)
         noise = torch.Generator().manual_seed(rng.randrange(2**31))
-        asked = _Asked(pixels, body, scene, now, then)
-        on_object, on_scene = asked.object_log_ratio(noise), asked.scene_log_ratio()
-        inside = pixels.mask[..., None]
-        found.append(PairPrior(inside * on_object + (1 - inside) * on_scene, light_confidence(now)))
-    return found
+        transfer = _PairTransfer(pixels, object_surfels, scene_surfels, source_light, target_light)
+        on_object, on_scene = transfer.object_log_ratio(noise), transfer.scene_log_ratio()
+        mask = pixels.mask[..., None]
+        priors.append(PairPrior(mask * on_object + (1 - mask) * on_scene, light_confidence(target_light)))
+    return priors
 
 
-class _Asked:
-    """One object under one pair of lights."""
+class _PairTransfer:
+    """Light transfer of one object from its source light to the target light."""
 
-    def __init__(self, pixels: SurfacePixels, body: Gaussians, scene: Gaussians, now: Light, then: Light) -> None:
-        self._pixels, self._body, self._then = pixels, body, then
-        self._seen = 0.5 * (now.coverage + then.coverage)
-        self._beams = sample_light(now)
-        self._ball = bounding_sphere(body)
-        self._region = BoundingSphere(self._ball.center, 1.2 * _REACH * self._ball.radius)
-        self._maps = object_shadow_maps(body, self._ball, self._beams)
-        self._around = scene_shadow_maps(scene, self._region, self._beams)
+    def __init__(
+        self,
+        pixels: SurfacePixels,
+        object_surfels: Gaussians,
+        scene_surfels: Gaussians,
+        source_light: Light,
+        target_light: Light,
+    ) -> None:
+        self._pixels, self._source_light = pixels, source_light
+        self._coverage = 0.5 * (target_light.coverage + source_light.coverage)
+        self._samples = sample_light(target_light)
+        self._sphere = bounding_sphere(object_surfels)
+        radius = SETTINGS.region_margin * SETTINGS.reach * self._sphere.radius
+        self._region = BoundingSphere(self._sphere.center, radius)
+        self._object_maps = object_shadow_maps(object_surfels, self._sphere, self._samples)
+        self._scene_maps = scene_shadow_maps(scene_surfels, self._region, self._samples)
 
     def object_log_ratio(self, noise: torch.Generator) -> Float[Tensor, "v h w 3"]:
-        pixels, beams = self._pixels, self._beams
-        inside = (pixels.mask > 0.02) & pixels.there
-        facing = torch.nn.functional.normalize(pixels.normals + _smooth_noise(pixels.normals.shape, noise), dim=-1)
-        facing = facing[inside].contiguous()
-        points = surfels(pixels.points[inside] + _LIFT * pixels.normals[inside], facing, _GRAY)
-        arrives = scene_visibility(self._around, points.means, facing)
-        arrives = torch.where(torch.as_tensor(beams.is_source), arrives, torch.ones(()))
-        own = self_visibility(self._maps, points, facing, beams)
-        lit = irradiance(beams, facing, arrives=own * arrives)
-        before = sample_light(self._then)
-        was = irradiance(before, facing, arrives=self_visibility(self._maps, points, facing, before))
-        sure = Normals(facing, torch.ones(len(facing)), torch.ones(len(facing), dtype=torch.bool))
-        out = torch.zeros(*inside.shape, 3)
-        out[inside] = shade_ratio(lit, was, sure, torch.ones(len(facing)), seen=self._seen).log()
-        return out
+        """Log ratio of the object's irradiance; 0 in the other pixels."""
+        pixels, samples = self._pixels, self._samples
+        inside = (pixels.mask > SETTINGS.min_coverage) & pixels.hit
+        normals = torch.nn.functional.normalize(pixels.normals + _smooth_noise(pixels.normals.shape, noise), dim=-1)
+        normals = normals[inside].contiguous()
+        points = surfels(pixels.points[inside] + SETTINGS.offset_m * pixels.normals[inside], normals, _GRAY)
+        visible = scene_visibility(self._scene_maps, points.means, normals)
+        visible = torch.where(torch.as_tensor(samples.is_source), visible, torch.ones(()))
+        self_visible = self_visibility(self._object_maps, points, normals, samples)
+        target = irradiance(samples, normals, arrives=self_visible * visible)
+        source_samples = sample_light(self._source_light)
+        self_visible = self_visibility(self._object_maps, points, normals, source_samples)
+        source = irradiance(source_samples, normals, arrives=self_visible)
+        certain = Normals(normals, torch.ones(len(normals)), torch.ones(len(normals), dtype=torch.bool))
+        log_ratio = torch.zeros(*inside.shape, 3)
+        log_ratio[inside] = shade_ratio(target, source, certain, torch.ones(len(normals)), seen=self._coverage).log()
+        return log_ratio
 
     def scene_log_ratio(self) -> Float[Tensor, "v h w 3"]:
-        pixels, beams = self._pixels, self._beams
-        outside = (pixels.mask < 0.98) & pixels.there
-        points, facing = pixels.points[outside], pixels.normals[outside]
-        near = reachable(points, self._ball, beams, farthest=self._region.radius)
-        points, facing = points[near] + _LIFT * facing[near], facing[near].contiguous()
-        arrives = scene_visibility(self._around, points, facing)
-        ratio = scene_ratio(self._maps, points, facing, arrives=arrives)
-        whole = torch.zeros(len(near), 3)
-        whole[near] = (ratio.shadow + ratio.bounce).log()
-        out = torch.zeros(*outside.shape, 3)
-        out[outside] = whole
-        return out
+        """Log ratio of the shadow and bounce that the object causes on the scene; 0 in the other pixels."""
+        pixels, samples = self._pixels, self._samples
+        outside = (pixels.mask < 1 - SETTINGS.min_coverage) & pixels.hit
+        points, normals = pixels.points[outside], pixels.normals[outside]
+        near = reachable(points, self._sphere, samples, farthest=self._region.radius)
+        points, normals = points[near] + SETTINGS.offset_m * normals[near], normals[near].contiguous()
+        visible = scene_visibility(self._scene_maps, points, normals)
+        ratio = scene_ratio(self._object_maps, points, normals, arrives=visible)
+        found = torch.zeros(len(near), 3)
+        found[near] = (ratio.shadow + ratio.bounce).log()
+        log_ratio = torch.zeros(*outside.shape, 3)
+        log_ratio[outside] = found
+        return log_ratio
 
 
 def _smooth_noise(shape: torch.Size, generator: torch.Generator) -> Float[Tensor, "v h w 3"]:
-    """Errors of normals as those of Gaussians are: alike over some ten pixels."""
+    """Errors of normals as on Gaussians: alike over several pixels."""
     v, h, w, _ = shape
-    coarse = torch.randn(v, 3, max(2, h // 10), max(2, w // 10), generator=generator) * math.tan(
-        math.radians(_NOISE_DEG)
-    )
+    coarse = torch.randn(
+        v, 3, max(2, h // SETTINGS.noise_px), max(2, w // SETTINGS.noise_px), generator=generator
+    ) * math.tan(math.radians(SETTINGS.normal_noise_deg))
     return torch.nn.functional.interpolate(coarse, size=(h, w), mode="bilinear").permute(0, 2, 3, 1)

@@ -1,4 +1,4 @@
-"""What a rendered pair's folder says of its surfaces: points as surfels, pixels as points. Knows no light."""
+"""Surfaces of a rendered pair: pixels lifted to points by their depth, and sampled points as surfels."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,23 +18,46 @@ from splatgraft.core.spherical_harmonics import C0
 
 
 @dataclass(frozen=True)
+class SurfelSettings:
+    """Shape of the surfels, set by hand."""
+
+    neighbor: int = 4
+    """The spacing of points is the median distance to this nearest neighbour."""
+    spacing_stride: int = 7
+    """Every so manyth point is used to measure the spacing."""
+    width: float = 0.6
+    """Standard deviation in the surface over the spacing."""
+    min_width: float = 1e-4
+    """Smallest standard deviation in the surface, metres."""
+    flatness: float = 0.1
+    """Standard deviation along the normal over that in the surface."""
+    opacity_logit: float = 3.0
+
+
+@dataclass(frozen=True)
 class SurfacePixels:
-    """The surfaces that the pictures of one object's take show, all cameras."""
+    """The surface points visible in the pixels of all cameras, with one object in the scene."""
 
     points: Float[Tensor, "v h w 3"]
     """World, metres."""
     normals: Float[Tensor, "v h w 3"]
     """Unit, world."""
     mask: Float[Tensor, "v h w"]
-    """How much of each pixel is the object."""
-    there: Bool[Tensor, "v h w"]
-    """Whether anything is."""
+    """Coverage by the object, in [0, 1]."""
+    hit: Bool[Tensor, "v h w"]
+    """False where the pixel shows the sky."""
 
 
 def read_pixels(folder: Path, object_: str, cameras: Cameras) -> SurfacePixels:
-    """The pixels of a take, lifted by their depth.
+    """Read the pixels of an object's take and lift them to points by their depth.
 
-    Raises: ValueError where a picture is missing or broken.
+    Args:
+        folder: of a rendered scene.
+        object_: name of the object.
+        cameras: of the scene.
+
+    Raises:
+        ValueError: a file is missing or broken.
     """
     take, points, normals, masks = folder / object_, [], [], []
     for i in range(len(cameras)):
@@ -56,9 +79,15 @@ def read_pixels(folder: Path, object_: str, cameras: Cameras) -> SurfacePixels:
 
 
 def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussians:
-    """The points of a surface as flat, opaque Gaussians that close it, of one sRGB colour.
+    """Read points sampled on a surface as surfels, see `surfels`.
 
-    Raises: ValueError where they are missing or broken.
+    Args:
+        folder: of a rendered scene.
+        name: of the object, or `scene`.
+        color: of all surfels, sRGB.
+
+    Raises:
+        ValueError: the points are missing or broken.
     """
     path = folder / f"{name}_surface" / "0000.npy"
     try:
@@ -71,14 +100,16 @@ def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussian
 
 
 def surfels(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], color: Float[Tensor, "3"]) -> Gaussians:
-    """Flat, opaque Gaussians as wide as the points are apart."""
-    distances, _ = KDTree(points.numpy()).query(points.numpy()[::7], k=5)
-    width = max(1e-4, 0.6 * float(np.median(distances[:, -1])))
+    """Make flat, opaque Gaussians whose width follows the spacing of the points, so that they close the surface."""
+    settings = SurfelSettings()
+    samples = points.numpy()[:: settings.spacing_stride]
+    distances, _ = KDTree(points.numpy()).query(samples, k=settings.neighbor + 1)
+    width = max(settings.min_width, settings.width * float(np.median(distances[:, -1])))
     rotations = frames_along(-normals).transpose(1, 2)
     return Gaussians(
         means=points,
-        log_scales=torch.tensor([width, width, 0.1 * width]).log().repeat(len(points), 1),
+        log_scales=torch.tensor([width, width, settings.flatness * width]).log().repeat(len(points), 1),
         quaternions=quaternion_from_rotation(rotations),
-        opacity_logits=torch.full((len(points),), 3.0),
+        opacity_logits=torch.full((len(points),), settings.opacity_logit),
         sh=((color - 0.5) / C0).repeat(len(points), 1)[:, None],
     )

@@ -1,1 +1,1 @@
-"""Where training pairs come from, one file each, and what makes those that are not rendered. Knows no network."""
+"""Sources of training pairs, and the generation of those that are not rendered."""

@@ -1,4 +1,4 @@
-"""Makes samples of relit pictures: what is done is kept, what is unfit is noted. Knows no particular model."""
+"""Generates samples of relit images into a folder; finished samples are kept, unsuitable ones are recorded."""
 
 import json
 import random
@@ -19,13 +19,13 @@ from splatgraft.training.sources.relit_pairs import RECORD_FILE, RelitPairs, Rel
 
 SHEET_FILE = "sheet.png"
 _REJECTED = "rejected"
-_SMALLEST, _LARGEST = 0.01, 0.6
-"""Share of the picture that an object may cover."""
+_MIN_COVERED, _MAX_COVERED = 0.01, 0.6
+"""Share of the image that an object may cover; set by hand."""
 
 
 @dataclass(frozen=True)
 class UnrelitSample:
-    """A target with its mask and background, before it is relit."""
+    """A target with its background and mask, before relighting."""
 
     target: Float[Tensor, "h w 3"]
     background: Float[Tensor, "h w 3"]
@@ -34,20 +34,20 @@ class UnrelitSample:
 
 @dataclass(frozen=True)
 class SamplePlan:
-    """One sample that is to be made."""
+    """One sample to be generated."""
 
     name: str
-    """Of its folder."""
+    """Of the sample's folder."""
     group: str
-    """What is held out together."""
+    """Samples of one group are held out together."""
     make: Callable[[], UnrelitSample]
     record: Mapping[str, Any]
-    """How it is made: prompt, seed, models, licence."""
+    """Provenance: prompt, seed, models, licence."""
 
 
 @dataclass(frozen=True)
 class Lighting:
-    """How samples are relit."""
+    """The relighter and the environment maps of the samples."""
 
     relighter: Relighter
     maps: Sequence[Path]
@@ -57,30 +57,41 @@ class Lighting:
     seed: int
 
     def choose(self, name: str) -> list[Path]:
-        """The maps of a sample, determined by its name and the seed."""
+        """Choose the maps of a sample, determined by its name and the seed."""
         return random.Random(f"lights-{self.seed}-{name}").sample(list(self.maps), min(self.each, len(self.maps)))
 
 
 def generate(
-    out: Path, wanted: Iterable[SamplePlan], lighting: Lighting, *, total: int, progress: Progress = silent
+    out: Path, plans: Iterable[SamplePlan], lighting: Lighting, *, total: int, progress: Progress = silent
 ) -> int:
-    """Make what is missing, up to `total` samples; manifest and sheet at the end; returns how many are there.
+    """Generate missing samples, then write the manifest and a contact sheet.
 
-    A sample whose object is too small, too large or not found is noted in rejected/ and not tried again.
+    A sample whose object is too small, too large or not found is recorded in rejected/ and not tried again.
 
-    Raises: ValueError where a model fails; what is done is kept.
+    Args:
+        out: folder of the samples.
+        plans: candidates, in order.
+        lighting: how they are relit.
+        total: number of samples to reach.
+        progress: called after each candidate.
+
+    Returns:
+        The number of samples in `out`.
+
+    Raises:
+        ValueError: a model fails; finished samples are kept.
     """
     (out / _REJECTED).mkdir(parents=True, exist_ok=True)
     done = 0
     try:
-        for item in wanted:
+        for plan in plans:
             if done >= total:
                 break
-            if (out / item.name / RECORD_FILE).is_file():
+            if (out / plan.name / RECORD_FILE).is_file():
                 done += 1
-            elif not (out / _REJECTED / f"{item.name}.json").is_file():
-                done += _make(out, item, lighting)
-            progress(done, total, item.name)
+            elif not (out / _REJECTED / f"{plan.name}.json").is_file():
+                done += _generate_one(out, plan, lighting)
+            progress(done, total, plan.name)
     finally:
         count = write_manifest(out)
     if count:
@@ -89,7 +100,7 @@ def generate(
 
 
 def contact_sheet(pairs: RelitPairs, *, rows: int = 24, width: int = 240) -> Float[Tensor, "h w 3"]:
-    """To look at: per row a target, its background and one composite; evenly chosen."""
+    """Show evenly chosen pairs, one per row: target, background, composite."""
     chosen = [round(i * (len(pairs) - 1) / max(rows - 1, 1)) for i in range(min(rows, len(pairs)))]
     lines = []
     for index in chosen:
@@ -101,22 +112,23 @@ def contact_sheet(pairs: RelitPairs, *, rows: int = 24, width: int = 240) -> Flo
     return torch.cat([torch.cat([line, torch.ones(tallest - line.shape[0], *line.shape[1:])]) for line in lines])
 
 
-def _make(out: Path, item: SamplePlan, lighting: Lighting) -> int:
-    made = item.make()
-    covered = float((made.mask > 0.5).float().mean())
-    if not _SMALLEST <= covered <= _LARGEST:
-        note = {**item.record, "reason": f"object covers {covered:.1%} of the picture"}
-        with atomic_write(out / _REJECTED / f"{item.name}.json") as stream:
+def _generate_one(out: Path, plan: SamplePlan, lighting: Lighting) -> int:
+    """Write the sample; 1 where it was written, 0 where it was rejected."""
+    unrelit = plan.make()
+    covered = float((unrelit.mask > 0.5).float().mean())
+    if not _MIN_COVERED <= covered <= _MAX_COVERED:
+        note = {**plan.record, "reason": f"object covers {covered:.1%} of the picture"}
+        with atomic_write(out / _REJECTED / f"{plan.name}.json") as stream:
             stream.write((json.dumps(note) + "\n").encode())
         return 0
-    maps = lighting.choose(item.name)
-    relit = lighting.relighter.relight(RelightingInput(item.name, made.target, made.mask), maps)
+    maps = lighting.choose(plan.name)
+    relit = lighting.relighter.relight(RelightingInput(plan.name, unrelit.target, unrelit.mask), maps)
     record = {
-        **item.record,
-        "group": item.group,
+        **plan.record,
+        "group": plan.group,
         "relighter": lighting.relighter.name,
         "relighter_licence": lighting.relighter.licence,
         "lights": [path.name for path in maps],
     }
-    write_sample(out / item.name, RelitSample(made.target, made.background, made.mask, relit), record)
+    write_sample(out / plan.name, RelitSample(unrelit.target, unrelit.background, unrelit.mask, relit), record)
     return 1

@@ -1,14 +1,13 @@
-"""ORIDa's photographs (Kim et al. 2025): which there are, and a balanced choice of them (paper: 2K of 27K). No pixels.
+"""Photographs of the ORIDa data set (Kim et al. 2025), and a balanced choice of them (paper: 2K of 27K).
 
-Read is an index, index.csv with the columns image, mask, background, object, scene (paths relative to the index); or,
-where there is none, this layout:
+The files are listed in index.csv with the columns image, mask, background, object, scene (paths relative to it), or
+without it lie in this layout:
 
     OBJECT/SCENE/background.*   images/NAME.*   masks/NAME.*
 
-The choice: every (object, scene) has a queue of its pictures in an order shuffled by the seed. Rounds over all queues,
-in an order shuffled for each round, take one picture each, until there are enough; within a round queues of objects
-that have fewer pictures so far come first, then those of scenes that have fewer. So no object and no scene counts more
-than one picture above what it must.
+The choice takes photographs in rounds. Every (object, scene) has a queue in an order shuffled by the seed; a round
+takes one photograph from each queue, in an order shuffled per round, first from objects and then from scenes with
+fewer photographs so far. Numbers per object, and then per scene, are therefore as equal as the data allows.
 """
 
 import csv
@@ -26,7 +25,7 @@ LICENCE = "ORIDa, see its own terms"
 
 @dataclass(frozen=True)
 class Photograph:
-    """One picture of an object in a scene."""
+    """One photograph of an object in a scene."""
 
     image: Path
     mask: Path
@@ -37,14 +36,15 @@ class Photograph:
 
     @property
     def name(self) -> str:
-        """A folder name, its own."""
+        """A unique folder name."""
         return f"{self.object}_{self.scene}_{self.image.stem}".replace("/", "-")
 
 
 def read_orida(root: Path) -> list[Photograph]:
-    """All photographs, sorted by name.
+    """List all photographs, sorted by name.
 
-    Raises: ValueError where the layout is another, a row is broken, or a file is missing.
+    Raises:
+        ValueError: the layout is another, a row is broken, or a file is missing.
     """
     found = _by_index(root / INDEX_FILE) if (root / INDEX_FILE).is_file() else _by_layout(root)
     if not found:
@@ -56,7 +56,7 @@ def read_orida(root: Path) -> list[Photograph]:
 
 
 def choose_balanced(photographs: list[Photograph], count: int, seed: int) -> list[Photograph]:
-    """`count` of them by the rule above; all where there are no more."""
+    """Choose `count` photographs, balanced by object and scene; all where there are fewer."""
     queues: dict[tuple[str, str], list[Photograph]] = defaultdict(list)
     for photograph in photographs:
         queues[photograph.object, photograph.scene].append(photograph)
@@ -65,11 +65,11 @@ def choose_balanced(photographs: list[Photograph], count: int, seed: int) -> lis
     chosen: list[Photograph] = []
     objects: dict[str, int] = defaultdict(int)
     scenes: dict[str, int] = defaultdict(int)
-    turn = 0
+    number = 0
     while len(chosen) < count and any(queues.values()):
         keys = sorted(key for key, queue in queues.items() if queue)
-        random.Random(f"orida-{seed}-round-{turn}").shuffle(keys)
-        turn += 1
+        random.Random(f"orida-{seed}-round-{number}").shuffle(keys)
+        number += 1
         while keys and len(chosen) < count:
             key = min(keys, key=lambda pair: (objects[pair[0]], scenes[pair[1]]))
             keys.remove(key)
@@ -88,7 +88,7 @@ def _by_index(path: Path) -> list[Photograph]:
         for number, row in enumerate(reader, 2):
             files = [path.parent / (row[name] or "?") for name in COLUMNS[:3]]
             if absent := next((file for file in files if not file.is_file()), None):
-                raise ValueError(f"{path}, line {number}: expected files that are there, found no {absent}")
+                raise ValueError(f"{path}, line {number}: expected existing files, found no {absent}")
             image, mask, background = files
             found.append(Photograph(image, mask, background, row["object"], row["scene"]))
     return found

@@ -1,6 +1,6 @@
-"""What every source of pairs gives, and how sources are mixed: by a rule, so that a run can go on anywhere.
+"""Training pairs, the protocol of their sources, and deterministic mixtures of sources.
 
-Knows nothing about files or networks.
+The pair at a position of a mixture depends only on the seed and the position, so that a run can be resumed anywhere.
 """
 
 import hashlib
@@ -21,19 +21,19 @@ ROLES: tuple[str, ...] = get_args(Role)
 
 @dataclass(frozen=True)
 class TrainingPair:
-    """One pair, sRGB in [0, 1]."""
+    """One training pair, sRGB in [0, 1]."""
 
     composite: Float[Tensor, "h w 3"]
-    """The object under other light, pasted on the scene without it (paper, Eq. 2)."""
+    """The object under another light, pasted onto the scene without it (paper, Eq. 2)."""
     target: Float[Tensor, "h w 3"]
     """The object in the scene."""
     background: Float[Tensor, "h w 3"]
     """The scene without the object."""
     mask: Float[Tensor, "h w"]
-    """How much of each pixel the object covers."""
+    """Coverage of each pixel by the object, in [0, 1]."""
 
     def picture(self, role: str) -> Float[Tensor, "h w 3"]:
-        """One of its pictures; the mask as three equal channels, binary as the network is shown it."""
+        """The image of a role; the mask is binary, with three equal channels, as networks take it."""
         if role == "mask":
             return (self.mask > 0.5).float()[..., None].expand(-1, -1, 3)
         return getattr(self, role)
@@ -41,32 +41,33 @@ class TrainingPair:
 
 @runtime_checkable
 class PairSource(Protocol):
-    """Pairs on disk."""
+    """A collection of pairs on disk."""
 
     name: str
-    """For messages and the log."""
+    """For messages and the log; part of the training's fingerprint."""
 
     def __len__(self) -> int: ...
 
     def group(self, index: int) -> str:
-        """The scene of a pair: what is held out is held out by scenes."""
+        """The pair's group, such as its scene; groups are held out as a whole."""
         ...
 
     def key(self, index: int, role: Role) -> str:
-        """What tells one picture from all others, and changes when its files do."""
+        """A unique key of an image, which changes when its file does."""
         ...
 
     def read(self, index: int) -> TrainingPair:
-        """A pair.
+        """Read a pair.
 
-        Raises: ValueError where a file is missing or broken.
+        Raises:
+            ValueError: a file is missing or broken.
         """
         ...
 
 
 @dataclass(frozen=True)
 class PairReference:
-    """One pair of one source."""
+    """A pair of a source, by its index."""
 
     source: PairSource
     index: int
@@ -74,23 +75,23 @@ class PairReference:
 
 @dataclass(frozen=True)
 class Mixture:
-    """Several sources, drawn from by weight."""
+    """Several sources from which pairs are drawn by weight."""
 
     sources: tuple[PairSource, ...]
     weights: tuple[float, ...]
-    """Relative; one a source."""
+    """Relative, one per source."""
     indices: tuple[tuple[int, ...], ...]
-    """Of each source's pairs, those that belong to this mixture."""
+    """The pairs of each source that belong to this mixture."""
     seed: int
 
     def draw(self, position: int) -> PairReference:
-        """The pair at a place in the endless order; independent of what was drawn before, and of who draws."""
+        """Draw the pair at a position of the infinite sequence; it depends only on seed and position."""
         rng = random.Random(f"{self.seed}-{position}")
         which = rng.choices(range(len(self.sources)), self.weights)[0]
         return PairReference(self.sources[which], rng.choice(self.indices[which]))
 
     def all(self) -> list[PairReference]:
-        """Every pair once, the sources taking turns."""
+        """List every pair once, alternating between sources."""
         longest = max(map(len, self.indices))
         pairs = zip(self.sources, self.indices, strict=True)
         listed = [(i, PairReference(source, index)) for source, own in pairs for i, index in enumerate(own)]
@@ -100,37 +101,45 @@ class Mixture:
 def split_mixture(
     sources: Sequence[PairSource], *, weights: Sequence[float], held_out: float, seed: int
 ) -> tuple[Mixture, Mixture | None]:
-    """What is trained on and what is held out: whole scenes, by the hash of their names, one at least of each source.
+    """Split sources into training and held-out pairs, by whole groups in the order of their names' hashes.
 
-    None where no source has two scenes or `held_out` is 0. Sources weigh as `weights` says, or by their numbers.
+    Args:
+        sources: of pairs.
+        weights: relative, one per source; by the number of training pairs where empty.
+        held_out: share of the groups of each source, at least one group; 0 holds out none.
+        seed: of the drawing.
 
-    Raises: ValueError where there is no pair, or the weights do not fit.
+    Returns:
+        The training mixture, and the held-out one or None where nothing is held out.
+
+    Raises:
+        ValueError: a source has no pair, or the weights do not fit.
     """
     if not sources or not all(map(len, sources)):
         empty = next((source.name for source in sources if not len(source)), "no source")
         raise ValueError(f"training data: expected pairs, found none in {empty}")
     if weights and (len(weights) != len(sources) or min(weights) < 0 or sum(weights) <= 0):
         raise ValueError(f"--weights: expected {len(sources)} numbers of at least 0, found {list(weights)}")
-    trained, kept = [], []
+    training, validation = [], []
     for source in sources:
         groups = sorted({source.group(i) for i in range(len(source))}, key=_hash)
         count = max(1, round(held_out * len(groups))) if held_out > 0 and len(groups) > 1 else 0
-        out = set(groups[:count])
-        trained.append(tuple(i for i in range(len(source)) if source.group(i) not in out))
-        kept.append(tuple(i for i in range(len(source)) if source.group(i) in out))
-    chosen = tuple(weights) or tuple(float(len(own)) for own in trained)
-    train = Mixture(tuple(sources), chosen, tuple(trained), seed)
-    there = [i for i, own in enumerate(kept) if own]
-    if not there:
+        excluded = set(groups[:count])
+        training.append(tuple(i for i in range(len(source)) if source.group(i) not in excluded))
+        validation.append(tuple(i for i in range(len(source)) if source.group(i) in excluded))
+    shares = tuple(weights) or tuple(float(len(indices)) for indices in training)
+    train = Mixture(tuple(sources), shares, tuple(training), seed)
+    used = [i for i, indices in enumerate(validation) if indices]
+    if not used:
         return train, None
-    validation = Mixture(
-        tuple(sources[i] for i in there), tuple(chosen[i] for i in there), tuple(kept[i] for i in there), seed
+    held_out_mixture = Mixture(
+        tuple(sources[i] for i in used), tuple(shares[i] for i in used), tuple(validation[i] for i in used), seed
     )
-    return train, validation
+    return train, held_out_mixture
 
 
 def crop_to_size(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "{height} {width} *c"]:
-    """The picture at another size, its middle where the shapes differ."""
+    """Resize to cover `width` x `height` pixels, then crop the centre."""
     h, w = image.shape[:2]
     scale = max(width / w, height / h)
     larger = resize(image, max(width, round(w * scale)), max(height, round(h * scale)))
@@ -139,13 +148,13 @@ def crop_to_size(image: Float[Tensor, "h w *c"], width: int, height: int) -> Flo
 
 
 def crop_pair_to_size(pair: TrainingPair, width: int, height: int) -> TrainingPair:
-    """All pictures of a pair at one size."""
+    """Resize and crop all images of a pair, see `crop_to_size`."""
     images = (crop_to_size(image, width, height) for image in (pair.composite, pair.target, pair.background, pair.mask))
     return TrainingPair(*(torch.clamp(image, 0, 1) for image in images))
 
 
 def sample_seed(seed: int, position: int) -> int:
-    """Of the noise of the pair at a place in the order; the same on any number of machines."""
+    """Seed of the noise of the pair at a position; independent of the number of processes."""
     return int.from_bytes(hashlib.sha256(f"{seed}|{position}".encode()).digest()[:7], "big")
 
 

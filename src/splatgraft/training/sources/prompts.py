@@ -1,7 +1,7 @@
-"""Prompts of generated pictures: the paper's sentence (Sec. 4.3) over lists of our own. Draws nothing itself.
+"""Prompts of generated images: the paper's sentence (Sec. 4.3) filled from own lists of words.
 
-Objects are things that one might move, of many materials; environments say what they stand on by themselves; lightings
-name a direction or a hardness, since that is what a harmoniser must read; angles keep the floor in view.
+Objects are movable things of many materials. Environments include the surface that objects stand on. Lightings name a
+direction or hardness, which a harmoniser must recognise. Camera angles keep the floor in view.
 """
 
 import random
@@ -66,7 +66,7 @@ ANGLES = (
 
 @dataclass(frozen=True)
 class Prompt:
-    """One prompt and the words it was made of."""
+    """The words of one prompt."""
 
     object: str
     environment: str
@@ -75,12 +75,12 @@ class Prompt:
 
     @property
     def text(self) -> str:
-        """The sentence."""
+        """The prompt."""
         return TEMPLATE.format(article="an" if self.object[0] in "aeiou" else "a", **vars(self))
 
 
 def prompt(seed: int, number: int) -> Prompt:
-    """The prompt of a number: objects take turns in a shuffled order, the rest is drawn."""
+    """Make prompt `number`: objects alternate in a shuffled order, the other words are drawn at random."""
     rng = random.Random(f"prompt-{seed}-{number}")
     turn, place = divmod(number, len(OBJECTS))
     order = random.Random(f"objects-{seed}-{turn}").sample(OBJECTS, len(OBJECTS))

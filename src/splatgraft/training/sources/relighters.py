@@ -1,6 +1,6 @@
-"""What relights whole pictures for training: DiffusionRenderer in the user's own installation, or our stand-in.
+"""Relighting of whole images for training: DiffusionRenderer in the user's own installation, or a simple stand-in.
 
-Both say in every record which they are. Knows nothing about sources or training.
+The relighter's name is written into the record of every sample.
 """
 
 import subprocess
@@ -27,54 +27,55 @@ _PROGRAMS = {
         "cosmos_predict1/diffusion/inference/inference_forward_renderer.py",
     ),
 }
-"""Inverse and forward."""
+"""The programs for inverse and forward rendering, by variant."""
 
 
 @dataclass(frozen=True)
 class RelightingInput:
-    """A picture to relight."""
+    """An image to relight."""
 
     name: str
     image: Float[Tensor, "h w 3"]
     mask: Float[Tensor, "h w"]
-    """Of the object that matters."""
+    """Of the object."""
 
 
 @runtime_checkable
 class Relighter(Protocol):
-    """Makes pictures under other light."""
+    """Relights images by environment maps."""
 
     name: str
-    """For the record."""
+    """For the sample's record."""
     licence: str
 
     def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
-        """The picture under each environment map.
+        """Relight the image by each environment map.
 
-        Raises: ValueError where that fails.
+        Raises:
+            ValueError: the relighter fails.
         """
         ...
 
 
 class SilhouetteRelighter:
-    """Our own: the object's silhouette, inflated, under an environment map's diffuse light. No learnt model.
+    """Shades the object's inflated silhouette by an environment map's diffuse light, without a learned model.
 
-    It changes direction, colour and contrast of the light over the object, so that a harmoniser has something to undo;
-    it makes no reflections and knows no shape but the outline.
+    It changes direction, colour and contrast of the light on the object. There are no reflections and no shape but that
+    of the outline.
     """
 
     name = "stand-in of splatgraft (inflated silhouette, diffuse; not DiffusionRenderer)"
     licence = "own"
 
     def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
-        """The picture, its object shaded anew."""
+        """Relight the object; the other pixels stay."""
         normal = inflated_normals(draft.mask)
         pictures = []
         for path in lights:
             shading = _irradiance(read_environment(path), normal)
             inside = draft.mask[..., None]
             level = (shading * inside).sum((0, 1)) / inside.sum().clamp_min(1e-6)
-            # the mean over the object and its three channels is kept: what differs is direction and tint
+            # the mean over the object and its channels is kept, so that only direction and tint change
             ratio = shading / level.mean().clamp_min(1e-6)
             linear = linear_from_srgb(draft.image) * (1 + inside * (ratio - 1))
             pictures.append(srgb_from_linear(linear).clamp(0, 1))
@@ -84,16 +85,22 @@ class SilhouetteRelighter:
 class DiffusionRenderer:
     """NVIDIA's DiffusionRenderer (Liang et al. 2025): inverse, then forward rendering, by its own programs.
 
-    `svd`: github.com/nv-tlabs/diffusion-renderer; `cosmos`: github.com/nv-tlabs/cosmos1-diffusion-renderer. Commands
-    follow their documentation as it was; neither has been run with this adaptor yet.
+    `svd`: github.com/nv-tlabs/diffusion-renderer; `cosmos`: github.com/nv-tlabs/cosmos1-diffusion-renderer. The command
+    lines follow their documentation at the time of writing; untested with either.
     """
 
     licence = "pictures by NVIDIA's DiffusionRenderer, see its licence"
 
     def __init__(self, checkout: Path, python: Path, variant: Literal["svd", "cosmos"] = "svd") -> None:
-        """The installation, found complete.
+        """Check an installation.
 
-        Raises: ValueError where a program is missing or its Python does not start.
+        Args:
+            checkout: folder of its code.
+            python: interpreter that runs it.
+            variant: which of the two.
+
+        Raises:
+            ValueError: a program is missing, or the interpreter does not start.
         """
         self.name = f"DiffusionRenderer ({variant})"
         self._checkout, self._python, self._variant = checkout.resolve(), python, variant
@@ -109,9 +116,10 @@ class DiffusionRenderer:
             raise ValueError(f"{python}: expected a Python that runs {self.name}, found {error}") from error
 
     def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
-        """The picture under each environment map, at its own size.
+        """Relight the image by each environment map; results have its size.
 
-        Raises: ValueError where a program fails or makes another number of pictures.
+        Raises:
+            ValueError: a program fails or writes no image.
         """
         height, width = draft.mask.shape
         with tempfile.TemporaryDirectory() as name:
@@ -171,11 +179,11 @@ class DiffusionRenderer:
 
 
 def inflated_normals(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
-    """Unit normals (right, up, towards the camera) of the silhouette blown up like a cushion."""
+    """Unit normals (right, up, towards the camera) of the inflated silhouette."""
     inside = (mask > 0.5).numpy().astype(np.uint8)
     depth = cv2.distanceTransform(inside, cv2.DIST_L2, 5)
     reach = max(float(depth.max()), 1.0)
-    # a circle's profile: height^2 = reach^2 - (reach - depth)^2
+    # circular profile: height^2 = reach^2 - (reach - depth)^2
     height = np.sqrt(np.maximum(reach**2 - (reach - depth) ** 2, 0)).astype(np.float32)
     height = cv2.GaussianBlur(height, (0, 0), max(reach / 10, 0.8))
     down, right = np.gradient(height)
@@ -183,9 +191,10 @@ def inflated_normals(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
 
 
 def read_environment(path: Path) -> Float[Tensor, "h w 3"]:
-    """Linear light of an equirectangular .hdr map.
+    """Read the linear light of an equirectangular .hdr map.
 
-    Raises: ValueError where it cannot be read.
+    Raises:
+        ValueError: it cannot be read.
     """
     found = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR) if path.is_file() else None
     if found is None:
@@ -194,11 +203,11 @@ def read_environment(path: Path) -> Float[Tensor, "h w 3"]:
 
 
 def _irradiance(environment: Float[Tensor, "h w 3"], normal: Float[Tensor, "h2 w2 3"]) -> Float[Tensor, "h2 w2 3"]:
-    """Light that falls on each normal, up to a factor."""
+    """Irradiance at each normal, up to a factor; the map is reduced to 16 x 8 directions."""
     small = resize(environment, 16, 8)
     polar = (torch.arange(8) + 0.5) / 8 * torch.pi
-    around = (torch.arange(16) + 0.5) / 16 * 2 * torch.pi
-    theta, phi = torch.meshgrid(polar, around, indexing="ij")
+    azimuth = (torch.arange(16) + 0.5) / 16 * 2 * torch.pi
+    theta, phi = torch.meshgrid(polar, azimuth, indexing="ij")
     direction = torch.stack([theta.sin() * phi.sin(), theta.cos(), theta.sin() * phi.cos()], -1).reshape(-1, 3)
     power = (small * theta.sin()[..., None]).reshape(-1, 3)
     return (normal @ direction.T).clamp_min(0) @ power

@@ -1,4 +1,4 @@
-"""How `synth generated` and `synth orida` relight: by whom and under which environment maps. Relights nothing."""
+"""Options of relighting that `synth generated` and `synth orida` share: the relighter and its environment maps."""
 
 import sys
 from dataclasses import dataclass
@@ -11,25 +11,26 @@ from splatgraft.training.sources.relighters import DiffusionRenderer, Relighter,
 
 @dataclass(frozen=True)
 class RelightingOptions:
-    """By whom pictures are relit."""
+    """The relighter and its environment maps."""
 
     lights: Path = Path("lights")
     """Folder with .hdr environment maps."""
     each: int = 4
-    """Lights per picture."""
+    """Lights per image."""
     relighter: Literal["diffusion-renderer", "stand-in"] = "diffusion-renderer"
-    """The paper's, in your own installation; or ours, simple and without a model, which the manifest says."""
+    """The paper's DiffusionRenderer, in your own installation; or a simple stand-in without a learned model."""
     renderer: Path | None = None
     """Folder of DiffusionRenderer's code."""
     renderer_variant: Literal["svd", "cosmos"] = "svd"
-    """Which of the two."""
+    """Which of its two versions."""
     renderer_python: Path | None = None
-    """The Python that runs it; this one where not given."""
+    """The Python that runs it; the current one where not given."""
 
     def open(self, seed: int) -> Lighting:
-        """The relighter, found complete.
+        """Prepare the relighter and list the maps; `seed` determines the choice of maps.
 
-        Raises: ValueError where it or the maps are missing.
+        Raises:
+            ValueError: the relighter or the maps are missing.
         """
         maps = sorted(self.lights.glob("*.hdr")) if self.lights.is_dir() else []
         if not maps:

@@ -1,6 +1,6 @@
-"""Pairs made of pictures that were relit: generated ones and photographs (paper, Sec. 4.2). Knows no network.
+"""The source of pairs made of relit images: generated ones and photographs (paper, Sec. 4.2).
 
-manifest.jsonl                 a line a sample: folder, group, relit (how many), and where all came from
+manifest.jsonl                 one line per sample: folder, group, relit (number of lights), provenance
 NAME/target.png  background.png  mask.png  relit_0.png ..  record.json
 """
 
@@ -26,17 +26,17 @@ RECORD_FILE = "record.json"
 
 @dataclass(frozen=True)
 class RelitSample:
-    """One target and what was made for it, before it is written."""
+    """One target with its background and relit images."""
 
     target: Float[Tensor, "h w 3"]
     background: Float[Tensor, "h w 3"]
     mask: Float[Tensor, "h w"]
     relit: Sequence[Float[Tensor, "h w 3"]]
-    """The whole picture under other light, a picture a light."""
+    """The whole target under other lights, one image per light."""
 
 
 def write_sample(folder: Path, sample: RelitSample, record: Mapping[str, Any]) -> None:
-    """Write one sample, whole or not at all; `record` says group, licence and how each picture was made."""
+    """Write one sample atomically; `record` holds group, licence and provenance of each image."""
     with atomic_folder(folder) as new:
         write_image(new / "target.png", sample.target)
         write_image(new / "background.png", sample.background)
@@ -47,7 +47,7 @@ def write_sample(folder: Path, sample: RelitSample, record: Mapping[str, Any]) -
 
 
 def write_manifest(out: Path) -> int:
-    """One line for each whole sample; returns their number."""
+    """Write one line for each complete sample; returns their number."""
     lines = []
     for path in sorted(out.glob(f"*/{RECORD_FILE}")):
         lines.append(json.dumps({"folder": path.parent.name, **json.loads(path.read_text())}))
@@ -57,12 +57,13 @@ def write_manifest(out: Path) -> int:
 
 
 class RelitPairs:
-    """The samples of one folder, a pair a light."""
+    """The samples of one folder; one pair per sample and light."""
 
     def __init__(self, folder: Path) -> None:
         """Read the manifest.
 
-        Raises: ValueError where it is missing or broken.
+        Raises:
+            ValueError: it is missing or broken.
         """
         self.name = str(folder)
         self._pairs: list[tuple[Path, str, int]] = []
@@ -85,26 +86,27 @@ class RelitPairs:
         return len(self._pairs)
 
     def group(self, index: int) -> str:
-        """The scene, or the prompt's object."""
+        """The photograph's scene, or the prompt's object."""
         return self._pairs[index][1]
 
     def key(self, index: int, role: Role) -> str:
-        """Path, size and time of the file for the role."""
+        """Identify the file of a role by path, size and time."""
         folder, _, light = self._pairs[index]
         return file_fingerprint(folder / (f"relit_{light}.png" if role == "composite" else f"{role}.png")) + f"|{role}"
 
     def read(self, index: int) -> TrainingPair:
-        """A pair, its composite made here: the relit object brought to the exposure of the one in the scene.
+        """Read a pair; its composite has the relit object at the exposure of the object in the scene.
 
-        Raises: ValueError where a file is missing or broken.
+        Raises:
+            ValueError: a file is missing or broken.
         """
         folder, _, light = self._pairs[index]
         target, background = read_rgb(folder / "target.png"), read_rgb(folder / "background.png")
         mask, relit = read_mask(folder / "mask.png"), read_rgb(folder / f"relit_{light}.png")
         for name, picture in (("background", background), ("mask", mask), (f"relit_{light}", relit)):
             if picture.shape[:2] != target.shape[:2]:
-                wanted, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
-                raise ValueError(f"{folder / name}.png: expected {wanted} pixels as target.png, found {found}")
+                expected, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
+                raise ValueError(f"{folder / name}.png: expected {expected} pixels as target.png, found {found}")
         return TrainingPair(
             composite(match_statistics(relit, target, mask), background, mask), target, background, mask
         )

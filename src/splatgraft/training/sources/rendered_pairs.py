@@ -1,4 +1,4 @@
-"""Pairs that Blender rendered (`splatgraft synth pairs`; paper, Sec. 4.2). Knows no network."""
+"""The source of pairs rendered by Blender (`splatgraft synth pairs`; paper, Sec. 4.2)."""
 
 from pathlib import Path
 
@@ -7,12 +7,13 @@ from splatgraft.training.sources.pair_source import Role, TrainingPair
 
 
 class RenderedPairs:
-    """The sound pairs of one folder, composites made while reading."""
+    """The pairs in the manifest of one folder; composites are computed when they are read."""
 
     def __init__(self, folder: Path) -> None:
         """Read the manifest.
 
-        Raises: ValueError where it is missing or broken.
+        Raises:
+            ValueError: it is missing or broken.
         """
         self.name = str(folder)
         self._samples = read_manifest(folder)
@@ -21,26 +22,28 @@ class RenderedPairs:
         return len(self._samples)
 
     def group(self, index: int) -> str:
-        """The scene."""
+        """Name of the pair's scene."""
         return self._samples[index].folder.name
 
     def key(self, index: int, role: Role) -> str:
-        """Path, size and time of the file that is rendered for the role."""
+        """Identify the file of a role by path, size and time."""
         return file_fingerprint(_file(self._samples[index], role)) + f"|{role}"
 
     def read(self, index: int) -> TrainingPair:
-        """A pair.
+        """Read a pair.
 
-        Raises: ValueError where a file is missing or broken.
+        Raises:
+            ValueError: a file is missing or broken.
         """
         pair = load_pair(self._samples[index])
         return TrainingPair(pair.composite, pair.target, pair.background, pair.mask)
 
 
 def file_fingerprint(path: Path) -> str:
-    """What changes when a file does.
+    """Identify a file's content by path, size and time of modification.
 
-    Raises: ValueError where it is missing.
+    Raises:
+        ValueError: it is missing.
     """
     try:
         status = path.stat()

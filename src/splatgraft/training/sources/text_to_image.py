@@ -1,4 +1,7 @@
-"""Pictures from prompts by the stock FLUX.1-schnell: 4 steps, guidance 1 (paper, Sec. 4.3). Not yet run."""
+"""Images from prompts by the stock FLUX.1-schnell pipeline: 4 steps, guidance 1 (paper, Sec. 4.3).
+
+Untested with the real weights.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,26 +11,33 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_WHOLE_BYTES = 36 << 30
-"""bf16 FLUX with both text encoders, and room to work."""
+_PIPELINE_BYTES = 36 << 30
+"""GPU memory of bf16 FLUX with both text encoders and its activations. An estimate."""
 
 
 class TextToImage:
-    """A loaded pipeline."""
+    """A loaded text-to-image pipeline."""
 
     def __init__(self, pipeline: Any, device: torch.device, size: tuple[int, int], say: Callable[[str], None]) -> None:
-        """`size`: width and height, px."""
+        """Move a pipeline to a device.
+
+        Args:
+            pipeline: a `FluxPipeline`.
+            device: where it runs; its parts stay on the CPU in turn where GPU memory does not suffice.
+            size: width and height of the images, pixels.
+            say: receives a message where parts stay on the CPU.
+        """
         self._pipeline, self._size = pipeline, size
-        if device.type == "cuda" and torch.cuda.mem_get_info(device)[0] < _WHOLE_BYTES:
-            say("painter: parts are fetched from the CPU in turn, since all together do not fit")
+        if device.type == "cuda" and torch.cuda.mem_get_info(device)[0] < _PIPELINE_BYTES:
+            say("text to image: parts are fetched from the CPU in turn, since GPU memory does not hold all of them")
             pipeline.enable_model_cpu_offload()
         else:
             pipeline.to(device)
 
     def generate(self, prompt: str, *, seed: int) -> Float[Tensor, "h w 3"]:
-        """The picture of a prompt and a seed."""
+        """Generate the image of a prompt and a seed, sRGB in [0, 1]."""
         width, height = self._size
-        made = self._pipeline(
+        image = self._pipeline(
             prompt,
             width=width,
             height=height,
@@ -35,4 +45,4 @@ class TextToImage:
             guidance_scale=1.0,
             generator=torch.Generator().manual_seed(seed),
         ).images[0]
-        return torch.from_numpy(np.array(made.convert("RGB"))).float() / 255
+        return torch.from_numpy(np.array(image.convert("RGB"))).float() / 255

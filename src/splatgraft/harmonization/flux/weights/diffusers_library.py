@@ -1,4 +1,4 @@
-"""Classes of the diffusers library, imported when one is asked for (the only module that imports diffusers)."""
+"""Classes of the diffusers library, imported on first use (the only module that imports diffusers)."""
 
 from typing import Any
 

@@ -177,7 +177,7 @@ def _placement(
 ) -> Placement:
     pixels, views = work
     if options.precision != "auto":
-        return Placement(options.precision, False, f"flux: {options.precision} on {device}, as asked")  # pyright: ignore
+        return Placement(options.precision, False, f"flux: {options.precision} on {device}, as requested")  # pyright: ignore
     if device.type != "cuda":
         return Placement("float32", False, f"flux: float32 on {device}; minutes per view at FLUX's size")
     config = checked.config
