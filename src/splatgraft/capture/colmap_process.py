@@ -94,13 +94,18 @@ def _find_features(job: dict[str, Any], database: Path) -> None:
     alone = [names[0] for names in job["groups"] if len(names) == 1]
     groups = [(pycolmap.CameraMode.SINGLE, names) for names in job["groups"] if len(names) > 1]
     groups += [(pycolmap.CameraMode.PER_IMAGE, alone)] if alone else []
+    photos, reader = Path(job["photos"]), pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+    pycolmap.Database.open(database).close()
+    for mode, names in groups:
+        # before the features, whose threads would number the photos as they finish
+        pycolmap.import_images(database, photos, mode, image_names=names, options=reader)
     for mode, names in groups:
         pycolmap.extract_features(
             database,
-            Path(job["photos"]),
+            photos,
             image_names=names,
             camera_mode=mode,
-            reader_options=pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL"),
+            reader_options=reader,
             extraction_options=extraction,
             device=pycolmap.Device.cpu,
         )
@@ -256,7 +261,8 @@ def _median_focals(database: Path, models: list[Any]) -> dict[int, float]:
 def _global_models(job: dict[str, Any], database: Path, name: str) -> list[Any]:
     import pycolmap
 
-    options = pycolmap.GlobalPipelineOptions(num_threads=job["threads"], random_seed=job["seed"], min_model_size=3)
+    # one thread: more add sums in another order each time, and save only a tenth of the time
+    options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=job["seed"], min_model_size=3)
     options.mapper.bundle_adjustment.ceres.use_gpu = False
     options.mapper.global_positioning.use_gpu = False
     folder = Path(job["models"]) / name
