@@ -129,15 +129,15 @@ class _Asked:
         facing = torch.nn.functional.normalize(pixels.normals + _smooth_noise(pixels.normals.shape, noise), dim=-1)
         facing = facing[inside].contiguous()
         points = surfels(pixels.points[inside] + _LIFT * pixels.normals[inside], facing, _GRAY)
-        arrives = scene_visibility(self._around, points.means, facing)
-        arrives = torch.where(torch.as_tensor(beams.is_source), arrives, torch.ones(()))
+        shares = scene_visibility(self._around, points.means, facing)
+        shares = torch.where(torch.as_tensor(beams.is_source), shares, torch.ones(()))
         own = self_visibility(self._maps, points, facing, beams)
-        lit = irradiance(beams, facing, arrives=own * arrives)
+        lit = irradiance(beams, facing, sample_visibility=own * shares)
         before = sample_light(self._then)
-        was = irradiance(before, facing, arrives=self_visibility(self._maps, points, facing, before))
+        was = irradiance(before, facing, sample_visibility=self_visibility(self._maps, points, facing, before))
         sure = Normals(facing, torch.ones(len(facing)), torch.ones(len(facing), dtype=torch.bool))
         out = torch.zeros(*inside.shape, 3)
-        out[inside] = shade_ratio(lit, was, sure, torch.ones(len(facing)), seen=self._seen).log()
+        out[inside] = shade_ratio(lit, was, sure, torch.ones(len(facing)), coverage=self._seen).log()
         return out
 
     def scene_log_ratio(self) -> Float[Tensor, "v h w 3"]:
@@ -146,8 +146,8 @@ class _Asked:
         points, facing = pixels.points[outside], pixels.normals[outside]
         near = reachable(points, self._ball, beams, farthest=self._region.radius)
         points, facing = points[near] + _LIFT * facing[near], facing[near].contiguous()
-        arrives = scene_visibility(self._around, points, facing)
-        ratio = scene_ratio(self._maps, points, facing, arrives=arrives)
+        shares = scene_visibility(self._around, points, facing)
+        ratio = scene_ratio(self._maps, points, facing, sample_visibility=shares)
         whole = torch.zeros(len(near), 3)
         whole[near] = (ratio.shadow + ratio.bounce).log()
         out = torch.zeros(*outside.shape, 3)
