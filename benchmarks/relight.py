@@ -17,6 +17,7 @@ from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
+from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.relighting import Light, LightSource, SourceScene, relight
 from splatgraft.relighting.light.estimate import estimate_light
 from splatgraft.relighting.light.light import fit_ambient
@@ -29,7 +30,7 @@ def surfels(points: torch.Tensor, normals: torch.Tensor, width: float, gray: flo
     n = len(points)
     rotations = frames_along(-normals).transpose(1, 2)
     log_scales = torch.tensor([width, width, 0.1 * width]).log().repeat(n, 1)
-    sh = torch.full((n, 1, 3), (gray - 0.5) / 0.28209479)
+    sh = dc_from_rgb(torch.full((n, 1, 3), gray))
     return Gaussians(points, log_scales, quaternion_from_rotation(rotations), torch.full((n,), 2.0), sh)
 
 

@@ -1,4 +1,4 @@
-"""How right shadows are where the truth is known: a ball and a box on a plane, by rays, against the transfer's picture.
+"""Error of shadows of a ball and a box on a plane: the transfer's picture against ray casting.
 
 `python benchmarks/relight_truth.py [--pictures FOLDER]`. The light is given: a sun of half a degree, round lights of 10
 and 30 degrees, an even sky. The plane is made of small, middle or large Gaussians; those wider than an edge are split
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
-from splatgraft.core.directions import even_directions, frames_along
+from splatgraft.core.directions import even_directions, frames_along, vogel_offsets
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.rotations import quaternion_from_rotation
@@ -36,7 +36,7 @@ VIEW = 7
 
 
 @dataclass(frozen=True)
-class BoundingSphere:
+class Ball:
     """Standing on the plane z = 0."""
 
     radius: float = 0.3
@@ -119,14 +119,12 @@ def plane(width: float) -> Gaussians:
 
 def disk(direction: Tensor, radius_deg: float, count: int) -> Float[Tensor, "n 3"]:
     """Directions spread evenly over the solid angle of a round light."""
-    right, down, _ = frames_along(direction[None])[0]
     i = torch.arange(count) + 0.5
     cosine = 1 - i / count * (1 - math.cos(math.radians(radius_deg)))
-    r, angle = (1 - cosine**2).sqrt(), i * math.pi * (3 - math.sqrt(5))
-    return (r * angle.cos())[:, None] * right + (r * angle.sin())[:, None] * down + cosine[:, None] * direction
+    return vogel_offsets(direction, (1 - cosine**2).sqrt(), i) + cosine[:, None] * direction
 
 
-def true_ratio(shape: BoundingSphere | Box, light: Light, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
+def true_ratio(shape: Ball | Box, light: Light, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
     """Irradiance on the plane with the object over that without, by rays."""
     hemisphere = even_directions(8192)
     hemisphere = hemisphere[hemisphere[:, 2] > 0]
@@ -186,13 +184,11 @@ class Measured:
 
     @property
     def rmse(self) -> float:
-        """Over the band."""
+        """Root mean square error over the band."""
         return float(((self.truth - self.found)[self.band] ** 2).mean().sqrt())
 
 
-def measure(
-    shape: BoundingSphere | Box, light: Light, truth: Float[Tensor, "h w"], *, width: float, split: bool
-) -> Measured:
+def measure(shape: Ball | Box, light: Light, truth: Float[Tensor, "h w"], *, width: float, split: bool) -> Measured:
     """The transfer's shadow on a plane of Gaussians `width` wide, in one view, beside the truth."""
     scene, thing, cameras = plane(width), shape.gaussians(), views()
     nothing_erased = torch.zeros(scene.count, dtype=torch.bool)
@@ -201,7 +197,7 @@ def measure(
     relit = relight(composite, cameras, light=light, options=options)
     camera = cameras[VIEW]
     before = render(scene, camera)
-    # the plane alone is looked at: what the object's own splats cover is measured nowhere
+    # the plane alone is rendered; pixels that the object's own splats cover are not measured
     after = render(relit.shaded().select(~relit.is_object), camera)
     covered = render(thing, camera).alpha[0] > 0.001
     light_before, light_after = (linear_from_srgb(r.color[0].clamp(0, 1)).mean(-1) for r in (before, after))
@@ -226,7 +222,7 @@ def main() -> None:
     errors: dict[tuple[str, bool], list[float]] = {(kind, split): [] for kind in KINDS for split in (False, True)}
     for light_name, light in lights().items():
         kind = "hard" if light_name == "hard" else "soft"
-        for shape in (BoundingSphere(), Box()):
+        for shape in (Ball(), Box()):
             truth = true_ratio(shape, light, on_plane(camera)).reshape(height, wide)
             for size, width in SIZES.items():
                 row = {}

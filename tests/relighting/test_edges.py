@@ -1,4 +1,4 @@
-"""Shadows in the picture against rays: a ball on a plane of Gaussians half as wide as the ball, or a tenth."""
+"""Rendered shadows against ray casting: a ball on a plane of Gaussians half as wide as the ball, or a tenth."""
 
 import math
 from dataclasses import replace
@@ -70,7 +70,7 @@ def error(width, options) -> float:
     away = center - ground
     shadow = (away**2).sum(-1) - (away @ sun) ** 2 < RADIUS**2
     band = shadow & (render(ball, camera).alpha[0] < 0.001) & (before.alpha[0] > 0.9)
-    return float(((ratio - 0.04)[band] ** 2).mean().sqrt())  # 0.04: no shadow is let get darker
+    return float(((ratio - 0.04)[band] ** 2).mean().sqrt())  # 0.04: the darkest shadow
 
 
 @pytest.mark.parametrize(

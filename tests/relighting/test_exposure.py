@@ -1,4 +1,4 @@
-"""The first form of light transfer on built rooms: light that was changed is found again; doubt changes nothing."""
+"""Transfer by one gain per object on synthetic rooms: the known ratio is found; unknown sources change nothing."""
 
 import math
 from dataclasses import fields
@@ -71,7 +71,7 @@ def test_an_unknown_or_empty_source_changes_no_bit(scene):
     assert all("pasted as it is" in line for line in report)
 
 
-def test_one_source_per_object_is_asked_for():
+def test_one_source_per_object_is_required():
     composite = compose(shell([0.5, 0.5, 0.5]), [], target_from_objects=[])
     assert relight_by_gain(composite, cameras(), sources=[])[1] == ()
     with pytest.raises(ValueError, match="expected 0 source scenes, found 1"):

@@ -1,4 +1,4 @@
-"""A reflection of the old light becomes one of the new light; what is matt stays matt."""
+"""Reflections of the old light become those of the new light; matt surfaces stay matt."""
 
 import math
 

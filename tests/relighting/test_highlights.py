@@ -1,4 +1,4 @@
-"""The light's direction told by glints alone: on a bare glossy plane, where no shadow speaks."""
+"""The light's direction from highlights alone: on a bare glossy plane without shadows."""
 
 import math
 
@@ -6,16 +6,18 @@ import pytest
 import torch
 
 from splatgraft.core import spherical_harmonics
+from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.core.rotations import quaternion_from_rotation
+from splatgraft.relighting.light.direction_estimate import estimate_direction
 from splatgraft.relighting.light.highlight_evidence import find_highlights
-from splatgraft.relighting.light.shadow_evidence import estimate_direction
 from splatgraft.relighting.shading.normals import estimate_normals
 
 UP = torch.tensor([0.0, 0.0, 1.0])
+REGION = BoundingSphere(torch.zeros(3), 1.0)
 
 
 def views():
@@ -45,30 +47,30 @@ def table(sun, gloss):
 
 
 @pytest.mark.parametrize("azimuth", [0.3, 2.4, 4.5])
-def test_a_bare_glossy_table_tells_the_direction(azimuth):
+def test_highlights_on_a_bare_table_give_the_direction(azimuth):
     height = math.radians(38)
     sun = torch.tensor([math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height)])
     scene = table(sun, gloss=0.4)
     normals = estimate_normals(scene, views())
-    glints = find_highlights(scene, normals, views(), center=torch.zeros(3), radius=1.0)
-    assert glints is not None
-    found = estimate_direction(scene, normals, center=torch.zeros(3), radius=1.0, up=UP, highlights=glints)
+    highlights = find_highlights(scene, normals, views(), region=REGION)
+    assert highlights is not None
+    found = estimate_direction(scene, normals, region=REGION, up=UP, highlights=highlights)
     assert found is not None
     off = math.degrees(math.acos(float(found.direction @ sun)))
     # tried directions lie 4 degrees apart near the best; harmonics of degree 3 shift the peak of the lobe by up to 6
     assert off < 10
-    assert found.heard > 0.5
+    assert found.highlight_evidence > 0.5
     assert found.confidence > 0.5
 
 
-def test_a_matt_table_tells_nothing():
+def test_a_matt_table_has_no_highlights():
     scene = table(UP, gloss=0.0)
-    glints = find_highlights(scene, estimate_normals(scene, views()), views(), center=torch.zeros(3), radius=1.0)
+    highlights = find_highlights(scene, estimate_normals(scene, views()), views(), region=REGION)
     # what is left is the rounding of float32
-    assert glints is None or float(glints.change.abs().max()) < 1e-5
+    assert highlights is None or float(highlights.change.abs().max()) < 1e-5
 
 
 def test_flat_colours_have_no_highlights():
     scene = table(UP, gloss=0.4).with_sh_degree(0)
     normals = estimate_normals(scene, views())
-    assert find_highlights(scene, normals, views(), center=torch.zeros(3), radius=1.0) is None
+    assert find_highlights(scene, normals, views(), region=REGION) is None

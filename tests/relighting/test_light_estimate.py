@@ -1,4 +1,4 @@
-"""The light found in scenes whose light is known: votes of shadows, patches of a panorama, normals, splits."""
+"""The estimated light in scenes of known light: shadow evidence, patches of a panorama, normals, splits."""
 
 import math
 
@@ -6,19 +6,20 @@ import torch
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.directions import even_directions, even_pairs, fit_sh, frames_along
+from splatgraft.core.directions import even_directions, fit_sh, frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.core.splitting import split_along
+from splatgraft.relighting.light.direction_estimate import estimate_direction
 from splatgraft.relighting.light.estimate import estimate_light
 from splatgraft.relighting.light.light import fit_ambient
-from splatgraft.relighting.light.shadow_evidence import estimate_direction
 from splatgraft.relighting.shading.normals import estimate_normals
 from splatgraft.rendering import render
 
 UP = torch.tensor([0.0, 0.0, 1.0])
+REGION = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.0)
 
 
 def colored(points, normals, width, rgb) -> Gaussians:
@@ -62,12 +63,10 @@ def sunlit_scene(sun, strength):
     return colored(point[keep], normal[keep], 0.03, srgb_from_linear(gray)[keep, None].repeat(1, 3))
 
 
-def test_shadows_tell_where_the_sun_is_and_how_strong():
+def test_shadows_give_the_direction_and_strength_of_the_sun():
     sun = torch.nn.functional.normalize(torch.tensor([0.6, -0.5, 0.8]), dim=0)
     scene = sunlit_scene(sun, strength=3.0)
-    found = estimate_direction(
-        scene, estimate_normals(scene, views()), center=torch.tensor([0, 0, 0.3]), radius=2.0, up=UP
-    )
+    found = estimate_direction(scene, estimate_normals(scene, views()), region=REGION, up=UP)
     assert found is not None
     # tried directions lie 8 degrees apart, the finer ones 2
     assert math.degrees(math.acos(float(found.direction @ sun))) < 6
@@ -78,9 +77,7 @@ def test_shadows_tell_where_the_sun_is_and_how_strong():
 
 def test_an_even_sky_gives_no_confident_sun():
     scene = sunlit_scene(UP, strength=0.0)
-    found = estimate_direction(
-        scene, estimate_normals(scene, views()), center=torch.tensor([0, 0, 0.3]), radius=2.0, up=UP
-    )
+    found = estimate_direction(scene, estimate_normals(scene, views()), region=REGION, up=UP)
     assert found is None or found.confidence < 0.3 or float(found.strength.mean()) < 0.2
 
 
@@ -96,21 +93,16 @@ def test_a_bright_window_is_found_in_the_panorama():
     main = light.sources[0]
     # half the patch's radius: its edge is ragged by the splats' width, 3 degrees
     assert math.degrees(math.acos(min(1.0, float(torch.tensor(main.direction) @ window)))) < 5
-    assert main.confidence < 0.7  # no shadow speaks for it
+    assert main.confidence < 0.7  # no shadow is evidence for it
 
 
-def test_smooth_fit_returns_what_it_was_made_of_and_stays_calm_where_nothing_was_seen():
+def test_a_harmonic_fit_of_half_the_sphere_recovers_an_even_light():
     around = even_directions(2000)
     ambient = fit_ambient(torch.tensor([0.2, 0.3, 0.4]))
     values = torch.tensor([0.2, 0.3, 0.4]).repeat(2000, 1)
     half = (around[:, 2] < 0).float()
     # the ridge takes a few parts in 1e3 where half is unseen
     assert torch.allclose(fit_sh(around, values, half), ambient, atol=5e-3)
-
-
-def test_opposites_are_exact():
-    pairs = even_pairs(32)
-    assert torch.equal(pairs[:16], -pairs[16:])
 
 
 def test_normals_of_a_ball_point_outwards():

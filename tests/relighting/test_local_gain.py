@@ -1,4 +1,4 @@
-"""One gain per channel: it measures what was done to the light, stays within its bounds, and moves colours exactly."""
+"""One gain per channel: it equals the ratio of known lights, stays within its limits, and is applied exactly."""
 
 import math
 
@@ -60,7 +60,7 @@ def test_same_light_changes_no_bit():
     assert torch.equal(apply_gain(object_, found.gain).sh, object_.sh)
 
 
-def test_bounds_hold_and_are_told():
+def test_gains_beyond_the_limits_are_held_back_and_reported():
     found = local_gain(panorama([0.01, 0.01, 0.01]), panorama([0.9, 0.9, 0.9]), source_up=UP, target_up=UP)
     assert torch.allclose(found.gain, torch.full((3,), 4.0))
     assert found.held_back

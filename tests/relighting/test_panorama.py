@@ -1,4 +1,4 @@
-"""Cube maps: everything is seen once, light arrives from where it is, what is unseen is marked."""
+"""Cube maps: all directions are covered once, radiance is right, uncaptured directions are marked."""
 
 import math
 
@@ -63,7 +63,7 @@ def test_light_is_seen_in_its_direction_in_linear_light():
     assert (above - linear_from_srgb(torch.tensor([0.9, 0.6, 0.3]))).abs().max() < 2e-3
 
 
-def test_coverage_tells_what_is_missing():
+def test_coverage_is_the_captured_share():
     directions = even()
     half = directions[directions[:, 2] > 0]
     seen = render_panorama(shell(torch.full((len(half), 3), 0.5), half), torch.zeros(3), size=32)

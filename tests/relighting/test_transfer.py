@@ -137,7 +137,7 @@ def test_shadow_of_a_ball_matches_ray_casting():
     to_center = torch.tensor([0.0, 0.0, 0.5]) - points
     along = to_center @ rays.T
     hit = (along > 0) & ((to_center**2).sum(1, keepdim=True) - along**2 < 0.3**2)
-    truth = hit.float().mean(1).clamp_max(0.96)  # no shadow is let get darker
+    truth = hit.float().mean(1).clamp_max(0.96)  # the darkest shadow leaves 0.04
     band = (truth > 0.02) | (lost > 0.02)
     # the bound of the issue for soft shadows
     assert ((lost - truth)[band] ** 2).mean().sqrt() < 0.03
@@ -162,7 +162,7 @@ def test_two_objects_shadow_each_other():
     relit = relight(placed(left, right), cameras(), light=sun_from(-1, 0, 0.1), options=WHOLE)
     bodies = relit.shadow[relit.is_object].mean(1)
     first, second = bodies.chunk(2)
-    # low light from the left: the right one stands in the left one's shadow, not the other way round
+    # low light from the left: the right one is in the left one's shadow, not the other way round
     assert second.min() < 0.5
     assert first.mean() > second.mean() + 0.05
 
@@ -195,7 +195,7 @@ def test_erased_and_far_gaussians_keep_every_bit():
     assert int((~relit.is_object).sum()) == scene.count - 10
     kept = relit.shaded().sh[scene.count - 11]
     assert torch.equal(kept[:1], far.sh[0])
-    # a scene without bands has one where an edge leans; elsewhere it is empty
+    # a scene of degree 0 gets a first band at shadow edges; elsewhere it is empty
     assert bool((kept[1:] == 0).all())
 
 
@@ -216,7 +216,7 @@ def test_splitting_sharpens_and_keeps_count_bounded():
     assert torch.equal(relit.origin.unique(), torch.arange(composite.merged()[0].count))
 
 
-def test_cache_gives_what_a_fresh_transfer_gives():
+def test_a_cached_transfer_equals_a_fresh_one():
     light, cache, scene, body, views = sun_from(-1, 0, 1), Memo(), floor(), ball(), cameras()
     erased = torch.zeros(scene.count, dtype=torch.bool)
 
@@ -241,7 +241,7 @@ def test_shade_follows_the_ratio_of_two_even_lights():
     assert torch.allclose(relit.shade[relit.is_object].mean(), expected, rtol=0.05)
 
 
-def test_bad_places_give_copy_paste_and_a_plain_reason():
+def test_places_without_light_give_the_plain_composite_and_a_reason():
     nothing = placed((ball(), at(0.0, 0.0, 0.35)), target=empty())
     inside = placed((ball(), at(0.0, 0.0, 0.0)), target=ball(radius=0.09, count=2000))
     night = surfels(20 * even_directions(4000), -even_directions(4000), width=0.7, rgb=(0.0, 0.0, 0.0))
@@ -252,7 +252,7 @@ def test_bad_places_give_copy_paste_and_a_plain_reason():
         assert torch.equal(relit.shaded().sh, composite.merged()[0].sh)
 
 
-def test_one_source_per_object_is_asked_for():
+def test_one_source_per_object_is_required():
     with pytest.raises(ValueError, match="expected 1 source scenes, found 2"):
         relight(placed((ball(), at(0.0, 0.0, 0.35))), cameras(), sources=(None, None))
 
@@ -274,7 +274,7 @@ def test_light_json_round_trip_and_its_messages():
         assert "\n" not in str(caught.value)
 
 
-def test_the_old_place_loses_the_shadow_that_was_there():
+def test_shadow_removal_clears_the_old_place():
     scene, light = floor(), sun_from(-1, 0, 1)
     normals = even_directions(3000)
     side = light.irradiance(normals) / light.irradiance(torch.tensor([[0.0, 0.0, 1.0]]))

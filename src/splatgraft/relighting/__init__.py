@@ -1,4 +1,4 @@
-"""Relight: what the new place's light does to an object, and the object to it. Knows nothing about files or views."""
+"""Light transfer: an object gets the light of its new place, and the place gets the object's shadow and bounce."""
 
 from splatgraft.relighting.layers import LayerWeights, Relit
 from splatgraft.relighting.light.light import Light, LightSource, light_from_json, light_to_json

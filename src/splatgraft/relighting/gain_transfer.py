@@ -1,6 +1,7 @@
-"""The first form of light transfer, whole: each object under the gain between its two places. Casts no shadow."""
+"""Light transfer by one gain per object and channel, from the light around its two places; casts no shadow."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import Cameras
@@ -19,10 +20,17 @@ def relight_by_gain(
     sources: Sequence[SourceScene | None],
     options: GainOptions = GainOptions(),
 ) -> tuple[Composite, tuple[str, ...]]:
-    """`composite` with exposure and white balance of every object adjusted, and a sentence on each.
+    """Adjust exposure and white balance of every object in a composite.
 
-    `cameras` are the target's; `sources` holds, per object, the scene it was taken from. Where that is unknown, or
-    one of the places shows no light, the object stays as it was captured and the sentence says so.
+    Args:
+        composite: Target scene and placed objects.
+        cameras: Of the target's capture.
+        sources: Per object the scene that it was taken from; None where that is not known.
+        options: Limits of a gain.
+
+    Returns:
+        The composite and a sentence on each object. An object stays as it was captured where its source is not known
+        or there is no light at one of its places, and the sentence gives the reason.
 
     Raises: ValueError where there is not one source (or None) per object.
     """
@@ -36,8 +44,9 @@ def relight_by_gain(
         if placed.gaussians.count == 0:
             gain = "It is empty."
         elif source is not None:
-            place = bounding_sphere(placed.in_target())
-            gain = _gain_between((scene, place, cameras), (source, bounding_sphere(placed.gaussians)), options)
+            target = _Place(scene, cameras, bounding_sphere(placed.in_target()))
+            origin = _Place(source.gaussians, source.cameras, bounding_sphere(placed.gaussians))
+            gain = _gain_between(origin, target, options)
         if isinstance(gain, LocalGain):
             recolored.append(apply_gain(placed.gaussians, gain.gain))
             report.append(name + gain.describe())
@@ -47,17 +56,22 @@ def relight_by_gain(
     return composite.with_object_colors(tuple(recolored)), tuple(report)
 
 
-def _gain_between(
-    target: tuple[Gaussians, BoundingSphere, Cameras], origin: tuple[SourceScene, BoundingSphere], options: GainOptions
-) -> LocalGain | str:
-    """The gain from the object's old place to its new one, or a sentence that says why there is none."""
-    scene, place, cameras = target
-    source, own_place = origin
-    after, problem = panorama_at(scene, place)
-    if after is None:
+@dataclass(frozen=True)
+class _Place:
+    """An object's place in a scene."""
+
+    scene: Gaussians
+    cameras: Cameras
+    sphere: BoundingSphere
+
+
+def _gain_between(source: _Place, target: _Place, options: GainOptions) -> LocalGain | str:
+    """The gain from the object's old place to its new one, or a sentence that gives the reason why there is none."""
+    target_panorama, problem = panorama_at(target.scene, target.sphere)
+    if target_panorama is None:
         return f"In the target: {problem}"
-    before, problem = panorama_at(source.gaussians, own_place)
-    if before is None:
+    source_panorama, problem = panorama_at(source.scene, source.sphere)
+    if source_panorama is None:
         return f"In the source: {problem}"
-    source_up, target_up = estimate_up(source.cameras), estimate_up(cameras)
-    return local_gain(before, after, source_up=source_up, target_up=target_up, options=options)
+    source_up, target_up = estimate_up(source.cameras), estimate_up(target.cameras)
+    return local_gain(source_panorama, target_panorama, source_up=source_up, target_up=target_up, options=options)

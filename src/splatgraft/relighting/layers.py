@@ -1,7 +1,4 @@
-"""The result of a transfer: a composite whose light is kept in layers that can be weighted again and baked.
-
-Knows nothing about how the layers were found.
-"""
+"""The result of a light transfer: a composite with shading, shadow, bounce and gloss as layers to weight and bake."""
 
 from dataclasses import dataclass, replace
 
@@ -17,12 +14,13 @@ from splatgraft.relighting.light.confidence import light_confidence
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.shading.gain import apply_gain
 
-_LEAST_LEFT = 0.9  # no direction of view takes more of what a shadow leaves
+_MOST_VIEW_CHANGE = 0.9
+"""Most share of the light in a shadow that a view direction takes away; set by hand."""
 
 
 @dataclass(frozen=True)
 class LayerWeights:
-    """How much of each layer is baked; 0 leaves it out, 1 is what physics says, above 1 exaggerates."""
+    """How much of each layer is baked: 0 leaves it out, 1 is physically right, more exaggerates."""
 
     shade: float = 1.0
     """The object's own light and dark sides."""
@@ -39,27 +37,27 @@ class Relit:
     """A composite of m Gaussians with its light transfer in layers."""
 
     gaussians: Gaussians
-    """The composite as pasted: target's Gaussians, then the objects'; large ones in a shadow are split."""
+    """The plain composite: the target's Gaussians, then the objects'; large ones in a shadow are split."""
     is_object: Bool[Tensor, "m"]
     """Which Gaussians belong to an object."""
     origin: Int[Tensor, "m"]
     """Position in `Composite.merged()` of the Gaussian that each one is, or is a piece of."""
     shade: Float[Tensor, "m 3"]
-    """Factor on linear rgb; 1 off the objects."""
+    """Factor on linear rgb; 1 outside the objects."""
     shadow: Float[Tensor, "m 3"]
-    """Factor on linear rgb in (0, 1]; 1 where no light is taken."""
+    """Factor on linear rgb in (0, 1]; 1 without a shadow."""
     bounce: Float[Tensor, "m 3"]
-    """Added to `shadow`, at least 0: light that an object sends, as a share of what was there."""
+    """Added to `shadow`, at least 0: light that an object reflects, as a share of the light without it."""
     slope: Float[Tensor, "m 3"]
-    """Its product with the unit vector from the camera is added to shadow and bounce; world axes, 0 away from edges."""
+    """View dependence, world axes: its product with the unit vector from the camera is added to shadow and bounce."""
     gloss: Float[Tensor, "m k 3"]
-    """Added to the harmonics after shading."""
+    """Coefficients that are added to the harmonics after shading."""
     objects: tuple[Gaussians, ...]
     """The placed objects, target's frame."""
     light: Light | None
-    """The light at the object's place that was used; None where there was no transfer."""
+    """At the objects' place; None where there was no transfer."""
     report: tuple[str, ...]
-    """Plain sentences: what was found, how sure, and what was not done and why."""
+    """Sentences: the lights that were found and their uncertainty, and what was not done and why."""
 
     @property
     def confidence(self) -> float:
@@ -79,16 +77,16 @@ class Relit:
     def shaded(self, weights: LayerWeights = LayerWeights()) -> Gaussians:
         """The m Gaussians under the layers, in the order of `gaussians`; those that no layer changes keep every bit."""
         ratio = self.ratio(weights)
-        leaning = (weights.shadow * self.slope != 0).any(1).nonzero()[:, 0]
-        sh = spherical_harmonics.with_degree(self.gaussians.sh, max(self.gaussians.sh_degree, int(len(leaning) > 0)))
+        sloped = (weights.shadow * self.slope != 0).any(1).nonzero()[:, 0]
+        sh = spherical_harmonics.with_degree(self.gaussians.sh, max(self.gaussians.sh_degree, int(len(sloped) > 0)))
         sh = sh.clone()
         lit = (ratio != 1).any(1).nonzero()[:, 0]
         if len(lit):
             sh[lit] = apply_gain(replace(self.gaussians, sh=sh).select(lit), ratio[lit]).sh
-        if len(leaning):
-            before = spherical_harmonics.rgb_from_dc(self.gaussians.sh[leaning, 0])
-            rise = _seen_change(before, ratio[leaning], weights.shadow * self.slope[leaning])
-            sh[leaning, 1:4] += spherical_harmonics.band_from_slope(rise)
+        if len(sloped):
+            color = spherical_harmonics.rgb_from_dc(self.gaussians.sh[sloped, 0])
+            slope = _srgb_slope(color, ratio[sloped], weights.shadow * self.slope[sloped])
+            sh[sloped, 1:4] += spherical_harmonics.band_from_slope(slope)
         glossy = (self.gloss != 0).flatten(1).any(1).nonzero()[:, 0]
         sh[glossy, : self.gloss.shape[1]] += weights.gloss * self.gloss[glossy]
         return replace(self.gaussians, sh=sh)
@@ -98,19 +96,19 @@ class Relit:
         return self.shade**weights.shade * (self.shadow**weights.shadow + weights.bounce * self.bounce)
 
 
-def _seen_change(
+def _srgb_slope(
     srgb: Float[Tensor, "n 3"], ratio: Float[Tensor, "n 3"], slope: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3 3"]:
-    """Rise of sRGB colours along the world's axes (second dimension) where `ratio` of linear light rises by `slope`.
+    """Slope of sRGB colours along the world's axes (second dimension) where `ratio` of linear light has `slope`.
 
-    By the secant between both ends, of which neither is in the dark, nor brighter than without a shadow.
+    By the secant between both ends, limited so that neither is black nor brighter than without a shadow.
     """
-    height = slope.norm(dim=1, keepdim=True)
-    room = torch.minimum(_LEAST_LEFT * ratio, (1 - ratio).clamp_min(0))
-    reach = torch.minimum(height, room).clamp_min(1e-6)
+    length = slope.norm(dim=1, keepdim=True)
+    most = torch.minimum(_MOST_VIEW_CHANGE * ratio, (1 - ratio).clamp_min(0))
+    change = torch.minimum(length, most).clamp_min(1e-6)
     linear = linear_from_srgb(srgb.clamp(0, 1))
-    top, bottom = (srgb_from_linear(linear * (ratio + way * reach)) for way in (1, -1))
-    return (slope / height)[:, :, None] * (0.5 * (top - bottom))[:, None]
+    high, low = (srgb_from_linear(linear * (ratio + sign * change)) for sign in (1, -1))
+    return (slope / length)[:, :, None] * (0.5 * (high - low))[:, None]
 
 
 def unchanged(

@@ -1,6 +1,7 @@
-"""A placed object made ready to be lit: its normals, depth maps and the light it had. Knows nothing of the scene.
+"""A placed object prepared for lighting: normals, shadow maps, self-visibility, and the light it was captured in.
 
-All of it moves with the object: only a turn, another size or other sources ask for it to be made anew.
+All of it moves with the object and is cached; it is computed again after a rotation, a change of scale, or with other
+light sources.
 """
 
 from dataclasses import dataclass, replace
@@ -19,8 +20,7 @@ from splatgraft.relighting.light.estimate import estimate_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.shading.irradiance import irradiance
 from splatgraft.relighting.shading.normals import Normals, estimate_normals
-from splatgraft.relighting.shadows.light_sampling import ambient_pairs, sample_light, source_pairs
-from splatgraft.relighting.shadows.occlusion import LightSamples
+from splatgraft.relighting.shadows.light_sampling import LightSamples, ambient_pairs, sample_light, source_pairs
 from splatgraft.relighting.shadows.scene_ratio import ObjectShadowMaps, object_shadow_maps, self_visibility
 from splatgraft.runtime.memo import Memo
 
@@ -32,87 +32,123 @@ class SourceScene:
     gaussians: Gaussians
     """In the object's own frame."""
     cameras: Cameras
-    """That saw it, in the same frame."""
+    """Of the capture, in the same frame."""
+
+
+@dataclass(frozen=True)
+class SourceLighting:
+    """The light that an object of n Gaussians was captured in."""
+
+    light: Light
+    """Target's frame."""
+    irradiance: Float[Tensor, "n 3"]
+    """Linear rgb on each Gaussian under that light."""
 
 
 @dataclass(frozen=True)
 class PreparedObject:
-    """One placed object, target's frame."""
+    """One placed object of n Gaussians, target's frame."""
 
     gaussians: Gaussians
+    """Target's frame."""
     target_from_object: Similarity
-    ball: BoundingSphere
+    """The placement."""
+    sphere: BoundingSphere
+    """Of the Gaussians."""
     normals: Normals
+    """Of the Gaussians."""
     maps: ObjectShadowMaps
-    own: Float[Tensor, "n k"]
-    """Share of every bundle of the new light that the object lets through to itself."""
-    then: Float[Tensor, "n 3"] | None
-    """Linear irradiance where it was captured; None where nobody knows."""
-    before: Light | None
-    """That light, target's frame."""
-    story: str | None
-    """What was found out about that light."""
+    """For the samples of the light at the new place."""
+    self_visibility: Float[Tensor, "n k"]
+    """Share of every sample of the new light that the object lets through to its own Gaussians, in [0, 1]."""
+    source_lighting: SourceLighting | None
+    """None where it is not known."""
+    notes: str | None
+    """A sentence on the light it was captured in, or on why that is not known; None without a source scene."""
 
 
 def prepare_object(
     placed: PlacedObject, source: SourceScene | None, cameras: Cameras, *, light: Light, index: int, cache: Memo
 ) -> PreparedObject:
-    """The object `placed`, under the bundles of `light`; what is kept is moved where only the place changed."""
-    beams = sample_light(light)
-    key = (placed.gaussians, source, cameras, light.sources)
-    kept: PreparedObject | None = cache.peek(f"body {index}", key)
-    if kept is not None and _same_pose(kept.target_from_object, placed.target_from_object):
-        return _moved(kept, placed, beams)
+    """Prepare one object for the light at its new place.
+
+    Args:
+        placed: Object and placement.
+        source: The scene it was taken from; None where not known.
+        cameras: Of the target's capture.
+        light: At the new place.
+        index: Of the object among all placed ones; part of the cache's keys.
+        cache: Reused where only the object's position changed.
+    """
+    samples = sample_light(light)
+    name, key = f"prepared object {index}", (placed.gaussians, source, cameras, light.sources)
+    cached: PreparedObject | None = cache.peek(name, key)
+    if cached is not None and _same_pose(cached.target_from_object, placed.target_from_object):
+        return _moved(cached, placed, samples)
     gaussians = placed.in_target()
-    ball = bounding_sphere(gaussians)
+    sphere = bounding_sphere(gaussians)
     normals = estimate_normals(gaussians, cameras)
-    maps = object_shadow_maps(gaussians, ball, beams)
-    then, before, story = None, None, None
+    maps = object_shadow_maps(gaussians, sphere, samples)
+    source_lighting, notes = None, None
     if source is not None:
-        before, problem = _origin(placed.gaussians, source, index, cache)
-        story = problem if before is None else before.describe(estimate_up(source.cameras)) + "."
-        if before is not None:
-            before = before.rotated(placed.target_from_object.rotation)
-            bundles = sample_light(before)
-            shares = self_visibility(maps, gaussians, normals.vectors, bundles)
-            then = irradiance(bundles, normals.vectors, arrives=shares)
-    own = self_visibility(maps, gaussians, normals.vectors, beams)
-    body = PreparedObject(gaussians, placed.target_from_object, ball, normals, maps, own, then, before, story)
-    cache.put(f"body {index}", key, body)
-    return body
+        source_light, problem = _source_light(placed.gaussians, source, index, cache)
+        notes = problem
+        if source_light is not None:
+            notes = source_light.describe(estimate_up(source.cameras)) + "."
+            source_light = source_light.rotated(placed.target_from_object.rotation)
+            source_samples = sample_light(source_light)
+            shares = self_visibility(maps, gaussians, normals.vectors, source_samples)
+            received = irradiance(source_samples, normals.vectors, sample_visibility=shares)
+            source_lighting = SourceLighting(source_light, received)
+    prepared = PreparedObject(
+        gaussians=gaussians,
+        target_from_object=placed.target_from_object,
+        sphere=sphere,
+        normals=normals,
+        maps=maps,
+        self_visibility=self_visibility(maps, gaussians, normals.vectors, samples),
+        source_lighting=source_lighting,
+        notes=notes,
+    )
+    cache.put(name, key, prepared)
+    return prepared
 
 
 def _same_pose(one: Similarity, other: Similarity) -> bool:
     return one.scale == other.scale and torch.equal(one.rotation, other.rotation)
 
 
-def _moved(body: PreparedObject, placed: PlacedObject, beams: LightSamples) -> PreparedObject:
-    shift = placed.target_from_object.translation - body.target_from_object.translation
-    center = body.ball.center + shift.to(body.ball.center)
-    window = replace(body.maps.ambient_maps.window, center=center)
-    parts = [p for p in (source_pairs(beams)[0], ambient_pairs(beams)[0]) if len(p)]
+def _moved(prepared: PreparedObject, placed: PlacedObject, samples: LightSamples) -> PreparedObject:
+    """The object translated to where `placed` has it, under samples of other irradiance from the same directions."""
+    shift = placed.target_from_object.translation - prepared.target_from_object.translation
+    center = prepared.sphere.center + shift.to(prepared.sphere.center)
+    window = replace(prepared.maps.ambient_maps.window, center=center)
+    parts = [p for p in (source_pairs(samples)[0], ambient_pairs(samples)[0]) if len(p)]
     occlusions = tuple(
         (part, replace(occlusion, center=center), bias)
-        for part, (_, occlusion, bias) in zip(parts, body.maps.occlusions, strict=True)
+        for part, (_, occlusion, bias) in zip(parts, prepared.maps.occlusions, strict=True)
     )
     return replace(
-        body,
+        prepared,
         gaussians=placed.in_target(),
         target_from_object=placed.target_from_object,
-        ball=BoundingSphere(center, body.ball.radius),
-        maps=ObjectShadowMaps(replace(body.maps.ambient_maps, window=window), occlusions),
+        sphere=BoundingSphere(center, prepared.sphere.radius),
+        maps=ObjectShadowMaps(replace(prepared.maps.ambient_maps, window=window), occlusions),
     )
 
 
-def _origin(own: Gaussians, source: SourceScene, index: int, cache: Memo) -> tuple[Light | None, str | None]:
-    """The light that object `index` had, found once for all copies of one object."""
+def _source_light(
+    gaussians: Gaussians, source: SourceScene, index: int, cache: Memo
+) -> tuple[Light | None, str | None]:
+    """The light that object `index` was captured in, estimated once for all copies of one object."""
     for earlier in range(index):
-        kept = cache.peek(f"origin {earlier}", (own, source))
-        if kept is not None:
-            return kept
-    return cache.get(f"origin {index}", (own, source), lambda: _origin_light(own, source))
+        cached = cache.peek(f"source light {earlier}", (gaussians, source))
+        if cached is not None:
+            return cached
 
+    def estimate() -> tuple[Light | None, str | None]:
+        # the object's shadow in its capture is evidence too
+        place = bounding_sphere(gaussians)
+        return estimate_light(source.gaussians, place, source.cameras, object_gaussians=gaussians)
 
-def _origin_light(own: Gaussians, source: SourceScene) -> tuple[Light | None, str | None]:
-    """The light on an object where it was captured; its own shadow there helps to tell."""
-    return estimate_light(source.gaussians, bounding_sphere(own), source.cameras, also=own)
+    return cache.get(f"source light {index}", (gaussians, source), estimate)

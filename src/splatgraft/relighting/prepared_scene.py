@@ -1,6 +1,6 @@
-"""The scene around the place of an object, prepared once: its normals, light and depth maps. Knows no objects.
+"""The scene around the place of objects, prepared for lighting: light, receivers, normals and shadow maps.
 
-What is kept stays valid while objects move within the inner half of the region; then it is made anew.
+Cached results stay valid while the objects' place moves by less than half of the region's radius.
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from splatgraft.relighting.light.panorama_sources import light_from_panorama
 from splatgraft.relighting.light.sun_visibility import observed_sun_visibility
 from splatgraft.relighting.shading.irradiance import irradiance
 from splatgraft.relighting.shading.normals import Normals, estimate_normals, raised
-from splatgraft.relighting.shadows.light_sampling import main_count, sample_light
+from splatgraft.relighting.shadows.light_sampling import LightSamples, main_source_samples, sample_light
 from splatgraft.relighting.shadows.receivers import RIM
 from splatgraft.relighting.shadows.scene_ratio import (
-    AMBIENT_SIZE,
     SceneShadowMaps,
+    ShadowMapSettings,
     reachable,
     scene_shadow_maps,
     scene_visibility,
@@ -32,104 +32,133 @@ from splatgraft.relighting.shadows.scene_ratio import (
 from splatgraft.relighting.shadows.shadow_maps import thinned
 from splatgraft.runtime.memo import Memo
 
+# set by hand
+_MARGIN = 1.2
+"""Radius of a new region over what the objects need."""
+_KEPT_RADII = (0.8, 2.0)
+"""Least and most radius of a cached region over what the objects need."""
+_KEPT_SHIFT = 0.5
+"""Radii of a cached region by which the objects' place may be off its centre."""
+
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """A part of a scene that waits for objects."""
+    """A scene that objects are placed in, and the m receivers of their shadows."""
 
     scene: Gaussians
-    """All of it, erased Gaussians left out."""
-    members: Int[Tensor, "m"]
-    """Positions of the scene's Gaussians that objects may reach."""
-    around: Gaussians
-    """The members."""
+    """All Gaussians that are not erased."""
+    receiver_indices: Int[Tensor, "m"]
+    """Positions in `scene` of the Gaussians that objects may reach."""
+    receivers: Gaussians
+    """Those Gaussians."""
     normals: Normals
-    """Of the members."""
+    """Of the receivers."""
     light: Light
-    """At the place."""
+    """At the objects' place."""
+    samples: LightSamples
+    """k samples of `light`."""
     maps: SceneShadowMaps
-    """The scene's own depth maps for the bundles of `light`."""
-    arrives: Float[Tensor, "m k"]
-    """Share of every bundle that reaches the members past the scene."""
+    """The scene's own shadow maps for the samples."""
+    sample_visibility: Float[Tensor, "m k"]
+    """Share of every sample that reaches the receivers past the scene, in [0, 1]."""
 
 
 def prepare_scene(
     scene: Gaussians,
     cameras: Cameras,
     *,
-    balls: Sequence[BoundingSphere],
+    spheres: Sequence[BoundingSphere],
     reach: float,
     light: Light | None,
     cache: Memo,
 ) -> tuple[PreparedScene | None, str | None]:
-    """The stage for objects in `balls`, `reach` of their radii wide, or a sentence that says why there is none.
+    """Prepare a scene for objects.
 
-    `light` is estimated where none is given.
+    Args:
+        scene: All Gaussians that are not erased.
+        cameras: Of its capture.
+        spheres: Of the objects, at least one.
+        reach: Object radii to which shadows are computed.
+        light: At the objects' place; None to estimate it.
+        cache: Reused where the scene is the same and the place has moved little.
+
+    Returns:
+        The prepared scene, or None and a sentence that gives the reason.
     """
-    place = BoundingSphere(torch.stack([ball.center for ball in balls]).mean(0), max(ball.radius for ball in balls))
+    center = torch.stack([sphere.center for sphere in spheres]).mean(0)
+    place = BoundingSphere(center, max(sphere.radius for sphere in spheres))
     region = _region(scene, place, reach, cache)
     if light is None:
-        light, problem = _estimated(scene, cameras, place, region, cache)
+        light, problem = _estimated_light(scene, cameras, place, region, cache)
         if light is None:
             return None, problem
-    lit = light
-    members = _members(scene, region, balls, lit, cache)
-    around = cache.get("around", (members,), lambda: scene.select(members))
-    # what hides them need not be finer than the maps are
-    hiding = cache.get("hiding", (scene, region), lambda: thinned(scene, width=2 * region.radius / AMBIENT_SIZE))
-    normals = cache.get("normals", (around, cameras), lambda: estimate_normals(around, cameras, among=hiding))
-    maps = cache.get("maps", (scene, region, lit.sources), lambda: scene_shadow_maps(scene, region, sample_light(lit)))
-    points = cache.get("points", (normals,), lambda: raised(around, normals.vectors))
-    arrives = cache.get(
-        "arrives",
+    known, samples = light, sample_light(light)
+    indices = _receiver_indices(scene, region, spheres, known, cache)
+    receivers = cache.get("receivers", (indices,), lambda: scene.select(indices))
+    # for the test of what cameras see, occluders need not be finer than a shadow map's pixel
+    width = 2 * region.radius / ShadowMapSettings().ambient_size
+    occluders = cache.get("occluders", (scene, region), lambda: thinned(scene, width=width))
+    normals = cache.get("normals", (receivers, cameras), lambda: estimate_normals(receivers, cameras, among=occluders))
+    maps = cache.get("maps", (scene, region, known.sources), lambda: scene_shadow_maps(scene, region, samples))
+    points = cache.get("points", (normals,), lambda: raised(receivers, normals.vectors))
+    sample_visibility = cache.get(
+        "sample visibility",
         (maps, normals),
-        lambda: _as_it_looks(around, normals, lit, scene_visibility(maps, points, normals.vectors)),
+        lambda: _with_observed_sun(receivers, normals, known, scene_visibility(maps, points, normals.vectors)),
     )
     found = PreparedScene(
-        scene=scene, members=members, around=around, normals=normals, light=lit, maps=maps, arrives=arrives
+        scene=scene,
+        receiver_indices=indices,
+        receivers=receivers,
+        normals=normals,
+        light=known,
+        samples=samples,
+        maps=maps,
+        sample_visibility=sample_visibility,
     )
     return found, None
 
 
 def _region(scene: Gaussians, place: BoundingSphere, reach: float, cache: Memo) -> BoundingSphere:
-    kept = cache.peek("region", (scene,))
+    """The sphere within which shadows are computed: the cached one where it fits."""
+    cached = cache.peek("region", (scene,))
     wanted = place.radius * reach
-    if kept is not None and 0.8 * wanted <= kept.radius <= 2 * wanted:
-        moved = float((kept.center - place.center).norm())
-        if moved < 0.5 * kept.radius:
-            return kept
-    region = BoundingSphere(place.center, 1.2 * wanted)
+    least, most = _KEPT_RADII
+    if cached is not None and least * wanted <= cached.radius <= most * wanted:
+        moved = float((cached.center - place.center).norm())
+        if moved < _KEPT_SHIFT * cached.radius:
+            return cached
+    region = BoundingSphere(place.center, _MARGIN * wanted)
     cache.put("region", (scene,), region)
     return region
 
 
-def _members(
-    scene: Gaussians, region: BoundingSphere, balls: Sequence[BoundingSphere], light: Light, cache: Memo
+def _receiver_indices(
+    scene: Gaussians, region: BoundingSphere, spheres: Sequence[BoundingSphere], light: Light, cache: Memo
 ) -> Int[Tensor, "m"]:
-    """What the objects may reach from where they are, and from a radius around."""
-    kept = cache.peek("members", (scene, region, light.sources))
-    if kept is not None:
-        members, before = kept
-        moves = [float((new.center - old.center).norm()) for new, old in zip(balls, before, strict=False)]
-        if len(before) == len(balls) and all(m <= b.radius for m, b in zip(moves, balls, strict=True)):
-            return members
-    beams = sample_light(light)
+    """Gaussians that the objects may reach from where they are, and after a move by up to their radius."""
+    cached = cache.peek("receiver indices", (scene, region, light.sources))
+    if cached is not None:
+        indices, earlier = cached
+        moves = [float((new.center - old.center).norm()) for new, old in zip(spheres, earlier, strict=False)]
+        if len(earlier) == len(spheres) and all(m <= s.radius for m, s in zip(moves, spheres, strict=True)):
+            return indices
+    samples = sample_light(light)
     reached = torch.zeros(scene.count, dtype=torch.bool)
     rims = RIM * scene.scales.max(1).values
-    for ball in balls:
-        wide = rims + ball.radius
-        reached |= reachable(scene.means, ball, beams, farthest=region.radius, rims=wide)
-    members = (reached & ((scene.means - region.center).norm(dim=1) < region.radius)).nonzero()[:, 0]
-    cache.put("members", (scene, region, light.sources), (members, tuple(balls)))
-    return members
+    for sphere in spheres:
+        reached |= reachable(scene.means, sphere, samples, farthest=region.radius, rims=rims + sphere.radius)
+    indices = (reached & ((scene.means - region.center).norm(dim=1) < region.radius)).nonzero()[:, 0]
+    cache.put("receiver indices", (scene, region, light.sources), (indices, tuple(spheres)))
+    return indices
 
 
-def _estimated(
+def _estimated_light(
     scene: Gaussians, cameras: Cameras, place: BoundingSphere, region: BoundingSphere, cache: Memo
 ) -> tuple[Light | None, str | None]:
-    """The light at `place`; after a move within the region its sources are kept and the rest is looked at again."""
-    kept = cache.peek("light", (scene, region))
-    if kept is None:
+    """The light at `place`; after a move within the region the sources are kept and the ambient light is new."""
+    cached = cache.peek("light", (scene, region))
+    if cached is None:
         lights, problem = estimate_lights(scene, place, cameras)
         if lights is None:
             return None, problem
@@ -138,23 +167,23 @@ def _estimated(
     panorama, problem = panorama_at(scene, place)
     if panorama is None:
         return None, problem
-    # sources keep their brightness too: depth maps and the object's own light are kept with them
-    before, level = kept
-    factor = float(level.ambient[0].sum() / before.ambient[0].sum().clamp_min(1e-9))
+    # the sources keep their brightness too: shadow maps and the object's own shading are cached with them
+    by_panorama, leveled = cached
+    factor = float(leveled.ambient[0].sum() / by_panorama.ambient[0].sum().clamp_min(1e-9))
     here = light_from_panorama(panorama, estimate_up(cameras))
-    return replace(here, sources=level.sources, ambient=factor * here.ambient), None
+    return replace(here, sources=leveled.sources, ambient=factor * here.ambient), None
 
 
-def _as_it_looks(
-    gaussians: Gaussians, normals: Normals, light: Light, arrives: Float[Tensor, "m k"]
+def _with_observed_sun(
+    gaussians: Gaussians, normals: Normals, light: Light, sample_visibility: Float[Tensor, "m k"]
 ) -> Float[Tensor, "m k"]:
-    """`arrives` with the main source taken from where the scene is plainly darker than it would make it."""
+    """`sample_visibility` with the main source's reduced where the scene's colours show that it does not arrive."""
     if not light.sources:
-        return arrives
-    everything, count = sample_light(light), main_count(light)
-    of_main = torch.arange(len(everything)) < count
-    ours = replace(everything, irradiance=everything.irradiance * of_main[:, None])
-    by_main = irradiance(ours, normals.vectors, arrives=arrives).mean(1)
-    by_all = irradiance(everything, normals.vectors, arrives=arrives).mean(1)
+        return sample_visibility
+    samples, count = sample_light(light), main_source_samples(light)
+    is_main = torch.arange(len(samples)) < count
+    main = replace(samples, irradiance=samples.irradiance * is_main[:, None])
+    by_main = irradiance(main, normals.vectors, sample_visibility=sample_visibility).mean(1)
+    by_all = irradiance(samples, normals.vectors, sample_visibility=sample_visibility).mean(1)
     share = observed_sun_visibility(gaussians, normals, rest=by_all - by_main, light=by_main)
-    return torch.cat([arrives[:, :count] * share[:, None], arrives[:, count:]], 1)
+    return torch.cat([sample_visibility[:, :count] * share[:, None], sample_visibility[:, count:]], 1)

@@ -1,6 +1,6 @@
-"""Takes an object's shadow out of the capture that it was taken from. Knows nothing about where the object goes."""
+"""Removal of an object's shadow and bounce from the capture that the object was taken from."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.capture_orientation import estimate_up
@@ -18,29 +18,50 @@ from splatgraft.relighting.shadows.scene_ratio import (
     scene_visibility,
 )
 
-_BRIGHTEST = 4.0  # what was darker than a quarter is noise, and stays dark
-_REACH = 8.0  # object radii
+
+@dataclass(frozen=True)
+class ShadowRemovalSettings:
+    """Extent and strength of the removal, both set by hand."""
+
+    brightest: float = 4.0
+    """Most gain; what was darker than a quarter is mostly noise and stays dark."""
+    reach: float = 8.0
+    """Object radii to which shadows are removed."""
 
 
-def remove_object_shadow(source: SourceScene, own: Gaussians) -> tuple[Gaussians, tuple[str, ...]]:
-    """The scene around an object as if the object `own` had never stood there: colours over the shadow's ratio.
+def remove_object_shadow(
+    source: SourceScene,
+    object_gaussians: Gaussians,
+    *,
+    settings: ShadowRemovalSettings = ShadowRemovalSettings(),
+) -> tuple[Gaussians, tuple[str, ...]]:
+    """Divide the colours around an object's old place by the ratio of its shadow and bounce.
 
-    Gaussian for Gaussian, with sentences on what was found; unchanged where the light cannot be told.
+    Args:
+        source: The capture without the object.
+        object_gaussians: The object, in the same frame.
+        settings: Extent and strength.
+
+    Returns:
+        The scene, Gaussian for Gaussian, and sentences for a report. The scene is unchanged where the light cannot be
+        estimated.
     """
-    scene, ball = source.gaussians, bounding_sphere(own)
-    light, problem = estimate_light(scene, ball, source.cameras, also=own)
+    scene, sphere = source.gaussians, bounding_sphere(object_gaussians)
+    light, problem = estimate_light(scene, sphere, source.cameras, object_gaussians=object_gaussians)
     if light is None:
         return scene, (f"{problem} The old place stays as it is.",)
-    beams = sample_light(light)
-    region = BoundingSphere(ball.center, _REACH * ball.radius)
-    index = reachable(scene.means, ball, beams, farthest=region.radius).nonzero()[:, 0]
+    samples = sample_light(light)
+    region = BoundingSphere(sphere.center, settings.reach * sphere.radius)
+    index = reachable(scene.means, sphere, samples, farthest=region.radius).nonzero()[:, 0]
     if len(index) == 0:
         return scene, ("Nothing stands within the reach of the object's shadow.",)
     receivers = scene.select(index)
-    facing = estimate_normals(receivers, source.cameras).vectors
-    arrives = scene_visibility(scene_shadow_maps(scene, region, beams), raised(receivers, facing), facing)
-    ratio = scene_ratio(object_shadow_maps(own, ball, beams), receivers.means, facing, arrives=arrives)
-    gain = 1 / (ratio.shadow + ratio.bounce).clamp(1 / _BRIGHTEST, _BRIGHTEST)
+    normals = estimate_normals(receivers, source.cameras).vectors
+    scene_maps = scene_shadow_maps(scene, region, samples)
+    shares = scene_visibility(scene_maps, raised(receivers, normals), normals)
+    maps = object_shadow_maps(object_gaussians, sphere, samples)
+    ratio = scene_ratio(maps, receivers.means, normals, sample_visibility=shares)
+    gain = 1 / (ratio.shadow + ratio.bounce).clamp(1 / settings.brightest, settings.brightest)
     sh = scene.sh.clone()
     sh[index] = apply_gain(receivers, gain).sh
     return replace(scene, sh=sh), (light.describe(estimate_up(source.cameras)) + ".",)

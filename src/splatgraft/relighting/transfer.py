@@ -1,6 +1,7 @@
-"""The physical light transfer, whole: two lights, then an object's shading, shadow, bounce and gloss in layers.
+"""Physically based light transfer: objects placed in a scene get shading, shadows, bounce and gloss in layers.
 
-Values in, values out: knows nothing about files or views.
+Differential rendering (Debevec 1998) on Gaussians: the light at the old and the new place is estimated, and colours are
+multiplied by ratios of irradiance. No training, no rendered views.
 """
 
 from collections.abc import Sequence
@@ -23,32 +24,34 @@ from splatgraft.relighting.prepared_scene import PreparedScene, prepare_scene
 from splatgraft.relighting.shading.irradiance import irradiance, shade_ratio, unknown_origin_ratio
 from splatgraft.relighting.shading.normals import raised
 from splatgraft.relighting.shading.reflection import gloss_layer
-from splatgraft.relighting.shadows.light_sampling import sample_light
-from splatgraft.relighting.shadows.occlusion import LightSamples
 from splatgraft.relighting.shadows.receivers import RIM, Receivers, shade_receivers
 from splatgraft.relighting.shadows.scene_ratio import SceneRatio, reachable, scene_ratio, scene_visibility
 from splatgraft.runtime.memo import Memo
 
-_ENOUGH = 40_000  # pieces hold the edges of one shadow on a surface of many layers
+_LEAST_BUDGET = 40_000
+"""Gaussians that splitting may add to any scene: enough for the edges of one shadow on a surface of many layers; set by
+hand."""
 
 
 @dataclass(frozen=True)
 class RelightOptions:
-    """What may be asked of a transfer."""
+    """Reach of a transfer and the number of Gaussians it may add."""
 
     reach: float = 8.0
-    """Shadows are followed this many object radii far."""
+    """Shadows are computed up to this many object radii from the object."""
     most_added: float = 0.3
     """At most this share of the composite's Gaussians is added by splitting, or 40,000 where that is more; 0: none."""
 
 
 @dataclass(frozen=True)
 class _LitObject:
-    """One object on the stage."""
+    """One object of n Gaussians in the prepared scene."""
 
-    body: PreparedObject
-    arrives: Float[Tensor, "n k"]
-    """Share of every bundle that the scene lets through to it."""
+    prepared: PreparedObject
+    sample_visibility: Float[Tensor, "n k"]
+    """Share of every light sample that reaches it past the scene, in [0, 1]."""
+    shade: Float[Tensor, "n 3"]
+    """Factor on linear rgb by its own shading."""
 
 
 def relight(
@@ -87,127 +90,122 @@ def relight(
     if not placed:
         return unchanged(baked, is_object, objects=(), report=("No object is placed: nothing to light.",))
     cache = cache or Memo()
-    scene = cache.get("scene", (composite.target, composite.erased), lambda: composite.target.select(~composite.erased))
-    balls = [bounding_sphere(p.in_target()) for p, _ in placed]
-    stage, problem = prepare_scene(scene, cameras, balls=balls, reach=options.reach, light=light, cache=cache)
-    if stage is None:
-        objects = tuple(p.in_target() for p, _ in placed)
-        return unchanged(baked, is_object, objects=objects, report=(f"{problem} The object is pasted as it is.",))
-    beams = sample_light(stage.light)
-    report = [stage.light.describe(estimate_up(cameras)) + (", as given." if light is not None else ".")]
-    actors, shades = [], []
+    target = cache.get(
+        "scene", (composite.target, composite.erased), lambda: composite.target.select(~composite.erased)
+    )
+    spheres = [bounding_sphere(p.in_target()) for p, _ in placed]
+    scene, problem = prepare_scene(target, cameras, spheres=spheres, reach=options.reach, light=light, cache=cache)
+    if scene is None:
+        in_target = tuple(p.in_target() for p, _ in placed)
+        return unchanged(baked, is_object, objects=in_target, report=(f"{problem} The object is pasted as it is.",))
+    report = [scene.light.describe(estimate_up(cameras)) + (", as given." if light is not None else ".")]
+    objects = []
     for i, (one, source) in enumerate(placed):
-        body = prepare_object(one, source, cameras, light=stage.light, index=i, cache=cache)
-        if body.story is not None:
-            report.append(f"Where object {i + 1} comes from: {body.story}")
-        if body.before is None:
+        prepared = prepare_object(one, source, cameras, light=scene.light, index=i, cache=cache)
+        if prepared.notes is not None:
+            report.append(f"Where object {i + 1} comes from: {prepared.notes}")
+        if prepared.source_lighting is None:
             report.append(f"The light that object {i + 1} had is not known: it keeps its mean brightness.")
-        facing = body.normals.vectors
-        actor = _LitObject(body, scene_visibility(stage.maps, raised(body.gaussians, facing), facing))
-        actors.append(actor)
-        shades.append(_shade(actor, beams, stage.light))
-    return _assembled(stage, actors, shades, beams, options=options, baked=baked, report=report)
+        objects.append(_lit_object(prepared, scene))
+    return _assembled(scene, objects, options=options, baked=baked, report=report)
 
 
-def _shade(actor: _LitObject, beams: LightSamples, light: Light) -> Float[Tensor, "n 3"]:
-    body = actor.body
-    # ambient light was looked at from the place itself: what blocks it is in the panorama already, as at the old place
-    arrives = torch.where(torch.as_tensor(beams.is_source), actor.arrives, torch.ones(()))
-    now = irradiance(beams, body.normals.vectors, arrives=body.own * arrives)
-    if body.then is None or body.before is None:
-        return unknown_origin_ratio(now, body.normals, body.gaussians.opacities)
-    seen = 0.5 * (light.coverage + body.before.coverage)
-    return shade_ratio(now, body.then, body.normals, body.gaussians.opacities, seen=seen)
+def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
+    """The object with its shading by the scene's light, ambient light included."""
+    normals, opacities = prepared.normals, prepared.gaussians.opacities
+    visibility = scene_visibility(scene.maps, raised(prepared.gaussians, normals.vectors), normals.vectors)
+    # the ambient light was captured at the place itself, where blockers are part of the panorama; so in the source
+    shares = torch.where(torch.as_tensor(scene.samples.is_source), visibility, torch.ones(()))
+    shares = prepared.self_visibility * shares
+    received = irradiance(scene.samples, normals.vectors, sample_visibility=shares)
+    source = prepared.source_lighting
+    if source is None:
+        return _LitObject(prepared, visibility, unknown_origin_ratio(received, normals, opacities))
+    coverage = 0.5 * (scene.light.coverage + source.light.coverage)
+    shade = shade_ratio(received, source.irradiance, normals, opacities, coverage=coverage)
+    return _LitObject(prepared, visibility, shade)
 
 
-def _assembled(  # noqa: PLR0913
-    stage: PreparedScene,
-    actors: list[_LitObject],
-    shades: list[Float[Tensor, "n 3"]],
-    beams: LightSamples,
-    *,
-    options: RelightOptions,
-    baked: Gaussians,
-    report: list[str],
+def _assembled(
+    scene: PreparedScene, objects: list[_LitObject], *, options: RelightOptions, baked: Gaussians, report: list[str]
 ) -> Relit:
-    """Objects on the scene, objects on each other, and all layers in one list."""
-    budget = max(int(options.most_added * baked.count), _ENOUGH) if options.most_added > 0 else 0
-    lit, ratio = _on_scene(stage, actors, beams, budget=budget, degree=baked.sh_degree)
-    scene_count = stage.scene.count
+    """The layers of all Gaussians, in the order of the baked composite; pieces where their whole was."""
+    budget = max(int(options.most_added * baked.count), _LEAST_BUDGET) if options.most_added > 0 else 0
+    receivers, ratio = _on_scene(scene, objects, budget=budget, degree=baked.sh_degree)
+    scene_count = scene.scene.count
     rest = torch.ones(scene_count, dtype=torch.bool)
-    rest[lit.origin] = False
+    rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
-    on_objects = [_on_object(i, actors) for i in range(len(actors))]
-    glosses = [_gloss(a, s, stage, baked.sh_degree) for a, s in zip(actors, shades, strict=True)]
+    on_objects = [_on_object(i, objects) for i in range(len(objects))]
+    glosses = [_gloss(one, scene.light, baked.sh_degree) for one in objects]
     object_rows = torch.arange(scene_count, baked.count)
-    gaussians = concatenate([baked.select(rest_index), lit.gaussians, baked.select(object_rows)])
+    gaussians = concatenate([baked.select(rest_index), receivers.gaussians, baked.select(object_rows)])
     count = gaussians.count - len(object_rows)
     ones, zeros = torch.ones(len(rest_index), 3), torch.zeros(len(rest_index), 3)
-    origin = torch.cat([rest_index, lit.origin, object_rows])
-    # the order of the baked composite, pieces where their whole was
+    origin = torch.cat([rest_index, receivers.origin, object_rows])
     order = origin.argsort(stable=True)
     return Relit(
         gaussians=gaussians.select(order),
         is_object=order >= count,
         origin=origin[order],
-        shade=torch.cat([torch.ones(count, 3), *shades])[order],
+        shade=torch.cat([torch.ones(count, 3), *[one.shade for one in objects]])[order],
         shadow=torch.cat([ones, ratio.shadow, *[r.shadow for r in on_objects]])[order],
         bounce=torch.cat([zeros, ratio.bounce, *[r.bounce for r in on_objects]])[order],
         slope=torch.cat([zeros, ratio.slope, *[r.slope for r in on_objects]])[order],
         gloss=torch.cat([torch.zeros_like(gaussians.sh[:count]), *glosses])[order],
-        objects=tuple(actor.body.gaussians for actor in actors),
-        light=stage.light,
+        objects=tuple(one.prepared.gaussians for one in objects),
+        light=scene.light,
         report=tuple(report),
     )
 
 
 def _on_scene(
-    stage: PreparedScene, actors: list[_LitObject], beams: LightSamples, *, budget: int, degree: int
+    scene: PreparedScene, objects: list[_LitObject], *, budget: int, degree: int
 ) -> tuple[Receivers, SceneRatio]:
-    """The members that some object reaches, split where needed, and the product of all objects' ratios on them."""
-    points, rims = stage.around.means, RIM * stage.around.scales.max(1).values
+    """The receivers that some object reaches, split where needed, and the product of all objects' ratios on them."""
+    points, rims = scene.receivers.means, RIM * scene.receivers.scales.max(1).values
     reached = torch.zeros(len(points), dtype=torch.bool)
-    for actor in actors:
-        reached |= reachable(points, actor.body.ball, beams, farthest=stage.maps.region.radius, rims=rims)
+    for one in objects:
+        sphere, farthest = one.prepared.sphere, scene.maps.region.radius
+        reached |= reachable(points, sphere, scene.samples, farthest=farthest, rims=rims)
     receivers = Receivers(
-        gaussians=stage.around.select(reached).with_sh_degree(degree),
-        normals=stage.normals.vectors[reached],
-        arrives=stage.arrives[reached],
-        trust=torch.ones(int(reached.sum())),
-        origin=stage.members[reached],
+        gaussians=scene.receivers.select(reached).with_sh_degree(degree),
+        normals=scene.normals.vectors[reached],
+        sample_visibility=scene.sample_visibility[reached],
+        origin=scene.receiver_indices[reached],
     )
-    found: SceneRatio | None = None
-    for actor in actors:
-        receivers, parents, ratio = shade_receivers(receivers, actor.body.maps, budget=budget // len(actors))
-        if found is None:
-            found = ratio
+    total: SceneRatio | None = None
+    for one in objects:
+        receivers, parents, ratio = shade_receivers(receivers, one.prepared.maps, budget=budget // len(objects))
+        if total is None:
+            total = ratio
             continue
-        found = SceneRatio(
-            shadow=found.shadow[parents] * ratio.shadow,
-            bounce=found.bounce[parents] + ratio.bounce,
-            slope=found.slope[parents] * ratio.shadow.mean(1, keepdim=True)
-            + found.shadow[parents].mean(1, keepdim=True) * ratio.slope,
+        total = SceneRatio(
+            shadow=total.shadow[parents] * ratio.shadow,
+            bounce=total.bounce[parents] + ratio.bounce,
+            slope=total.slope[parents] * ratio.shadow.mean(1, keepdim=True)
+            + total.shadow[parents].mean(1, keepdim=True) * ratio.slope,
         )
-    assert found is not None
-    return receivers, found
+    assert total is not None
+    return receivers, total
 
 
-def _gloss(actor: _LitObject, shade: Float[Tensor, "n 3"], stage: PreparedScene, degree: int) -> Float[Tensor, "n k 3"]:
-    body = actor.body
-    gaussians = body.gaussians.with_sh_degree(degree)
-    if body.before is None:
+def _gloss(one: _LitObject, light: Light, degree: int) -> Float[Tensor, "n k 3"]:
+    """The gloss layer of an object; zero where its source light is not known."""
+    gaussians, source = one.prepared.gaussians.with_sh_degree(degree), one.prepared.source_lighting
+    if source is None:
         return torch.zeros_like(gaussians.sh)
-    return gloss_layer(gaussians, body.normals, body.before, stage.light, ratio=shade)
+    return gloss_layer(gaussians, one.prepared.normals, source.light, light, ratio=one.shade)
 
 
-def _on_object(index: int, actors: list[_LitObject]) -> SceneRatio:
-    """What all other objects take from and give to one."""
-    actor = actors[index]
-    shadow = torch.ones(actor.body.gaussians.count, 3)
-    bounce = torch.zeros(actor.body.gaussians.count, 3)
-    for other in actors:
-        if other is not actor:
-            points, facing = actor.body.gaussians.means, actor.body.normals.vectors
-            ratio = scene_ratio(other.body.maps, points, facing, arrives=actor.arrives)
+def _on_object(index: int, objects: list[_LitObject]) -> SceneRatio:
+    """Shadow and bounce of all other objects on one."""
+    one = objects[index]
+    gaussians, normals = one.prepared.gaussians, one.prepared.normals.vectors
+    shadow, bounce = torch.ones(gaussians.count, 3), torch.zeros(gaussians.count, 3)
+    for other in objects:
+        if other is not one:
+            maps, visibility = other.prepared.maps, one.sample_visibility
+            ratio = scene_ratio(maps, gaussians.means, normals, sample_visibility=visibility)
             shadow, bounce = shadow * ratio.shadow, bounce + ratio.bounce
     return SceneRatio(shadow=shadow, bounce=bounce, slope=torch.zeros_like(shadow))

@@ -1,7 +1,4 @@
-"""The value `Light`: what shines on a place, as a few sources and a smooth ambient part, and its text form light.json.
-
-Knows nothing about Gaussians, panoramas or files: text in, text out.
-"""
+"""The value `Light`: the light at a place as a few sources and smooth ambient light; its text form light.json."""
 
 import json
 import math
@@ -16,33 +13,36 @@ from splatgraft.core import spherical_harmonics
 FORMAT = "splatgraft light 1"
 _AMBIENT_DEGREE = 2
 _AMBIENT_COUNT = 9
-# of the doubt blurs shadows: that leaves the least error in rendered scenes; all of it pales those that lie right
-_BLURRED = 0.5
+_UNCERTAINTY_BLUR = 0.5
+"""Share of a direction's uncertainty that blurs shadows; measured: least error in rendered scenes. All of it makes
+shadows of a right direction too pale."""
+_LEAST_AMBIENT = 1e-3
+"""Share of the largest ambient coefficient below which ambient irradiance does not fall: expansions may be negative."""
 
 
 @dataclass(frozen=True)
 class LightSource:
-    """One bright, far patch of light."""
+    """One distant, bright, round light."""
 
     direction: tuple[float, float, float]
     """Unit vector from the place towards the light, world frame."""
     irradiance: tuple[float, float, float]
-    """Linear rgb on a plane that faces the light; a white sky of radiance 1 gives pi on the ground."""
+    """Linear rgb on a plane that faces the light, in units in which a white sky of radiance 1 gives pi."""
     angular_radius_deg: float = 3.0
-    """Half the angle under which the light is seen, degrees; the sun's is 0.27."""
+    """Half the angle that the light subtends, degrees; the sun's is 0.27."""
     uncertainty_deg: float = 0.0
     """Standard error of `direction`, degrees; shadows are softened by it."""
     confidence: float = 1.0
-    """How sure it is that this light is there, in [0, 1]; scales its shadow."""
+    """Probability that this light exists, in [0, 1]; scales its shadow."""
     name: str = "light"
-    """What a report calls it: sun, window, lamp."""
+    """Shown in reports: sun, window, lamp."""
     blockers_within: float = math.inf
-    """Only what is nearer than this, world units, can block it: beyond lies what it comes through, as a window."""
+    """World units; occluders farther away do not block it, such as the window that it comes through."""
 
     @property
     def softness(self) -> float:
-        """Radius of the cone over which a shadow is spread, radians: the light's own size and part of the doubt."""
-        return math.hypot(math.radians(self.angular_radius_deg), _BLURRED * math.radians(self.uncertainty_deg))
+        """Radius of the cone over which its shadow is blurred, radians: its size and half of its uncertainty."""
+        return math.hypot(math.radians(self.angular_radius_deg), _UNCERTAINTY_BLUR * math.radians(self.uncertainty_deg))
 
     @property
     def luminance(self) -> float:
@@ -53,34 +53,34 @@ class LightSource:
 
 @dataclass(frozen=True)
 class Light:
-    """The light that arrives at one place, world frame, linear rgb."""
+    """The light at one place, world frame, linear rgb."""
 
     sources: tuple[LightSource, ...]
-    """Brightest first; none under an even sky."""
+    """Brightest first; empty under an even sky."""
     ambient: Float[Tensor, "9 3"]
-    """Radiance of everything else, spherical harmonics of degree 2."""
+    """Radiance from everything else, spherical harmonics of degree 2."""
     coverage: float = 1.0
-    """Share of the sphere around the place that the capture saw, in [0, 1]."""
+    """Share of the directions around the place that were captured, in [0, 1]."""
     unseen_up: float = 0.0
-    """Share of the 60 degrees around straight up that the capture did not see, in [0, 1]."""
+    """Share of the directions within 60 degrees of up that were not captured, in [0, 1]."""
 
     def ambient_radiance(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Linear radiance of the ambient part from unit `directions`, never negative."""
+        """Linear rgb radiance of the ambient light from unit `directions`, at least 0."""
         values = spherical_harmonics.basis(directions, _AMBIENT_DEGREE) @ self.ambient.to(directions)
         return values.clamp_min(0)
 
     def irradiance(self, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Linear irradiance on unshadowed planes with unit `normals` (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
+        """Linear rgb irradiance on unshadowed planes with unit `normals` (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
         bands = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5).to(normals)
         total = spherical_harmonics.basis(normals, _AMBIENT_DEGREE) @ (bands[:, None] * self.ambient.to(normals))
-        total = total.clamp_min(1e-3 * float(self.ambient[0].abs().max()) + 1e-6)
+        total = total.clamp_min(_LEAST_AMBIENT * float(self.ambient[0].abs().max()) + 1e-6)
         for source in self.sources:
             cosine = (normals @ torch.tensor(source.direction).to(normals)).clamp_min(0)
             total = total + cosine[:, None] * torch.tensor(source.irradiance).to(normals)
         return total
 
     def rotated(self, rotation: Float[Tensor, "3 3"]) -> "Light":
-        """The same light in a frame turned by `rotation`."""
+        """The same light in a frame that is rotated by `rotation`."""
         turned = [(rotation.double() @ torch.tensor(s.direction, dtype=torch.float64)).tolist() for s in self.sources]
         sources = tuple(replace(s, direction=(d[0], d[1], d[2])) for s, d in zip(self.sources, turned, strict=True))
         ambient = spherical_harmonics.rotate(self.ambient[None], rotation)[0]
@@ -104,7 +104,7 @@ class Light:
 
 
 def fit_ambient(radiance: Float[Tensor, "3"]) -> Float[Tensor, "9 3"]:
-    """Coefficients of an even ambient light of linear `radiance`."""
+    """Coefficients of uniform ambient light of linear rgb `radiance`."""
     out = torch.zeros(_AMBIENT_COUNT, 3)
     out[0] = radiance / spherical_harmonics.C0
     return out

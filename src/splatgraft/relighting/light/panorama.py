@@ -1,4 +1,4 @@
-"""What surrounds a point of a scene: six square renders in linear light, and what is unseen. Picks no light."""
+"""Panorama around a point of a scene: a cube map of linear radiance and alpha, rendered from the Gaussians."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.rendering import RenderOptions, render
 
-# right, down and forward of each face: +x, -x, +y, -y, +z, -z
+# rows right, down and forward of each face: +x, -x, +y, -y, +z, -z
 _FACES = torch.tensor(
     [
         [[0.0, -1, 0], [0, 0, -1], [1, 0, 0]],
@@ -23,10 +23,11 @@ _FACES = torch.tensor(
         [[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]],
     ]
 )
-# under this much opacity the colour of a pixel is noise
+# set by hand
 _FAINTEST = 0.02
-# standard deviation over distance: what is wider is smeared over half a face by the affine approximation of splatting
+"""Alpha below which a pixel is empty: its colour is noise."""
 _WIDEST = 0.2
+"""Standard deviation over distance; wider Gaussians are left out, as splatting's affine approximation smears them."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,9 @@ class Panorama:
     """A cube map of s x s pixels per face around one point."""
 
     radiance: Float[Tensor, "6 s s 3"]
-    """Linear light from each direction, of what is there (not darkened where it is half transparent); at least 0."""
+    """Linear rgb, at least 0, from each direction, not premultiplied by alpha."""
     alpha: Float[Tensor, "6 s s"]
-    """How much is there, in [0, 1]: 0 where the capture never saw anything."""
+    """In [0, 1]; 0 where nothing was captured."""
     directions: Float[Tensor, "6 s s 3"]
     """Unit, from the point outwards, in the scene's frame."""
     solid_angles: Float[Tensor, "6 s s"]
@@ -49,7 +50,7 @@ class Panorama:
 
 
 def cube_cameras(center: Float[Tensor, "3"], size: int) -> Cameras:
-    """Six cameras of 90 degrees at `center` that together see everything once."""
+    """Six cameras of 90 degrees at `center`, `size` pixels wide, that cover all directions once."""
     poses = torch.eye(4).repeat(6, 1, 1)
     poses[:, :3, :3] = _FACES.transpose(1, 2)
     poses[:, :3, 3] = center
@@ -57,7 +58,7 @@ def cube_cameras(center: Float[Tensor, "3"], size: int) -> Cameras:
 
 
 def cube_directions(size: int) -> tuple[Float[Tensor, "6 s s 3"], Float[Tensor, "6 s s"]]:
-    """Unit directions and solid angles of the pixels of a cube map, in the order of `cube_cameras`."""
+    """Unit directions and solid angles (steradians) of a cube map's pixels, in the order of `cube_cameras`."""
     x = (torch.arange(size, dtype=torch.float64) + 0.5) / size * 2 - 1
     v, u = torch.meshgrid(x, x, indexing="ij")
     rays = torch.stack([u, v, torch.ones_like(u)], -1)
@@ -71,20 +72,27 @@ def cube_directions(size: int) -> tuple[Float[Tensor, "6 s s 3"], Float[Tensor, 
 
 
 def render_panorama(scene: Gaussians, center: Float[Tensor, "3"], *, size: int = 64, nearest: float = 0.0) -> Panorama:
-    """What `scene` looks like from `center`; Gaussians centred nearer than `nearest` (world units) are left out."""
+    """Render the panorama of `scene` from `center`.
+
+    Args:
+        scene: All Gaussians.
+        center: World units.
+        size: Width of a face, pixels.
+        nearest: World units; Gaussians whose centre is nearer are left out.
+    """
     distance = (scene.means - center.to(scene.means)).norm(dim=-1)
     far_enough = (distance >= nearest) & (scene.scales.max(1).values < _WIDEST * distance)
-    # the plane of each face only has to keep out what is behind it: distance was taken care of above
+    # the near plane of each face only removes what is behind it: near Gaussians are already left out
     near = max(nearest / math.sqrt(3), 1e-6)
-    seen = render(scene.select(far_enough), cube_cameras(center, size), options=RenderOptions(near=near))
-    alpha = seen.alpha.detach().clamp(0, 1)
-    # Gaussians are blended in sRGB: the colour of what is there comes first, its linear light second
-    color = seen.color.detach().clamp_min(0) / alpha.clamp_min(_FAINTEST)[..., None]
-    there = alpha > _FAINTEST
+    rendered = render(scene.select(far_enough), cube_cameras(center, size), options=RenderOptions(near=near))
+    alpha = rendered.alpha.detach().clamp(0, 1)
+    # Gaussians are blended in sRGB, so alpha is divided out before the conversion to linear light
+    color = rendered.color.detach().clamp_min(0) / alpha.clamp_min(_FAINTEST)[..., None]
+    visible = alpha > _FAINTEST
     directions, solid_angles = cube_directions(size)
     return Panorama(
-        radiance=linear_from_srgb(color) * there[..., None],
-        alpha=alpha * there,
+        radiance=linear_from_srgb(color) * visible[..., None],
+        alpha=alpha * visible,
         directions=directions.to(alpha),
         solid_angles=solid_angles.to(alpha),
     )

@@ -1,4 +1,4 @@
-"""A `Light` from a panorama: bright patches become sources, the rest an ambient part. Knows nothing about shadows."""
+"""A `Light` from a panorama: bright patches become sources, the rest becomes ambient light of degree 2."""
 
 import math
 from dataclasses import dataclass
@@ -14,10 +14,35 @@ from splatgraft.core.images import srgb_from_linear
 from splatgraft.relighting.light.light import Light, LightSource
 from splatgraft.relighting.light.panorama import Panorama
 
-_CLIPPED = 0.97  # sRGB at which a photograph may hide more light
-_SMALLEST = 2e-4  # steradians; fewer is a glint or a stray Gaussian (the sun's glare in a photograph is larger)
-_LARGEST = 0.6  # steradians; a wider bright patch is a sky, and stays ambient
-_MAX_SOURCES = 4
+
+@dataclass(frozen=True)
+class PanoramaSourceSettings:
+    """Which patches of a panorama are sources, all set by hand."""
+
+    clipped: float = 0.97
+    """sRGB of the brightest channel from which a photograph may be clipped."""
+    brightest_mean: float = 0.85
+    """sRGB that the mean of the three channels exceeds, besides: saturated colours are no light."""
+    covered: float = 0.5
+    """Alpha above which a pixel counts as captured."""
+    smallest: float = 2e-4
+    """Steradians; a smaller patch is a highlight or a stray Gaussian (the sun's glare in a photograph is larger)."""
+    largest: float = 0.6
+    """Steradians; a larger patch is sky and stays ambient."""
+    most: int = 4
+    """Sources."""
+    joined_px: float = 2.0
+    """Pixels between patches that are joined."""
+    most_joined: int = 32
+    """Patches that are joined at all, the largest ones."""
+    widest: float = math.radians(15)
+    """Radians, half the extent; longer patches are cut in half (median cut, Debevec 2005)."""
+    cuts: int = 2
+    """Most cuts of a patch, one after another."""
+    uncertainty_deg: float = 2.0
+    """Degrees, of a source's direction."""
+    overhead: float = 0.5
+    """Cosine to the up direction of what counts as ceiling, 60 degrees."""
 
 
 @dataclass(frozen=True)
@@ -25,26 +50,35 @@ class Patch:
     """A bright, connected part of a panorama."""
 
     direction: Float[Tensor, "3"]
+    """Unit, towards its middle."""
     radiance: Float[Tensor, "3"]
     """Mean linear rgb, as clipped by the camera."""
     solid_angle: float
     """Steradians."""
 
 
-def light_from_panorama(panorama: Panorama, up: Float[Tensor, "3"]) -> Light:
-    """The light that a panorama shows, as far as its camera did not clip it."""
-    seen = panorama.alpha > 0.5
-    patches, covered = bright_patches(panorama)
-    weights = (panorama.solid_angles * panorama.alpha * (seen & ~covered)).flatten()
+def light_from_panorama(
+    panorama: Panorama, up: Float[Tensor, "3"], *, settings: PanoramaSourceSettings = PanoramaSourceSettings()
+) -> Light:
+    """The light in a panorama; sources are as bright as the camera's clipping left them.
+
+    Args:
+        panorama: At the place.
+        up: Unit, world frame; for the share of the ceiling that was not captured.
+        settings: Which patches are sources.
+    """
+    captured = panorama.alpha > settings.covered
+    patches, of_sources = bright_patches(panorama, settings=settings)
+    weights = (panorama.solid_angles * panorama.alpha * (captured & ~of_sources)).flatten()
     ambient = fit_sh(panorama.directions.reshape(-1, 3), panorama.radiance.reshape(-1, 3), weights)
-    above = (panorama.directions @ up) > 0.5
+    above = (panorama.directions @ up) > settings.overhead
     overhead = panorama.solid_angles * above
     sources = [
         LightSource(
             direction=_tuple(patch.direction),
             irradiance=_tuple(patch.radiance * patch.solid_angle),
             angular_radius_deg=math.degrees(math.acos(1 - patch.solid_angle / (2 * math.pi))),
-            uncertainty_deg=2.0,
+            uncertainty_deg=settings.uncertainty_deg,
             confidence=1.0,
             name="bright patch",
         )
@@ -58,14 +92,17 @@ def light_from_panorama(panorama: Panorama, up: Float[Tensor, "3"]) -> Light:
     )
 
 
-def bright_patches(panorama: Panorama) -> tuple[list[Patch], Bool[Tensor, "6 s s"]]:
-    """Connected parts near the camera's clipping point, brightest first, and the pixels they cover.
+def bright_patches(
+    panorama: Panorama, *, settings: PanoramaSourceSettings = PanoramaSourceSettings()
+) -> tuple[list[Patch], Bool[Tensor, "6 s s"]]:
+    """Connected parts of a panorama near the camera's clipping point, brightest first, and the pixels they cover.
 
-    Parts that are cut by an edge between faces are joined where they touch; long ones are cut in half along their
-    longest extent until none is wider than 30 degrees (median cut, Debevec 2005).
+    Parts that an edge between faces separates are joined. Parts wider than 30 degrees are cut in half along their
+    longest extent, twice at most (median cut, Debevec 2005).
     """
     srgb = srgb_from_linear(panorama.radiance)
-    bright = (srgb.max(-1).values >= _CLIPPED) & (srgb.mean(-1) > 0.85) & (panorama.alpha > 0.5)
+    bright = srgb.max(-1).values >= settings.clipped
+    bright &= (srgb.mean(-1) > settings.brightest_mean) & (panorama.alpha > settings.covered)
     labels = np.zeros(bright.shape, np.int32)
     count = 0
     for face in range(6):
@@ -73,24 +110,27 @@ def bright_patches(panorama: Panorama) -> tuple[list[Patch], Bool[Tensor, "6 s s
         labels[face] = np.where(found > 0, found + count, 0)
         count += n
     groups: list[Bool[Tensor, "6 s s"]] = [torch.from_numpy(labels == i) for i in range(1, count + 1)]
-    groups = _joined(groups, panorama)
+    groups = _joined(groups, panorama, settings)
     covered = torch.zeros_like(bright)
     patches = []
     for group in groups:
         solid_angle = float(panorama.solid_angles[group].sum())
-        if not _SMALLEST <= solid_angle <= _LARGEST:
+        if not settings.smallest <= solid_angle <= settings.largest:
             continue
         covered |= group
-        patches += _cut(panorama, group)
+        patches += _cut(panorama, group, settings)
     patches.sort(key=lambda p: -float(p.radiance.sum()) * p.solid_angle)
-    return patches[:_MAX_SOURCES], covered
+    return patches[: settings.most], covered
 
 
-def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Bool[Tensor, "6 s s"]]:
-    """Groups whose nearest pixels lie within two pixels' angle become one."""
-    touching = 4.0 / panorama.alpha.shape[1]
+def _joined(
+    groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama, settings: PanoramaSourceSettings
+) -> list[Bool[Tensor, "6 s s"]]:
+    """The groups, of which those with pixels nearer than two pixels' angle are joined."""
+    # a face spans 2 units of tan(angle)
+    touching = 2 * settings.joined_px / panorama.alpha.shape[1]
     out: list[Bool[Tensor, "6 s s"]] = []
-    for group in sorted(groups, key=lambda g: -int(g.sum()))[:32]:
+    for group in sorted(groups, key=lambda g: -int(g.sum()))[: settings.most_joined]:
         for i, other in enumerate(out):
             cosine = panorama.directions[group][::3] @ panorama.directions[other][::3].T
             if float(cosine.max()) > math.cos(touching):
@@ -101,7 +141,10 @@ def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Boo
     return out
 
 
-def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], depth: int = 0) -> list[Patch]:
+def _cut(
+    panorama: Panorama, group: Bool[Tensor, "6 s s"], settings: PanoramaSourceSettings, *, depth: int = 0
+) -> list[Patch]:
+    """The group as one patch, or as several where it is long."""
     directions, angles = panorama.directions[group], panorama.solid_angles[group]
     radiance = panorama.radiance[group]
     weight = angles * radiance.mean(-1)
@@ -110,15 +153,15 @@ def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], depth: int = 0) -> li
     spread = directions - center
     covariance = spread.T @ (weight[:, None] * spread)
     values, vectors = torch.linalg.eigh(covariance)
-    # an even strip of half-width w has variance w^2 / 3
-    if depth < 2 and float(values[-1].clamp_min(0).sqrt()) * math.sqrt(3) > math.radians(15):
+    # a uniform strip of half-width w has variance w^2 / 3
+    if depth < settings.cuts and float(values[-1].clamp_min(0).sqrt()) * math.sqrt(3) > settings.widest:
         side = spread @ vectors[:, -1] > 0
         halves = []
         for half in (side, ~side):
             part = torch.zeros_like(group)
             part[group] = half
             if bool(part.any()):
-                halves += _cut(panorama, part, depth + 1)
+                halves += _cut(panorama, part, settings, depth=depth + 1)
         return halves
     mean = (angles[:, None] * radiance).sum(0) / angles.sum()
     return [Patch(direction=center, radiance=mean, solid_angle=float(angles.sum()))]

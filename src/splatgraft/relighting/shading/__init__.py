@@ -1,1 +1,1 @@
-"""How surfaces answer to light: normals, irradiance, reflection, and the change between two lights."""
+"""Shading of Gaussians: normals, irradiance, reflections, and ratios between two lights."""

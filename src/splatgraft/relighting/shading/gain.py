@@ -1,4 +1,7 @@
-"""The first form of light transfer: one gain per colour channel, from the light around both places. Casts no shadow."""
+"""One gain per colour channel from the mean light around an object's old and new place; applied to Gaussians.
+
+The simplest light transfer: exposure and white balance, no shading and no shadow.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,38 +15,41 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.relighting.light.panorama import Panorama
 
+_DARKEST = 1e-4
+"""Linear light, a third of one 8-bit step; darker light counts as this."""
+
 
 @dataclass(frozen=True)
 class GainOptions:
-    """How far a gain may go."""
+    """Limits of a gain, all set by hand."""
 
     largest: float = 4.0
-    """No channel is multiplied or divided by more."""
+    """Most factor by which a channel is multiplied or divided."""
     largest_tint: float = 1.6
-    """No channel departs from the mean of the three by more: what exceeds it is rather a coloured wall than light."""
+    """Most factor between a channel and the mean of the three; more is likely a coloured wall, not the light."""
     trusted_coverage: float = 0.5
-    """Where less of the light's sphere was captured, the gain shrinks towards 1 in proportion."""
+    """Share of directions, in [0, 1]; where less was captured the gain is moved towards 1 in proportion."""
 
 
 @dataclass(frozen=True)
 class LocalGain:
-    """The gain of one object, and what it comes from."""
+    """The gain of one object, with the two lights that it is the ratio of."""
 
     gain: Float[Tensor, "3"]
-    """Multiplies linear light, r g b."""
+    """Factor on linear rgb."""
     source_light: Float[Tensor, "3"]
     """Mean linear radiance on the object where it was captured."""
     target_light: Float[Tensor, "3"]
     """The same where it is placed."""
     source_coverage: float
-    """Share of that light's directions that the source capture covers, in [0, 1]."""
+    """Share of that light's directions that the source's capture covers, in [0, 1]."""
     target_coverage: float
     """The same in the target."""
     held_back: bool
-    """Whether a bound or missing coverage made the gain smaller than measured."""
+    """Whether a limit or missing coverage made the gain smaller than measured."""
 
     def describe(self) -> str:
-        """One line for people."""
+        """One line for a report."""
         r, g, b = self.gain.tolist()
         text = (
             f"Exposure and white balance: red x{r:.2f}, green x{g:.2f}, blue x{b:.2f}. "
@@ -61,25 +67,29 @@ def local_gain(
     target_up: Float[Tensor, "3"],
     options: GainOptions = GainOptions(),
 ) -> LocalGain:
-    """The light at the object's new place over that at its old one, per channel, in linear light.
+    """The mean light at an object's new place over that at its old one, per channel, in linear light, limited.
 
-    `source` is taken with the object removed. Without a panorama of one of them (coverage 0) the gain is 1.
+    Args:
+        source: Panorama at the old place, with the object removed.
+        target: Panorama at the new place. The gain is 1 where either covers nothing.
+        source_up: Unit, in the source's frame.
+        target_up: Unit, in the target's frame.
+        options: Limits.
     """
-    before, source_coverage = mean_light(source, source_up)
-    after, target_coverage = mean_light(target, target_up)
-    # 1e-4 in linear light is a third of one 8-bit step: darker light is not told apart
-    measured = (after.clamp_min(1e-4) / before.clamp_min(1e-4)).log()
+    source_light, source_coverage = mean_light(source, source_up)
+    target_light, target_coverage = mean_light(target, target_up)
+    measured = (target_light.clamp_min(_DARKEST) / source_light.clamp_min(_DARKEST)).log()
     exposure = measured.mean()
     tint = math.log(options.largest_tint)
     bounded = (exposure + (measured - exposure).clamp(-tint, tint)).clamp(
         -math.log(options.largest), math.log(options.largest)
     )
-    trust = min(1.0, min(source_coverage, target_coverage) / options.trusted_coverage)
-    gain = (bounded * trust).exp()
+    share = min(1.0, min(source_coverage, target_coverage) / options.trusted_coverage)
+    gain = (bounded * share).exp()
     return LocalGain(
         gain=gain,
-        source_light=before,
-        target_light=after,
+        source_light=source_light,
+        target_light=target_light,
         source_coverage=source_coverage,
         target_coverage=target_coverage,
         held_back=bool((gain.log() - measured).abs().max() > 1e-3),
@@ -87,10 +97,17 @@ def local_gain(
 
 
 def mean_light(panorama: Panorama, up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], float]:
-    """Mean radiance on a dome that stands on a surface, and the coverage of the directions that matter to it.
+    """Mean radiance that reaches a dome on a surface, and the coverage of the directions that light it.
 
-    Over all normals of the upper hemisphere, light from direction d counts by (1 + d . up) / 2: the integral of the
-    cosine. Directions that were not captured are taken to be as bright as the rest.
+    The mean over all normals of the upper hemisphere weights light from direction d by (1 + d . up) / 2, the integral
+    of the clamped cosine. Directions that were not captured are assumed to be as bright as the rest.
+
+    Args:
+        panorama: At the dome's place.
+        up: Unit, the axis of the dome.
+
+    Returns:
+        Linear rgb radiance, and the weighted share of directions that were captured, in [0, 1].
     """
     cosine = panorama.directions @ torch.nn.functional.normalize(up, dim=0).to(panorama.directions)
     weight = (1 + cosine) / 2 * panorama.solid_angles
@@ -100,13 +117,13 @@ def mean_light(panorama: Panorama, up: Float[Tensor, "3"]) -> tuple[Float[Tensor
 
 
 def apply_gain(gaussians: Gaussians, gain: Float[Tensor, "3"] | Float[Tensor, "n 3"]) -> Gaussians:
-    """The same Gaussians under `gain` times the light, in linear light; bands above 0 to first order around the mean.
+    """Gaussians whose linear colour is multiplied by `gain`; bands above 0 to first order around the mean colour.
 
-    DC' = sRGB(gain * linear(DC)); higher bands are multiplied by the slope of that curve at DC.
+    DC' = sRGB(gain * linear(DC)); higher bands are multiplied by the derivative of that curve at DC. A Gaussian whose
+    gain is exactly 1 keeps every bit.
     """
     color = spherical_harmonics.rgb_from_dc(gaussians.sh[:, 0])
     lit, slope = _through_linear(color, gain.to(color).expand_as(color))
-    # where nothing changes, not a bit does
     same = (gain == 1).to(color.device).expand_as(color)
     dc = torch.where(same, gaussians.sh[:, 0], spherical_harmonics.dc_from_rgb(lit))
     higher = gaussians.sh[:, 1:] * torch.where(same, torch.ones_like(slope), slope)[:, None]
@@ -116,8 +133,8 @@ def apply_gain(gaussians: Gaussians, gain: Float[Tensor, "3"] | Float[Tensor, "n
 def _through_linear(
     srgb: Float[Tensor, "n 3"], gain: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """sRGB after its linear light is multiplied, and the derivative of that."""
-    # the gain may be a leaf of someone's optimisation: only the slope is taken here
+    """sRGB colours after a gain on linear light, and the derivative by the sRGB colour before."""
+    # the caller may be optimising the gain: this derivative is by the colour alone
     with torch.enable_grad():
         point = srgb.detach().requires_grad_()
         lit = srgb_from_linear(linear_from_srgb(point) * gain.detach())

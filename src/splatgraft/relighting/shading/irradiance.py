@@ -1,26 +1,55 @@
-"""The factor on an object's linear colours that turns one place's light into another's. Knows no scene and no files."""
+"""Irradiance of Gaussians under light samples, and the ratio of two lights' irradiance as a factor on linear colours.
+
+The ratio is limited, and its mean is shrunk where the lights were seen in part (ratio images, Debevec 1998).
+"""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.relighting.shading.normals import Normals
-from splatgraft.relighting.shadows.occlusion import LightSamples
+from splatgraft.relighting.shadows.light_sampling import LightSamples
 
-_SPAN = 5.0  # no Gaussian changes by more than this against the object's mean change
-_FLOOR = 0.08  # of the mean irradiance: interreflections that no bundle follows
+
+@dataclass(frozen=True)
+class ShadeSettings:
+    """Limits of the shading ratio."""
+
+    span: float = 5.0
+    """Most factor by which a Gaussian's ratio may differ from the object's mean ratio; set by hand."""
+    floor: float = 0.08
+    """Share of the mean irradiance that is added to all: interreflections that no sample follows; set by hand."""
+    confidence_gain: float = 1.6
+    """Factor on the confidence of normals; 1 and more means fully believed; set by hand."""
+    gray_power: float = 0.5
+    """The mean's gray part is scaled by coverage to this power; near least squares over rendered scenes."""
+    tint_power: float = 3.0
+    """The same for the mean's tint."""
+    unknown_share: float = 0.5
+    """Share of the new light's variation that an object of unknown source light takes on; set by hand."""
+
+
+def soft_cosine(cosine: Float[Tensor, "n k"], softness: Float[Tensor, "k"]) -> Float[Tensor, "n k"]:
+    """Mean of max(0, cos) over a cone of radius `softness`, radians, approximated by a quadratic."""
+    edge = torch.sin(softness.clamp_max(math.pi / 2))
+    return torch.where(cosine >= edge, cosine, ((cosine + edge).clamp_min(0)) ** 2 / (4 * edge))
 
 
 def irradiance(
-    beams: LightSamples, normals: Float[Tensor, "n 3"], *, arrives: Float[Tensor, "n k"]
+    samples: LightSamples, normals: Float[Tensor, "n 3"], *, sample_visibility: Float[Tensor, "n k"]
 ) -> Float[Tensor, "n 3"]:
-    """Linear irradiance where `arrives` is the share of every bundle that reaches each point."""
-    cosine = normals @ beams.directions.T
-    edge = torch.sin(beams.softness.clamp_max(math.pi / 2))
-    soft = torch.where(cosine >= edge, cosine, ((cosine + edge).clamp_min(0)) ** 2 / (4 * edge))
-    return (soft * arrives) @ beams.irradiance
+    """Linear rgb irradiance on surfaces with unit `normals`.
+
+    Args:
+        samples: The k samples of a light.
+        normals: Unit.
+        sample_visibility: Share of every sample that reaches each surface, in [0, 1].
+    """
+    soft = soft_cosine(normals @ samples.directions.T, samples.softness)
+    return (soft * sample_visibility) @ samples.irradiance
 
 
 def shade_ratio(
@@ -29,26 +58,47 @@ def shade_ratio(
     normals: Normals,
     opacities: Float[Tensor, "n"],
     *,
-    seen: float = 1.0,
+    coverage: float = 1.0,
+    settings: ShadeSettings = ShadeSettings(),
 ) -> Float[Tensor, "n 3"]:
-    """Irradiance at the new place over irradiance at the old one, made safe.
+    """Factor on an object's linear colours: irradiance at the new place over irradiance at the old one.
 
-    Floored, clamped around the object's mean, and drawn towards that mean where the normal is unsure. The mean is drawn
-    towards 1 the less of both lights was `seen`, in [0, 1], and its tint more so: both captures were exposed and white
-    balanced for their own light. The powers, 1/2 and 3, are near least squares over rendered scenes with known light.
+    Floored, limited around the object's mean, and reduced to that mean where normals are unsure. The mean, and its
+    tint even more, is moved towards 1 as `coverage` falls: both captures were exposed and white balanced for their
+    own light.
+
+    Args:
+        target: Linear irradiance at the new place.
+        source: Linear irradiance at the old place.
+        normals: Of the object's Gaussians.
+        opacities: Weights of the means, in [0, 1].
+        coverage: Share of both lights' surroundings that was captured, in [0, 1].
+        settings: Limits.
     """
-    log_ratio = (_floored(target, opacities) / _floored(source, opacities)).log()
-    middle = _mean(log_ratio, opacities)
-    gray = middle.mean()
-    return _safe(log_ratio - middle + seen**0.5 * gray + seen**3 * (middle - gray), normals, opacities)
+    log_ratio = (_floored(target, opacities, settings) / _floored(source, opacities, settings)).log()
+    mean = _mean(log_ratio, opacities)
+    gray = mean.mean()
+    gray_share, tint_share = coverage**settings.gray_power, coverage**settings.tint_power
+    return _limited(log_ratio - mean + gray_share * gray + tint_share * (mean - gray), normals, opacities, settings)
 
 
 def unknown_origin_ratio(
-    target: Float[Tensor, "n 3"], normals: Normals, opacities: Float[Tensor, "n"]
+    target: Float[Tensor, "n 3"],
+    normals: Normals,
+    opacities: Float[Tensor, "n"],
+    *,
+    settings: ShadeSettings = ShadeSettings(),
 ) -> Float[Tensor, "n 3"]:
-    """Ratio for an object whose old light nobody knows: half of the new light's variation, no change of the mean."""
-    log_ratio = 0.5 * _floored(target, opacities).log()
-    return _safe(log_ratio - _mean(log_ratio, opacities), normals, opacities)
+    """The factor for an object of unknown source light: half of the new light's variation, a mean of 1.
+
+    Args:
+        target: Linear irradiance at the new place.
+        normals: Of the object's Gaussians.
+        opacities: Weights of the mean, in [0, 1].
+        settings: Limits.
+    """
+    log_ratio = settings.unknown_share * _floored(target, opacities, settings).log()
+    return _limited(log_ratio - _mean(log_ratio, opacities), normals, opacities, settings)
 
 
 def _mean(values: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Float[Tensor, "1 3"]:
@@ -56,12 +106,17 @@ def _mean(values: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Float[
     return (weight[:, None] * values).sum(0, keepdim=True)
 
 
-def _floored(values: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    return (values + _FLOOR * _mean(values, opacities)).clamp_min(1e-6)
+def _floored(
+    values: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], settings: ShadeSettings
+) -> Float[Tensor, "n 3"]:
+    return (values + settings.floor * _mean(values, opacities)).clamp_min(1e-6)
 
 
-def _safe(log_ratio: Float[Tensor, "n 3"], normals: Normals, opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    middle = _mean(log_ratio, opacities)
-    trust = (1.6 * normals.confidence).clamp(0, 1)[:, None]
-    spread = ((log_ratio - middle) * trust).clamp(-math.log(_SPAN), math.log(_SPAN))
-    return (middle + spread).exp()
+def _limited(
+    log_ratio: Float[Tensor, "n 3"], normals: Normals, opacities: Float[Tensor, "n"], settings: ShadeSettings
+) -> Float[Tensor, "n 3"]:
+    """The ratio of which the variation is scaled by the normals' confidence and limited."""
+    mean = _mean(log_ratio, opacities)
+    believed = (settings.confidence_gain * normals.confidence).clamp(0, 1)[:, None]
+    span = math.log(settings.span)
+    return (mean + ((log_ratio - mean) * believed).clamp(-span, span)).exp()

@@ -1,7 +1,4 @@
-"""The k nearest of a set of points to each of them, exactly: a tree of boxes over points sorted along a Z curve.
-
-Points in, indices out; knows nothing about Gaussians.
-"""
+"""Exact k nearest neighbours within a set of points, by a tree of bounding boxes over points in Morton order."""
 
 from typing import no_type_check
 
@@ -13,22 +10,23 @@ from torch import Tensor
 
 from splatgraft.runtime.kernel_lock import serialized
 
-_LEAF = 8  # points per lowest box
+_LEAF = 8
+"""Points per lowest box."""
 
 
 def nearest_neighbours(points: Float[Tensor, "n 3"], *, count: int) -> Int[Tensor, "n k"]:
-    """Indices of the `count` nearest points to each point, itself among them, in no order; k = min(count, n)."""
+    """Indices of the `count` nearest points to each point, itself included, unordered; k = min(count, n)."""
     found = np.empty((len(points), min(count, len(points))), np.int32)
     if found.size:
-        placed = np.ascontiguousarray(points.detach().numpy(), dtype=np.float32)
-        order = np.argsort(_z_codes(placed)).astype(np.int32)
-        boxes = _boxes(placed[order])
-        _search(placed[order], order, boxes, found)
+        coordinates = np.ascontiguousarray(points.detach().numpy(), dtype=np.float32)
+        order = np.argsort(_morton_codes(coordinates)).astype(np.int32)
+        boxes = _boxes(coordinates[order])
+        _search(coordinates[order], order, boxes, found)
     return torch.from_numpy(found)
 
 
-def _z_codes(points: np.ndarray) -> np.ndarray:
-    """Places along a Z curve through the points' bounding cube, 21 bits an axis (Morton order)."""
+def _morton_codes(points: np.ndarray) -> np.ndarray:
+    """Positions along a Z curve through the points' bounding cube, 21 bits per axis."""
     low = points.min(0)
     width = max(float((points.max(0) - low).max()), 1e-30)
     cell = ((points - low) * (float((1 << 21) - 1) / width)).astype(np.uint64)
@@ -69,7 +67,7 @@ def _boxes(points):
 @njit(cache=True, fastmath=True, inline="always")
 @no_type_check
 def _gap(box, x, y, z):
-    """Squared distance from a point to a box."""
+    """Squared distance from a point to a box; 0 inside."""
     dx = max(box[0] - x, np.float32(0), x - box[3])
     dy = max(box[1] - y, np.float32(0), y - box[4])
     dz = max(box[2] - z, np.float32(0), z - box[5])
@@ -83,15 +81,15 @@ def _search(points, order, boxes, found):  # noqa: PLR0912  (one kernel: descent
     n, k = len(points), found.shape[1]
     leaves = len(boxes) // 2
     for start in prange((n + 1023) // 1024):
-        waiting = np.empty(64, np.int64)
+        stack = np.empty(64, np.int64)
         gaps = np.empty(64, np.float32)
-        near = np.empty(k, np.float32)
-        who = np.empty(k, np.int32)
+        distances = np.empty(k, np.float32)
+        neighbour = np.empty(k, np.int32)
         for i in range(start * 1024, min(n, start * 1024 + 1024)):
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            near[:] = np.float32(1e30)
-            who[:] = order[i]
-            # the points around it on the curve first: they bound the search from the start
+            distances[:] = np.float32(1e30)
+            neighbour[:] = order[i]
+            # starts at the point's own box: its neighbours on the curve bound the search early
             own = leaves + i // _LEAF
             box, top = own, 0
             while True:
@@ -99,38 +97,38 @@ def _search(points, order, boxes, found):  # noqa: PLR0912  (one kernel: descent
                     first = (box - leaves) * _LEAF
                     for j in range(first, min(n, first + _LEAF)):
                         dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
-                        away = dx * dx + dy * dy + dz * dz
-                        if away < near[k - 1]:
+                        squared = dx * dx + dy * dy + dz * dz
+                        if squared < distances[k - 1]:
                             slot = k - 1
-                            while slot > 0 and near[slot - 1] > away:
-                                near[slot] = near[slot - 1]
-                                who[slot] = who[slot - 1]
+                            while slot > 0 and distances[slot - 1] > squared:
+                                distances[slot] = distances[slot - 1]
+                                neighbour[slot] = neighbour[slot - 1]
                                 slot -= 1
-                            near[slot] = away
-                            who[slot] = order[j]
+                            distances[slot] = squared
+                            neighbour[slot] = order[j]
                 else:
                     one, other = 2 * box, 2 * box + 1
                     a, b = _gap(boxes[one], x, y, z), _gap(boxes[other], x, y, z)
                     if a > b:
                         one, other, a, b = other, one, b, a
-                    if b < near[k - 1]:
-                        waiting[top], gaps[top] = other, b
+                    if b < distances[k - 1]:
+                        stack[top], gaps[top] = other, b
                         top += 1
-                    if a < near[k - 1]:
-                        waiting[top], gaps[top] = one, a
+                    if a < distances[k - 1]:
+                        stack[top], gaps[top] = one, a
                         top += 1
-                # what was put aside and may still hold something; then the sibling of the box that is done
-                while top > 0 and gaps[top - 1] >= near[k - 1]:
+                # next: a stacked box that may hold a nearer point, else the sibling of the finished box
+                while top > 0 and gaps[top - 1] >= distances[k - 1]:
                     top -= 1
                 if top > 0:
                     top -= 1
-                    box = waiting[top]
+                    box = stack[top]
                     continue
-                while own > 1 and _gap(boxes[own ^ 1], x, y, z) >= near[k - 1]:
+                while own > 1 and _gap(boxes[own ^ 1], x, y, z) >= distances[k - 1]:
                     own //= 2
                 if own <= 1:
                     break
                 box = own ^ 1
                 own //= 2
             for slot in range(k):
-                found[order[i], slot] = who[slot]
+                found[order[i], slot] = neighbour[slot]

@@ -1,7 +1,8 @@
-"""Surface normals of Gaussians, with a confidence. Knows nothing about light or images.
+"""Surface normals of Gaussians with a confidence, turned towards the cameras that see them.
 
-A Gaussian and its neighbours together are a mixture; the shortest axis of the mixture's covariance is the normal. It
-joins each one's own shortest axis, its neighbours' axes and how they lie, and stays defined where Gaussians are round.
+A Gaussian and its nearest neighbours are taken as a mixture; the shortest axis of the mixture's covariance is the
+normal. The covariance joins the Gaussian's own shape, its neighbours' shapes and their positions, so the normal is
+defined for round Gaussians too.
 """
 
 from dataclasses import dataclass
@@ -19,68 +20,82 @@ from splatgraft.relighting.shading.nearest_neighbours import nearest_neighbours
 from splatgraft.relighting.shadows.camera_visibility import seen_from, spread_over
 from splatgraft.runtime.kernel_lock import serialized
 
-NEIGHBOURS = 16
-_VIEWERS = 8
+# set by hand
+_NEIGHBOURS = 16
+"""Gaussians per mixture."""
+_CAMERAS = 8
+"""Cameras whose view is tested."""
+_UNSEEN_CONFIDENCE = 0.5
+"""Factor on the confidence of normals that no tested camera sees."""
+_RAISED = 1.5
+"""Standard deviations along the normal from a Gaussian's centre to where its surface is visible."""
+_OWN_WEIGHT = 0.5
+"""Of a Gaussian's own covariance beside the mixture's, both scaled to trace 1."""
+_FLATNESS_GAIN = 2
+"""1 - thickness / width, times this, is the confidence: a Gaussian twice as wide as thick is a surface."""
 
 
 @dataclass(frozen=True)
 class Normals:
-    """Per Gaussian, where its surface looks."""
+    """Surface normals of n Gaussians."""
 
     vectors: Float[Tensor, "n 3"]
     """Unit, world frame, towards the cameras."""
     confidence: Float[Tensor, "n"]
-    """0 where neighbours are a round cloud or face different ways, 1 on a plane."""
+    """In [0, 1]: 0 where neighbours form a round cloud or disagree, 1 on a plane."""
     seen: Bool[Tensor, "n"]
-    """Whether some camera sees it, not behind others: what none sees was never given its true colour."""
+    """Whether some camera sees it unoccluded; the colour of others was never observed."""
 
 
 def estimate_normals(gaussians: Gaussians, cameras: Cameras, *, among: Gaussians | None = None) -> Normals:
-    """Normals turned towards the cameras that see each Gaussian, not behind others; less sure where none does.
+    """Normals of `gaussians`, towards the cameras that see each one; with less confidence where none does.
 
-    `among` are the others that may hide it; they are itself where none are given.
+    Args:
+        gaussians: n Gaussians.
+        cameras: Of their capture; some of them, spread over the list, are tested.
+        among: All Gaussians that may occlude them; `gaussians` themselves by default.
     """
     n = gaussians.count
     if n == 0:
         return Normals(vectors=torch.zeros(0, 3), confidence=torch.zeros(0), seen=torch.zeros(0, dtype=torch.bool))
-    neighbours = nearest_neighbours(gaussians.means, count=NEIGHBOURS).numpy()
+    neighbours = nearest_neighbours(gaussians.means, count=_NEIGHBOURS).numpy()
     cloud = (gaussians.means.numpy(), gaussians.covariances.numpy(), gaussians.opacities.numpy())
-    towards, seen = _towards_viewers(gaussians, cameras, gaussians if among is None else among)
+    towards, seen = _towards_cameras(gaussians, cameras, gaussians if among is None else among)
     out = np.zeros((n, 4), np.float32)
     _estimate(cloud, neighbours, towards.numpy(), out)
-    result = torch.from_numpy(_agree(out, neighbours))
-    confidence = result[:, 3] * torch.where(seen, 1.0, 0.5)
+    result = torch.from_numpy(_smoothed(out, neighbours))
+    confidence = result[:, 3] * torch.where(seen, 1.0, _UNSEEN_CONFIDENCE)
     return Normals(vectors=result[:, :3].contiguous(), confidence=confidence, seen=seen)
 
 
 def raised(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Where the surface is seen: a Gaussian's own thickness above its centre."""
+    """Points on the visible side of each Gaussian: 1.5 standard deviations above its centre along its unit normal."""
     half = torch.einsum("nij,ni->nj", gaussians.rotations, normals) * gaussians.scales
-    return gaussians.means + 1.5 * half.norm(dim=1, keepdim=True) * normals
+    return gaussians.means + _RAISED * half.norm(dim=1, keepdim=True) * normals
 
 
-def _towards_viewers(
+def _towards_cameras(
     gaussians: Gaussians, cameras: Cameras, among: Gaussians
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-    """Sum of unit vectors to the cameras that see each Gaussian (to all, where none does), and whether any does."""
+    """Sum of unit vectors to the cameras that see each Gaussian (to all where none does), and whether any does."""
     total = np.zeros((2, gaussians.count, 3), np.float32)
-    for i in spread_over(cameras, count=_VIEWERS):
-        _look(
+    for i in spread_over(cameras, count=_CAMERAS):
+        _add_directions(
             gaussians.means.numpy(),
             cameras[i].centers[0].numpy(),
             seen_from(gaussians, cameras[i], among=among).numpy(),
             total,
         )
-    by_viewers, everyone = torch.from_numpy(total)
-    seen_at_all = by_viewers.norm(dim=1) > 0
-    return torch.where(seen_at_all[:, None], by_viewers, everyone), seen_at_all
+    to_seeing, to_all = torch.from_numpy(total)
+    seen_at_all = to_seeing.norm(dim=1) > 0
+    return torch.where(seen_at_all[:, None], to_seeing, to_all), seen_at_all
 
 
 @serialized
 @njit(cache=True, parallel=True)
 @no_type_check
-def _look(means, center, seen, total):
-    """Add the unit vector to a camera where a Gaussian is seen (first plane), and everywhere (second plane)."""
+def _add_directions(means, center, seen, total):
+    """Add the unit vectors to a camera: for visible Gaussians (first plane), and for all (second plane)."""
     for i in prange(len(means)):
         x, y, z = center[0] - means[i, 0], center[1] - means[i, 1], center[2] - means[i, 2]
         length = np.float32(np.sqrt(x * x + y * y + z * z)) + np.float32(1e-12)
@@ -93,7 +108,7 @@ def _look(means, center, seen, total):
 @njit(cache=True, inline="always")
 @no_type_check
 def _shortest_axis(xx, xy, xz, yy, yz, zz):
-    """Unit eigenvector of the smallest eigenvalue of a symmetric matrix, and how much shorter it is than the next."""
+    """Unit eigenvector of the smallest eigenvalue of a symmetric matrix, and 1 - sqrt(smallest / middle)."""
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean
     p = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
@@ -104,7 +119,7 @@ def _shortest_axis(xx, xy, xz, yy, yz, zz):
     smallest = mean + 2 * p * np.cos(angle + 2 * np.pi / 3)
     middle = 3 * mean - smallest - (mean + 2 * p * np.cos(angle))
     a, b, c = xx - smallest, yy - smallest, zz - smallest
-    # the eigenvector is across any two rows; of the three products the longest is the surest
+    # the eigenvector is perpendicular to any two rows; the longest of the three products is the most accurate
     best_x, best_y, best_z, longest = 0.0, 0.0, 1.0, 0.0
     for r in range(3):
         if r == 0:
@@ -128,7 +143,7 @@ def _shortest_axis(xx, xy, xz, yy, yz, zz):
 def _estimate(cloud, neighbours, towards, out):
     means, covariances, opacities = cloud
     for i in prange(len(means)):
-        # places from the point itself: squares of world coordinates would lose digits
+        # coordinates relative to the point: squares of world coordinates would lose digits
         total, cx, cy, cz = 1e-12, 0.0, 0.0, 0.0
         xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for j in neighbours[i]:
@@ -144,7 +159,7 @@ def _estimate(cloud, neighbours, towards, out):
         yy, yz, zz = yy / total - cy * cy, yz / total - cy * cz, zz / total - cz * cz
         own = covariances[i]
         scale = 1 / (xx + yy + zz + 1e-30)
-        own_scale = 0.5 / (float(own[0, 0]) + own[1, 1] + own[2, 2] + 1e-30)
+        own_scale = _OWN_WEIGHT / (float(own[0, 0]) + own[1, 1] + own[2, 2] + 1e-30)
         x, y, z, flatness = _shortest_axis(
             scale * xx + own_scale * own[0, 0],
             scale * xy + own_scale * own[0, 1],
@@ -156,15 +171,14 @@ def _estimate(cloud, neighbours, towards, out):
         if x * towards[i, 0] + y * towards[i, 1] + z * towards[i, 2] < 0:
             x, y, z = -x, -y, -z
         out[i, 0], out[i, 1], out[i, 2] = x, y, z
-        # twice as wide as thick is a surface
-        out[i, 3] = min(1.0, max(0.0, 2 * flatness))
+        out[i, 3] = min(1.0, max(0.0, _FLATNESS_GAIN * flatness))
 
 
 @serialized
 @njit(cache=True, parallel=True)
 @no_type_check
-def _agree(normals, neighbours):
-    """Average over neighbours, weighted by confidence; the length of the average says how far they agree."""
+def _smoothed(normals, neighbours):
+    """Average over neighbours, weighted by confidence; a short average lowers the confidence."""
     out = np.zeros_like(normals)
     for i in prange(len(normals)):
         x, y, z, weight = 0.0, 0.0, 0.0, 0.0

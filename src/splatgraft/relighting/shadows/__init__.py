@@ -1,1 +1,1 @@
-"""Visibility of light: samples of a light, shadow maps, occlusion, and the Gaussians that receive shadows."""
+"""Shadows: light samples, shadow maps, soft occlusion, and the Gaussians that receive shadows."""

@@ -1,4 +1,4 @@
-"""Which Gaussians a camera sees, not behind others. Knows nothing about light or colours."""
+"""Which Gaussians a camera sees unoccluded: their centres compared with a small depth image."""
 
 from typing import no_type_check
 
@@ -13,7 +13,15 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import render
 from splatgraft.runtime.kernel_lock import serialized
 
-_WIDTH = 128  # pixels; finer than any light's edge that matters here
+# set by hand
+_WIDTH = 128
+"""Pixels; width of the depth image."""
+_SURFACE_ALPHA = 0.5
+"""A pixel of at least this alpha shows a surface."""
+_DEPTH_TOLERANCE = np.float32(0.005)
+"""Share of its depth by which a Gaussian may lie behind the surface."""
+_BEHIND = 2
+"""Standard deviations by which it may lie behind, besides."""
 
 
 def spread_over(cameras: Cameras, *, count: int) -> list[int]:
@@ -23,20 +31,26 @@ def spread_over(cameras: Cameras, *, count: int) -> list[int]:
 
 
 def seen_from(gaussians: Gaussians, camera: Cameras, *, among: Gaussians) -> Bool[Tensor, "n"]:
-    """Whether one `camera` sees each Gaussian's centre, or only what of `among` is in front of it."""
+    """Whether one camera sees each Gaussian's centre.
+
+    Args:
+        gaussians: The n Gaussians that are tested.
+        camera: A single camera.
+        among: All Gaussians that may occlude them.
+    """
     small = camera.resized(_WIDTH / int(camera.sizes[0, 0]))
-    seen = render(among, small, outputs=frozenset({"depth"}))
-    surface = torch.where(seen.alpha[0] > 0.5, seen.depth[0], torch.inf).numpy()
+    rendered = render(among, small, outputs=frozenset({"depth"}))
+    surface = torch.where(rendered.alpha[0] > _SURFACE_ALPHA, rendered.depth[0], torch.inf).numpy()
     pose, intrinsics = small.camera_from_world[0].numpy(), small.intrinsics[0].numpy()
     out = np.zeros(gaussians.count, np.bool_)
-    _in_sight(gaussians.means.numpy(), gaussians.scales.mean(1).numpy(), (pose, intrinsics), surface, out)
+    _compare_depths(gaussians.means.numpy(), gaussians.scales.mean(1).numpy(), (pose, intrinsics), surface, out)
     return torch.from_numpy(out)
 
 
 @serialized
 @njit(cache=True, parallel=True)
 @no_type_check
-def _in_sight(means, widths, camera, surface, out):
+def _compare_depths(means, widths, camera, surface, out):
     pose, intrinsics = camera
     height, width = surface.shape
     for i in prange(len(means)):
@@ -49,4 +63,4 @@ def _in_sight(means, widths, camera, surface, out):
         u, v = u + intrinsics[0, 2], v + intrinsics[1, 2]
         if u < 0 or v < 0 or u >= width or v >= height:
             continue
-        out[i] = depth < surface[int(v), int(u)] + np.float32(0.005) * depth + 2 * widths[i]
+        out[i] = depth < surface[int(v), int(u)] + _DEPTH_TOLERANCE * depth + _BEHIND * widths[i]

@@ -1,99 +1,129 @@
-"""A `Light` cut into bundles that depth maps can follow: up to 9 for sources, 32 for the rest. Knows no Gaussians."""
+"""Samples of a `Light`: every source is cut into directional samples, the ambient light into 32 even ones.
+
+Area lights and environment light as sets of directional lights, each of which one shadow map follows.
+"""
 
 import math
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatgraft.core.directions import even_pairs, frames_along
+from splatgraft.core.directions import even_pairs, vogel_offsets
 from splatgraft.relighting.light.light import Light, LightSource
-from splatgraft.relighting.shadows.occlusion import LightSamples
-
-AMBIENT_COUNT = 32
-SOURCE_SAMPLES = 9
-# up to this softness one filtered map is within 0.02 of the truth; beyond, several are used
-_SINGLE = math.radians(8.0)
 
 
-def sample_light(light: Light) -> LightSamples:
-    """All bundles of `light`: those of the sources first, then the ambient ones.
+@dataclass(frozen=True)
+class LightSamplingSettings:
+    """How finely a light is sampled."""
 
-    What a source's confidence leaves is given back as even light, so an unsure source casts a weaker shadow.
+    ambient_samples: int = 32
+    """Directions over the sphere, an even number; set by hand."""
+    source_samples: int = 9
+    """Most samples of all sources together; set by hand."""
+    single_softness: float = math.radians(8.0)
+    """Radians; a source up to this softness is one sample. Measured: one filtered map is then within 0.02 of rays."""
+
+
+@dataclass(frozen=True)
+class LightSamples:
+    """k directional samples that together are the light at a place; those of the sources come first."""
+
+    directions: Float[Tensor, "k 3"]
+    """Unit, towards the light."""
+    irradiance: Float[Tensor, "k 3"]
+    """Linear rgb on a plane that faces the sample's direction."""
+    softness: Float[Tensor, "k"]
+    """Radius of the cone of directions that the sample stands for, radians."""
+    is_source: tuple[bool, ...]
+    """True for a sample of a source, False for one of the ambient light."""
+    blockers_within: tuple[float, ...]
+    """World units; occluders farther away towards the light do not block the sample."""
+
+    def __len__(self) -> int:
+        """Number of samples k."""
+        return len(self.is_source)
+
+
+def sample_light(light: Light, *, settings: LightSamplingSettings = LightSamplingSettings()) -> LightSamples:
+    """All samples of `light`: those of its sources first, brightest source first, then the ambient ones.
+
+    A source of confidence c gives c of its irradiance to its own samples and the rest to the ambient ones, so a source
+    that may not exist casts a weaker shadow.
     """
     directions, irradiance, softness, within = [], [], [], []
-    for source, parts in zip(light.sources, _parts(light), strict=False):
-        rgb = torch.tensor(source.irradiance) * source.confidence / parts
-        for direction in _disk(source, parts):
+    for source, count in zip(light.sources, _sample_counts(light, settings), strict=False):
+        rgb = torch.tensor(source.irradiance) * source.confidence / count
+        for direction in _cone_directions(source, count):
             directions.append(direction)
             irradiance.append(rgb)
             within.append(source.blockers_within)
-            softness.append(source.softness / math.sqrt(parts) if parts > 1 else source.softness)
-    doubt = sum((torch.tensor(s.irradiance) * (1 - s.confidence) for s in light.sources), torch.zeros(3))
-    around = even_pairs(AMBIENT_COUNT)
-    radiance = light.ambient_radiance(around) + doubt / (4 * math.pi)
+            softness.append(source.softness / math.sqrt(count) if count > 1 else source.softness)
+    unsure = sum((torch.tensor(s.irradiance) * (1 - s.confidence) for s in light.sources), torch.zeros(3))
+    n = settings.ambient_samples
+    ambient = even_pairs(n)
+    radiance = light.ambient_radiance(ambient) + unsure / (4 * math.pi)
     return LightSamples(
-        directions=torch.cat([torch.stack(directions), around]) if directions else around,
+        directions=torch.cat([torch.stack(directions), ambient]) if directions else ambient,
         irradiance=torch.cat(
-            [torch.stack(irradiance).reshape(-1, 3) if irradiance else torch.zeros(0, 3), radiance * 4 * math.pi / 32]
+            [torch.stack(irradiance).reshape(-1, 3) if irradiance else torch.zeros(0, 3), radiance * 4 * math.pi / n]
         ),
-        softness=torch.tensor(softness + [math.acos(1 - 2 / AMBIENT_COUNT)] * AMBIENT_COUNT),
-        is_source=(True,) * len(directions) + (False,) * AMBIENT_COUNT,
-        blockers_within=(*within, *(math.inf,) * AMBIENT_COUNT),
+        softness=torch.tensor(softness + [math.acos(1 - 2 / n)] * n),
+        is_source=(True,) * len(directions) + (False,) * n,
+        blockers_within=(*within, *(math.inf,) * n),
     )
 
 
-def main_count(light: Light) -> int:
-    """How many of the first bundles belong to the first source."""
-    return _parts(light)[0] if light.sources else 0
+def main_source_samples(light: Light, *, settings: LightSamplingSettings = LightSamplingSettings()) -> int:
+    """How many of the first samples of `light` belong to its first source."""
+    return _sample_counts(light, settings)[0] if light.sources else 0
 
 
-def _parts(light: Light) -> list[int]:
-    """Bundles per source, brightest first: as many for a wide one as are free; half of those where others are wide."""
-    wide = [source.softness > _SINGLE for source in light.sources[:SOURCE_SAMPLES]]
-    free = SOURCE_SAMPLES - len(wide)
-    parts = []
+def _sample_counts(light: Light, settings: LightSamplingSettings) -> list[int]:
+    """Samples per source, brightest first: a wide one takes all that are free, or half where later ones are wide."""
+    wide = [source.softness > settings.single_softness for source in light.sources[: settings.source_samples]]
+    free = settings.source_samples - len(wide)
+    counts = []
     for i, is_wide in enumerate(wide):
         taken = (free + 1) // 2 if any(wide[i + 1 :]) else free
-        parts.append(1 + taken if is_wide else 1)
-        free -= parts[-1] - 1
-    return parts
+        counts.append(1 + taken if is_wide else 1)
+        free -= counts[-1] - 1
+    return counts
 
 
-def source_pairs(beams: LightSamples) -> tuple[LightSamples, Int[Tensor, "k"], Int[Tensor, "k"]]:
-    """The bundles of sources, and where in `cat(directions, -directions)` each one's front and back lie."""
-    return _part(beams, source=True)
+def source_pairs(samples: LightSamples) -> tuple[LightSamples, Int[Tensor, "k"], Int[Tensor, "k"]]:
+    """The k samples of sources, and the positions of each one and of its opposite in `cat(directions, -directions)`."""
+    return _pairs(samples, source=True)
 
 
-def ambient_pairs(beams: LightSamples) -> tuple[LightSamples, Int[Tensor, "k"], Int[Tensor, "k"]]:
-    """The ambient bundles, and each one's front and back among themselves, as opposites are in the set."""
-    return _part(beams, source=False)
+def ambient_pairs(samples: LightSamples) -> tuple[LightSamples, Int[Tensor, "k"], Int[Tensor, "k"]]:
+    """The k ambient samples, and the positions of each one and of its opposite among them."""
+    return _pairs(samples, source=False)
 
 
-def _part(beams: LightSamples, *, source: bool) -> tuple[LightSamples, Int[Tensor, "k"], Int[Tensor, "k"]]:
-    which = torch.tensor([flag == source for flag in beams.is_source])
+def _pairs(samples: LightSamples, *, source: bool) -> tuple[LightSamples, Int[Tensor, "k"], Int[Tensor, "k"]]:
+    which = torch.tensor([flag == source for flag in samples.is_source])
     count = int(which.sum())
     part = LightSamples(
-        directions=beams.directions[which],
-        irradiance=beams.irradiance[which],
-        softness=beams.softness[which],
+        directions=samples.directions[which],
+        irradiance=samples.irradiance[which],
+        softness=samples.softness[which],
         is_source=(source,) * count,
-        blockers_within=tuple(beams.blockers_within[int(i)] for i in which.nonzero()[:, 0]),
+        blockers_within=tuple(samples.blockers_within[int(i)] for i in which.nonzero()[:, 0]),
     )
     front = torch.arange(count)
     return part, front, front + count if source else (front + count // 2) % max(count, 1)
 
 
-def _disk(source: LightSource, parts: int) -> list[torch.Tensor]:
-    """Directions spread over the cone of `source` (Vogel spiral), within it by as much as a part's own cone is wide."""
+def _cone_directions(source: LightSource, count: int) -> list[torch.Tensor]:
+    """Directions over the cone of `source` (Vogel spiral), inside its rim by as much as a sample's own cone is wide."""
     direction = torch.tensor(source.direction)
-    if parts == 1:
+    if count == 1:
         return [direction]
-    right, down, _ = frames_along(direction[None])[0]
-    j = torch.arange(parts)
-    # variances add: of the spiral, radius R sqrt(1 - 1/parts), and of a part, radius R / sqrt(parts)
-    r = ((j + 0.5) / parts * (1 - 1 / parts)).sqrt() * math.sin(source.softness)
-    angle = j * math.pi * (3 - math.sqrt(5))
-    side = (r * angle.cos())[:, None] * right + (r * angle.sin())[:, None] * down
-    side = side - side.mean(0)
-    return list(side + (1 - (side**2).sum(1, keepdim=True)).sqrt() * direction)
+    j = torch.arange(count)
+    # variances add: of the spiral, radius R sqrt(1 - 1/count), and of a sample, radius R / sqrt(count)
+    r = ((j + 0.5) / count * (1 - 1 / count)).sqrt() * math.sin(source.softness)
+    offsets = vogel_offsets(direction, r, j)
+    offsets = offsets - offsets.mean(0)
+    return list(offsets + (1 - (offsets**2).sum(1, keepdim=True)).sqrt() * direction)

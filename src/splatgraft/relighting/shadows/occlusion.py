@@ -1,6 +1,7 @@
-"""How much light a compact occluder takes from points around it, with soft edges, and what it sends back instead.
+"""Soft shadows of a compact object: irradiance with and without it, and the light that its unlit side sends on.
 
-Depth maps of the occluder in, per-point sums out. Knows nothing about Gaussians' colours, files or where light is from.
+Percentage-closer soft shadows (Fernando 2005) from one prefiltered depth map per light sample: a blocker search gives
+the penumbra's width, a second filter of that width gives visibility.
 """
 
 from dataclasses import dataclass
@@ -13,49 +14,56 @@ from jaxtyping import Float, Int
 from numba import njit, prange
 from torch import Tensor
 
+from splatgraft.relighting.shadows.light_sampling import LightSamples
 from splatgraft.relighting.shadows.shadow_maps import FAR, DepthMaps
 from splatgraft.runtime.kernel_lock import serialized
 
-_COARSEST = 4  # pixels; the top of the pyramids
-
-
-@dataclass(frozen=True)
-class LightSamples:
-    """k narrow bundles of light that together light a place."""
-
-    directions: Float[Tensor, "k 3"]
-    """Unit, towards the light."""
-    irradiance: Float[Tensor, "k 3"]
-    """Linear rgb on a plane that faces the bundle."""
-    softness: Float[Tensor, "k"]
-    """Radius of the cone that a bundle fills, radians."""
-    is_source: tuple[bool, ...]
-    """Whether the bundle is a dominant source, or a piece of the ambient light."""
-    blockers_within: tuple[float, ...]
-    """World units; what is farther towards the light lets it through."""
-
-    def __len__(self) -> int:
-        """Number of bundles k."""
-        return len(self.is_source)
+# compiled into the kernel; all set by hand
+_COARSEST = 4
+"""Pixels; width of the mip pyramid's last level."""
+_SEARCH_TAPS = 8
+"""Taps of the blocker search."""
+_SOURCE_TAPS, _AMBIENT_TAPS = 24, 12
+"""Taps of the visibility filter: the noise of many ambient samples averages out, that of few sources does not."""
+_FEW_SAMPLES = 16
+"""Fewer samples than this are taken for sources."""
+_SEARCH_GAP = 0.8
+"""Distance between neighbouring taps of the search over the radius of its disk."""
+_BLUR = np.float32(1.5)
+"""A mip level is used up to a tap distance of this many of its pixels."""
+_WIDEST_CONE = np.float32(1.2)
+"""Radians; wider cones are filtered as this one."""
+_GOLDEN_ANGLE = 2.399963
+"""Radians; rounded, and kept so: `core.directions.GOLDEN_ANGLE` would change results in the last bits."""
+_LEAST_ALPHA = 1e-4
+"""Alpha below which a texel blocks nothing."""
 
 
 @dataclass(frozen=True)
 class Occlusion:
-    """The occluder as every bundle meets it: mip pyramids, finest level first, flattened."""
+    """An object's depth maps as k mip pyramids, one per light sample."""
 
     center: Float[Tensor, "3"]
+    """Of the maps' window, world units."""
     radius: float
+    """Half the width of the maps, world units."""
     frames: Float[Tensor, "k 3 3"]
+    """Rows right, down, away from the light."""
     texels: Float[Tensor, "k p 6"]
-    """Premultiplied by alpha: alpha, depth of the lit side, depth of the middle, linear rgb of the unlit side."""
+    """All p texels, finest level first, premultiplied by alpha: alpha, depth of the lit side, depth of the middle,
+    linear rgb of the unlit side."""
     size: int
     """Width of the finest level, pixels."""
 
 
 def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tensor, "k"]) -> Occlusion:
-    """Pyramids of the maps `front`, completed by the opposite maps `back` (mirrored in u, depth negated).
+    """Mip pyramids of some depth maps.
 
-    Both were made with colour.
+    Args:
+        maps: Of the object, with colour.
+        front: Position in `maps` of each sample's map.
+        back: Position of the map from the opposite direction, which shows the unlit side (mirrored in u, depth
+            negated).
     """
     alpha = maps.alpha[front]
     first = torch.where(maps.first < float(FAR) / 2, maps.first, maps.mean)
@@ -81,35 +89,43 @@ def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tens
     )
 
 
-def cast(
+def occluded_irradiance(
     occlusion: Occlusion,
-    beams: LightSamples,
+    samples: LightSamples,
     points: Float[Tensor, "m 3"],
     normals: Float[Tensor, "m 3"],
     *,
-    arrives: Float[Tensor, "m k"],
+    sample_visibility: Float[Tensor, "m k"],
     bias: float,
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Irradiance at `points`: without the occluder, with it, and what the occluder's unlit side adds.
+    """Irradiance at points around an object: what compositing by differential rendering needs (Debevec 1998, Eq. 1).
 
-    `arrives` is the share of each bundle that the rest of the scene lets through. An occluder nearer than `bias`,
-    world units, is the point's own surface. (Debevec 1998, Eq. 1: the differences of these are what compositing needs.)
+    Args:
+        occlusion: The object's k pyramids, one per sample.
+        samples: The k samples of the light.
+        points: World units.
+        normals: Unit, of the surface at each point.
+        sample_visibility: Share of each sample that the rest of the scene lets through, in [0, 1].
+        bias: World units; an occluder nearer than this is the point's own surface.
+
+    Returns:
+        Linear rgb irradiance without the object, with it, and what the object's unlit side adds.
     """
     arrays = [
         np.ascontiguousarray(t.numpy(), dtype=np.float32)
-        for t in (occlusion.frames, beams.irradiance, beams.softness, points, normals, arrives)
+        for t in (occlusion.frames, samples.irradiance, samples.softness, points, normals, sample_visibility)
     ]
     out = np.zeros((3, len(points), 3), np.float32)
     place = np.array([*occlusion.center.tolist(), occlusion.radius, bias], np.float32)
-    _cast(np.ascontiguousarray(occlusion.texels.numpy()), occlusion.size, place, tuple(arrays), out)
-    before, after, bounce = torch.from_numpy(out)
-    return before, after, bounce
+    _sum_samples(np.ascontiguousarray(occlusion.texels.numpy()), occlusion.size, place, tuple(arrays), out)
+    without, with_object, bounce = torch.from_numpy(out)
+    return without, with_object, bounce
 
 
 @njit(cache=True, fastmath=True, inline="always")
 @no_type_check
 def _soft_cosine(cosine, softness):
-    """Mean of max(0, cos) over a cone, to a quadratic."""
+    """Mean of max(0, cos) over a cone, approximated by a quadratic; as `shading.irradiance.soft_cosine`."""
     edge = np.sin(softness)
     if cosine >= edge:
         return cosine
@@ -121,34 +137,33 @@ def _soft_cosine(cosine, softness):
 @serialized
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
-def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one kernel: search, filter, sums)
-    frames, irradiance, softness, points, normals, arrives = arrays
+def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one kernel: search, filter, sums)
+    frames, irradiance, softness, points, normals, sample_visibility = arrays
     radius, bias = place[3], place[4]
     texel = 2 * radius / size
-    # many ambient bundles average their own noise away; few dominant ones need finer filters
-    search, taps = 8, 24 if len(frames) < 16 else 12
+    search, taps = _SEARCH_TAPS, _SOURCE_TAPS if len(frames) < _FEW_SAMPLES else _AMBIENT_TAPS
     disk = np.empty((search + taps, 2), np.float32)  # Vogel spirals
-    search_gap, tap_gap = np.float32(0.8), np.float32(2 / np.sqrt(taps))
+    search_gap, tap_gap = np.float32(_SEARCH_GAP), np.float32(2 / np.sqrt(taps))
     for t in range(search + taps):
         count, j = (search, t) if t < search else (taps, t - search)
-        r, angle = np.sqrt((j + 0.5) / count), j * 2.399963
+        r, angle = np.sqrt((j + 0.5) / count), j * _GOLDEN_ANGLE
         disk[t, 0], disk[t, 1] = r * np.cos(angle), r * np.sin(angle)
     for i in prange(len(points)):
         x, y, z = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
         for k in range(len(frames)):
             f = frames[k]
             cosine = -(f[2, 0] * normals[i, 0] + f[2, 1] * normals[i, 1] + f[2, 2] * normals[i, 2])
-            weight = _soft_cosine(cosine, softness[k]) * arrives[i, k]
+            weight = _soft_cosine(cosine, softness[k]) * sample_visibility[i, k]
             if weight <= 0:
                 continue
             for c in range(3):
                 out[0, i, c] += weight * irradiance[k, c]
             u, v = f[0, 0] * x + f[0, 1] * y + f[0, 2] * z, f[1, 0] * x + f[1, 1] * y + f[1, 2] * z
             depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
-            spread = np.tan(min(softness[k], np.float32(1.2)))
-            # how the cosine changes over the cone: what lies behind the surface lights nothing
-            lean_u = spread * (f[0, 0] * normals[i, 0] + f[0, 1] * normals[i, 1] + f[0, 2] * normals[i, 2])
-            lean_v = spread * (f[1, 0] * normals[i, 0] + f[1, 1] * normals[i, 1] + f[1, 2] * normals[i, 2])
+            spread = np.tan(min(softness[k], _WIDEST_CONE))
+            # change of the cosine over the cone: directions below the surface give no light
+            tilt_u = spread * (f[0, 0] * normals[i, 0] + f[0, 1] * normals[i, 1] + f[0, 2] * normals[i, 2])
+            tilt_v = spread * (f[1, 0] * normals[i, 0] + f[1, 1] * normals[i, 1] + f[1, 2] * normals[i, 2])
             facing = np.float32(0)
             width = spread * max(np.float32(0), depth + radius)
             blocked, red, green, blue = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -156,18 +171,18 @@ def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one ker
                 found, distance = np.float32(0), np.float32(0)
                 for t in range(search + taps):
                     if t == search:
-                        if found < 1e-4:
+                        if found < _LEAST_ALPHA:
                             break
                         width = spread * max(np.float32(0), distance / found)
-                    tilt = max(np.float32(0), cosine + disk[t, 0] * lean_u + disk[t, 1] * lean_v)
+                    tap_cosine = max(np.float32(0), cosine + disk[t, 0] * tilt_u + disk[t, 1] * tilt_v)
                     if t >= search:
-                        facing += tilt
-                    if tilt <= 0:
+                        facing += tap_cosine
+                    if tap_cosine <= 0:
                         continue
-                    # the level whose pixels are about as wide as the gap between taps
+                    # the mip level whose pixels are about as wide as the distance between taps
                     gap = width / texel * (search_gap if t < search else tap_gap)
                     level_size, level_start, scale = size, 0, np.float32(1)
-                    while level_size > 4 and gap > scale * np.float32(1.5):
+                    while level_size > _COARSEST and gap > scale * _BLUR:
                         level_start += level_size * level_size
                         level_size //= 2
                         scale *= 2
@@ -181,14 +196,14 @@ def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one ker
                             if cu < 0 or cv < 0 or cu >= level_size or cv >= level_size:
                                 continue
                             p = texels[k, level_start + cv * level_size + cu]
-                            if p[0] < 1e-4 or p[1] > (depth - bias) * p[0]:
+                            if p[0] < _LEAST_ALPHA or p[1] > (depth - bias) * p[0]:
                                 continue
                             share = (fu if du == 1 else 1 - fu) * (fv if dv == 1 else 1 - fv)
                             if t < search:
                                 found += share * p[0]
                                 distance += share * (depth * p[0] - p[2])
                             else:
-                                share *= tilt
+                                share *= tap_cosine
                                 blocked += share * p[0]
                                 red += share * p[3]
                                 green += share * p[4]
@@ -196,7 +211,7 @@ def _cast(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one ker
             if facing > 0:
                 blocked, red, green, blue = blocked / facing, red / facing, green / facing, blue / facing
             blocked = min(blocked, np.float32(1))
-            # radiance of the unlit side over the solid angle it fills: of the bundle's pi * sin^2 cone
+            # radiance of the unlit side over the solid angle it fills: of the sample's cone, pi * sin^2
             cone = np.float32(np.pi) * np.sin(softness[k]) ** 2
             for c in range(3):
                 out[1, i, c] += weight * (1 - blocked) * irradiance[k, c]

@@ -1,6 +1,8 @@
-"""Puts an object's shadow and bounce on the Gaussians that can be reached, and splits those too wide for its edge.
+"""Receivers of shadows: an object's shadow and bounce averaged over Gaussians, of which wide ones are split at edges.
 
-Knows nothing about where the light is from, nor about files.
+A Gaussian has one colour, so one that is wider than a shadow's edge cannot show it: it is split along the axis over
+which the ratio varies most, again and again while the budget lasts. A slope in the first band corrects where an edge
+appears.
 """
 
 import math
@@ -12,61 +14,93 @@ from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.splitting import PIECE_WIDTH, PIECES, split_along
-from splatgraft.relighting.shadows.scene_ratio import ObjectShadowMaps, SceneRatio, light_sums, ratio_of
+from splatgraft.relighting.shadows.scene_ratio import ObjectShadowMaps, SceneRatio, light_sums, ratio_from_sums
 
-_ROUNDS = 12
 RIM = 2.4
 """Standard deviations; beyond, a Gaussian's alpha is below 0.05."""
 _STEPS = (-RIM, -RIM / 2, 0.0, RIM / 2, RIM)
+"""Standard deviations of the points along a line."""
 _LINES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.7, 0.7], [0.7, -0.7]])
-_BROAD, _FINEST = 0.1, 0.02  # object radii
-_VARIATION = 0.003  # share of light times alpha: what many that overlap may each leave out
-SHOWS_BEHIND = 1.2
-"""Standard deviations. Splats are blended in the order of their centres, so that what shows of one among others lies
-behind its centre, seen from the camera; without this every edge stands too far from all cameras. Measured on planes:
-1.0 for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
-_UNSEEN = 0.25  # of the finest width that is split: an edge in narrower ones is not looked for
-_AT_RIMS = 0.02  # share of light: a rim shows a twentieth of it
+"""Directions of lines, along the widest and the second widest axis."""
+
+
+@dataclass(frozen=True)
+class ReceiverSettings:
+    """Which receivers are split, and how far an edge is corrected."""
+
+    rounds: int = 12
+    """Most splits of one Gaussian and its pieces, one after another; set by hand."""
+    broad: float = 0.1
+    """Object radii (standard deviation): ambient light is averaged over wider Gaussians alone; set by hand."""
+    finest: float = 0.02
+    """Object radii (standard deviation): no piece gets narrower; set by hand."""
+    variation: float = 0.003
+    """Share of light times alpha below which a Gaussian is not split, small as many overlap; set by hand."""
+    faintest: float = 0.05
+    """Opacity below which a Gaussian is not split and gets no slope; set by hand."""
+    shows_behind: float = 1.2
+    """Standard deviations. Splats are blended in the order of their centres, so what is visible of one among others
+    lies behind its centre, seen from the camera; without this an edge appears too far from all cameras. Measured on
+    planes: 1.0 for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
+    narrowest: float = 0.25
+    """Of the finest width that is split: narrower Gaussians get no slope; set by hand."""
+    edge: float = 0.02
+    """Share of light by which rim and centre differ at an edge; a rim shows a twentieth of it; set by hand."""
 
 
 @dataclass(frozen=True)
 class Receivers:
-    """Gaussians that may be in the shadow, with what is needed to light them."""
+    """m Gaussians of the scene that may be in an object's shadow, with what is needed to light them."""
 
     gaussians: Gaussians
+    """World frame."""
     normals: Float[Tensor, "m 3"]
-    arrives: Float[Tensor, "m k"]
-    """Share of every bundle that the scene lets through."""
-    trust: Float[Tensor, "m"]
-    """In [0, 1]; scales the change where a Gaussian's surface is unsure."""
+    """Unit, world frame."""
+    sample_visibility: Float[Tensor, "m k"]
+    """Share of every light sample that the scene lets through, in [0, 1]."""
     origin: Int[Tensor, "m"]
     """Position in the list that they were taken from."""
 
     def select(self, which: Tensor) -> "Receivers":
-        """Those that a mask keeps or an index list names."""
+        """The receivers that a mask keeps or an index list names."""
         return Receivers(
             gaussians=self.gaussians.select(which),
             normals=self.normals[which],
-            arrives=self.arrives[which],
-            trust=self.trust[which],
+            sample_visibility=self.sample_visibility[which],
             origin=self.origin[which],
         )
 
 
 def shade_receivers(
-    receivers: Receivers, maps: ObjectShadowMaps, *, budget: int
+    receivers: Receivers,
+    maps: ObjectShadowMaps,
+    *,
+    budget: int,
+    settings: ReceiverSettings = ReceiverSettings(),
 ) -> tuple[Receivers, Int[Tensor, "j"], SceneRatio]:
-    """Receivers, some split (at most `budget` added); which one each was; their ratios, averaged over their extent."""
+    """Split receivers at shadow edges and average the ratio over each.
+
+    Args:
+        receivers: All that the object may reach.
+        maps: The object's.
+        budget: Most Gaussians that are added by splitting.
+        settings: Which are split.
+
+    Returns:
+        j receivers, some of them pieces; the position in `receivers` that each was or is a piece of; their ratios.
+    """
     done: list[tuple[Receivers, Tensor, SceneRatio]] = []
     pending, which = receivers, torch.arange(len(receivers.origin))
     ambient = _sums(pending, maps, sources=False)
-    for round_ in range(_ROUNDS + 1):
-        ratio, variation = _extended_ratio(pending, maps, ambient)
+    for round_ in range(settings.rounds + 1):
+        ratio, variation = _averaged_ratio(pending, maps, ambient, settings)
         axis = variation.argmax(1)
         wanted = variation.max(1).values
-        wanted = torch.where((wanted > _VARIATION) & (pending.gaussians.opacities > 0.05), wanted, 0)
+        wanted = torch.where(
+            (wanted > settings.variation) & (pending.gaussians.opacities > settings.faintest), wanted, 0
+        )
         room = budget // (PIECES - 1)
-        if round_ == _ROUNDS or room == 0 or not bool((wanted > 0).any()):
+        if round_ == settings.rounds or room == 0 or not bool((wanted > 0).any()):
             done.append((pending, which, ratio))
             break
         order = wanted.argsort(descending=True)[: min(room, int((wanted > 0).sum()))]
@@ -79,172 +113,190 @@ def shade_receivers(
         pending = replace(parents.select(parent), gaussians=pieces)
         which, ambient = which[order][parent], ambient[:, order][:, parent]
         # ambient light differs between pieces only where the whole was broad
-        anew = _broad(parents.gaussians, maps)[parent].nonzero()[:, 0]
+        anew = _broad(parents.gaussians, maps, settings)[parent].nonzero()[:, 0]
         ambient[:, anew] = _sums(pending.select(anew), maps, sources=False)
         budget -= (PIECES - 1) * len(order)
     joined = Receivers(
         gaussians=concatenate([r.gaussians for r, _, _ in done]),
         normals=torch.cat([r.normals for r, _, _ in done]),
-        arrives=torch.cat([r.arrives for r, _, _ in done]),
-        trust=torch.cat([r.trust for r, _, _ in done]),
+        sample_visibility=torch.cat([r.sample_visibility for r, _, _ in done]),
         origin=torch.cat([r.origin for r, _, _ in done]),
     )
-    trust = joined.trust[:, None]
-    shadow = torch.cat([ratio.shadow for _, _, ratio in done])
-    bounce = torch.cat([ratio.bounce for _, _, ratio in done])
-    slope = torch.cat([ratio.slope for _, _, ratio in done])
-    parents = torch.cat([w for _, w, _ in done])
-    return joined, parents, SceneRatio(1 - (1 - shadow) * trust, bounce * trust, slope * trust)
+    ratios = SceneRatio(
+        # not shadow itself: this rounds it to the precision near 1, as all results so far have it
+        shadow=1 - (1 - torch.cat([ratio.shadow for _, _, ratio in done])),
+        bounce=torch.cat([ratio.bounce for _, _, ratio in done]),
+        slope=torch.cat([ratio.slope for _, _, ratio in done]),
+    )
+    return joined, torch.cat([w for _, w, _ in done]), ratios
 
 
-def _broad(gaussians: Gaussians, maps: ObjectShadowMaps) -> Bool[Tensor, "m"]:
-    """Whether ambient light may differ within one: it has no edge that is finer than a part of the object."""
-    return gaussians.scales.max(1).values > _BROAD * maps.ambient_maps.window.radius
+def _broad(gaussians: Gaussians, maps: ObjectShadowMaps, settings: ReceiverSettings) -> Bool[Tensor, "m"]:
+    """Whether ambient light may vary over a Gaussian: its edges are no finer than a part of the object."""
+    return gaussians.scales.max(1).values > settings.broad * maps.ambient_maps.window.radius
 
 
-def _extended_ratio(
-    receivers: Receivers, maps: ObjectShadowMaps, ambient: Float[Tensor, "3 m 3"]
+def _averaged_ratio(
+    receivers: Receivers, maps: ObjectShadowMaps, ambient: Float[Tensor, "3 m 3"], settings: ReceiverSettings
 ) -> tuple[SceneRatio, Float[Tensor, "m 3"]]:
     """Ratio averaged over each Gaussian, and how much it varies along each own axis (0 along narrow ones).
 
-    Variation counts as far as it is seen: by the Gaussian's alpha in the point. Splats are drawn in the order of their
-    centres, so the rims of those in front cover what lies between them and the object.
+    Variation at a point is weighted by the Gaussian's alpha there, as far as it is visible.
     """
     g = receivers.gaussians
     by_sources = _sums(receivers, maps, sources=True)
-    ratio, variation = ratio_of(by_sources + ambient), torch.zeros(g.count, 3)
-    smallest = _FINEST * maps.ambient_maps.window.radius / math.sqrt(PIECE_WIDTH)
-    broad = _broad(g, maps)
+    ratio, variation = ratio_from_sums(by_sources + ambient), torch.zeros(g.count, 3)
+    smallest = settings.finest * maps.ambient_maps.window.radius / math.sqrt(PIECE_WIDTH)
+    broad = _broad(g, maps, settings)
     fine = ((g.scales.max(1).values > smallest) & ~broad).nonzero()[:, 0]
-    fine = _at_an_edge(receivers, maps, fine, (by_sources, ambient)) if bool(by_sources.any()) else fine[:0]
-    _average(receivers, maps, fine, (ratio, variation), ambient=ambient[:, fine])
-    _average(receivers, maps, broad.nonzero()[:, 0], (ratio, variation), ambient=None)
-    _lean(receivers, maps, _in_penumbra(g, by_sources, ratio, smallest), ratio, ambient=ambient)
+    lit = bool(by_sources.any())
+    fine = _at_an_edge(receivers, maps, fine, (by_sources, ambient), settings=settings) if lit else fine[:0]
+    averages = _Averages(ratio, variation, settings)
+    averages.fill_in(receivers, maps, fine, ambient=ambient[:, fine])
+    averages.fill_in(receivers, maps, broad.nonzero()[:, 0], ambient=None)
+    penumbra = _in_penumbra(g, by_sources, ratio, smallest, settings=settings)
+    averages.fill_in_slope(receivers, maps, penumbra, ambient=ambient)
     variation[g.scales < smallest] = 0
     return ratio, variation
 
 
 def _sums(receivers: Receivers, maps: ObjectShadowMaps, *, sources: bool, points: Tensor | None = None) -> Tensor:
-    """Light at the middle of every receiver, or at `points`, as many for each."""
+    """Light sums at every receiver's centre, or at `points`, as many for each receiver."""
     if points is None:
         points = receivers.gaussians.means[:, None]
     count = points.shape[1]
-    normals, arrives = (t.repeat_interleave(count, 0) for t in (receivers.normals, receivers.arrives))
-    return light_sums(maps, points.reshape(-1, 3), normals, arrives=arrives, sources=sources)
+    normals, shares = (t.repeat_interleave(count, 0) for t in (receivers.normals, receivers.sample_visibility))
+    return light_sums(maps, points.reshape(-1, 3), normals, sample_visibility=shares, sources=sources)
 
 
 def _at_an_edge(
     receivers: Receivers,
     maps: ObjectShadowMaps,
     which: Int[Tensor, "f"],
-    center: tuple[Float[Tensor, "3 m 3"], Float[Tensor, "3 m 3"]],
+    center_sums: tuple[Float[Tensor, "3 m 3"], Float[Tensor, "3 m 3"]],
+    *,
+    settings: ReceiverSettings,
 ) -> Int[Tensor, "g"]:
-    """Those of `which` that see a source differently at their rims than in their middle."""
+    """Those of `which` whose rims receive another share of the light than their centres."""
     if not len(which):
         return which
-    part, ambient = receivers.select(which), center[1][:, which, None]
+    by_sources, by_ambient = center_sums
+    part, ambient = receivers.select(which), by_ambient[:, which, None]
     rims = _points(part.gaussians, torch.tensor([[RIM, -RIM, 0.0, 0.0], [0.0, 0.0, RIM, -RIM]]))
-    there = _sums(part, maps, sources=True, points=rims).reshape(3, len(which), -1, 3) + ambient
-    here = center[0][:, which, None] + ambient
-    changes = (there[1] / there[0].clamp_min(1e-9) - here[1] / here[0].clamp_min(1e-9)).abs()
-    return which[changes.amax((1, 2)) > _AT_RIMS]
+    at_rims = _sums(part, maps, sources=True, points=rims).reshape(3, len(which), -1, 3) + ambient
+    at_center = by_sources[:, which, None] + ambient
+    changes = (at_rims[1] / at_rims[0].clamp_min(1e-9) - at_center[1] / at_center[0].clamp_min(1e-9)).abs()
+    return which[changes.amax((1, 2)) > settings.edge]
 
 
-def _average(
-    receivers: Receivers,
-    maps: ObjectShadowMaps,
-    which: Int[Tensor, "f"],
-    found: tuple[SceneRatio, Float[Tensor, "m 3"]],
-    *,
-    ambient: Float[Tensor, "3 f 3"] | None,
-) -> None:
-    """Fill in mean and variation of those Gaussians from points along both wide axes, and between them.
+@dataclass(frozen=True)
+class _Averages:
+    """Ratio and variation of m receivers, filled in for some of them after others."""
 
-    `ambient`, if given, is even over each; then so narrow ones are not asked between their axes.
-    """
-    if not len(which):
-        return
-    part, lines, line = receivers.select(which), 2 if ambient is not None else 4, torch.tensor(_STEPS)
-    beside = line[line != 0]
-    points = _points(part.gaussians, (_LINES[:lines, :, None] * beside).transpose(0, 1).flatten(1))
-    sums = _sums(part, maps, sources=True, points=points)
-    if ambient is None:
-        sums = sums + _sums(part, maps, sources=False, points=points)
-    else:
-        sums = sums + ambient.repeat_interleave(lines * len(beside), 1)
-    there = ratio_of(sums)
-    ratio, variation = found
-    shadow = _with_middle(there.shadow.reshape(len(which), lines, len(beside), 3), ratio.shadow[which])
-    bounce = _with_middle(there.bounce.reshape(len(which), lines, len(beside), 3), ratio.bounce[which])
-    # what is seen of a Gaussian is mostly its middle: half the weight of its width
-    seen = torch.exp(-(line**2))[:, None]
-    seen = seen / seen.sum()
-    ratio.shadow[which] = _both_ways((shadow * seen).sum(2), ratio.shadow[which]).clamp(0, 1)
-    ratio.bounce[which] = _both_ways((bounce * seen).sum(2), ratio.bounce[which]).clamp_min(0)
-    alpha = part.gaussians.opacities[:, None, None] * torch.exp(-0.5 * line**2)
-    moves = ((shadow - shadow.mean(2, keepdim=True)).abs().amax(3) * alpha).amax(2)
-    if lines > 2:
-        # half of what varies between the axes is along either
-        moves = torch.maximum(moves[:, :2], 0.5 * moves[:, 2:].amax(1, keepdim=True))
-    along = (((shadow + bounce).mean(3) * seen[:, 0] * line).sum(2) / (seen[:, 0] * line**2).sum())[:, :2]
-    ratio.slope[which] = SHOWS_BEHIND * _in_world(part.gaussians, along)
-    variation[which[:, None], part.gaussians.scales.argsort(1, descending=True)[:, :2]] = moves
+    ratio: SceneRatio
+    variation: Float[Tensor, "m 3"]
+    settings: ReceiverSettings
+
+    def fill_in(
+        self,
+        receivers: Receivers,
+        maps: ObjectShadowMaps,
+        which: Int[Tensor, "f"],
+        *,
+        ambient: Float[Tensor, "3 f 3"] | None,
+    ) -> None:
+        """Average over the Gaussians `which` from points along both wide axes, and along the diagonals between them.
+
+        `ambient`, if given, is constant over each: they are narrow, and not sampled along the diagonals.
+        """
+        if not len(which):
+            return
+        part, lines, line = receivers.select(which), 2 if ambient is not None else 4, torch.tensor(_STEPS)
+        beside = line[line != 0]
+        points = _points(part.gaussians, (_LINES[:lines, :, None] * beside).transpose(0, 1).flatten(1))
+        sums = _sums(part, maps, sources=True, points=points)
+        if ambient is None:
+            sums = sums + _sums(part, maps, sources=False, points=points)
+        else:
+            sums = sums + ambient.repeat_interleave(lines * len(beside), 1)
+        there, ratio = ratio_from_sums(sums), self.ratio
+        shadow = _with_center(there.shadow.reshape(len(which), lines, len(beside), 3), ratio.shadow[which])
+        bounce = _with_center(there.bounce.reshape(len(which), lines, len(beside), 3), ratio.bounce[which])
+        # mostly the centre of a Gaussian is visible: weights exp(-x^2), narrower than its alpha exp(-x^2 / 2)
+        weight = torch.exp(-(line**2))[:, None]
+        weight = weight / weight.sum()
+        ratio.shadow[which] = _ellipse_mean((shadow * weight).sum(2), ratio.shadow[which]).clamp(0, 1)
+        ratio.bounce[which] = _ellipse_mean((bounce * weight).sum(2), ratio.bounce[which]).clamp_min(0)
+        alpha = part.gaussians.opacities[:, None, None] * torch.exp(-0.5 * line**2)
+        moves = ((shadow - shadow.mean(2, keepdim=True)).abs().amax(3) * alpha).amax(2)
+        if lines > 2:
+            # half of what varies along a diagonal is along either axis
+            moves = torch.maximum(moves[:, :2], 0.5 * moves[:, 2:].amax(1, keepdim=True))
+        along = (((shadow + bounce).mean(3) * weight[:, 0] * line).sum(2) / (weight[:, 0] * line**2).sum())[:, :2]
+        ratio.slope[which] = self.settings.shows_behind * _in_world(part.gaussians, along)
+        self.variation[which[:, None], part.gaussians.scales.argsort(1, descending=True)[:, :2]] = moves
+
+    def fill_in_slope(
+        self,
+        receivers: Receivers,
+        maps: ObjectShadowMaps,
+        which: Int[Tensor, "p"],
+        *,
+        ambient: Float[Tensor, "3 m 3"],
+    ) -> None:
+        """The slope of the Gaussians `which` from points beside their centres; ambient light is constant over each."""
+        if not len(which):
+            return
+        part, ratio = receivers.select(which), self.ratio
+        beside = _points(part.gaussians, torch.eye(2))
+        sums = _sums(part, maps, sources=True, points=beside) + ambient[:, which].repeat_interleave(2, 1)
+        there = ratio_from_sums(sums)
+        here = (ratio.shadow[which] + ratio.bounce[which]).mean(1, keepdim=True)
+        along = (there.shadow + there.bounce).mean(1).reshape(-1, 2) - here
+        ratio.slope[which] = self.settings.shows_behind * _in_world(part.gaussians, along)
 
 
-def _with_middle(beside: Float[Tensor, "f l s 3"], middle: Float[Tensor, "f 3"]) -> Float[Tensor, "f l t 3"]:
-    """Values along lines, t = s + 1, from those at the steps but the middle one."""
+def _with_center(beside: Float[Tensor, "f l s 3"], center: Float[Tensor, "f 3"]) -> Float[Tensor, "f l t 3"]:
+    """Values along lines, t = s + 1, from those at all steps but the centre."""
     half = beside.shape[2] // 2
-    there = middle[:, None, None].expand(-1, beside.shape[1], 1, 3)
+    there = center[:, None, None].expand(-1, beside.shape[1], 1, 3)
     return torch.cat([beside[:, :, :half], there, beside[:, :, half:]], 2)
 
 
 def _in_penumbra(
-    gaussians: Gaussians, by_sources: Float[Tensor, "3 m 3"], ratio: SceneRatio, smallest: float
+    gaussians: Gaussians,
+    by_sources: Float[Tensor, "3 m 3"],
+    ratio: SceneRatio,
+    smallest: float,
+    *,
+    settings: ReceiverSettings,
 ) -> Int[Tensor, "p"]:
-    """Those too narrow to be averaged, yet not so narrow that an edge crosses them unseen."""
-    before, after, _ = by_sources.mean(-1)
-    cut = (after > _AT_RIMS * before) & (after < (1 - _AT_RIMS) * before)
+    """Receivers in a penumbra that were too narrow to be averaged, yet are wide enough that their slope is visible."""
+    without, with_object, _ = by_sources.mean(-1)
+    partly = (with_object > settings.edge * without) & (with_object < (1 - settings.edge) * without)
     widest = gaussians.scales.max(1).values
     unknown = (ratio.slope == 0).all(1)
-    return (cut & unknown & (widest > _UNSEEN * smallest) & (gaussians.opacities > 0.05)).nonzero()[:, 0]
-
-
-def _lean(
-    receivers: Receivers,
-    maps: ObjectShadowMaps,
-    which: Int[Tensor, "p"],
-    ratio: SceneRatio,
-    *,
-    ambient: Float[Tensor, "3 m 3"],
-) -> None:
-    """Fill in the slope of those Gaussians from points beside their middle; ambient light is even over each."""
-    if not len(which):
-        return
-    part = receivers.select(which)
-    beside = _points(part.gaussians, torch.eye(2))
-    there = ratio_of(_sums(part, maps, sources=True, points=beside) + ambient[:, which].repeat_interleave(2, 1))
-    here = (ratio.shadow[which] + ratio.bounce[which]).mean(1, keepdim=True)
-    along = (there.shadow + there.bounce).mean(1).reshape(-1, 2) - here
-    ratio.slope[which] = SHOWS_BEHIND * _in_world(part.gaussians, along)
+    visible = (widest > settings.narrowest * smallest) & (gaussians.opacities > settings.faintest)
+    return (partly & unknown & visible).nonzero()[:, 0]
 
 
 def _in_world(gaussians: Gaussians, along: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
-    """A vector given along the two widest axes."""
+    """World vectors from components along the two widest axes."""
     return (_widest(gaussians)[1] @ along[..., None])[..., 0]
 
 
-def _both_ways(along: Float[Tensor, "f l 3"], middle: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
-    """Mean over an ellipse from those along its axes: what they differ from the middle by adds up."""
-    return along[:, 0] + along[:, 1] - middle
+def _ellipse_mean(along: Float[Tensor, "f l 3"], center: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
+    """Mean over an ellipse from the means along its two axes: their differences from the centre add up."""
+    return along[:, 0] + along[:, 1] - center
 
 
 def _points(gaussians: Gaussians, offsets: Float[Tensor, "2 p"]) -> Float[Tensor, "n p 3"]:
-    """Points at `offsets`, standard deviations, along the two widest axes."""
+    """Points at `offsets`, in standard deviations along the two widest axes."""
     widths, axes = _widest(gaussians)
     return gaussians.means[:, None] + ((axes * widths[:, None]) @ offsets).transpose(1, 2)
 
 
 def _widest(gaussians: Gaussians) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 3 2"]]:
-    """The two largest scales, and their axes as columns in the world."""
+    """The two largest scales, and their axes as columns, world frame."""
     widths, axes = gaussians.scales.sort(1, descending=True)
     return widths[:, :2], torch.gather(gaussians.rotations, 2, axes[:, None, :2].expand(-1, 3, -1))

@@ -1,6 +1,6 @@
-"""What an object does to the light on the scene around it: shadow and bounce ratios per Gaussian.
+"""The change that an object makes to the light on the scene around it: shadow and bounce ratios per point.
 
-Debevec 1998: S = (light with the object) / (light without it). Knows nothing about files, and not where light is from.
+Differential rendering (Debevec 1998): the ratio of irradiance with the object to irradiance without it.
 """
 
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.directions import frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.shading.normals import raised
-from splatgraft.relighting.shadows.light_sampling import ambient_pairs, source_pairs
-from splatgraft.relighting.shadows.occlusion import LightSamples, Occlusion, cast, occlusion_from_maps
+from splatgraft.relighting.shadows.light_sampling import LightSamples, ambient_pairs, source_pairs
+from splatgraft.relighting.shadows.occlusion import Occlusion, occluded_irradiance, occlusion_from_maps
 from splatgraft.relighting.shadows.shadow_maps import (
     DepthMaps,
     Window,
@@ -24,98 +24,177 @@ from splatgraft.relighting.shadows.shadow_maps import (
     visibility,
 )
 
-SOURCE_SIZE, AMBIENT_SIZE = 512, 256
-_DEAD_ZONE = 0.004  # changes of linear light below half an 8-bit step of a mid grey are left out
-_DARKEST = 0.04  # no shadow is darker: there is always some light that no map follows
+
+@dataclass(frozen=True)
+class ShadowMapSettings:
+    """Resolution and bias of the shadow maps of objects and scenes."""
+
+    source_size: int = 512
+    """Pixels, a multiple of 16: width of a map of a source sample; set by hand."""
+    ambient_size: int = 256
+    """Pixels, a multiple of 16: width of a map of an ambient sample; set by hand."""
+    object_bias: tuple[float, float] = (2.0, 1.0)
+    """Pixels, for sources and for ambient light: nearer occluders are the receiver's own surface; set by hand."""
+    self_bias: tuple[float, float] = (2.5, 2.0)
+    """The same for an object's shadow on itself."""
+    scene_bias: tuple[float, float] = (2.5, 1.5)
+    """The same for the scene's shadow on itself and on objects."""
+    self_ambient: float = 1 / 3
+    """Share of an ambient sample that still arrives where the object itself blocks it; set by hand."""
+    scene_ambient: float = 0.5
+    """Share of an ambient sample that still arrives where the scene blocks it; set by hand."""
+    blockers_around: float = 1.5
+    """Radii of the region within which the scene's Gaussians block light; set by hand."""
+
+
+@dataclass(frozen=True)
+class SceneRatioSettings:
+    """Limits of shadow and bounce."""
+
+    least_change: float = 0.004
+    """Share of light; smaller changes become 0, full from three times this on. Half an 8-bit step of a mid grey."""
+    darkest: float = 0.04
+    """Share of light that every shadow leaves: light that no sample follows; set by hand."""
+    near_reach: float = 3.5
+    """Object radii within which ambient shadow and bounce are computed; set by hand."""
+    widest_cone: float = 1.2
+    """Radians; wider cones of a source reach as far aside as this one; set by hand."""
 
 
 @dataclass(frozen=True)
 class ObjectShadowMaps:
-    """An object as all bundles of a light see it."""
+    """An object's depth maps from all samples of a light."""
 
     ambient_maps: DepthMaps
-    """One per ambient bundle; opposites are each other's back."""
+    """One per ambient sample."""
     occlusions: tuple[tuple[LightSamples, Occlusion, float], ...]
-    """For sources, if any, and ambient light: the bundles, what the object blocks of them, and the depth bias."""
+    """For the sources, if there are any, and for the ambient light: samples, occlusion, and bias in world units."""
 
 
-def object_shadow_maps(gaussians: Gaussians, ball: BoundingSphere, beams: LightSamples) -> ObjectShadowMaps:
-    """Depth maps of an object (already in the world) for every bundle, with its colours for the bounce."""
+def object_shadow_maps(
+    gaussians: Gaussians,
+    sphere: BoundingSphere,
+    samples: LightSamples,
+    *,
+    settings: ShadowMapSettings = ShadowMapSettings(),
+) -> ObjectShadowMaps:
+    """Depth maps of an object, in the target's frame, for every light sample, with its colours for the bounce.
+
+    Args:
+        gaussians: The object.
+        sphere: Its bounding sphere, which the maps cover.
+        samples: Of the light at its place.
+        settings: Resolution and bias.
+    """
     occluders = occluders_of(gaussians)
-    sources, front, back = source_pairs(beams)
-    around, around_front, around_back = ambient_pairs(beams)
+    sources, front, back = source_pairs(samples)
+    ambient, ambient_front, ambient_back = ambient_pairs(samples)
+    source_bias, ambient_bias = settings.object_bias
     occlusions = []
     if len(sources):
         both = torch.cat([sources.directions, -sources.directions])
-        window = Window(center=ball.center, radius=ball.radius, frames=frames_along(both))
-        maps = splat_depth_maps(occluders, window, size=SOURCE_SIZE, with_color=True)
-        occlusions.append((sources, occlusion_from_maps(maps, front, back), 2 * maps.texel))
-    window = Window(center=ball.center, radius=ball.radius, frames=frames_along(around.directions))
-    maps = splat_depth_maps(occluders, window, size=AMBIENT_SIZE, with_color=True)
-    occlusions.append((around, occlusion_from_maps(maps, around_front, around_back), maps.texel))
+        window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(both))
+        maps = splat_depth_maps(occluders, window, size=settings.source_size, with_color=True)
+        occlusions.append((sources, occlusion_from_maps(maps, front, back), source_bias * maps.texel))
+    window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(ambient.directions))
+    maps = splat_depth_maps(occluders, window, size=settings.ambient_size, with_color=True)
+    occlusions.append((ambient, occlusion_from_maps(maps, ambient_front, ambient_back), ambient_bias * maps.texel))
     return ObjectShadowMaps(maps, tuple(occlusions))
 
 
 def self_visibility(
-    maps: ObjectShadowMaps, gaussians: Gaussians, normals: Float[Tensor, "m 3"], beams: LightSamples
+    maps: ObjectShadowMaps,
+    gaussians: Gaussians,
+    normals: Float[Tensor, "m 3"],
+    samples: LightSamples,
+    *,
+    settings: ShadowMapSettings = ShadowMapSettings(),
 ) -> Float[Tensor, "m k"]:
-    """Share of every bundle of `beams` that an object lets through to its own Gaussians.
+    """Visibility of every light sample from an object's own Gaussians, past the object itself.
 
-    `beams` may belong to another light than the maps were made for: its sources are then mapped anew. An ambient
-    bundle that is blocked still brings a third: light between the object's own parts.
+    Args:
+        maps: The object's.
+        gaussians: The m Gaussians that receive light.
+        normals: Unit, of their surfaces.
+        samples: k samples, of the light that the maps were made for or of another one: maps of sources are made anew.
+        settings: Resolution, bias, and the share of ambient light that is reflected between the object's own parts.
+
+    Returns:
+        Share of each sample that arrives, in [0, 1].
     """
-    window = maps.ambient_maps.window
+    window, (source_bias, ambient_bias) = maps.ambient_maps.window, settings.self_bias
     points = raised(gaussians, normals)
-    around = visibility(maps.ambient_maps, points, normals, bias=2 * maps.ambient_maps.texel)
-    around = 1 / 3 + 2 / 3 * around
-    sources, _, _ = source_pairs(beams)
+    ambient = visibility(maps.ambient_maps, points, normals, bias=ambient_bias * maps.ambient_maps.texel)
+    ambient = settings.self_ambient + (1 - settings.self_ambient) * ambient
+    sources, _, _ = source_pairs(samples)
     if not len(sources):
-        return around
+        return ambient
     lit = Window(center=window.center, radius=window.radius, frames=frames_along(sources.directions))
-    fronts = splat_depth_maps(occluders_of(gaussians), lit, size=AMBIENT_SIZE, with_color=False)
-    return torch.cat([visibility(fronts, points, normals, bias=2.5 * fronts.texel), around], 1)
+    fronts = splat_depth_maps(occluders_of(gaussians), lit, size=settings.ambient_size, with_color=False)
+    return torch.cat([visibility(fronts, points, normals, bias=source_bias * fronts.texel), ambient], 1)
 
 
 @dataclass(frozen=True)
 class SceneShadowMaps:
-    """The scene's own depth maps around a place: they do not change when an object moves there."""
+    """The scene's own depth maps around a place; they stay valid while objects move there."""
 
     region: BoundingSphere
-    """Where they hold."""
+    """What the maps cover."""
     source_maps: DepthMaps | None
-    """One per bundle of a source; None without sources."""
+    """One per source sample; None for a light without sources."""
     ambient_maps: DepthMaps
-    """One per ambient bundle."""
+    """One per ambient sample."""
 
 
-def scene_shadow_maps(scene: Gaussians, region: BoundingSphere, beams: LightSamples) -> SceneShadowMaps:
-    """Depth maps of `scene` for every bundle. Only what is in the region blocks: the light is from beyond it."""
+def scene_shadow_maps(
+    scene: Gaussians,
+    region: BoundingSphere,
+    samples: LightSamples,
+    *,
+    settings: ShadowMapSettings = ShadowMapSettings(),
+) -> SceneShadowMaps:
+    """Depth maps of `scene` for every light sample. Only Gaussians in or near `region` block light."""
     maps: list[DepthMaps | None] = []
-    near = (scene.means - region.center).norm(dim=1) < 1.5 * region.radius + 3 * scene.scales.max(1).values
-    blockers = scene.select(near)
-    for part, size in ((source_pairs(beams)[0], SOURCE_SIZE), (ambient_pairs(beams)[0], AMBIENT_SIZE)):
+    reach = settings.blockers_around * region.radius + 3 * scene.scales.max(1).values
+    blockers = scene.select((scene.means - region.center).norm(dim=1) < reach)
+    sizes = (settings.source_size, settings.ambient_size)
+    for part, size in zip((source_pairs(samples)[0], ambient_pairs(samples)[0]), sizes, strict=True):
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
         nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
-        # what is finer than a pixel of the map tells no more than a sample of it
+        # Gaussians finer than a pixel of the map add no detail: a random part of them is enough
         occluders = occluders_of(thinned(blockers, width=2 * region.radius / size))
-        seen = splat_depth_maps(occluders, window, size=size, with_color=False, nearest=nearest)
-        maps.append(seen if len(part) else None)
+        splatted = splat_depth_maps(occluders, window, size=size, with_color=False, nearest=nearest)
+        maps.append(splatted if len(part) else None)
     of_sources, of_ambient = maps
     assert of_ambient is not None
     return SceneShadowMaps(region=region, source_maps=of_sources, ambient_maps=of_ambient)
 
 
 def scene_visibility(
-    maps: SceneShadowMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]
+    maps: SceneShadowMaps,
+    points: Float[Tensor, "m 3"],
+    normals: Float[Tensor, "m 3"],
+    *,
+    settings: ShadowMapSettings = ShadowMapSettings(),
 ) -> Float[Tensor, "m k"]:
-    """Share of every bundle that the scene itself lets through to `points`: the guard against darkening twice.
+    """Visibility of every light sample from `points` past the scene, so that existing shadows are not darkened twice.
 
-    An ambient bundle that is blocked still brings half: the light of the blocker itself.
+    Args:
+        maps: The scene's, for k samples.
+        points: World units.
+        normals: Unit, of the surface at each point.
+        settings: Bias, and the share of an ambient sample that a blocker reflects or emits itself.
+
+    Returns:
+        Share of each sample that arrives, in [0, 1].
     """
-    around = 0.5 + 0.5 * visibility(maps.ambient_maps, points, normals, bias=1.5 * maps.ambient_maps.texel)
+    source_bias, ambient_bias = settings.scene_bias
+    ambient = visibility(maps.ambient_maps, points, normals, bias=ambient_bias * maps.ambient_maps.texel)
+    ambient = settings.scene_ambient + (1 - settings.scene_ambient) * ambient
     if maps.source_maps is None:
-        return around
-    return torch.cat([visibility(maps.source_maps, points, normals, bias=2.5 * maps.source_maps.texel), around], 1)
+        return ambient
+    of_sources = visibility(maps.source_maps, points, normals, bias=source_bias * maps.source_maps.texel)
+    return torch.cat([of_sources, ambient], 1)
 
 
 @dataclass(frozen=True)
@@ -123,11 +202,11 @@ class SceneRatio:
     """Per receiver, the change that an object makes to the light on it."""
 
     shadow: Float[Tensor, "m 3"]
-    """Share of linear light left, in (0, 1]; exactly 1 out of reach."""
+    """Share of linear light that is left, in (0, 1]; exactly 1 out of reach."""
     bounce: Float[Tensor, "m 3"]
-    """Light from the object, as a share of the light before."""
+    """Light from the object, as a share of the light without it."""
     slope: Float[Tensor, "m 3"]
-    """Change of both by the direction of view, world axes: seen along the unit vector d, slope . d is added (grey)."""
+    """View dependence of both, world axes: seen along the unit vector d, slope . d is added (grey)."""
 
 
 def scene_ratio(
@@ -135,11 +214,23 @@ def scene_ratio(
     points: Float[Tensor, "m 3"],
     normals: Float[Tensor, "m 3"],
     *,
-    arrives: Float[Tensor, "m k"],
+    sample_visibility: Float[Tensor, "m k"],
+    settings: SceneRatioSettings = SceneRatioSettings(),
 ) -> SceneRatio:
-    """Ratio at `points`; `arrives` is the share of each bundle that the scene lets through."""
-    sums = (light_sums(maps, points, normals, arrives=arrives, sources=flag) for flag in (True, False))
-    return ratio_of(sum(sums, torch.zeros(3, len(points), 3)))
+    """Shadow and bounce of an object on a surface.
+
+    Args:
+        maps: The object's.
+        points: World units.
+        normals: Unit, of the surface at each point.
+        sample_visibility: Share of each light sample that the scene lets through, in [0, 1].
+        settings: Limits.
+
+    Returns:
+        The ratios at `points`, with a slope of 0.
+    """
+    sums = (light_sums(maps, points, normals, sample_visibility=sample_visibility, sources=f) for f in (True, False))
+    return ratio_from_sums(sum(sums, torch.zeros(3, len(points), 3)), settings=settings)
 
 
 def light_sums(
@@ -147,52 +238,63 @@ def light_sums(
     points: Float[Tensor, "m 3"],
     normals: Float[Tensor, "m 3"],
     *,
-    arrives: Float[Tensor, "m k"],
+    sample_visibility: Float[Tensor, "m k"],
     sources: bool,
 ) -> Float[Tensor, "3 m 3"]:
-    """Irradiance at `points` before, after and by bounce, of the sources' bundles or of the ambient ones."""
+    """Irradiance at `points` without the object, with it, and by its bounce: of the sources or of the ambient light."""
     total, column = torch.zeros(3, len(points), 3), 0
     for part, occlusion, bias in maps.occlusions:
-        share = arrives[:, column : column + len(part)].contiguous()
+        share = sample_visibility[:, column : column + len(part)].contiguous()
         column += len(part)
         if part.is_source[0] == sources:
-            total = total + torch.stack(cast(occlusion, part, points, normals, arrives=share, bias=bias))
+            found = occluded_irradiance(occlusion, part, points, normals, sample_visibility=share, bias=bias)
+            total = total + torch.stack(found)
     return total
 
 
-def ratio_of(sums: Float[Tensor, "3 m 3"]) -> SceneRatio:
-    """What such sums come to as a change."""
-    before, after, bounce = sums
-    total = before.clamp_min(1e-9)
-    # where no light was, none can be taken
-    ratio = torch.where(before > 1e-8, after / total, 1).clamp(_DARKEST, 1)
-    lost = _beyond_dead_zone(1 - ratio)
-    gained = _beyond_dead_zone(torch.where(before > 1e-8, bounce / total, 0).clamp(0, 1))
+def ratio_from_sums(sums: Float[Tensor, "3 m 3"], *, settings: SceneRatioSettings = SceneRatioSettings()) -> SceneRatio:
+    """Ratios from such sums of all light, limited and with small changes set to 0; the slope is 0."""
+    without, with_object, bounce = sums
+    total = without.clamp_min(1e-9)
+    # an unlit point cannot get darker
+    ratio = torch.where(without > 1e-8, with_object / total, 1).clamp(settings.darkest, 1)
+    lost = _soft_threshold(1 - ratio, settings.least_change)
+    gained = _soft_threshold(torch.where(without > 1e-8, bounce / total, 0).clamp(0, 1), settings.least_change)
     return SceneRatio(shadow=1 - lost, bounce=gained, slope=torch.zeros_like(lost))
 
 
-def _beyond_dead_zone(change: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-    """`change` with small values taken to exactly 0, without a step: full from three times the zone on."""
+def _soft_threshold(change: Float[Tensor, "m 3"], least: float) -> Float[Tensor, "m 3"]:
+    """`change` with values below `least` set to exactly 0, without a step: unchanged from three times `least` on."""
     strongest = change.max(1, keepdim=True).values
-    return change * ((strongest - _DEAD_ZONE) / (2 * _DEAD_ZONE)).clamp(0, 1)
+    return change * ((strongest - least) / (2 * least)).clamp(0, 1)
 
 
 def reachable(
     points: Float[Tensor, "m 3"],
-    ball: BoundingSphere,
-    beams: LightSamples,
+    sphere: BoundingSphere,
+    samples: LightSamples,
     *,
     farthest: float,
     rims: Float[Tensor, "m"] | float = 0.0,
+    settings: SceneRatioSettings = SceneRatioSettings(),
 ) -> Bool[Tensor, "m"]:
-    """Points within `farthest` of the object that some bundle's shadow cone may touch, or come nearer than `rims`."""
-    away = points - ball.center
+    """Points whose light an object may change: those near it, and those in the shadow cone of a source.
+
+    Args:
+        points: World units.
+        sphere: The object's bounding sphere.
+        samples: Of the light.
+        farthest: World units from the object; no point beyond is reached.
+        rims: World units; extent of what lies around each point.
+        settings: How near ambient shadows reach.
+    """
+    away = points - sphere.center
     distance = away.norm(dim=1)
-    near = distance - rims < 3.5 * ball.radius
-    for direction, softness, source in zip(beams.directions, beams.softness, beams.is_source, strict=True):
+    near = distance - rims < settings.near_reach * sphere.radius
+    for direction, softness, source in zip(samples.directions, samples.softness, samples.is_source, strict=True):
         if source:
             along = -(away @ direction)
             aside = (distance**2 - along**2).clamp_min(0).sqrt()
-            spread = torch.tan(softness.clamp_max(1.2)) * (along + ball.radius).clamp_min(0)
-            near |= (along + rims > -ball.radius) & (aside - rims < ball.radius + spread)
+            spread = torch.tan(softness.clamp_max(settings.widest_cone)) * (along + sphere.radius).clamp_min(0)
+            near |= (along + rims > -sphere.radius) & (aside - rims < sphere.radius + spread)
     return near & (distance - rims < farthest)

@@ -1,6 +1,6 @@
-"""Orthographic depth maps splatted from Gaussians along many directions, and visibility looked up in them.
+"""Shadow maps: orthographic depth maps splatted from Gaussians along many directions, and visibility from them.
 
-Knows nothing about light, colour spaces or objects: occluders in, maps out; points in, visibility out.
+Visibility by percentage-closer filtering (Reeves et al. 1987) with an offset along the normal.
 """
 
 import math
@@ -20,23 +20,39 @@ from splatgraft.rendering.cpu_rows import LANES, lanes, largest, load, smaller, 
 from splatgraft.runtime.kernel_lock import serialized
 
 FAR = np.float32(1e30)
+"""Depth of a texel where less than half of the light is blocked."""
+
+# compiled into the kernels; all set by hand
 _BINS = 4096
-_CUTOFF = np.float32(3.04)  # standard deviations, where a splat of opacity 1 falls to `_FAINTEST`
-_FAINTEST = np.float32(0.01)  # alpha
-_SPENT = np.float32(0.02)  # share of light that is not followed further
+"""Depth bins of the counting sort."""
+_FAINTEST = np.float32(0.01)
+"""Alpha below which a splat is cut off."""
+_CUTOFF = np.float32(3.04)
+"""Standard deviations, where a splat of opacity 1 falls to `_FAINTEST`."""
+_SPENT = np.float32(0.02)
+"""Transmittance below which a tile of pixels is finished."""
 _HALF = np.float32(0.5)
+"""Transmittance at which a texel's first depth is taken."""
+_MOST_ALPHA = np.float32(0.99)
+"""Of one splat in one pixel, as in 3DGS."""
+_DILATION = np.float32(0.15)
+"""Pixels squared, added to the variance of a splat's footprint against aliasing."""
+_LIFT = np.float32(1.5)
+"""Pixels; a receiver is looked up this far above its surface, along the normal."""
+_FLATTEST = np.float32(0.2)
+"""Cosine of incidence below which the slope-dependent bias grows no further."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """The ball that depth maps look at, and their frames."""
+    """The sphere that depth maps cover, and their k frames."""
 
     center: Float[Tensor, "3"]
     """World; the middle of every map and depth 0."""
     radius: float
     """Half the width of every map, world units."""
     frames: Float[Tensor, "k 3 3"]
-    """Rows right, down, away from the light; x_in_light = frame @ (x_in_world - center)."""
+    """Rotations with rows right, down, away from the light: x_in_light = frame @ (x_in_world - center)."""
 
     @property
     def directions(self) -> Float[Tensor, "k 3"]:
@@ -46,17 +62,20 @@ class Window:
 
 @dataclass(frozen=True)
 class Occluders:
-    """What Gaussians' maps need of them, computed once for many maps."""
+    """Gaussians as depth maps need them, computed once for many maps."""
 
     means: Float[Tensor, "n 3"]
+    """World units."""
     covariances: Float[Tensor, "n 3 3"]
+    """World units squared."""
     opacities: Float[Tensor, "n"]
+    """In [0, 1]."""
     linear_rgb: Float[Tensor, "n 3"]
-    """Mean colour, linear."""
+    """Colour from the zeroth band, linear, in [0, 1]."""
 
 
 def occluders_of(gaussians: Gaussians) -> Occluders:
-    """The Gaussians as things that block light."""
+    """`gaussians` as occluders."""
     return Occluders(
         means=gaussians.means,
         covariances=gaussians.covariances,
@@ -66,30 +85,32 @@ def occluders_of(gaussians: Gaussians) -> Occluders:
 
 
 def thinned(gaussians: Gaussians, *, width: float) -> Gaussians:
-    """Fewer, wider Gaussians that cover the same area: those narrower than `width` survive by chance, and grow to it.
+    """Fewer, wider Gaussians that cover the same area (stochastic simplification, Cook et al. 2007).
 
-    Stochastic simplification (Cook et al. 2007): one survives with probability (its width / `width`)^2.
+    A Gaussian narrower than `width`, world units, is kept with probability (its width / `width`)^2 and grown to
+    `width`. The random numbers have a fixed seed.
     """
     share = (gaussians.log_scales.sort(1).values[:, 1:].sum(1) - 2 * math.log(width)).exp().clamp(1e-6, 1)
-    lots = torch.rand(gaussians.count, generator=torch.Generator().manual_seed(0))
-    chosen = (lots < share).nonzero()[:, 0]
+    random = torch.rand(gaussians.count, generator=torch.Generator().manual_seed(0))
+    chosen = (random < share).nonzero()[:, 0]
     kept = gaussians.select(chosen)
     return replace(kept, log_scales=kept.log_scales - 0.5 * share[chosen, None].log())
 
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """What k far lights see of some occluders."""
+    """Orthographic depth maps of some occluders, s x s pixels each, from k directions."""
 
     window: Window
+    """What the maps cover."""
     first: Float[Tensor, "k s s"]
-    """Depth at which light is half blocked; 1e30 where less than half is blocked."""
+    """Depth at which half of the light is blocked; 1e30 where less than half is."""
     alpha: Float[Tensor, "k s s"]
     """Share of the light blocked, in [0, 1]."""
     mean: Float[Tensor, "c s s"]
-    """Blended depth of what blocks; 0 where nothing does; c is k, or 0 where no colour was asked for."""
+    """Blended depth of the occluders, 0 where there are none; c = k, or 0 for maps without colour."""
     color: Float[Tensor, "c 3 s s"]
-    """Blended linear colour of the side towards the light, over black."""
+    """Blended linear colour of the occluders' side towards the light, over black."""
 
     @property
     def texel(self) -> float:
@@ -100,22 +121,27 @@ class DepthMaps:
 def splat_depth_maps(
     occluders: Occluders, window: Window, *, size: int, with_color: bool, nearest: Float[Tensor, "k"] | None = None
 ) -> DepthMaps:
-    """Depth maps of `occluders`, `size` (a multiple of 16) pixels square; blended front to back as the renderer does.
+    """Splat depth maps of `occluders`, blended front to back as the renderer does.
 
-    Colour and mean depth are kept where `with_color` asks for it. Occluders at a depth below `nearest` (that is,
-    farther than -`nearest` from the window's centre towards that light) are left out.
+    Args:
+        occluders: All that may block light.
+        window: What the maps cover, and their directions.
+        size: Width of a map, pixels, a multiple of 16.
+        with_color: Whether to keep colour and mean depth too.
+        nearest: Per map, world units: occluders of a smaller depth (nearer to the light) are left out.
     """
     k = len(window.frames)
     c = k if with_color else 0
     assert size % LANES == 0
-    first, left = np.zeros((k, size, size), np.float32), np.ones((k, size, size), np.float32)
+    first, transmittance = np.zeros((k, size, size), np.float32), np.ones((k, size, size), np.float32)
     mean, color = np.zeros((c, size, size), np.float32), np.zeros((c, 3, size, size), np.float32)
     geometry = (_array(occluders.means), _array(occluders.covariances), _array(occluders.opacities))
     view = (_array(window.frames), _array(window.center), np.float32(window.radius))
     limits = _array(nearest) if nearest is not None else np.full(k, -FAR, np.float32)
-    _splat(geometry, _array(occluders.linear_rgb), view, limits, (first, left, mean, color), get_num_threads())
-    first[left >= _HALF] = FAR
-    alpha = np.subtract(np.float32(1), left, out=left)
+    planes = (first, transmittance, mean, color)
+    _splat(geometry, _array(occluders.linear_rgb), view, limits, planes, get_num_threads())
+    first[transmittance >= _HALF] = FAR
+    alpha = np.subtract(np.float32(1), transmittance, out=transmittance)
     mean /= np.maximum(alpha[:c], np.float32(1e-6))
     return DepthMaps(
         window=window,
@@ -129,13 +155,19 @@ def splat_depth_maps(
 def visibility(
     maps: DepthMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], *, bias: float
 ) -> Float[Tensor, "m k"]:
-    """Share of each light that reaches `points` on a surface with `normals`; 1 outside the window.
+    """Visibility of each map's light from points on a surface, in [0, 1]; 1 outside the window.
 
-    `bias` is the distance, world units, below which an occluder is the surface itself.
+    Args:
+        maps: k depth maps.
+        points: World units.
+        normals: Unit, of the surface at each point.
+        bias: World units; an occluder nearer than this is the surface itself.
     """
     out = np.ones((len(points), len(maps.first)), np.float32)
     view = (_array(maps.window.frames), _array(maps.window.center), np.float32(maps.window.radius))
-    _look_up(_array(points), _array(normals), view, (_array(maps.first), _array(maps.alpha)), np.float32(bias), out)
+    _filter_visibility(
+        _array(points), _array(normals), view, (_array(maps.first), _array(maps.alpha)), np.float32(bias), out
+    )
     return torch.from_numpy(out)
 
 
@@ -145,8 +177,8 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _project(frame, geometry, view, nearest, splats):  # noqa: PLR0915  (one kernel: what touches, order, shapes)
-    """Gaussians that touch a map, in the order of their depth: rows of `splats`, and how many."""
+def _project(frame, geometry, view, nearest, splats):  # noqa: PLR0915  (one kernel: culling, sorting, projection)
+    """Write the splats that touch a map into the rows of `splats`, sorted by depth, and return their number."""
     means, covariances, opacities = geometry
     center, radius, size = view
     f = frame
@@ -190,9 +222,9 @@ def _project(frame, geometry, view, nearest, splats):  # noqa: PLR0915  (one ker
         b0 = f[1, 0] * c[0, 0] + f[1, 1] * c[1, 0] + f[1, 2] * c[2, 0]
         b1 = f[1, 0] * c[0, 1] + f[1, 1] * c[1, 1] + f[1, 2] * c[2, 1]
         b2 = f[1, 0] * c[0, 2] + f[1, 1] * c[1, 2] + f[1, 2] * c[2, 2]
-        uu = (a0 * f[0, 0] + a1 * f[0, 1] + a2 * f[0, 2]) * square + np.float32(0.15)
+        uu = (a0 * f[0, 0] + a1 * f[0, 1] + a2 * f[0, 2]) * square + _DILATION
         uv = (a0 * f[1, 0] + a1 * f[1, 1] + a2 * f[1, 2]) * square
-        vv = (b0 * f[1, 0] + b1 * f[1, 1] + b2 * f[1, 2]) * square + np.float32(0.15)
+        vv = (b0 * f[1, 0] + b1 * f[1, 1] + b2 * f[1, 2]) * square + _DILATION
         uz = (a0 * f[2, 0] + a1 * f[2, 1] + a2 * f[2, 2]) * per_unit
         vz = (b0 * f[2, 0] + b1 * f[2, 1] + b2 * f[2, 2]) * per_unit
         inverse = np.float32(1) / (uu * vv - uv * uv)
@@ -210,9 +242,9 @@ def _project(frame, geometry, view, nearest, splats):  # noqa: PLR0915  (one ker
 @njit(cache=True, fastmath=True, inline="always")
 @no_type_check
 def _blend(splat, at, dv, du, maps):
-    """One splat over a row of pixels; whether no light is left behind all of them."""
+    """Blend one splat over a row of pixels; the last value returned is whether all of them are finished."""
     _, _, depth, ca, cb, cc, su, sv, opacity, _, cut, _ = splat
-    near, through = maps
+    near, transmittance = maps
     q = du * (du * ca + np.float32(2) * cb * dv) + cc * dv * dv
     # exp(-q / 2) to 0.004, by squaring (1 - q / 128) six times
     bell = np.float32(1) - q * np.float32(1 / 128)
@@ -222,13 +254,13 @@ def _blend(splat, at, dv, du, maps):
     bell = bell * bell
     bell = bell * bell
     bell = bell * bell
-    before = load(through, at)
-    weight = before * where_below(q, cut, smaller(bell * opacity, np.float32(0.99)))
+    before = load(transmittance, at)
+    weight = before * where_below(q, cut, smaller(bell * opacity, _MOST_ALPHA))
     after = before - weight
-    place = du * su + (depth + sv * dv)
-    store(near, at, load(near, at) + where_at_least(before, _HALF, where_below(after, _HALF, place)))
-    store(through, at, after)
-    return weight, weight * place, largest(after) < _SPENT
+    pixel_depth = du * su + (depth + sv * dv)
+    store(near, at, load(near, at) + where_at_least(before, _HALF, where_below(after, _HALF, pixel_depth)))
+    store(transmittance, at, after)
+    return weight, weight * pixel_depth, largest(after) < _SPENT
 
 
 @serialized
@@ -236,14 +268,14 @@ def _blend(splat, at, dv, du, maps):
 @no_type_check
 def _splat(geometry, rgb, view, limits, maps, threads):
     frames, center, radius = view
-    first, left, mean, color = maps
+    first, transmittances, mean, color = maps
     size = first.shape[1]
     for thread in prange(threads):
         splats = np.empty((len(geometry[0]), 12), np.float32)
         for k in range(thread, len(frames), threads):
             count = _project(frames[k], geometry, (center, radius, size), limits[k], splats)
-            closed = np.zeros((size, size // LANES), np.bool_)  # where light no longer reaches
-            near, through = first[k], left[k]
+            finished = np.zeros((size, size // LANES), np.bool_)
+            near, transmittance = first[k], transmittances[k]
             for j in range(count):
                 u, v, _, ca, cb, cc, _, _, _, var_v, cut, who = splats[j]
                 reach = np.sqrt(cut * var_v)
@@ -260,13 +292,15 @@ def _splat(geometry, rgb, view, limits, maps, threads):
                     if low > high:
                         continue
                     for tile in range(low // LANES, high // LANES + 1):
-                        if closed[row, tile]:
+                        if finished[row, tile]:
                             continue
                         at = row * size + tile * LANES
                         du = lanes() + (np.float32(tile * LANES) + np.float32(0.5) - u)
-                        weight, placed, closed[row, tile] = _blend(splats[j], at, dv, du, (near, through))
+                        weight, weighted_depth, finished[row, tile] = _blend(
+                            splats[j], at, dv, du, (near, transmittance)
+                        )
                         if len(color):
-                            store(mean[k], at, load(mean[k], at) + placed)
+                            store(mean[k], at, load(mean[k], at) + weighted_depth)
                             for channel in range(3):
                                 plane = color[k, channel]
                                 store(plane, at, load(plane, at) + weight * rgb[int(who), channel])
@@ -275,7 +309,7 @@ def _splat(geometry, rgb, view, limits, maps, threads):
 @serialized
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
-def _look_up(points, normals, view, maps, bias, out):
+def _filter_visibility(points, normals, view, maps, bias, out):
     frames, center, radius = view
     first, alpha = maps
     size = first.shape[1]
@@ -285,7 +319,7 @@ def _look_up(points, normals, view, maps, bias, out):
             f = frames[k]
             cosine = -(f[2, 0] * normals[i, 0] + f[2, 1] * normals[i, 1] + f[2, 2] * normals[i, 2])
             # a map pixel on a tilted surface spans tan(angle) of depth; the offset along the normal takes most of it
-            lift = texel * np.float32(1.5)
+            lift = texel * _LIFT
             x = points[i, 0] - center[0] + lift * normals[i, 0]
             y = points[i, 1] - center[1] + lift * normals[i, 1]
             z = points[i, 2] - center[2] + lift * normals[i, 2]
@@ -294,7 +328,7 @@ def _look_up(points, normals, view, maps, bias, out):
             depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
             if u < 0 or v < 0 or u >= size - 1 or v >= size - 1:
                 continue
-            slope = np.sqrt(max(np.float32(0), 1 - cosine * cosine)) / max(abs(cosine), np.float32(0.2))
+            slope = np.sqrt(max(np.float32(0), 1 - cosine * cosine)) / max(abs(cosine), _FLATTEST)
             limit = depth - bias - texel * slope
             column, row = int(u), int(v)
             fu, fv = u - column, v - row
@@ -304,6 +338,6 @@ def _look_up(points, normals, view, maps, bias, out):
                     at = first[k, row + dv, column + du]
                     if at < limit:
                         share = (fu if du == 1 else 1 - fu) * (fv if dv == 1 else 1 - fv)
-                        # fades in over one pixel's depth, so that no hard step shows
+                        # fades in over one pixel's depth, against a visible step
                         blocked += share * alpha[k, row + dv, column + du] * min(1, (limit - at) / texel)
             out[i, k] = 1 - blocked

@@ -177,13 +177,15 @@ class _PairTransfer:
         visible = scene_visibility(self._scene_maps, points.means, normals)
         visible = torch.where(torch.as_tensor(samples.is_source), visible, torch.ones(()))
         self_visible = self_visibility(self._object_maps, points, normals, samples)
-        target = irradiance(samples, normals, arrives=self_visible * visible)
+        target = irradiance(samples, normals, sample_visibility=self_visible * visible)
         source_samples = sample_light(self._source_light)
         self_visible = self_visibility(self._object_maps, points, normals, source_samples)
-        source = irradiance(source_samples, normals, arrives=self_visible)
+        source = irradiance(source_samples, normals, sample_visibility=self_visible)
         certain = Normals(normals, torch.ones(len(normals)), torch.ones(len(normals), dtype=torch.bool))
         log_ratio = torch.zeros(*inside.shape, 3)
-        log_ratio[inside] = shade_ratio(target, source, certain, torch.ones(len(normals)), seen=self._coverage).log()
+        log_ratio[inside] = shade_ratio(
+            target, source, certain, torch.ones(len(normals)), coverage=self._coverage
+        ).log()
         return log_ratio
 
     def scene_log_ratio(self) -> Float[Tensor, "v h w 3"]:
@@ -194,7 +196,7 @@ class _PairTransfer:
         near = reachable(points, self._sphere, samples, farthest=self._region.radius)
         points, normals = points[near] + SETTINGS.offset_m * normals[near], normals[near].contiguous()
         visible = scene_visibility(self._scene_maps, points, normals)
-        ratio = scene_ratio(self._object_maps, points, normals, arrives=visible)
+        ratio = scene_ratio(self._object_maps, points, normals, sample_visibility=visible)
         found = torch.zeros(len(near), 3)
         found[near] = (ratio.shadow + ratio.bounce).log()
         log_ratio = torch.zeros(*outside.shape, 3)
