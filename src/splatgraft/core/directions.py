@@ -38,7 +38,7 @@ def vogel_offsets(
 
 
 def perpendicular(axis: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """A unit vector perpendicular to unit `axis`: its cross product with the world axis farthest from it."""
+    """A unit vector perpendicular to unit `axis`: from the world axis that is least aligned with it."""
     world_axis = torch.eye(3, dtype=axis.dtype, device=axis.device)[int(axis.abs().argmin())]
     return torch.nn.functional.normalize(torch.linalg.cross(axis, world_axis), dim=0)
 

@@ -8,7 +8,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.estimate import panorama_at
+from splatgraft.relighting.light.estimate import NoLight, panorama_at
 from splatgraft.relighting.shading.gain import GainOptions, LocalGain, apply_gain, local_gain
 from splatgraft.relighting.transfer import SourceScene
 
@@ -67,11 +67,11 @@ class _Place:
 
 def _gain_between(source: _Place, target: _Place, options: GainOptions) -> LocalGain | str:
     """The gain from the object's old place to its new one, or a sentence that gives the reason why there is none."""
-    target_panorama, problem = panorama_at(target.scene, target.sphere)
-    if target_panorama is None:
-        return f"In the target: {problem}"
-    source_panorama, problem = panorama_at(source.scene, source.sphere)
-    if source_panorama is None:
-        return f"In the source: {problem}"
+    target_panorama = panorama_at(target.scene, target.sphere)
+    if isinstance(target_panorama, NoLight):
+        return f"In the target: {target_panorama.reason}"
+    source_panorama = panorama_at(source.scene, source.sphere)
+    if isinstance(source_panorama, NoLight):
+        return f"In the source: {source_panorama.reason}"
     source_up, target_up = estimate_up(source.cameras), estimate_up(target.cameras)
     return local_gain(source_panorama, target_panorama, source_up=source_up, target_up=target_up, options=options)

@@ -16,7 +16,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
-from splatgraft.relighting.light.estimate import estimate_light
+from splatgraft.relighting.light.estimate import NoLight, estimate_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.shading.irradiance import irradiance
 from splatgraft.relighting.shading.normals import Normals, estimate_normals
@@ -91,9 +91,10 @@ def prepare_object(
     maps = object_shadow_maps(gaussians, sphere, samples)
     source_lighting, notes = None, None
     if source is not None:
-        source_light, problem = _source_light(placed.gaussians, source, index, cache)
-        notes = problem
-        if source_light is not None:
+        source_light = _source_light(placed.gaussians, source, index, cache)
+        if isinstance(source_light, NoLight):
+            notes = source_light.reason
+        else:
             notes = source_light.describe(estimate_up(source.cameras)) + "."
             source_light = source_light.rotated(placed.target_from_object.rotation)
             source_samples = sample_light(source_light)
@@ -137,16 +138,14 @@ def _moved(prepared: PreparedObject, placed: PlacedObject, samples: LightSamples
     )
 
 
-def _source_light(
-    gaussians: Gaussians, source: SourceScene, index: int, cache: Memo
-) -> tuple[Light | None, str | None]:
+def _source_light(gaussians: Gaussians, source: SourceScene, index: int, cache: Memo) -> Light | NoLight:
     """The light that object `index` was captured in, estimated once for all copies of one object."""
     for earlier in range(index):
         cached = cache.peek(f"source light {earlier}", (gaussians, source))
         if cached is not None:
             return cached
 
-    def estimate() -> tuple[Light | None, str | None]:
+    def estimate() -> Light | NoLight:
         # the object's shadow in its capture is evidence too
         place = bounding_sphere(gaussians)
         return estimate_light(source.gaussians, place, source.cameras, object_gaussians=gaussians)

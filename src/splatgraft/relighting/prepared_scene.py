@@ -14,7 +14,7 @@ from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.estimate import estimate_lights, panorama_at
+from splatgraft.relighting.light.estimate import EstimatedLights, NoLight, estimate_lights, panorama_at
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama_sources import light_from_panorama
 from splatgraft.relighting.light.sun_visibility import observed_sun_visibility
@@ -71,7 +71,7 @@ def prepare_scene(
     reach: float,
     light: Light | None,
     cache: Memo,
-) -> tuple[PreparedScene | None, str | None]:
+) -> PreparedScene | NoLight:
     """Prepare a scene for objects.
 
     Args:
@@ -81,18 +81,14 @@ def prepare_scene(
         reach: Object radii to which shadows are computed.
         light: At the objects' place; None to estimate it.
         cache: Reused where the scene is the same and the place has moved little.
-
-    Returns:
-        The prepared scene, or None and a sentence that gives the reason.
     """
     center = torch.stack([sphere.center for sphere in spheres]).mean(0)
     place = BoundingSphere(center, max(sphere.radius for sphere in spheres))
     region = _region(scene, place, reach, cache)
-    if light is None:
-        light, problem = _estimated_light(scene, cameras, place, region, cache)
-        if light is None:
-            return None, problem
-    known, samples = light, sample_light(light)
+    known = _estimated_light(scene, cameras, place, region, cache) if light is None else light
+    if isinstance(known, NoLight):
+        return known
+    samples = sample_light(known)
     indices = _receiver_indices(scene, region, spheres, known, cache)
     receivers = cache.get("receivers", (indices,), lambda: scene.select(indices))
     # for the test of what cameras see, occluders need not be finer than a shadow map's pixel
@@ -106,7 +102,7 @@ def prepare_scene(
         (maps, normals),
         lambda: _with_observed_sun(receivers, normals, known, scene_visibility(maps, points, normals.vectors)),
     )
-    found = PreparedScene(
+    return PreparedScene(
         scene=scene,
         receiver_indices=indices,
         receivers=receivers,
@@ -116,7 +112,6 @@ def prepare_scene(
         maps=maps,
         sample_visibility=sample_visibility,
     )
-    return found, None
 
 
 def _region(scene: Gaussians, place: BoundingSphere, reach: float, cache: Memo) -> BoundingSphere:
@@ -155,23 +150,23 @@ def _receiver_indices(
 
 def _estimated_light(
     scene: Gaussians, cameras: Cameras, place: BoundingSphere, region: BoundingSphere, cache: Memo
-) -> tuple[Light | None, str | None]:
+) -> Light | NoLight:
     """The light at `place`; after a move within the region the sources are kept and the ambient light is new."""
-    cached = cache.peek("light", (scene, region))
+    cached: EstimatedLights | None = cache.peek("light", (scene, region))
     if cached is None:
-        lights, problem = estimate_lights(scene, place, cameras)
-        if lights is None:
-            return None, problem
+        lights = estimate_lights(scene, place, cameras)
+        if isinstance(lights, NoLight):
+            return lights
         cache.put("light", (scene, region), lights)
-        return lights[1], None
-    panorama, problem = panorama_at(scene, place)
-    if panorama is None:
-        return None, problem
+        return lights.leveled
+    panorama = panorama_at(scene, place)
+    if isinstance(panorama, NoLight):
+        return panorama
     # the sources keep their brightness too: shadow maps and the object's own shading are cached with them
-    by_panorama, leveled = cached
-    factor = float(leveled.ambient[0].sum() / by_panorama.ambient[0].sum().clamp_min(1e-9))
+    leveled = cached.leveled
+    factor = float(leveled.ambient[0].sum() / cached.by_panorama.ambient[0].sum().clamp_min(1e-9))
     here = light_from_panorama(panorama, estimate_up(cameras))
-    return replace(here, sources=leveled.sources, ambient=factor * here.ambient), None
+    return replace(here, sources=leveled.sources, ambient=factor * here.ambient)
 
 
 def _with_observed_sun(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.estimate import estimate_light
+from splatgraft.relighting.light.estimate import NoLight, estimate_light
 from splatgraft.relighting.prepared_object import SourceScene
 from splatgraft.relighting.shading.gain import apply_gain
 from splatgraft.relighting.shading.normals import estimate_normals, raised
@@ -47,9 +47,9 @@ def remove_object_shadow(
         estimated.
     """
     scene, sphere = source.gaussians, bounding_sphere(object_gaussians)
-    light, problem = estimate_light(scene, sphere, source.cameras, object_gaussians=object_gaussians)
-    if light is None:
-        return scene, (f"{problem} The old place stays as it is.",)
+    light = estimate_light(scene, sphere, source.cameras, object_gaussians=object_gaussians)
+    if isinstance(light, NoLight):
+        return scene, (f"{light.reason} The old place stays as it is.",)
     samples = sample_light(light)
     region = BoundingSphere(sphere.center, settings.reach * sphere.radius)
     index = reachable(scene.means, sphere, samples, farthest=region.radius).nonzero()[:, 0]

@@ -18,6 +18,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.layers import Relit, unchanged
+from splatgraft.relighting.light.estimate import NoLight
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.prepared_object import PreparedObject, SourceScene, prepare_object
 from splatgraft.relighting.prepared_scene import PreparedScene, prepare_scene
@@ -94,10 +95,10 @@ def relight(
         "scene", (composite.target, composite.erased), lambda: composite.target.select(~composite.erased)
     )
     spheres = [bounding_sphere(p.in_target()) for p, _ in placed]
-    scene, problem = prepare_scene(target, cameras, spheres=spheres, reach=options.reach, light=light, cache=cache)
-    if scene is None:
+    scene = prepare_scene(target, cameras, spheres=spheres, reach=options.reach, light=light, cache=cache)
+    if isinstance(scene, NoLight):
         in_target = tuple(p.in_target() for p, _ in placed)
-        return unchanged(baked, is_object, objects=in_target, report=(f"{problem} The object is pasted as it is.",))
+        return unchanged(baked, is_object, objects=in_target, report=(f"{scene.reason} The object is pasted as it is.",))
     report = [scene.light.describe(estimate_up(cameras)) + (", as given." if light is not None else ".")]
     objects = []
     for i, (one, source) in enumerate(placed):

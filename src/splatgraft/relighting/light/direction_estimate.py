@@ -102,19 +102,13 @@ def estimate_direction(
     directions = directions[directions @ up > math.sin(settings.lowest)]
     by_highlights = _highlight_shares(highlights, directions)
     belief = _highlight_belief(by_highlights, settings)
-    coarse = _scores(evidence.explained(evidence.lit(directions), settings.shadows), by_highlights, belief)
+    coarse = _scores(evidence.explained(evidence.lit(directions)), by_highlights, belief)
     directions = _cap(directions[int(coarse.argmax())], settings.cap, settings.finer)
     directions = directions[directions @ up > math.sin(settings.lowest)]
     lit = evidence.lit(directions)
-    by_shadows, by_highlights = evidence.explained(lit, settings.shadows), _highlight_shares(highlights, directions)
+    by_shadows, by_highlights = evidence.explained(lit), _highlight_shares(highlights, directions)
     scores = _scores(by_shadows, by_highlights, belief)
-    best, typical = float(scores.max()), float(coarse.median())
-    # the centre of the peak is the estimate, its width an uncertainty
-    start, rise = settings.peak
-    share = ((scores - start * best) / max(rise * best, 1e-9)).clamp_min(0)
-    direction = torch.nn.functional.normalize((share[:, None] * directions).sum(0), dim=0)
-    angle = torch.acos((directions @ direction).clamp(-1, 1))
-    width = float(((share * angle**2).sum() / share.sum().clamp_min(1e-9)).sqrt())
+    direction, width = _peak(directions, scores, settings)
     nearest = int((directions @ direction).argmax())
     explained = float(by_shadows[nearest])
     highlight = float(by_highlights[nearest])
@@ -123,6 +117,7 @@ def estimate_direction(
     shadow_error = math.radians(least + more * math.exp(-explained / decay))
     precision = shadow_error**-2 + highlight_weight / settings.highlight_error**2
     gain, dilution = settings.attenuation
+    best, typical = float(scores.max()), float(coarse.median())
     contrast = (best - typical) / max(best, 1e-9)
     return DirectionEstimate(
         direction=direction,
@@ -152,6 +147,18 @@ def _scores(shadows: Float[Tensor, "d"], highlights: Float[Tensor, "d"], belief:
     Believed highlights count twice: on rendered scenes with both they were nearer to the truth.
     """
     return 1 - (1 - shadows) * (1 - highlights) ** (2 * belief)
+
+
+def _peak(
+    directions: Float[Tensor, "d 3"], scores: Float[Tensor, "d"], settings: DirectionSettings
+) -> tuple[Float[Tensor, "3"], float]:
+    """Centre of the peak of the scores, a unit vector, and its width (standard deviation, radians)."""
+    best = float(scores.max())
+    start, rise = settings.peak
+    share = ((scores - start * best) / max(rise * best, 1e-9)).clamp_min(0)
+    direction = torch.nn.functional.normalize((share[:, None] * directions).sum(0), dim=0)
+    angle = torch.acos((directions @ direction).clamp(-1, 1))
+    return direction, float(((share * angle**2).sum() / share.sum().clamp_min(1e-9)).sqrt())
 
 
 def _cap(axis: Float[Tensor, "3"], radius: float, count: int) -> Float[Tensor, "n 3"]:

@@ -21,6 +21,17 @@ from splatgraft.relighting.light.panorama import Panorama, cube_cameras, render_
 from splatgraft.relighting.shading.normals import estimate_normals
 from splatgraft.rendering import render
 
+_SURFACE_ALPHA = 0.5
+"""A pixel of a depth image above this alpha shows a surface."""
+
+
+@dataclass(frozen=True)
+class NoLight:
+    """The light at a place could not be estimated."""
+
+    reason: str
+    """A sentence for a report."""
+
 
 @dataclass(frozen=True)
 class PlaceSettings:
@@ -104,7 +115,7 @@ def estimate_light(
     *,
     object_gaussians: Gaussians | None = None,
     settings: LightEstimateSettings = LightEstimateSettings(),
-) -> tuple[Light | None, str | None]:
+) -> Light | NoLight:
     """Estimate the light in the middle of `place`.
 
     Args:
@@ -113,12 +124,19 @@ def estimate_light(
         cameras: Of the scene's capture.
         object_gaussians: The object itself, if it stands there: it casts shadows, but is not part of the panorama.
         settings: Of all methods.
-
-    Returns:
-        The light, or None and a sentence that gives the reason.
     """
-    lights, problem = estimate_lights(scene, place, cameras, object_gaussians=object_gaussians, settings=settings)
-    return (None if lights is None else lights[1]), problem
+    lights = estimate_lights(scene, place, cameras, object_gaussians=object_gaussians, settings=settings)
+    return lights if isinstance(lights, NoLight) else lights.leveled
+
+
+@dataclass(frozen=True)
+class EstimatedLights:
+    """The light at a place in two brightnesses."""
+
+    by_panorama: Light
+    """As bright as what was captured."""
+    leveled: Light
+    """As bright as panorama and surfaces around suggest together."""
 
 
 def estimate_lights(
@@ -128,11 +146,11 @@ def estimate_lights(
     *,
     object_gaussians: Gaussians | None = None,
     settings: LightEstimateSettings = LightEstimateSettings(),
-) -> tuple[tuple[Light, Light] | None, str | None]:
-    """As `estimate_light`, but two lights: as bright as in the panorama, and as bright as surfaces around suggest."""
-    panorama, problem = panorama_at(scene, place, settings=settings.place)
-    if panorama is None:
-        return None, problem
+) -> EstimatedLights | NoLight:
+    """As `estimate_light`, with the light before its brightness is leveled too."""
+    panorama = panorama_at(scene, place, settings=settings.place)
+    if isinstance(panorama, NoLight):
+        return panorama
     up = estimate_up(cameras)
     whole = scene if object_gaussians is None else concatenate([scene, object_gaussians])
     distance = float((cameras.centers - place.center).norm(dim=1).median())
@@ -144,7 +162,7 @@ def estimate_lights(
         panorama, estimate, up, estimated_within=surroundings.radius, reflected=reflected, settings=settings.fusion
     )
     light = _with_distances(light, scene, place, settings)
-    return (light, _leveled(light, reflected, up, settings.level)), None
+    return EstimatedLights(light, _leveled(light, reflected, up, settings.level))
 
 
 def _direction_around(
@@ -225,7 +243,7 @@ def _with_distances(light: Light, scene: Gaussians, place: BoundingSphere, setti
         up = torch.tensor([0.0, 0.0, 1.0]) if abs(source.direction[2]) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
         pose = look_at(place.center[None], place.center + direction, up)
         rendered = render(scene, pinhole(pose, focal, width=width, height=width), outputs=frozenset({"depth"}))
-        visible = (rendered.alpha > 0.5) & (rendered.depth > place.radius)
+        visible = (rendered.alpha > _SURFACE_ALPHA) & (rendered.depth > place.radius)
         distance = (
             float(rendered.depth[visible].quantile(settings.window_quantile)) if bool(visible.any()) else math.inf
         )
@@ -235,27 +253,24 @@ def _with_distances(light: Light, scene: Gaussians, place: BoundingSphere, setti
 
 def panorama_at(
     scene: Gaussians, place: BoundingSphere, *, settings: PlaceSettings = PlaceSettings()
-) -> tuple[Panorama | None, str | None]:
+) -> Panorama | NoLight:
     """The panorama from the middle of `place`.
 
     Args:
         scene: All Gaussians, without the object.
         place: The object's bounding sphere.
         settings: Resolution, and when there is no panorama.
-
-    Returns:
-        The panorama, or None and a sentence that gives the reason.
     """
     if scene.count == 0:
-        return None, "The scene is empty."
+        return NoLight("The scene is empty.")
     rendered = render(scene, cube_cameras(place.center, settings.test_size), outputs=frozenset({"depth"}))
-    blocked = (rendered.alpha > 0.5) & (rendered.depth < settings.blocked_within * place.radius)
+    blocked = (rendered.alpha > _SURFACE_ALPHA) & (rendered.depth < settings.blocked_within * place.radius)
     if float(blocked.float().mean()) > settings.most_blocked:
-        return None, "The object is inside a wall or another thing: there is no light to be found there."
+        return NoLight("The object is inside a wall or another thing: there is no light to be found there.")
     panorama = render_panorama(scene, place.center, size=settings.size, nearest=settings.nearest * place.radius)
     if panorama.coverage < settings.least_coverage:
-        return None, f"Only {100 * panorama.coverage:.0f}% of the object's surroundings were captured."
+        return NoLight(f"Only {100 * panorama.coverage:.0f}% of the object's surroundings were captured.")
     mean = float((panorama.radiance.mean(-1) * panorama.alpha * panorama.solid_angles).sum()) / (4 * math.pi)
     if mean < settings.darkest:
-        return None, "There is no light at the object's place."
-    return panorama, None
+        return NoLight("There is no light at the object's place.")
+    return panorama

@@ -44,6 +44,8 @@ class HighlightSettings:
     squarings: int = 3
     """The lobe is cos^(2^squarings), by default cos^8: 24 degrees wide at half height, as narrow as harmonics of degree
     3 can be, and wide enough for windows."""
+    most_explained: float = 0.99
+    """Most share of the variance that one direction is said to explain; set by hand."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,8 @@ class Highlights:
     """Linear gray minus the Gaussian's mean over its cameras."""
     weight: Float[Tensor, "m v"]
     """0 where the camera does not see the Gaussian; they sum to 1."""
-    squarings: int = HighlightSettings().squarings
-    """Exponent of the lobe, see `HighlightSettings`."""
+    settings: HighlightSettings
+    """Of the lobe."""
 
     def explained(self, directions: Float[Tensor, "d 3"]) -> Float[Tensor, "d"]:
         """Share of all variance from view to view that a single light in each unit direction explains, in [0, 1]."""
@@ -65,13 +67,13 @@ class Highlights:
         shares = []
         for chunk in directions.split(_CHUNK):
             lobe = (self.mirrored @ chunk.T).clamp_min(0)
-            for _ in range(self.squarings):
+            for _ in range(self.settings.squarings):
                 lobe = lobe * lobe
             lobe = lobe - _mean(lobe, self.weight[..., None])
             covariance = (self.weight[..., None] * lobe * self.change[..., None]).sum((0, 1)).clamp_min(0)
             variance = (self.weight[..., None] * lobe * lobe).sum((0, 1)).clamp_min(1e-12)
             shares.append(covariance**2 / (variance * total))
-        return torch.cat(shares).clamp(0, 0.99)
+        return torch.cat(shares).clamp(0, self.settings.most_explained)
 
 
 def find_highlights(
@@ -118,7 +120,7 @@ def find_highlights(
         mirrored=2 * cosine[..., None] * facing[:, None] - towards,
         change=gray - _mean(gray, weight),
         weight=weight / weight.sum(),
-        squarings=settings.squarings,
+        settings=settings,
     )
 
 

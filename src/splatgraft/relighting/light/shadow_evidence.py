@@ -65,6 +65,10 @@ class ShadowEvidenceSettings:
     """Standard deviation of log brightness that no light explains."""
     strengths: tuple[float, ...] = (0.3, 0.8, 2.0, 4.0, 8.0)
     """Irradiance facing the light over ambient irradiance, as tried for every direction."""
+    strength_range: tuple[float, float, int] = (-1, 1.3, 24)
+    """Decimal logarithms of the least and the most strength of the estimate, and how many are tried between them."""
+    most_explained: float = 0.99
+    """Most share of the variance that one direction is said to explain."""
 
 
 @dataclass(frozen=True)
@@ -87,26 +91,28 @@ class ShadowEvidence:
     """Weight of each receiver in its material group, 0 in all others."""
     maps: "_ShadowMapper"
     """Shadow maps from any direction."""
+    settings: ShadowEvidenceSettings
+    """Of the model."""
 
     def lit(self, directions: Float[Tensor, "d 3"]) -> Float[Tensor, "m d"]:
         """Visibility times cosine of a light in each of d unit directions."""
         return self.maps.lit(self.points, self.normals, directions)
 
-    def explained(self, lit: Float[Tensor, "m d"], settings: ShadowEvidenceSettings) -> Float[Tensor, "d"]:
+    def explained(self, lit: Float[Tensor, "m d"]) -> Float[Tensor, "d"]:
         """Share of the brightness variance within groups that a light explains beyond ambient light, in [0, 1]."""
         value = self.log_rgb.mean(1)
         without = self._residual((value - self.ambient.log())[:, None])
         tried = [
             self._residual(value[:, None] - (self.ambient[:, None] + strength * lit).log())
-            for strength in settings.strengths
+            for strength in self.settings.strengths
         ]
         residual = torch.stack(tried).min(0).values
-        noise = settings.noise**2 * self.membership.sum()
-        return (1 - (residual + noise) / (without + noise)).clamp(0, 0.99)
+        noise = self.settings.noise**2 * self.membership.sum()
+        return (1 - (residual + noise) / (without + noise)).clamp(0, self.settings.most_explained)
 
     def strength(self, lit: Float[Tensor, "m"]) -> Float[Tensor, "3"]:
-        """Irradiance facing the light over ambient irradiance, per channel: the best of 24 between 0.1 and 20."""
-        fine = torch.logspace(-1, 1.3, 24)
+        """Irradiance facing the light over ambient irradiance, per channel; searched over `strength_range`."""
+        fine = torch.logspace(*self.settings.strength_range)
         modelled = (self.ambient[:, None] + lit[:, None] * fine).log()
         return torch.stack([fine[self._residual(self.log_rgb[:, c : c + 1] - modelled).argmin()] for c in range(3)])
 
@@ -152,7 +158,7 @@ def find_shadow_evidence(
     log_rgb = brightness.clamp_min(settings.least_log).log()
     mean = (membership @ log_rgb) / membership.sum(1, keepdim=True).clamp_min(1e-9)
     away = (log_rgb - mean[groups]).clamp(-math.log(settings.other_material), math.log(settings.highlight))
-    return ShadowEvidence(points, facing, mean[groups] + away, ambient, membership, maps)
+    return ShadowEvidence(points, facing, mean[groups] + away, ambient, membership, maps, settings)
 
 
 def _choose_receivers(

@@ -6,7 +6,7 @@ appears.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,7 +14,13 @@ from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.splitting import PIECE_WIDTH, PIECES, split_along
-from splatgraft.relighting.shadows.scene_ratio import ObjectShadowMaps, SceneRatio, light_sums, ratio_from_sums
+from splatgraft.relighting.shadows.scene_ratio import (
+    ObjectShadowMaps,
+    SceneRatio,
+    SceneRatioSettings,
+    light_sums,
+    ratio_from_sums,
+)
 
 RIM = 2.4
 """Standard deviations; beyond, a Gaussian's alpha is below 0.05."""
@@ -46,6 +52,8 @@ class ReceiverSettings:
     """Of the finest width that is split: narrower Gaussians get no slope; set by hand."""
     edge: float = 0.02
     """Share of light by which rim and centre differ at an edge; a rim shows a twentieth of it; set by hand."""
+    ratio: SceneRatioSettings = field(default_factory=SceneRatioSettings)
+    """Limits of the ratio at a point."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +153,7 @@ def _averaged_ratio(
     """
     g = receivers.gaussians
     by_sources = _sums(receivers, maps, sources=True)
-    ratio, variation = ratio_from_sums(by_sources + ambient), torch.zeros(g.count, 3)
+    ratio, variation = ratio_from_sums(by_sources + ambient, settings=settings.ratio), torch.zeros(g.count, 3)
     smallest = settings.finest * maps.ambient_maps.window.radius / math.sqrt(PIECE_WIDTH)
     broad = _broad(g, maps, settings)
     fine = ((g.scales.max(1).values > smallest) & ~broad).nonzero()[:, 0]
@@ -219,7 +227,7 @@ class _Averages:
             sums = sums + _sums(part, maps, sources=False, points=points)
         else:
             sums = sums + ambient.repeat_interleave(lines * len(beside), 1)
-        there, ratio = ratio_from_sums(sums), self.ratio
+        there, ratio = ratio_from_sums(sums, settings=self.settings.ratio), self.ratio
         shadow = _with_center(there.shadow.reshape(len(which), lines, len(beside), 3), ratio.shadow[which])
         bounce = _with_center(there.bounce.reshape(len(which), lines, len(beside), 3), ratio.bounce[which])
         # mostly the centre of a Gaussian is visible: weights exp(-x^2), narrower than its alpha exp(-x^2 / 2)
@@ -250,7 +258,7 @@ class _Averages:
         part, ratio = receivers.select(which), self.ratio
         beside = _points(part.gaussians, torch.eye(2))
         sums = _sums(part, maps, sources=True, points=beside) + ambient[:, which].repeat_interleave(2, 1)
-        there = ratio_from_sums(sums)
+        there = ratio_from_sums(sums, settings=self.settings.ratio)
         here = (ratio.shadow[which] + ratio.bounce[which]).mean(1, keepdim=True)
         along = (there.shadow + there.bounce).mean(1).reshape(-1, 2) - here
         ratio.slope[which] = self.settings.shows_behind * _in_world(part.gaussians, along)
