@@ -1,6 +1,6 @@
-"""Puts this folder on the path, so that every test can import the tiny models; marks tests and sets their limits.
+"""Puts this folder on the path, so that every test can import the tiny models; marks tests that use a browser.
 
-No test may fail because the machine is slow or busy: time limits are there against hangs alone.
+No test may fail because the machine is slow or busy: time limits (pyproject.toml) are there against hangs alone.
 """
 
 import pytest
@@ -10,13 +10,9 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
-BROWSER_LIMIT = 3600
-"""Seconds after which a test in a browser is taken for a hang; it takes two minutes on two idle cores."""
-
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark tests that use a browser."""
     for item in items:
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.browser)
-            item.add_marker(pytest.mark.timeout(BROWSER_LIMIT))

@@ -41,6 +41,7 @@ class SceneView:
         self._budget = budget
         self._splats: dict[str, tuple[tuple[object, ...], viser.GaussianSplatHandle | None, ShownCount]] = {}
         self._references: dict[str, object] = {}
+        self._units: dict[str, float] = {}
         self.shown: dict[str, ShownCount] = {}
 
     def show_splats(
@@ -144,12 +145,11 @@ class SceneView:
             rgbs=colors.numpy(),
             opacities=shown.opacities[:, None].numpy(),
         )
-        self._references[f"{name} unit"] = unit
+        self._units[name] = unit
         return handle, ShownCount(shown.count, gaussians.count)
 
     def _place(self, handle: viser.GaussianSplatHandle, transform: Similarity) -> None:
-        unit = self._references[f"{handle.name} unit"]
-        assert isinstance(unit, float)
+        unit = self._units[handle.name]
         gizmo = gizmo_from_similarity(transform, torch.zeros(3))
         handle.position, handle.wxyz = np.array(gizmo.position), np.array(gizmo.wxyz)
         handle.scale = gizmo.scale * unit

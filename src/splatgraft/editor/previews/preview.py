@@ -76,7 +76,13 @@ class Preview:
     def picture(
         self, kind: PictureKind, state: EditState, camera: Cameras, *, draft: bool = False
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """One picture from one camera; with `draft` its light is the one that is there best_available.
+        """Render one image.
+
+        Args:
+            kind: What the image shows.
+            state: The edits.
+            camera: One camera.
+            draft: Use a draft of the light where the full light transfer is not available yet.
 
         Raises:
             ValueError: If a file that the image needs does not exist yet.

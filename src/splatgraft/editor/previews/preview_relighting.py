@@ -46,7 +46,7 @@ class PreviewRelighting:
         return self._memo.get("composite", inputs, lambda: self._scenes.composite(state))
 
     def is_relit(self, state: EditState) -> bool:
-        """Whether the relit scene of this state is available without the physical light transfer."""
+        """Whether the light of this state is memoised, or project.toml selects no physical light transfer."""
         return not self._scenes.files.transfers_light or self._memo.peek("relit", self._inputs(state)) is not None
 
     def relit(self, state: EditState) -> Relit:
