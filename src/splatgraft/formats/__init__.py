@@ -1,4 +1,4 @@
-"""Reading and writing files, by suffix and by what lies in a folder. Holds no format itself."""
+"""Reads and writes scenes, captures and cameras, in the format given by the suffix or by the files in a folder."""
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -32,23 +32,25 @@ _WRITERS = {".ply": write_gaussian_ply, ".splat": write_splat, ".spz": write_spz
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a file of that name would be a trained scene, as its suffix says."""
+    """Whether the suffix is that of a trained scene."""
     return path.suffix.lower() in _READERS
 
 
 def read_gaussians(path: Path) -> Gaussians:
     """The scene in a .ply, .splat or .spz file.
 
-    Raises: ValueError where the suffix is another, or the file is not what its suffix says.
+    Raises:
+        ValueError: Where the suffix is another, or the file is not of the suffix's format.
     """
     with _readable(path):
         return _by_suffix(path, _READERS)(path)
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
-    """Write a scene in the format of the suffix; the file appears whole or not at all. Only .ply is exact.
+    """Write a scene, atomically, in the format of the suffix; only .ply is exact.
 
-    Raises: ValueError where the suffix is another, or the format cannot hold the scene.
+    Raises:
+        ValueError: Where the suffix is another, or the format cannot hold the scene.
     """
     _by_suffix(path, _WRITERS)(path, gaussians)
 
@@ -61,11 +63,15 @@ def _by_suffix(path: Path, functions: dict[str, Callable]) -> Callable:
 
 
 def read_capture(path: Path) -> PosedImages:
-    """Posed photographs: a COLMAP folder, a folder with transforms.json (or Blender's), or that file itself.
+    """Posed photographs of a COLMAP folder, of a folder with transforms.json (also Blender's), or of that file itself.
 
-    Where a folder has both, transforms.json counts. Masks are found by stem in masks/, or in the images' alpha.
+    Masks are found by stem in masks/, or in the images' alpha channels.
 
-    Raises: ValueError where nothing of these is there, or what is there is broken.
+    Args:
+        path: A folder or a file; of a folder with both formats, transforms.json is read.
+
+    Raises:
+        ValueError: Where none of these exists, or a file is broken.
     """
     with _readable(path):
         transforms = _transforms_path(path)
@@ -73,9 +79,10 @@ def read_capture(path: Path) -> PosedImages:
 
 
 def read_images(path: Path) -> PosedImages:
-    """Posed photographs without their points: what a ground truth is, where no points file need be there.
+    """Posed photographs without points, as of a ground truth; a points file need not exist.
 
-    Raises: ValueError where nothing of these is there, or what is there is broken.
+    Raises:
+        ValueError: Where no capture exists, or a file is broken.
     """
     with _readable(path):
         transforms = _transforms_path(path)
@@ -83,14 +90,15 @@ def read_images(path: Path) -> PosedImages:
 
 
 def write_capture(folder: Path, posed_images: PosedImages) -> None:
-    """Write transforms.json and points.ply into an existing folder; image files are referred to, not copied."""
+    """Write transforms.json and points.ply into an existing folder; image files are referenced, not copied."""
     transforms_json.write_capture(folder, posed_images)
 
 
 def read_cameras(path: Path) -> Cameras:
-    """The cameras of a capture, a transforms.json or a cameras.json of the original code; images need not exist.
+    """The cameras of a capture, a transforms.json, or a cameras.json of the original 3DGS code; images need not exist.
 
-    Raises: ValueError where nothing of these is there, or what is there is broken.
+    Raises:
+        ValueError: Where none of these exists, or a file is broken.
     """
     with _readable(path):
         if cameras_json.is_cameras_json(path):
@@ -100,13 +108,13 @@ def read_cameras(path: Path) -> Cameras:
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:
-    """Write a transforms.json of cameras alone."""
+    """Write cameras without images as a transforms.json."""
     transforms_json.write_cameras(path, cameras)
 
 
 @contextmanager
 def _readable(path: Path) -> Generator[None]:
-    """What the system refuses (rights, impossible names) told like any other bad file."""
+    """Turns the system's errors (permissions, impossible names) into a ValueError that names the file."""
     try:
         yield
     except OSError as error:
