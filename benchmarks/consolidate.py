@@ -1,8 +1,8 @@
-"""The fast road of consolidation against 10K iterations of Adam: `python benchmarks/consolidate.py [CAPTURE]`.
+"""The `fast` method of consolidation against 10K iterations of Adam: `python benchmarks/consolidate.py [CAPTURE]`.
 
-A scene is reconstructed from the capture (kept in build/), its colours are spoilt as a naive composite's are, and both
-roads fit them to the photographs again, with the same loss. Every 8th view is held out of everything. Then losses are
-compared on photographs that disagree as independently harmonised views do. The last line reads
+A scene is reconstructed from the capture (kept in build/), its colours are changed as a naive composite's are wrong,
+and both methods fit them to the photographs again, with the same loss. Every 8th view is held out of all steps. Then
+losses are compared on photographs that disagree as independently harmonised views do. The last line reads
 speedup=.. error_ratio=.. peak_mb=.., where error_ratio is the larger of the ratios of held-out loss and held-out RMSE.
 """
 
@@ -34,22 +34,22 @@ LOSSES: dict[str, ImageLoss] = {"fourier": windowed_fourier, "l1-dssim": l1_dssi
 
 @dataclass(frozen=True)
 class Problem:
-    """A composite with wrong colours, the views that say what they should be, and views that judge."""
+    """A composite with wrong colours, the views that it is fitted to, and held-out views."""
 
     composite: Gaussians
     cameras: Cameras
     images: list[Tensor]
-    judge_cameras: Cameras
-    judge_images: list[Tensor]
+    test_cameras: Cameras
+    test_images: list[Tensor]
 
     def pictures(self, scene: Gaussians) -> list[Tensor]:
-        """Renders from the test_views cameras."""
+        """Renders from the held-out cameras."""
         with torch.no_grad():
-            return [render(scene, camera).color[0].clamp(0, 1) for camera in self.judge_cameras]
+            return [render(scene, camera).color[0].clamp(0, 1) for camera in self.test_cameras]
 
     def errors(self, scene: Gaussians, loss: ImageLoss) -> tuple[float, float, float, float]:
         """Held out: mean loss, RMSE over all pixels, mean PSNR, gradient energy over that of the photographs."""
-        pairs = list(zip(self.pictures(scene), self.judge_images, strict=True))
+        pairs = list(zip(self.pictures(scene), self.test_images, strict=True))
         squares = sum(float(((a - b) ** 2).mean()) for a, b in pairs) / len(pairs)
         energy = sum(gradient_energy(a) for a, _ in pairs) / sum(gradient_energy(b) for _, b in pairs)
         mean_loss = sum(float(loss(a, b)) for a, b in pairs) / len(pairs)
@@ -113,13 +113,13 @@ def problem_of(capture: PosedImages, scene: Gaussians) -> Problem:
         composite=spoilt(scene),
         cameras=fitted.cameras,
         images=[fitted.image(i) for i in range(len(fitted))],
-        judge_cameras=test_views.cameras,
-        judge_images=[test_views.image(i) for i in range(len(test_views))],
+        test_cameras=test_views.cameras,
+        test_images=[test_views.image(i) for i in range(len(test_views))],
     )
 
 
-def compare_roads(problem: Problem, loss: ImageLoss, iterations: int) -> str:
-    """Both roads on photographs that agree."""
+def compare_methods(problem: Problem, loss: ImageLoss, iterations: int) -> str:
+    """Both methods on photographs that agree."""
     options = ConsolidateOptions(loss=loss, view_error=None)
     consolidate(problem.composite, problem.cameras[:2], problem.images[:2], options)  # compiles the kernels
     runs = {
@@ -141,14 +141,14 @@ def compare_roads(problem: Problem, loss: ImageLoss, iterations: int) -> str:
             flush=True,
         )
     fast, adam = results["fast"], results["adam"]
-    # the `fast` without tint and flow: both roads minimise the same. CPU time: they run one after the other, and a
-    # machine that others use would favour one of them
+    # `fast` without tint and flow, so that both methods minimise the same loss; CPU time, since other load during one
+    # of the runs would distort wall times
     ratio = max(fast[3] / adam[3], fast[4] / adam[4])
     return f"speedup={adam[1] / fast[1]:.1f} error_ratio={ratio:.3f} peak_mb={fast[2]:.0f}"
 
 
 def compare_losses(problem: Problem, passes: int) -> None:
-    """What each loss keeps when the views disagree; judged on photographs that do not."""
+    """Quality of each loss where the views disagree, measured on held-out photographs that agree."""
     losses = dict(LOSSES)
     try:
         losses["lpips"] = lpips_vgg()
@@ -205,7 +205,7 @@ def main() -> None:
     )
     if args.losses == "compare":
         compare_losses(problem, args.passes)
-    print(compare_roads(problem, LOSSES[args.loss], args.iterations))
+    print(compare_methods(problem, LOSSES[args.loss], args.iterations))
 
 
 if __name__ == "__main__":

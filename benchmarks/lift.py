@@ -1,4 +1,4 @@
-"""Lifting masks to Gaussians: the closed form against 10K iterations of binary cross-entropy, judged on held-out views.
+"""Lifting masks to Gaussians: the closed form against 10K iterations of binary cross-entropy, on held-out views.
 
 Every 8th view of the capture is held out of reconstruction and lifting. The object is what each feature selects at the
 same threshold; its picture in a held-out view (where most of the blend is object) is compared with the true mask.

@@ -1,8 +1,8 @@
-"""Time of the CPU rasteriser beside a plain numba one, on random 2D splats, with one thread.
+"""Time of the CPU rasteriser against a plain numba rasteriser, on random 2D splats, with one thread.
 
-Forward is blending, backward the gradients of every splat's centre, shape, opacity and colour, both in CPU time on
-lists that are ready; sorting and listing are printed by themselves. The plain one has the same tiles, alpha bounds and
-early stop, written pixel by pixel.
+Forward is blending, backward the gradients of every splat's centre, shape, opacity and colour, both in CPU time with
+tile lists given; sorting and listing are measured separately. The plain one has the same tiles, alpha bounds and early
+stop, written pixel by pixel.
 """
 
 import math

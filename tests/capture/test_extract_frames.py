@@ -1,4 +1,4 @@
-"""Capture, video: the sharpest frame of each stretch is taken, and files that are no video are refused."""
+"""Capture, video: the sharpest frame of each interval is taken, and files that are no video are refused."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Capture, orientation: the world is turned so that up is +z and the support lies at z = 0."""
+"""Orientation of a capture: up becomes +z and the support plane z = 0, in any initial frame."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Where a scene without cameras is looked at from."""
+"""Virtual cameras of a scene without images: dense part, up direction, poses without occlusion."""
 
 import math
 
@@ -88,7 +88,7 @@ def room() -> Gaussians:
     return blobs(faces, 0.08)
 
 
-def test_a_room_is_looked_at_from_within_where_one_says_so_and_is_told_to_be_hollow() -> None:
+def test_a_room_is_seen_from_within_on_request_and_reported_as_hollow() -> None:
     around = place_virtual_cameras(room(), VirtualCameraOptions(views=8, up=(0.0, 0.0, 1.0)))
     assert any("look = within" in sentence for sentence in around.report)
     within = place_virtual_cameras(room(), VirtualCameraOptions(views=8, up=(0.0, 0.0, 1.0), look="within"))

@@ -1,4 +1,4 @@
-"""Composite: what is moved, erased and joined; identities hold bit by bit."""
+"""Composite: objects are transformed, Gaussians erased and joined; identities hold exactly."""
 
 from dataclasses import fields
 

@@ -1,4 +1,4 @@
-"""The placement helper on a built room: a table under a ceiling, a box to stand on it, floaters in the air."""
+"""Automatic placement in a synthetic room: a table under a ceiling, a box to place on it, floaters in the air."""
 
 import math
 

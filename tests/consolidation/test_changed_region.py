@@ -1,3 +1,5 @@
+"""Restriction to changes: active Gaussians and windows follow the changed pixels."""
+
 import torch
 from conftest import ball, ring
 

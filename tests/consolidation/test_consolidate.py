@@ -1,3 +1,5 @@
+"""Consolidation: closer to the images, geometry unchanged, reproducible, bounded memory."""
+
 import subprocess
 import sys
 from dataclasses import fields, replace
@@ -30,7 +32,7 @@ def test_comes_closer_to_the_images_and_keeps_the_geometry(relit, options):
     assert score(out, relit) > score(relit.composite, relit)
 
 
-def test_the_fast_road_explains_images_that_agree(relit):
+def test_the_fast_method_explains_images_that_agree(relit):
     # the truth itself is feasible; band ridge and clamping leave a residual, far under one grey level of 8 bits x 4
     out = consolidate(relit.composite, relit.cameras, relit.images, PLAIN)
     assert score(out, relit) > 36.0

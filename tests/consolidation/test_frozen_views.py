@@ -1,3 +1,5 @@
+"""Frozen views: equal to the renderer, cropped cameras, transposes, the cache."""
+
 import torch
 from conftest import ball, ring
 from hypothesis import given, settings
@@ -29,7 +31,7 @@ def test_render_equals_the_renderer_with_and_without_a_subset():
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**16))
-def test_gather_is_the_transpose_of_blend(seed):
+def test_blend_transpose_is_the_transpose_of_blend(seed):
     scene, cameras = ball(100, degree=1, seed=seed), ring(2, 40)
     active = torch.arange(100) % 2 == 0
     view = views_of(scene, cameras).restricted(active, [(0, 0, 40, 40)] * 2)[1]

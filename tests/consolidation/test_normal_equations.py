@@ -1,3 +1,5 @@
+"""Normal equations: equal to a dense solve, priors, choice of the ridge, tints."""
+
 from dataclasses import replace
 
 import torch

@@ -1,3 +1,5 @@
+"""Noise schedules and the iterative dataset update."""
+
 from itertools import pairwise
 
 import pytest

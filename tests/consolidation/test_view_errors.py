@@ -1,3 +1,5 @@
+"""Per-view errors: known tints and flows are recovered, and weights of zero ignored."""
+
 import pytest
 import torch
 import torch.nn.functional as F

@@ -1,4 +1,4 @@
-"""Lens distortion is undone: a picture taken through it becomes the pinhole's picture, without empty borders."""
+"""Lens distortion: an undistorted image equals the pinhole's image and has no empty borders."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Image files of every kind that cameras and tools write, the sRGB transfer, resampling."""
+"""Image files in all modes that cameras and tools write, the sRGB transfer function, resampling."""
 
 import resource
 import struct

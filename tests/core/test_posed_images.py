@@ -1,4 +1,4 @@
-"""Posed images serve pixels at their cameras' size, undistorted, with whatever belongs to a view kept together."""
+"""Posed images: pixels at the cameras' size, undistorted; selecting views selects all that belongs to them."""
 
 import numpy as np
 import torch

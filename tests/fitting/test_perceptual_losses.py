@@ -1,3 +1,5 @@
+"""Perceptual losses: zero for equal images, gradients, LPIPS with given weights."""
+
 import numpy as np
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""COLMAP models: poses, points and layouts, held against hand-packed files and against pycolmap where it is there."""
+"""COLMAP models: poses, points and layouts, compared with hand-packed files, and with pycolmap if installed."""
 
 import struct
 

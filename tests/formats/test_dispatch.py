@@ -1,4 +1,4 @@
-"""The choice of the format by suffix and by what lies in a folder."""
+"""The choice of the format by suffix and by the files in a folder."""
 
 import format_files
 import pytest

@@ -1,4 +1,4 @@
-"""Broken files: whatever the bytes, a reader gives a value or one ValueError line with the file, in little memory."""
+"""Broken files: for any bytes a reader returns a value or raises a one-line ValueError that names the file."""
 
 import shutil
 import struct

@@ -1,4 +1,4 @@
-"""Which mask belongs to which photograph."""
+"""Masks are matched to photographs by stem, or taken from alpha channels."""
 
 import format_files
 import numpy as np

@@ -139,7 +139,7 @@ MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
 
 
 @pytest.mark.parametrize(
-    ("frame", "content", "told"),
+    ("frame", "content", "expected"),
     [
         ({"transform_matrix": SCALED}, {}, "axes of length 2, 2, 2"),
         ({"transform_matrix": MIRRORED}, {}, "determinant -1"),
@@ -164,7 +164,7 @@ MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
         ({}, {"frames": "none"}, "frames"),
     ],
 )
-def test_refusals(tmp_path, frame, content, told):
+def test_refusals(tmp_path, frame, content, expected):
     path = format_files.write_transforms(tmp_path, content)
     meta = json.loads(path.read_text())
     if meta["frames"] and isinstance(meta["frames"], list):
@@ -174,7 +174,7 @@ def test_refusals(tmp_path, frame, content, told):
         formats.read_capture(tmp_path)
     message = str(caught.value)
     assert str(tmp_path) in message
-    assert told in message
+    assert expected in message
     assert "\n" not in message
 
 

@@ -1,4 +1,4 @@
-"""Splitting."""
+"""Density control: the children of a split Gaussian."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Where a reconstruction starts."""
+"""Initial Gaussians from sparse points, and random points in the volume that cameras see."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""A renderer in plain torch operations, every pixel against every Gaussian: the judge of the fast ones.
+"""A renderer in plain torch operations, every pixel against every Gaussian: the reference for the fast ones.
 
 Written from the 3DGS paper's formulas, for small scenes, in the dtype of its input (float64 in the tests).
 """

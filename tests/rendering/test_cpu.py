@@ -1,4 +1,4 @@
-"""The CPU renderer against the plain-torch reference, and the properties a renderer has of itself."""
+"""The CPU renderer against the plain-torch reference, and properties of any renderer."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace

@@ -1,4 +1,4 @@
-"""The kernels' spherical harmonics against the values' own."""
+"""The kernels' spherical harmonics against `core.spherical_harmonics`."""
 
 import numpy as np
 import pytest

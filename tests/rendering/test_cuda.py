@@ -1,4 +1,4 @@
-"""The CUDA renderer against the CPU's; runs where a GPU and gsplat are."""
+"""The CUDA renderer against the CPU's; needs a GPU and gsplat."""
 
 import sys
 

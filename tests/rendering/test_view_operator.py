@@ -1,4 +1,4 @@
-"""The operator of one view: linear, the same as the renderer, and its transpose truly its adjoint."""
+"""The operator of one view: linear, equal to the renderer, and with its adjoint as transpose."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""A file appears whole or not at all."""
+"""Atomic files: replaced when complete, unchanged after an error or a kill."""
 
 import subprocess
 import sys

@@ -56,7 +56,7 @@ def test_a_failing_listener_kills_the_process(tmp_path):
         run_logged(
             python("import os, time; print(os.getpid(), flush=True); time.sleep(3600)"), tmp_path / "log", on_line=fail
         )
-    # killed and waited for: the system knows its id no more
+    # killed and waited for, so that the id is free
     with pytest.raises(ProcessLookupError):
         os.kill(ids[0], 0)
 

@@ -1,4 +1,4 @@
-"""Jobs side by side: order of failures, one that fails stops none, Ray with a worker that is killed."""
+"""Parallel tasks: order of failures, a failure stops no other task, Ray with a worker that is killed."""
 
 import os
 import signal
@@ -39,11 +39,11 @@ def test_every_job_is_done_and_failures_come_in_the_order_of_the_jobs(tmp_path):
     tasks = tasks_in(tmp_path, 3)
     tasks.insert(1, Task("bad", partial(fail, "x.png: expected light, found none")))
     tasks.append(Task("worse", partial(fail, "y.png: expected light, found none")))
-    told = []
-    failures = run_tasks(tasks, at_once=3, progress=lambda done, total, name: told.append((done, total)))
+    reported = []
+    failures = run_tasks(tasks, at_once=3, progress=lambda done, total, name: reported.append((done, total)))
     assert failures == ["bad: x.png: expected light, found none", "worse: y.png: expected light, found none"]
     assert len(list(tmp_path.glob("*.txt"))) == 3
-    assert told == [(i, 5) for i in range(1, 6)]
+    assert reported == [(i, 5) for i in range(1, 6)]
 
 
 def test_an_error_that_is_no_fault_of_the_data_is_raised(tmp_path):

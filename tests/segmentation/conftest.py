@@ -1,4 +1,4 @@
-"""A ball of Gaussians before a wall of them, seen from an arc of cameras."""
+"""A ball of Gaussians in front of a wall of Gaussians, seen by an arc of cameras."""
 
 import math
 

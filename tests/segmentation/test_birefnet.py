@@ -1,4 +1,4 @@
-"""BiRefNet: pictures are scaled and normalised as it was trained, its answer is a mask, bad weights are named."""
+"""BiRefNet: images are scaled and normalised as in training, the output is a mask, bad weights are named."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""GrabCut from a 3D box: finds an object of its own colour, and a second pass mends what one view got wrong."""
+"""GrabCut from a 3D box: finds an object of a distinct colour; the second pass corrects a wrong mask of one view."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def test_the_ball_is_found_in_every_view(photographs, cameras, masks, ball):
     assert all(set(mask.unique().tolist()) <= {0.0, 1.0} for mask in found)
 
 
-def test_the_views_outvote_a_spoilt_mask(photographs, cameras, masks, scene):
+def test_the_other_views_correct_a_wrong_mask(photographs, cameras, masks, scene):
     spoilt = [mask.clone() for mask in masks]
     spoilt[2][40:70, 5:40] = 1
     mended = refine_masks(spoilt, photographs, cameras, scene)

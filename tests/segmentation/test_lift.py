@@ -28,7 +28,7 @@ def test_closed_form_is_the_weighted_average_of_the_differentiable_render(scene,
 
 def test_object_and_surroundings_part_at_the_threshold(feature):
     chosen = feature >= 0.75
-    # the ball's back is hidden by its front: seen by nobody, or only through gaps at the outline
+    # the ball's back is hidden by its front: seen by no camera, or only through gaps at the outline
     assert float(chosen[:BALL].float().mean()) > 0.45
     assert float(chosen[BALL:].float().mean()) < 0.01
 
@@ -40,7 +40,7 @@ def test_mask_and_complement_sum_to_one_where_seen(scene, cameras, masks, featur
     assert torch.all(torch.isclose(total, torch.tensor(1.0), atol=1e-4) | (total == 0))
 
 
-def test_nobody_sees_what_lies_behind_all_cameras(scene, cameras, masks):
+def test_a_gaussian_behind_all_cameras_has_feature_zero(scene, cameras, masks):
     behind = replace(scene.select(torch.arange(3)), means=torch.tensor([[0.0, -50.0, 0.0]] * 3))
     assert lift_masks(concatenate([scene, behind]), cameras, masks)[-3:].tolist() == [0, 0, 0]
 

@@ -1,4 +1,4 @@
-"""Selection: threshold, box, largest piece; and the box itself."""
+"""Selection: threshold, box and connected components; the default box."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ def test_threshold_is_inclusive(threshold):
     assert chosen.tolist() == [True, False, True]
 
 
-def test_a_distant_crumb_falls_away(ball):
+def test_a_small_distant_component_is_removed(ball):
     crumb = splats(torch.tensor([[3.0, 0, 0], [3.05, 0, 0]]), 0.05, 0.99, torch.ones(2, 3))
     both = concatenate([ball, crumb])
     chosen = select_object(both, torch.ones(both.count))
@@ -44,7 +44,7 @@ def test_a_second_part_of_the_object_stays_unless_the_largest_alone_is_wanted(ba
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
-def test_pieces_do_not_depend_on_the_unit_of_length(ball, factor):
+def test_components_do_not_depend_on_the_unit_of_length(ball, factor):
     crumb = splats(torch.tensor([[3.0, 0, 0]]), 0.05, 0.99, torch.ones(1, 3))
     both = concatenate([ball, crumb])
     unit = Similarity(scale=factor, rotation=torch.eye(3), translation=torch.zeros(3))

@@ -1,4 +1,4 @@
-"""Solid objects: what shines through in its own scene is closed, what sticks out of the mask is taken away."""
+"""Solidifying: a half-transparent object becomes opaque inside its masks and transparent outside."""
 
 from dataclasses import replace
 

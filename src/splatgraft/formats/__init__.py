@@ -1,4 +1,4 @@
-"""Reading and writing files, by suffix and by what lies in a folder. Holds no format itself."""
+"""Reads and writes scenes, captures and cameras, in the format given by the suffix or by the files in a folder."""
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -32,7 +32,7 @@ _WRITERS = {".ply": write_gaussian_ply, ".splat": write_splat, ".spz": write_spz
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a file of that name would be a trained scene, as its suffix says."""
+    """Whether the suffix is that of a trained scene."""
     return path.suffix.lower() in _READERS
 
 
@@ -95,9 +95,10 @@ def read_capture(path: Path | str) -> PosedImages:
 
 
 def read_images(path: Path) -> PosedImages:
-    """Posed photographs without their points: what a ground truth is, where no points file need be there.
+    """Posed photographs without points, as of a ground truth; a points file need not exist.
 
-    Raises: ValueError where nothing of these is there, or what is there is broken.
+    Raises:
+        ValueError: Where no capture exists, or a file is broken.
     """
     with _readable(path):
         transforms = _transforms_path(path)
@@ -105,7 +106,7 @@ def read_images(path: Path) -> PosedImages:
 
 
 def write_capture(folder: Path, posed_images: PosedImages) -> None:
-    """Write transforms.json and points.ply into an existing folder; image files are referred to, not copied."""
+    """Write transforms.json and points.ply into an existing folder; image files are referenced, not copied."""
     transforms_json.write_capture(folder, posed_images)
 
 
@@ -130,13 +131,13 @@ def read_cameras(path: Path | str) -> Cameras:
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:
-    """Write a transforms.json of cameras alone."""
+    """Write cameras without images as a transforms.json."""
     transforms_json.write_cameras(path, cameras)
 
 
 @contextmanager
 def _readable(path: Path) -> Generator[None]:
-    """What the system refuses (rights, impossible names) told like any other bad file."""
+    """Turns the system's errors (permissions, impossible names) into a ValueError that names the file."""
     try:
         yield
     except OSError as error:

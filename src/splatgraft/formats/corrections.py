@@ -1,6 +1,6 @@
-"""corrections.npy: what a person added to the Gaussians of an object and removed from them. Knows no scenes.
+"""corrections.npy: the user's corrections to the selection of an object's Gaussians.
 
-One int8 per Gaussian of the source scene: 1 added, -1 removed, 0 as the masks gave it.
+One int8 per Gaussian of the source scene: 1 added, -1 removed, 0 as selected by the masks.
 """
 
 from pathlib import Path
@@ -16,7 +16,8 @@ from splatgraft.runtime.atomic_file import atomic_write
 def read_corrections(path: Path) -> Int8[Tensor, "n"]:
     """The corrections in `path`.
 
-    Raises: ValueError where the file is no one-dimensional array of -1, 0 and 1.
+    Raises:
+        ValueError: Where the file is no one-dimensional int8 array of -1, 0 and 1.
     """
     try:
         array = np.load(path, allow_pickle=False)
@@ -31,6 +32,6 @@ def read_corrections(path: Path) -> Int8[Tensor, "n"]:
 
 
 def write_corrections(path: Path, corrections: Int8[Tensor, "n"]) -> None:
-    """Write the array; the file appears whole or not at all."""
+    """Write the array, atomically."""
     with atomic_write(path) as stream:
         np.save(stream, corrections.cpu().numpy())

@@ -1,4 +1,4 @@
-"""JSON files of numbers and names that people wrote: each value is checked as it is taken. Knows no format's keys."""
+"""Checked access to the values of a JSON file: numbers, image sides, file names and arrays."""
 
 import json
 from pathlib import Path
@@ -6,15 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from splatgraft.formats.captures.described_view import MAX_SIDE
+from splatgraft.formats.captures.view_record import MAX_SIDE
 
 _LONGEST = 60
+"""Characters of a value in an error message."""
 
 
 def load(path: Path) -> Any:
     """The file's content.
 
-    Raises: ValueError where it is missing or no JSON.
+    Raises: ValueError where the file is missing or is no JSON.
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a JSON file, found none")
@@ -31,7 +32,7 @@ def number(path: Path, entry: dict[str, Any], key: str, default: float | None = 
     """
     value = entry.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
-        raise ValueError(f"{path}: expected a finite number for '{key}', found {shown(value)}")
+        raise ValueError(f"{path}: expected a finite number for '{key}', found {excerpt(value)}")
     return float(value)
 
 
@@ -53,7 +54,7 @@ def text(path: Path, entry: dict[str, Any], key: str) -> str:
     """
     value = entry.get(key)
     if not isinstance(value, str) or not value.strip("./\\ ") or not value.isprintable() or len(value) > 1024:
-        raise ValueError(f"{path}: expected a file name for '{key}', found {shown(value)}")
+        raise ValueError(f"{path}: expected a file name for '{key}', found {excerpt(value)}")
     return value.replace("\\", "/")
 
 
@@ -68,10 +69,10 @@ def array(path: Path, entry: dict[str, Any], key: str, shapes: tuple[tuple[int, 
     except (ValueError, TypeError, OverflowError):
         out = np.empty(0)
     if out.shape not in shapes:
-        raise ValueError(f"{path}: expected numbers of shape {shapes[0]} for '{key}', found {shown(value)}")
+        raise ValueError(f"{path}: expected numbers of shape {shapes[0]} for '{key}', found {excerpt(value)}")
     return out
 
 
-def shown(value: Any) -> str:
-    """The beginning of a value, on one line."""
+def excerpt(value: Any) -> str:
+    """The start of a value as text on one line."""
     return repr(value)[:_LONGEST] if not isinstance(value, int) or abs(value) < 1e30 else "a huge number"

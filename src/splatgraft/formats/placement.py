@@ -1,4 +1,4 @@
-"""placement.json: where objects stand in the target scene, and what is erased from it. Knows nothing about scenes.
+"""placement.json: transforms of objects into the target scene, and the Gaussians that are erased from it.
 
     {"objects": [{"object": "object.ply", "scale": 1.0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}],
      "erased": "erased.npy"}
@@ -28,20 +28,20 @@ _OBJECT_KEYS = frozenset({"object", "scale", "rotation", "translation"})
 
 @dataclass(frozen=True)
 class ObjectPlacement:
-    """Where one object stands."""
+    """The placement of one object."""
 
     target_from_object: Similarity
     """From the object's capture to the target's."""
     object_path: Path | None = None
-    """The object's Gaussians, where the placement names them."""
+    """File of the object's Gaussians; None where the placement names none."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """What a placement.json holds."""
+    """The content of a placement.json."""
 
     objects: tuple[ObjectPlacement, ...]
-    """In the order in which they are baked; may be empty."""
+    """In the order in which they are baked into the composite; may be empty."""
     erased: Bool[Tensor, "n"] | None = None
     """True where a Gaussian of the target is left out; None where none is."""
 
@@ -65,7 +65,7 @@ def read_placement(path: Path) -> Placement:
 
 
 def write_placement(path: Path, placement: Placement) -> None:
-    """Write placement.json, and erased.npy beside it where anything is erased; reading gives the same bits back."""
+    """Write placement.json, and erased.npy beside it where anything is erased; both are read back exactly."""
     entries = []
     for item in placement.objects:
         entry: dict[str, Any] = {}
@@ -133,7 +133,7 @@ def _parse_object(entry: Any, path: Path, where: str) -> ObjectPlacement:
 def _parse_rotation(value: Any, path: Path, where: str) -> Tensor:
     if isinstance(value, list) and value and isinstance(value[0], list):
         matrix = _numbers(value, (3, 3), path, where)
-        # files of six digits are welcome, a scale or shear hidden in the matrix is not
+        # accepts files with six digits, refuses a scale or shear in the matrix
         if (matrix @ matrix.T - torch.eye(3, dtype=matrix.dtype)).abs().max() > 1e-4 or torch.linalg.det(matrix) < 0:
             raise ValueError(f"{path}: expected {where} to be orthonormal with determinant 1, found {_short(value)}")
         return matrix.float()

@@ -1,4 +1,4 @@
-"""Rendering of Gaussians: one interface, numba kernels on the CPU, gsplat on CUDA."""
+"""Rendering of Gaussians (3D Gaussian Splatting): one interface, numba kernels on the CPU, gsplat on CUDA."""
 
 from splatgraft.rendering.interface import Render, RenderOptions, ViewOperator, render, view_operator
 

@@ -1,4 +1,4 @@
-"""The channels that every device blends together, and the pictures made of them. Knows no device."""
+"""The channels of values that are blended together on every device, and the `Render` assembled from them."""
 
 from collections.abc import Set as AbstractSet
 
@@ -8,11 +8,13 @@ from torch import Tensor
 
 from splatgraft.rendering.interface import Output, Render, RenderOptions
 
-WIDTHS: dict[Output, int] = {"color": 3, "depth": 1, "normal": 3}
-"""Channels of each output, blended in this order; features follow."""
+LOW_PASS_PX2 = 0.3
+"""Variance added to projected covariances on every device, pixels squared (3DGS)."""
+CHANNEL_COUNTS: dict[Output, int] = {"color": 3, "depth": 1, "normal": 3}
+"""Number of channels of each output, blended in this order; features follow."""
 
 
-def pictures(
+def assemble_render(
     image: Float[Tensor, "v c h w"],
     alpha: Float[Tensor, "v h w"],
     visible: Bool[Tensor, "v n"],
@@ -21,9 +23,18 @@ def pictures(
     has_features: bool,
     options: RenderOptions,
 ) -> Render:
-    """The `Render` of blended channels: background behind colour, depth per hit, normals of length one."""
+    """Split blended channels into the outputs of a `Render`.
+
+    Args:
+        image: Blended channels over black, in the order of `CHANNEL_COUNTS`, then features.
+        alpha: Accumulated opacity.
+        visible: Gaussians in each view.
+        outputs: Which of `CHANNEL_COUNTS` are in `image`.
+        has_features: Whether features follow.
+        options: Of which the background is added to the colour.
+    """
     planes, at = {}, 0
-    for name, width in WIDTHS.items():
+    for name, width in CHANNEL_COUNTS.items():
         if name in outputs:
             planes[name], at = image[:, at : at + width], at + width
     made: dict[str, Tensor] = {}

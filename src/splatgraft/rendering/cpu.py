@@ -1,4 +1,4 @@
-"""Rendering on the CPU: numba kernels behind torch autograd. Knows nothing about files or training."""
+"""Rendering on the CPU: numba kernels for projection, tile lists and blending, as torch autograd functions."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,7 +11,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import cpu_blend, cpu_project, cpu_tiles
-from splatgraft.rendering.channels import WIDTHS, pictures
+from splatgraft.rendering.channels import CHANNEL_COUNTS, assemble_render
 from splatgraft.rendering.interface import Output, Render, RenderOptions
 from splatgraft.runtime.kernel_lock import KERNEL_LOCK
 
@@ -27,9 +27,9 @@ def render(
     """`rendering.render` for tensors on the CPU."""
     extra = gaussians.means.new_zeros(gaussians.count, 0) if features is None else features
     fields = [t.float() for t in (*_geometry(gaussians), gaussians.sh, extra)]
-    views = [_Splat.apply(_View.of(camera, options), outputs, *fields) for camera in cameras]
+    views = [_RenderView.apply(_View.of(camera, options), outputs, *fields) for camera in cameras]
     image, alpha, visible = (_stack(parts) for parts in zip(*views, strict=True))
-    return pictures(image, alpha, visible, outputs=outputs, has_features=features is not None, options=options)
+    return assemble_render(image, alpha, visible, outputs=outputs, has_features=features is not None, options=options)
 
 
 def view_operator(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> "CpuViewOperator":
@@ -52,7 +52,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _View:
-    """One camera and the low-pass mode, as the kernels take them."""
+    """One camera and the low-pass mode in the form of the kernels' arguments."""
 
     numbers: np.ndarray
     width: int
@@ -88,7 +88,7 @@ class _TileLists:
     entries: np.ndarray
     """(e,) splats, tile after tile."""
     slots: np.ndarray
-    """(e,) a place for each entry's sums, so that those of one splat lie together."""
+    """(e,) index of each entry's sums, so that those of one splat are adjacent."""
     first: np.ndarray
     """(m + 1,) where each splat's slots begin."""
 
@@ -107,10 +107,10 @@ class _TileLists:
         out[self.order[np.diff(self.first) > 0]] = True
         return out
 
-    def shown(self, view: _View) -> "_TileLists":
-        """Lists of what has weight in some pixel of the tile; drawn to their ends they give the same pictures."""
+    def without_hidden(self, view: _View) -> "_TileLists":
+        """Lists of the splats with weight in some pixel of the tile; rendered to the end they give the same image."""
         ones = np.ones((1, view.height, view.width), np.float32)
-        shown = self.gather(ones, cpu_blend.MIN_TRANSMITTANCE)[:, 0] > 0
+        shown = self.blend_transpose(ones, cpu_blend.MIN_TRANSMITTANCE)[:, 0] > 0
         listed = shown[self.slots]
         shown_before, listed_before = (np.concatenate([[0], np.cumsum(x)]).astype(np.int32) for x in (shown, listed))
         return replace(
@@ -128,21 +128,21 @@ class _TileLists:
         cpu_blend.blend(self.splats, self.start, self.entries, values[self.order], image, alpha, least)
         return image, alpha
 
-    def gather(self, image: np.ndarray, least: np.float32) -> np.ndarray:
+    def blend_transpose(self, image: np.ndarray, least: np.float32) -> np.ndarray:
         """For every slot (e, c) the sum over pixels of weight times `image (c, h, w)`."""
         sums = np.empty((len(self.entries), len(image)), np.float32)
         cpu_blend.blend_transpose(self.splats, self.start, self.entries, self.slots, image, sums, least)
         return sums
 
     def sum_slots(self, sums: np.ndarray) -> np.ndarray:
-        """Entries' sums (e, c) gathered to Gaussians (n, c)."""
+        """Sums of entries (e, c) added up per Gaussian (n, c)."""
         out = np.zeros((len(self.drawn), sums.shape[1]), np.float32)
         cpu_blend.sum_slots(sums, self.first, self.order, out)
         return out
 
 
-class _Splat(torch.autograd.Function):
-    """One view: raw fields and features to blended channels (c, h, w) in the order of `channels.WIDTHS`."""
+class _RenderView(torch.autograd.Function):
+    """From raw fields and features to the blended channels (c, h, w) of one view, in the order of `CHANNEL_COUNTS`."""
 
     @staticmethod
     def forward(ctx, view: _View, outputs: frozenset[Output], *fields: Tensor):
@@ -174,7 +174,7 @@ class _Splat(torch.autograd.Function):
         grads = [np.zeros(field.shape, np.float32) for field in ctx.saved_tensors]
         grad_means, grad_log_scales, grad_quaternions, grad_logits, grad_sh, _ = grads
         places, at = {}, cpu_blend.MOMENTS
-        for name, width in WIDTHS.items():
+        for name, width in CHANNEL_COUNTS.items():
             if name in ctx.outputs:
                 places[name], at = at, at + width
         with KERNEL_LOCK:
@@ -185,8 +185,10 @@ class _Splat(torch.autograd.Function):
             )  # fmt: skip
             totals = lists.sum_slots(sums)
             if "color" in places:
-                cpu_project.unshade(means, sh, lists.drawn, view.numbers, totals, places["color"], grad_means, grad_sh)
-            cpu_project.unproject(
+                cpu_project.shade_backward(
+                    means, sh, lists.drawn, view.numbers, totals, places["color"], grad_means, grad_sh
+                )
+            cpu_project.project_backward(
                 means, log_scales, quaternions, logits, lists.drawn, view.numbers, view.antialiased,
                 totals, places.get("depth", 0), places.get("normal", 0),
                 grad_means, grad_log_scales, grad_quaternions, grad_logits,
@@ -196,14 +198,14 @@ class _Splat(torch.autograd.Function):
 
 
 class CpuViewOperator:
-    """`ViewOperator` on the CPU; tile lists are made once, of what is seen, and drawn to their ends."""
+    """`ViewOperator` on the CPU: tile lists of the visible splats are made once and always rendered to their ends."""
 
     def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> None:
-        """Project, sort, list, and drop what is hidden."""
+        """Project, sort, make tile lists, and drop hidden splats."""
         self._view = _View.of(camera, options)
         with KERNEL_LOCK:
             lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
-            self._lists = lists.shown(self._view)
+            self._lists = lists.without_hidden(self._view)
             _, alpha = self._lists.blend(np.empty((gaussians.count, 0), np.float32), self._view, cpu_blend.ALL)
         self.alpha = torch.from_numpy(alpha)
         self.visible = torch.from_numpy(self._lists.drawn)
@@ -219,7 +221,7 @@ class CpuViewOperator:
 
 def _transpose(lists: _TileLists, image: Tensor) -> Tensor:
     with KERNEL_LOCK:
-        return torch.from_numpy(lists.sum_slots(lists.gather(_array(image.permute(2, 0, 1)), cpu_blend.ALL)))
+        return torch.from_numpy(lists.sum_slots(lists.blend_transpose(_array(image.permute(2, 0, 1)), cpu_blend.ALL)))
 
 
 class _Blend(torch.autograd.Function):

@@ -1,10 +1,15 @@
-"""Spherical-harmonic basis values and slopes at one direction, for numba kernels; the twin of spherical_harmonics."""
+"""Spherical-harmonic basis values and derivatives at one direction, for numba kernels.
+
+The same functions as in `core.spherical_harmonics`, which torch evaluates; a test compares the two.
+"""
 
 from typing import no_type_check
 
 from numba import njit
 
-C0 = 0.28209479177387814
+from splatgraft.core import spherical_harmonics
+
+C0 = spherical_harmonics.C0
 C1 = 0.4886025119029199
 C20, C22, C24 = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
 C30, C31, C32, C33, C35 = (

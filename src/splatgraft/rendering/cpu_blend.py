@@ -1,8 +1,8 @@
-"""Alpha blending of tile lists, forward, backward and transposed: numba kernels. Knows nothing about 3D.
+"""Alpha blending of tile lists, forward, backward and transposed: numba kernels.
 
-A tile is worked on row by row, 16 pixels at once, in planes of float32 inside one array. Inner loops have no branch,
-no call and no reduction; exp is multiplications. Colours (3 channels) keep their sums in registers; any other number
-of channels goes through memory.
+A tile is processed row by row, 16 pixels at once (`cpu_simd`), in planes of float32 inside one array. Inner loops have
+no branch, call or reduction; exp is a polynomial and multiplications. For colours (3 channels) sums are held in
+registers; for any other number of channels in memory.
 """
 
 import math
@@ -12,13 +12,13 @@ import numpy as np
 from numba import float32, njit, prange
 
 from splatgraft.rendering.cpu_project import CA, CB, CC, LOG_OPACITY, MIN_ALPHA, MX, MY, REACH_Y
-from splatgraft.rendering.cpu_rows import (
+from splatgraft.rendering.cpu_simd import (
+    broadcast,
     lanes,
     larger,
     largest,
     load,
     smaller,
-    spread,
     store,
     total,
     where_at_least,
@@ -32,7 +32,7 @@ RGB = 3
 MAX_ALPHA = float32(0.99)
 MIN_TRANSMITTANCE = np.float32(1e-4)
 ALL = np.float32(0)
-"""A least transmittance that draws every list to its end."""
+"""A least transmittance with which every list is rendered to its end."""
 MOMENTS = 6
 
 ONE, ZERO, HALF = float32(1), float32(0), float32(0.5)
@@ -47,7 +47,7 @@ E0, E1, E2, E3, E4 = (float32(x) for x in (0.99999994, 0.9999898, 0.49976337, 0.
 def _shape(splats, s, x0, y0):
     """Centre in the tile, the quadratic's a, b, c and constant over 16, first and one past the last row."""
     mx, my = splats[s, MX] - x0 - HALF, splats[s, MY] - y0 - HALF
-    # a thousandth of a pixel covers rounding, and every pixel is tested by itself; truncation is floor above 0
+    # a thousandth of a pixel covers rounding, and each pixel is tested exactly; truncation is floor above 0
     reach = splats[s, REACH_Y] + float32(1e-3)
     top = int(max(my - reach + ONE, ZERO))
     bottom = int(max(min(my + reach + ONE, float32(TILE)), ZERO))
@@ -71,7 +71,7 @@ def _alpha(across, dx, along, down):
 @njit(cache=True)
 @no_type_check
 def _saturated(work, least):
-    """Whether no pixel of the tile lets through as much as `least`."""
+    """Whether the transmittance of all pixels of the tile is below `least`."""
     most = load(work, 0)
     for y in range(1, TILE):
         most = larger(most, load(work, y * TILE))
@@ -126,7 +126,7 @@ def _blend_any(splats, entries, values, x0, y0, work, least):
 @njit(cache=True)
 @no_type_check
 def _open_tile(tile, width, planes):
-    """Corner of the tile, and its planes: the first 1, the rest 0."""
+    """Corner of the tile, and its planes: transmittance 1, the others 0."""
     tiles_x = (width + TILE - 1) // TILE
     work = np.zeros(planes * PIXELS, np.float32)
     work[:PIXELS] = ONE
@@ -167,13 +167,13 @@ def _read(image, x0, y0, work, plane):
 
 @njit(cache=True)
 @no_type_check
-def _gather_rgb(splats, entries, slots, x0, y0, work, sums, least):
+def _transpose_rgb(splats, entries, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, red, green, blue."""
     for k in range(entries.shape[0]):
         mx, my, a, b, c, d, top, bottom = _shape(splats, entries[k], x0, y0)
         dx = lanes() - mx
         across = dx * dx * a + d
-        red, green, blue = spread(ZERO), spread(ZERO), spread(ZERO)
+        red, green, blue = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
         for y in range(top, bottom):
             dy = float32(y) - my
             at = y * TILE
@@ -192,7 +192,7 @@ def _gather_rgb(splats, entries, slots, x0, y0, work, sums, least):
 
 @njit(cache=True)
 @no_type_check
-def _gather_any(splats, entries, slots, x0, y0, work, sums, least):
+def _transpose_any(splats, entries, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, the channels of the image, one for sums (at most 256 channels in rows)."""
     channels = sums.shape[1]
     column = np.empty(channels * TILE, np.float32)
@@ -228,9 +228,9 @@ def blend_transpose(splats, start, entries, slots, image, sums, least):
         for c in range(channels):
             _read(image[c], x0, y0, work, 1 + c)
         if channels == RGB:
-            used = _gather_rgb(splats, listed, places, float32(x0), float32(y0), work, sums, least)
+            used = _transpose_rgb(splats, listed, places, float32(x0), float32(y0), work, sums, least)
         else:
-            used = _gather_any(splats, listed, places, float32(x0), float32(y0), work, sums, least)
+            used = _transpose_any(splats, listed, places, float32(x0), float32(y0), work, sums, least)
         for k in range(used, listed.shape[0]):
             sums[places[k]] = ZERO
 
@@ -238,7 +238,7 @@ def blend_transpose(splats, start, entries, slots, image, sums, least):
 @njit(cache=True)
 @no_type_check
 def _write_moments(sums, slot, dx, s0, sy, syy):
-    """Moments of an entry from its sums by column: of the pull, times dy, times dy squared."""
+    """Moments of an entry from its sums by column: of the exponent's gradient, times dy, times dy squared."""
     sx = s0 * dx
     sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(s0), total(sx), total(sy)
     sums[slot, 3], sums[slot, 4], sums[slot, 5] = total(sx * dx), total(sy * dx), total(syy)
@@ -246,8 +246,8 @@ def _write_moments(sums, slot, dx, s0, sy, syy):
 
 @njit(cache=True)
 @no_type_check
-def _pull(uncapped, alpha, before, value, left):
-    """Gradient of a row to the exponent: none where alpha is capped."""
+def _exponent_gradient(uncapped, alpha, before, value, left):
+    """Gradient of the loss by the exponent for a row: 0 where alpha is capped."""
     return where_below(uncapped, MAX_ALPHA, alpha * (before * value - left / (ONE - alpha)))
 
 
@@ -261,8 +261,8 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
         dx = lanes() - mx
         across = dx * dx * a + d
-        s0, sy, syy = spread(ZERO), spread(ZERO), spread(ZERO)
-        sum_red, sum_green, sum_blue = spread(ZERO), spread(ZERO), spread(ZERO)
+        s0, sy, syy = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
+        sum_red, sum_green, sum_blue = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
         for y in range(top, bottom):
             dy = float32(y) - my
             at = y * TILE
@@ -276,7 +276,7 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
             left = load(work, at + PIXELS) - weight * value
             store(work, at, before - weight)
             store(work, at + PIXELS, left)
-            pull = _pull(uncapped, alpha, before, value, left)
+            pull = _exponent_gradient(uncapped, alpha, before, value, left)
             s0, sy, syy = s0 + pull, sy + pull * dy, syy + pull * (dy * dy)
             sum_red, sum_green = sum_red + weight * to_red, sum_green + weight * to_green
             sum_blue = sum_blue + weight * to_blue
@@ -300,7 +300,7 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
         mx, my, a, b, c, d, top, bottom = _shape(splats, s, x0, y0)
         dx = lanes() - mx
         across = dx * dx * a + d
-        s0, sy, syy = spread(ZERO), spread(ZERO), spread(ZERO)
+        s0, sy, syy = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
         column[:] = ZERO
         for y in range(top, bottom):
             dy = float32(y) - my
@@ -317,7 +317,7 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
             left = load(work, at + PIXELS) - weight * value
             store(work, at, before - weight)
             store(work, at + PIXELS, left)
-            pull = _pull(uncapped, alpha, before, value, left)
+            pull = _exponent_gradient(uncapped, alpha, before, value, left)
             s0, sy, syy = s0 + pull, sy + pull * dy, syy + pull * (dy * dy)
         _write_moments(sums, slot, dx, s0, sy, syy)
         for channel in range(channels):
@@ -330,7 +330,7 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
 @njit(cache=True, parallel=True)
 @no_type_check
 def blend_backward(splats, start, entries, slots, values, image, alpha, grad_image, grad_alpha, sums, least):
-    """Fill `sums (e, 6 + c)`: for every entry its moments, as `unproject` takes them, and its values' gradients."""
+    """Fill `sums (e, 6 + c)`: for every entry its moments for `project_backward`, and its values' gradients."""
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = _open_tile(tile, alpha.shape[1], 3 + channels)
@@ -338,7 +338,7 @@ def blend_backward(splats, start, entries, slots, values, image, alpha, grad_ima
         _read(grad_alpha, x0, y0, work, 2)
         for c in range(channels):
             _read(grad_image[c], x0, y0, work, 3 + c)
-        # what is behind a splat: at first everything, the gradient times the finished pixel
+        # contribution of what lies behind a splat; before the first splat, gradient times final pixel
         for y in range(y0, min(y0 + TILE, alpha.shape[0])):
             for x in range(x0, min(x0 + TILE, alpha.shape[1])):
                 rest = grad_alpha[y, x] * alpha[y, x]

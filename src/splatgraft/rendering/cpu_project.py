@@ -1,7 +1,7 @@
-"""Gaussians of one camera as 2D splats, and the way back for gradients: numba kernels. Knows nothing about tiles.
+"""Projection of Gaussians to 2D splats of one camera, their colours, and the gradients of both: numba kernels.
 
-The projection is the original's EWA (3DGS, Eq. 5): covariance J W S W^T J^T plus 0.3 px^2, with the point that J is
-taken at held inside 1.3 times the field of view. All arithmetic on one Gaussian is float64, all storage float32.
+The projection is EWA splatting as in 3DGS (Eq. 5): covariance J W S W^T J^T plus 0.3 px^2, with J taken at a point
+clamped to 1.3 times the field of view. All arithmetic on one Gaussian is float64, all storage float32.
 """
 
 import math
@@ -10,9 +10,9 @@ from typing import no_type_check
 import numpy as np
 from numba import float32, njit, prange
 
+from splatgraft.rendering.channels import LOW_PASS_PX2
 from splatgraft.rendering.cpu_basis import basis_and_slope, basis_at
 
-LOW_PASS_PX2 = 0.3
 MIN_ALPHA = 1.0 / 255.0
 BLOCK = 256
 ZERO, HALF = float32(0), float32(0.5)
@@ -28,7 +28,7 @@ FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR, WIDTH, HEIGHT = range(15, 26
 @njit(cache=True)
 @no_type_check
 def _rotation(quaternion, out):
-    """Fill the 3x3 matrix of a wxyz quaternion; one of no length turns nothing. Returns one over the length."""
+    """Fill the 3x3 matrix of a wxyz quaternion, the identity for one of length 0. Returns one over the length."""
     w, x, y, z = float(quaternion[0]), float(quaternion[1]), float(quaternion[2]), float(quaternion[3])
     inverse = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
@@ -77,7 +77,7 @@ def _camera_point(mean, camera, offset):
 @njit(cache=True)
 @no_type_check
 def _jacobian(x, y, z, camera):
-    """Non-zero entries J00, J02, J11, J12, and whether the point was inside the bounds in x and in y."""
+    """Non-zero entries J00, J02, J11, J12, and whether the point is inside the clamping bounds in x and in y."""
     u, v = x / z, y / z
     held_u = min(max(u, camera[LOW_X]), camera[HIGH_X])
     held_v = min(max(v, camera[LOW_Y]), camera[HIGH_Y])
@@ -88,7 +88,7 @@ def _jacobian(x, y, z, camera):
 @njit(cache=True, parallel=True)
 @no_type_check
 def project(means, log_scales, quaternions, opacity_logits, camera, antialiased, splats, depths):
-    """Fill `splats (n, 8)` and `depths (n,)`; what no pixel can see has log opacity -inf."""
+    """Fill `splats (n, 8)` and `depths (n,)`; a splat outside the image or too transparent has log opacity -inf."""
     n = means.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         rotation, axes, offset = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -164,7 +164,7 @@ def normals(means, log_scales, quaternions, drawn, camera, out):
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def unshade(means, sh, drawn, camera, totals, at, grad_means, grad_sh):
+def shade_backward(means, sh, drawn, camera, totals, at, grad_means, grad_sh):
     """Add the gradients of `shade`, which are columns from `at` of `totals (n, ..)`, to `grad_means` and `grad_sh`."""
     n, k = sh.shape[0], sh.shape[1]
     for block in prange((n + BLOCK - 1) // BLOCK):
@@ -215,11 +215,11 @@ def _add_quaternion_gradient(quaternion, inverse, d, out):
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def unproject(
+def project_backward(
     means, log_scales, quaternions, opacity_logits, drawn, camera, antialiased, totals, depth_at, normal_at,
     grad_means, grad_log_scales, grad_quaternions, grad_opacity_logits,
 ):  # fmt: skip
-    """Add what pixels say about splats to the gradients of the raw fields.
+    """Add the gradients of `project`, given those of the splats, to the gradients of the raw fields.
 
     `totals (n, ..)`: first sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2, with d from centre
     to pixel; gradients of depth and of the normal from columns `depth_at` and `normal_at`, unless 0.

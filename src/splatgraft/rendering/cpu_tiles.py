@@ -1,4 +1,4 @@
-"""Depth order and tile lists of 2D splats: numba kernels. Knows nothing about 3D, colours or pixels' values."""
+"""Depth order (radix sort) and tile lists of 2D splats: numba kernels."""
 
 import math
 from typing import no_type_check
@@ -91,10 +91,10 @@ def _spans(packed, first_row, tiles_x, tiles_y):
 @njit(cache=True)
 @no_type_check
 def bin_splats(splats, order, width, height):
-    """Sorted splats, their tile lists and where each splat's entries stand.
+    """Sorted splats, their tile lists, and the position of each splat's entries.
 
     Returns `sorted (m, 8)`; `start (tiles + 1,)` into `entries (e,)` (splat index, nearest first) and `slots (e,)`
-    (a place of its own for each entry, so that one splat's places are `first (m + 1,)`, next to each other).
+    (one index per entry, such that the slots of splat s are `first[s]` to `first[s + 1]`, `first (m + 1,)`).
     """
     m = order.shape[0]
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE

@@ -1,4 +1,4 @@
-"""Rendering on CUDA through gsplat's `rasterization`; its only importer. Knows nothing about files or training."""
+"""Rendering on CUDA by gsplat's `rasterization`."""
 
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
@@ -10,10 +10,8 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.rendering.channels import pictures
+from splatgraft.rendering.channels import LOW_PASS_PX2, assemble_render
 from splatgraft.rendering.interface import Output, Render, RenderOptions
-
-LOW_PASS_PX2 = 0.3
 
 
 def render(
@@ -31,7 +29,7 @@ def render(
     views = [_channels(gaussians, camera, outputs, features) for camera in cameras]
     drawn = [_draw(gaussians, camera, values, options) for camera, values in zip(cameras, views, strict=True)]
     image, alpha, visible = (torch.stack(parts) for parts in zip(*drawn, strict=True))
-    return pictures(
+    return assemble_render(
         image.permute(0, 3, 1, 2), alpha, visible, outputs=outputs, has_features=features is not None, options=options
     )
 
@@ -45,7 +43,7 @@ def view_operator(gaussians: Gaussians, camera: Cameras, options: RenderOptions)
 
 
 class CudaViewOperator:
-    """`ViewOperator` on CUDA: gsplat keeps no tile lists between calls, so each call draws anew."""
+    """`ViewOperator` on CUDA: gsplat keeps no tile lists between calls, so each call rasterises again."""
 
     def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> None:
         """Freeze geometry and opacity."""
@@ -96,7 +94,7 @@ def _draw(
 def _channels(
     gaussians: Gaussians, camera: Cameras, outputs: AbstractSet[Output], features: Tensor | None
 ) -> Float[Tensor, "n c"]:
-    """What `channels.WIDTHS` lists, per Gaussian."""
+    """What `channels.CHANNEL_COUNTS` lists, per Gaussian."""
     offset = gaussians.means - camera.centers[0].to(gaussians.means)
     parts = []
     if "color" in outputs:

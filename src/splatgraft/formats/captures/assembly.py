@@ -1,4 +1,4 @@
-"""From views to cameras and posed images: sizes held against the files, distortion, masks. Knows no file format."""
+"""From view records to `Cameras` and `PosedImages`: image sizes checked against the files, distortion, masks."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,16 +13,29 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import stored_size
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures.described_view import MAX_SIDE, View, same_shape
 from splatgraft.formats.captures.masks import with_masks
+from splatgraft.formats.captures.view_record import MAX_SIDE, ViewRecord, same_shape
 
 
 def posed_images_of(
-    views: Sequence[View], source: Path, *, folder: Path, points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"]
+    views: Sequence[ViewRecord],
+    source: Path,
+    *,
+    folder: Path,
+    points: Float[Tensor, "m 3"],
+    colors: Float[Tensor, "m 3"],
 ) -> PosedImages:
-    """The capture of `views` that the file `source` describes, with the masks in `folder`.
+    """The capture of `views`.
 
-    Raises: ValueError where an image is missing, or does not fit its camera or mask.
+    Args:
+        views: One per photograph.
+        source: The file that describes them, for error messages.
+        folder: Where masks/ is looked for.
+        points: Sparse points, world units.
+        colors: Of the points, sRGB in [0, 1].
+
+    Raises:
+        ValueError: Where an image is missing, or does not fit its camera or mask.
     """
     for view in views:
         if view.image_path is None:
@@ -39,10 +52,10 @@ def posed_images_of(
     )
 
 
-def fitted_to_file(view: View, source: Path) -> View:
-    """The view with the intrinsics of its file's size, where that is an exact downscale of the camera's.
+def fitted_to_file(view: ViewRecord, source: Path) -> ViewRecord:
+    """The view with intrinsics for its file's size, where that is smaller than the camera's and of the same shape.
 
-    A larger file of the same shape keeps the camera's size: it is resampled when it is read.
+    For a larger file of the same shape the camera's size stays: the image is resampled on reading.
 
     Raises: ValueError where the shapes differ.
     """
@@ -69,10 +82,10 @@ def fitted_to_file(view: View, source: Path) -> View:
     )
 
 
-def cameras_of(views: Sequence[View], source: Path) -> tuple[Cameras, tuple[Distortion | None, ...]]:
-    """The pinholes at which the views are served, and what stands between them and the files.
+def cameras_of(views: Sequence[ViewRecord], source: Path) -> tuple[Cameras, tuple[Distortion | None, ...]]:
+    """The pinhole cameras of the undistorted views, and the distortion of each file.
 
-    Raises: ValueError that names `source`, for intrinsics that no camera has.
+    Raises: ValueError that names `source`, for invalid intrinsics.
     """
     distortions = tuple(_distortion(view, source) for view in views)
     intrinsics = np.empty((len(views), 3, 3))
@@ -93,11 +106,11 @@ def cameras_of(views: Sequence[View], source: Path) -> tuple[Cameras, tuple[Dist
     return cameras, distortions
 
 
-def _matrix(view: View) -> np.ndarray:
+def _matrix(view: ViewRecord) -> np.ndarray:
     return np.array([[view.focal[0], 0, view.center[0]], [0, view.focal[1], view.center[1]], [0, 0, 1]])
 
 
-def _distortion(view: View, source: Path) -> Distortion | None:
+def _distortion(view: ViewRecord, source: Path) -> Distortion | None:
     numbers = np.array([*view.focal, *view.center, *view.distortion])
     if not np.isfinite(numbers).all() or min(view.focal) <= 0 or np.abs(numbers).max() > 1e7:
         raise ValueError(
@@ -113,8 +126,8 @@ def _distortion(view: View, source: Path) -> Distortion | None:
     )
 
 
-def _unique_names(views: Sequence[View], source: Path) -> tuple[str, ...]:
-    """File names; where folders share one, with as many folders in front as it takes. Each could name a file itself."""
+def _unique_names(views: Sequence[ViewRecord], source: Path) -> tuple[str, ...]:
+    """File names, prefixed by as many folders as make them unique, joined by underscores."""
     parts = [[p for p in Path(v.image_path or v.name).parts if p not in ("..", ".", "/")] for v in views]
     for depth in range(1, 1 + max(map(len, parts), default=0)):
         names = tuple("_".join(part[-depth:]) for part in parts)

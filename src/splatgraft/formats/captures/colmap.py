@@ -1,6 +1,6 @@
-"""COLMAP reconstructions, text and binary: cameras, images, points3D. Knows which folders hold them, and nothing else.
+"""Reads COLMAP reconstructions, text and binary: cameras, images and points3D, in the folders that COLMAP uses.
 
-Counts in binary files are never believed: every record is held against the bytes that are there.
+Counts in binary files are not trusted: every record is checked against the bytes that are left.
 """
 
 import struct
@@ -16,7 +16,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures.assembly import cameras_of, fitted_to_file, posed_images_of
-from splatgraft.formats.captures.described_view import MAX_SIDE, View, existing_file, rigid
+from splatgraft.formats.captures.view_record import MAX_SIDE, ViewRecord, existing_file, rigid
 
 _MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
 _PARAMETER_COUNTS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
@@ -50,7 +50,7 @@ class _Image:
 
 
 def is_colmap(folder: Path) -> bool:
-    """Whether a COLMAP model lies in `folder` or where COLMAP would put it under it."""
+    """Whether a COLMAP model lies in `folder` or in one of the sub-folders that COLMAP uses."""
     return bool(_model_folders(folder))
 
 
@@ -101,7 +101,7 @@ def _file(model: Path, stem: str) -> Path:
     raise ValueError(f"{model}: expected {stem}.bin or {stem}.txt, found neither")
 
 
-def _views(model: Path, images: list[_Image], folder: Path) -> list[View]:
+def _views(model: Path, images: list[_Image], folder: Path) -> list[ViewRecord]:
     cameras = _read_cameras(_file(model, "cameras"))
     source = _file(model, "images")
     roots = [root / "images" for root in (folder, model, model.parent, model.parent.parent)]
@@ -112,7 +112,7 @@ def _views(model: Path, images: list[_Image], folder: Path) -> list[View]:
         if camera is None:
             raise ValueError(f"{source}: expected camera {image.camera_id} of {image.name} in cameras, found none")
         views.append(
-            View(
+            ViewRecord(
                 name=image.name,
                 image_path=existing_file(roots[0] / image.name),
                 world_from_camera=_pose(image, source),
@@ -262,7 +262,7 @@ def _lines(path: Path) -> list[str]:
 
 
 class _Records:
-    """A binary file read front to back; every step is held against its length."""
+    """A binary file read from front to back; every step is checked against its length."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -1,19 +1,19 @@
-"""Which mask belongs to which photograph: by stem in a folder masks/, or the photographs' own alpha channels."""
+"""Finds the object mask of each photograph: by stem in a folder masks/, or in the photograph's alpha channel."""
 
 from dataclasses import replace
 from pathlib import Path
 
 from splatgraft.core.images import has_transparency, list_images, read_alpha, stored_size
-from splatgraft.formats.captures.described_view import View, same_shape
+from splatgraft.formats.captures.view_record import ViewRecord, same_shape
 
 _ALPHA_SAMPLES = 8
-"""Files decoded to find out whether alpha channels are meant as masks."""
+"""Number of files decoded to decide whether alpha channels are masks."""
 
 
-def with_masks(views: list[View], folder: Path) -> list[View]:
-    """The views with the masks of `folder`/masks; else, where photographs have transparent parts, with their own.
+def with_masks(views: list[ViewRecord], folder: Path) -> list[ViewRecord]:
+    """The views with the masks in `folder`/masks, or, without that folder, with varying alpha channels as masks.
 
-    0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask the view already has stays.
+    0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask that the view already has stays.
 
     Raises: ValueError where masks/ has no mask for any view, two for one, or one of another shape.
     """
@@ -35,8 +35,8 @@ def with_masks(views: list[View], folder: Path) -> list[View]:
     return views
 
 
-def _with_alpha_masks(views: list[View]) -> list[View]:
-    """Many files have an alpha channel that is 1 everywhere: one of a few that varies settles that it is meant."""
+def _with_alpha_masks(views: list[ViewRecord]) -> list[ViewRecord]:
+    """Alpha channels are masks where one of a few samples varies; many files have alpha 1 everywhere."""
     transparent = [v.image_path is not None and has_transparency(v.image_path) for v in views]
     paths = [v.image_path for v, t in zip(views, transparent, strict=True) if t and v.image_path]
     sample = paths[:: max(1, len(paths) // _ALPHA_SAMPLES)]
@@ -45,7 +45,7 @@ def _with_alpha_masks(views: list[View]) -> list[View]:
     return [replace(v, mask_path=v.image_path) if t else v for t, v in zip(transparent, views, strict=True)]
 
 
-def _mask_of(view: View, masks: Path, files: dict[tuple[Path, str], list[Path]]) -> Path | None:
+def _mask_of(view: ViewRecord, masks: Path, files: dict[tuple[Path, str], list[Path]]) -> Path | None:
     name = Path(view.name)
     inner = Path(*name.parts[1:]) if name.parts[0] == "images" and len(name.parts) > 1 else name
     for folder in dict.fromkeys([(masks / inner).parent, masks]):

@@ -1,4 +1,4 @@
-"""Coloured point clouds as .ply. Knows nothing about Gaussians beyond how their mean colour is stored."""
+"""Reads and writes coloured point clouds as .ply; reads Gaussians as points with their mean colour."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ _GREY = 0.5
 
 
 def read_points(path: Path) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Positions, and sRGB in [0, 1]: mid grey where the file has no colours, the mean colour of Gaussians.
+    """Positions, and sRGB in [0, 1]: mid grey where the file has no colours, the mean colour for Gaussians.
 
     Raises: ValueError where the file is no whole PLY with finite x, y, z.
     """
@@ -46,7 +46,7 @@ def read_points(path: Path) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]
 
 
 def write_points(path: Path, points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"]) -> None:
-    """Write float32 positions and 8-bit colours; the file appears whole or not at all."""
+    """Write float32 positions and 8-bit colours, atomically."""
     rows = np.empty(len(points), np.dtype([("position", "<f4", 3), ("color", "u1", 3)]))
     rows["position"] = points.detach().cpu().numpy()
     rows["color"] = (colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()

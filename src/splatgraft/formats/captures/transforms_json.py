@@ -1,4 +1,4 @@
-"""transforms.json: cameras and photographs with Blender's and nerfstudio's keys, OpenGL axes. Knows no other format."""
+"""Reads and writes transforms.json: cameras and photographs with the keys of Blender and nerfstudio, OpenGL axes."""
 
 import json
 import math
@@ -15,9 +15,9 @@ from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import IMAGE_SUFFIXES, stored_size
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures.assembly import cameras_of, fitted_to_file, posed_images_of
-from splatgraft.formats.captures.described_view import View, existing_file, rigid
 from splatgraft.formats.captures.points_ply import read_points, write_points
-from splatgraft.formats.json_file import array, load, number, shown, text, whole_side
+from splatgraft.formats.captures.view_record import ViewRecord, existing_file, rigid
+from splatgraft.formats.json_file import array, excerpt, load, number, text, whole_side
 from splatgraft.runtime.atomic_file import atomic_write
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -26,7 +26,7 @@ _CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 
 
 def read_capture(path: Path) -> PosedImages:
-    """The capture that a transforms.json describes; each image file must be there.
+    """The capture that a transforms.json describes; every image file must exist.
 
     Raises: ValueError where the file or one that it names is missing or broken.
     """
@@ -38,7 +38,7 @@ def read_capture(path: Path) -> PosedImages:
 
 
 def read_images(path: Path) -> PosedImages:
-    """The capture without its points, whose file need not be there.
+    """The capture without its points, whose file need not exist.
 
     Raises: ValueError where the file or an image that it names is missing or broken.
     """
@@ -57,25 +57,24 @@ def read_cameras(path: Path) -> Cameras:
 def _load(path: Path) -> dict[str, Any]:
     meta = load(path)
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list):
-        raise ValueError(f"{path}: expected a JSON object with a list 'frames', found {shown(meta)}")
+        raise ValueError(f"{path}: expected a JSON object with a list 'frames', found {excerpt(meta)}")
     if not meta["frames"]:
         raise ValueError(f"{path}: expected at least one frame, found none")
     return meta
 
 
-def _views(path: Path, meta: dict[str, Any]) -> list[View]:
+def _views(path: Path, meta: dict[str, Any]) -> list[ViewRecord]:
     return [_view(path, index, meta, frame) for index, frame in enumerate(meta["frames"])]
 
 
-def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> View:
+def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> ViewRecord:
     if not isinstance(frame, dict):
         raise ValueError(f"{path}: expected frame {index} to be an object, found {type(frame).__name__}")
     camera = {**{k: v for k, v in meta.items() if k != "frames"}, **frame}
     model = camera.get("camera_model", "OPENCV")
     if model not in _CAMERA_MODELS or camera.get("is_fisheye") or number(path, camera, "k4", 0.0):
-        found = (
-            f"{shown(model)}, k4 = {shown(camera.get('k4', 0))}, is_fisheye = {shown(camera.get('is_fisheye', False))}"
-        )
+        fisheye = excerpt(camera.get("is_fisheye", False))
+        found = f"{excerpt(model)}, k4 = {excerpt(camera.get('k4', 0))}, is_fisheye = {fisheye}"
         raise ValueError(f"{path}: expected camera_model {', '.join(_CAMERA_MODELS)} without k4, found {found}")
     name = text(path, camera, "file_path")
     image_path = _image_file(path.parent / name)
@@ -84,7 +83,7 @@ def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> View:
     fl_y = _focal(path, camera, "y", height) or fl_x
     if fl_x is None or fl_y is None:
         raise ValueError(f"{path}: expected fl_x or camera_angle_x for frame {index}, found neither")
-    return View(
+    return ViewRecord(
         name=name,
         image_path=image_path,
         mask_path=_mask_file(path, camera),
@@ -107,7 +106,7 @@ def _size(path: Path, camera: dict[str, Any], image_path: Path | None) -> tuple[
     if "w" not in camera and "h" not in camera:
         if image_path is None:
             raise ValueError(
-                f"{path}: expected w and h, or the image file {shown(camera.get('file_path'))}, found neither"
+                f"{path}: expected w and h, or the image file {excerpt(camera.get('file_path'))}, found neither"
             )
         return stored_size(image_path)
     return whole_side(path, camera, "w"), whole_side(path, camera, "h")
@@ -141,13 +140,13 @@ def _mask_file(path: Path, camera: dict[str, Any]) -> Path | None:
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:
-    """Write cameras alone; the poses and intrinsics come back bit for bit."""
+    """Write cameras without images; poses and intrinsics are read back exactly."""
     frames = [{"file_path": name, **_frame(cameras, i, None)} for i, name in enumerate(cameras.names)]
     _dump(path, {"camera_model": "OPENCV"}, frames)
 
 
 def write_capture(folder: Path, posed_images: PosedImages) -> None:
-    """Write transforms.json and points.ply; images and masks are referred to by relative path, not copied."""
+    """Write transforms.json and points.ply; images and masks are referenced by relative path, not copied."""
     frames = []
     for i, image_path in enumerate(posed_images.image_paths):
         frame: dict[str, Any] = {"file_path": _relative(image_path, folder)}
@@ -161,12 +160,12 @@ def write_capture(folder: Path, posed_images: PosedImages) -> None:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """A link keeps its own name: only the folders are resolved."""
+    """Relative path with resolved folders; a symbolic link keeps its own name."""
     return (Path(os.path.relpath(path.parent.resolve(), folder.resolve())) / path.name).as_posix()
 
 
 def _frame(cameras: Cameras, index: int, distortion: Distortion | None) -> dict[str, Any]:
-    """Intrinsics are those of the file's pixels: the distorted camera's where there is one, at the served size."""
+    """Intrinsics of the file's pixels, at the camera's size: the distorted camera's where the image is distorted."""
     width, height = cameras.sizes[index].tolist()
     matrix = cameras.intrinsics[index].double().cpu().numpy()
     out: dict[str, Any] = {"w": width, "h": height}
@@ -183,7 +182,7 @@ def _frame(cameras: Cameras, index: int, distortion: Distortion | None) -> dict[
 
 
 def _dump(path: Path, shared: dict[str, Any], frames: list[dict[str, Any]]) -> None:
-    """Keys on which all frames agree are written once, as nerfstudio does."""
+    """Write keys with one value in all frames once, as nerfstudio does."""
     if not frames:
         raise ValueError(f"{path}: expected at least one camera to write, found none")
     same = [k for k in ("w", "h", "fl_x", "fl_y", "cx", "cy", *_COEFFICIENTS) if k in frames[0]]

@@ -1,7 +1,7 @@
-"""SuperSplat's compressed .ply, read only: chunks of 256 Gaussians, packed between each chunk's bounds.
+"""Reads SuperSplat's compressed .ply: chunks of 256 Gaussians, quantised between each chunk's bounds.
 
 Layout (PlayCanvas): element chunk with min/max of position, log scale and, in newer files, colour; element vertex with
-four packed uint32; optional element sh with 8-bit f_rest. Knows nothing of any other file.
+four packed uint32; optional element sh with 8-bit f_rest.
 """
 
 import numpy as np

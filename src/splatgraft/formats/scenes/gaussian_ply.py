@@ -1,8 +1,8 @@
-"""3DGS scenes as .ply, raw: the fields come back bit for bit. Knows the names and order of the properties only.
+"""Reads and writes 3DGS scenes as .ply; the raw fields are stored exactly.
 
 Layout of the original code (Kerbl et al. 2023): x y z, nx ny nz (zeros), f_dc_0..2, f_rest (channel-major), opacity,
 scale_0..2, rot_0..3 (wxyz), all float32. Read in any order, with extra properties or without normals and f_rest.
-Values that are not finite are kept as they are: a file survives reading and writing, and renderers cull them.
+Values that are not finite are kept, so that reading and writing copies a file exactly; renderers cull them.
 """
 
 import re
@@ -64,7 +64,7 @@ def read_gaussian_ply(path: Path) -> Gaussians:
 
 
 def _rest_names(path: Path, vertex: ply.Element) -> tuple[str, ...]:
-    """f_rest_0 .. in their number's order, wherever they stand in the row."""
+    """f_rest_0 .. in the order of their numbers, whatever their order in the row."""
     count = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in vertex.names)
     names = tuple(f"f_rest_{i}" for i in range(count))
     missing = [name for name in names if name not in vertex.names]
@@ -88,7 +88,7 @@ def _require_gaussians(path: Path, vertex: ply.Element) -> None:
 
 
 def write_gaussian_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write the original code's layout, byte for byte; the file appears whole or not at all."""
+    """Write the layout of the original code, byte for byte, atomically."""
     n, k = gaussians.sh.shape[:2]
     rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
     names = [*_MEANS, "nx", "ny", "nz", *_DC, *rest, "opacity", *_SCALES, *_QUATERNION]

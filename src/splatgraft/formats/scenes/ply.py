@@ -1,6 +1,6 @@
-"""The PLY container: header, elements, properties; binary of both byte orders and ascii. Knows nothing about Gaussians.
+"""The PLY container: header, elements, properties; binary of both byte orders and ascii.
 
-Nothing is allocated on the word of a header: element counts are first held against the size of the file.
+Element counts of a header are checked against the size of the file before anything is allocated.
 """
 
 import re
@@ -70,7 +70,7 @@ class Element:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a PLY file says of itself."""
+    """The header of a PLY file."""
 
     path: Path
     order: str
@@ -85,9 +85,9 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """The header, with counts that the file is long enough for.
+    """The header, with counts checked against the length of the file.
 
-    Raises: ValueError where the file is no PLY, or shorter or longer than its header says.
+    Raises: ValueError where the file is no PLY, or shorter or longer than the header requires.
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a .ply file, found none")

@@ -1,4 +1,4 @@
-"""Bytes to raw Gaussian fields and back, as all compressed scene formats need it. Knows no format."""
+"""Conversion between bytes and raw Gaussian fields, shared by the compressed scene formats."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def bytes_from_unit(values: Float[Tensor, "*n"]) -> UInt8[Tensor, "*n"]:
 
 
 def require_finite(path: Path, gaussians: Gaussians) -> None:
-    """Integers hold no nan and no infinity.
+    """Check that all fields are finite, as quantised formats store neither nan nor infinity.
 
     Raises: ValueError where a field of any Gaussian is not finite.
     """

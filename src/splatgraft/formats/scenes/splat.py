@@ -1,4 +1,4 @@
-""".splat scenes: 32 bytes per Gaussian, colour without view dependence. Knows no other format.
+"""Reads and writes .splat scenes: 32 bytes per Gaussian, colour without view dependence.
 
 Layout (antimatter15/splat): position 3 x float32, scale 3 x float32, colour and opacity 4 x uint8,
 quaternion wxyz 4 x uint8 as 128 + 128 q.
@@ -16,7 +16,7 @@ from splatgraft.runtime.atomic_file import atomic_write
 
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)])
 _SMALLEST_SCALE = 1e-30
-"""World units; what a scale of exactly 0 becomes, since its logarithm is stored."""
+"""World units; replaces a scale of exactly 0, since the logarithm is stored."""
 
 
 def read_splat(path: Path) -> Gaussians:

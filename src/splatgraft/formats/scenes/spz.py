@@ -1,6 +1,6 @@
-""".spz scenes (Niantic, versions 2 and 3): gzip of one quantised array per field. Knows no other format.
+"""Reads and writes .spz scenes (Niantic, versions 2 and 3): gzip of one quantised array per field.
 
-Stored axes are right-up-back, ours and a .ply's are right-down-front: read and written turned by half a turn about x.
+Stored axes are right-up-back, ours and a .ply's are right-down-front: scenes are rotated by half a turn about x.
 """
 
 import struct
@@ -153,9 +153,9 @@ def _packed(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
 
 
 def _half_turn(gaussians: Gaussians) -> Gaussians:
-    """The scene turned about x, by exact changes of sign; its own inverse."""
+    """The scene rotated by half a turn about x, by exact changes of sign; its own inverse."""
     g = gaussians
-    # every basis function is even or odd under the turn; any direction on no symmetry plane tells which
+    # every basis function is even or odd under the rotation; the sign at one generic direction decides which
     direction = torch.nn.functional.normalize(torch.tensor([0.31, 0.53, 0.79]), dim=0)
     basis = [spherical_harmonics.basis(d, g.sh_degree) for d in (direction, direction * _FLIP)]
     return Gaussians(

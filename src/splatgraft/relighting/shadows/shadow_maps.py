@@ -16,7 +16,7 @@ from torch import Tensor
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.spherical_harmonics import rgb_from_dc
-from splatgraft.rendering.cpu_rows import LANES, lanes, largest, load, smaller, store, where_at_least, where_below
+from splatgraft.rendering.cpu_simd import LANES, lanes, largest, load, smaller, store, where_at_least, where_below
 from splatgraft.runtime.kernel_lock import serialized
 
 FAR = np.float32(1e30)

@@ -1,4 +1,4 @@
-"""The value `View`: what every capture format says of one photograph. Knows no file format."""
+"""The value `ViewRecord`: one photograph with its camera, as a capture file describes it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 
 _RIGID_TOLERANCE = 1e-3
-"""Largest entry of R^T R - I: room for matrices printed with four digits."""
+"""Largest entry of R^T R - I; allows matrices printed with four digits."""
 
 MAX_SIDE = 32766
 """Longest image side, pixels: OpenCV cannot undistort longer ones."""
 
 
 @dataclass(frozen=True)
-class View:
-    """One photograph as its capture describes it."""
+class ViewRecord:
+    """One photograph with its camera, as a capture file describes it."""
 
     name: str
     """Path of the image as the capture writes it."""
@@ -34,9 +34,9 @@ class View:
 
 
 def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
-    """The pose (4, 4) with a rotation that is orthonormal to float64.
+    """The pose (4, 4) with its rotation made orthonormal in float64.
 
-    Raises: ValueError that starts with `where`, for a matrix that is no rotation and translation.
+    Raises: ValueError that starts with `where`, for a matrix that is not a rotation and a translation.
     """
     rotation = matrix[:3, :3]
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e30:
@@ -59,7 +59,7 @@ def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
 
 
 def existing_file(path: Path) -> Path | None:
-    """`path` where it is a file; None also for names that no file can have."""
+    """`path` where it is a file, otherwise None, also for invalid file names."""
     try:
         return path if path.is_file() else None
     except (OSError, ValueError):
@@ -67,6 +67,6 @@ def existing_file(path: Path) -> Path | None:
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes are one image scaled, each side rounded to whole pixels."""
+    """Whether two sizes are those of one image scaled, with sides rounded to whole pixels."""
     # with both sides scaled by one factor and rounded, the cross products differ by at most one longer side
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)

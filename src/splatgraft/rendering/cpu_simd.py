@@ -1,7 +1,8 @@
-"""Sixteen float32 side by side as one value of numba kernels, on whatever SIMD registers the machine has.
+"""A SIMD type for numba kernels: a row of 16 float32 as one LLVM vector value.
 
-Numba's loops are vectorised by the compiler's leave, and small ones badly; this says it outright. Rows add, subtract,
-multiply and divide with each other and with float32 scalars. Knows nothing about rendering.
+The compiler vectorises loops only where it can prove independence, and short ones badly; with this type kernels are
+vectorised explicitly. Rows add, subtract, multiply and divide with each other and with float32 scalars. LLVM maps them
+to the SIMD registers of the machine.
 """
 
 import operator
@@ -32,7 +33,7 @@ class _RowModel(models.PrimitiveModel):
         super().__init__(dmm, fe_type, _VECTOR)
 
 
-def _spread(builder, value):
+def _broadcast(builder, value):
     if value.type == _VECTOR:
         return value
     first = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
@@ -41,7 +42,7 @@ def _spread(builder, value):
 
 
 def _define(symbol, instruction: str) -> None:
-    """Let rows and float32 scalars meet in the operator `symbol`."""
+    """Define the operator `symbol` for rows and float32 scalars."""
 
     @infer_global(symbol)  # pyright: ignore[reportOptionalCall]
     class _Template(ConcreteTemplate):
@@ -52,7 +53,7 @@ def _define(symbol, instruction: str) -> None:
         )
 
     def generate(_context, builder, _signature, args):
-        return getattr(builder, instruction)(_spread(builder, args[0]), _spread(builder, args[1]), flags=_ALGEBRA)
+        return getattr(builder, instruction)(_broadcast(builder, args[0]), _broadcast(builder, args[1]), flags=_ALGEBRA)
 
     for left, right in [(_Row, _Row), (_Row, types.Float), (types.Float, _Row)]:
         lower_builtin(symbol, left, right)(generate)
@@ -97,9 +98,9 @@ def store(_typing, array, at, row):
 
 @intrinsic
 @no_type_check
-def spread(_typing, value):
-    """A row of one float32 everywhere."""
-    return _ROW(types.float32), lambda _context, builder, _signature, args: _spread(builder, args[0])
+def broadcast(_typing, value):
+    """A row with one float32 in all lanes."""
+    return _ROW(types.float32), lambda _context, builder, _signature, args: _broadcast(builder, args[0])
 
 
 @intrinsic
@@ -119,7 +120,7 @@ def smaller(_typing, row, bound):
     """The lesser of each lane and a scalar."""
 
     def generate(_context, builder, _signature, args):
-        other = _spread(builder, args[1])
+        other = _broadcast(builder, args[1])
         return builder.select(builder.fcmp_ordered("<", args[0], other), args[0], other)
 
     return _ROW(row, types.float32), generate
@@ -142,7 +143,7 @@ def where_at_least(_typing, tested, bound, row):
     """`row` in the lanes where `tested` is at least the scalar `bound`, else 0; 0 where it is nan."""
 
     def generate(_context, builder, _signature, args):
-        inside = builder.fcmp_ordered(">=", args[0], _spread(builder, args[1]))
+        inside = builder.fcmp_ordered(">=", args[0], _broadcast(builder, args[1]))
         return builder.select(inside, args[2], ir.Constant(_VECTOR, None))
 
     return _ROW(tested, types.float32, row), generate
@@ -154,7 +155,7 @@ def where_below(_typing, tested, bound, row):
     """`row` in the lanes where `tested` is below the scalar `bound`, else 0."""
 
     def generate(_context, builder, _signature, args):
-        inside = builder.fcmp_ordered("<", args[0], _spread(builder, args[1]))
+        inside = builder.fcmp_ordered("<", args[0], _broadcast(builder, args[1]))
         return builder.select(inside, args[2], ir.Constant(_VECTOR, None))
 
     return _ROW(tested, types.float32, row), generate
