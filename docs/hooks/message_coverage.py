@@ -1,6 +1,7 @@
 """Fails the build where the code has an error message that troubleshooting.md does not explain.
 
-A message is the text given to ValueError, OSError, RuntimeError or `cli._fail` in src; its replaced parts become "…".
+A message is the text given to ValueError, OSError, RuntimeError or `cli._fail` in src, or any text in the house's form
+"FILE: expected X, found Y"; its replaced parts become "…".
 Inline code in the first column of the page's tables is a pattern, in which "…" stands for a replaced part, at the
 end for any text.
 """
@@ -16,6 +17,8 @@ from mkdocs.exceptions import PluginError
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs/troubleshooting.md"
 _MAKERS = ("ValueError", "OSError", "RuntimeError", "_fail")
+_IS_MESSAGE = re.compile(r": expected .*found", re.DOTALL)
+"""Text that some other function turns into an error."""
 _WORDLESS = re.compile(r"[^\w]|expected|found|…|x")
 """What is left of a message without these are the words that tell it from others."""
 
@@ -50,13 +53,11 @@ def _messages(function: ast.FunctionDef) -> Iterator[str]:
         for target in node.targets
         if isinstance(target, ast.Name)
     }
-    for call in nodes:
-        if isinstance(call, ast.Call) and getattr(call.func, "id", "") in _MAKERS and call.args:
-            whole = _template(call.args[0], texts)
-            inner = (_template(node, {}) for node in ast.walk(call.args[0])) if whole == "…" else ()
-            for text in (whole, *(text for text in inner if "expected" in text)):
-                if _WORDLESS.sub("", text):
-                    yield text
+    given = [n.args[0] for n in nodes if isinstance(n, ast.Call) and getattr(n.func, "id", "") in _MAKERS and n.args]
+    built = (_template(node, texts) for node in nodes if isinstance(node, ast.JoinedStr))
+    for text in (*(_template(node, texts) for node in given), *(text for text in built if _IS_MESSAGE.search(text))):
+        if _WORDLESS.sub("", text):
+            yield text
 
 
 def page_patterns() -> list[str]:

@@ -110,7 +110,8 @@ def _project_page() -> Iterator[str]:
     yield (
         "Made from the code. A project file has the tables `[source]` and `[target]`, and one optional table per step."
         " Paths are relative to the file. The keys of a step are the options of its command, with `_` for `-`;"
-        " `[source.reconstruct]` and `[target.reconstruct]` apply to one capture alone.\n"
+        " `[source.reconstruct]` and `[target.reconstruct]` apply to one capture alone. `splatgraft init --full` writes"
+        " a commented file with all of them.\n"
     )
     for table in _tables():
         yield f"\n## [{table.name}] {{#{table.name}}}\n\n{table.meaning}\n"
@@ -140,24 +141,17 @@ def _key_table(keys: Sequence[Any]) -> Iterator[str]:
 def _api_page() -> Iterator[str]:
     yield "# Python API\n"
     yield (
-        "Values are frozen dataclasses of tensors; stages are functions from values to values. Quantities are in"
-        " radians, world units, sRGB in [0, 1], OpenCV camera axes and wxyz quaternions unless a name says otherwise.\n"
+        "`import splatgraft as sg` gives the names below; each is loaded when it is first used. Values are frozen"
+        " dataclasses of tensors, functions return new ones. Quantities are in radians, world units, sRGB in [0, 1],"
+        " OpenCV camera axes and wxyz quaternions unless a name says otherwise. The scripts in `examples/` use the API"
+        " from capture to result.\n"
     )
-    yield "The scripts in `examples/` use the API from capture to result.\n"
-    if getattr(splatgraft, "__all__", None):
-        yield from _exports(splatgraft.__name__)
-        return
-    stages = ("capture", "reconstruction", "segmentation", "composition", "relighting", "rendering")
-    for name in (*stages, "harmonization", "consolidation", "evaluation", "formats"):
-        yield f"\n## splatgraft.{name}\n"
-        yield from _exports(f"splatgraft.{name}")
-
-
-def _exports(module_name: str) -> Iterator[str]:
-    """A mkdocstrings directive for each public name, at the place of its definition."""
-    module = importlib.import_module(module_name)
-    for name in sorted(getattr(module, "__all__", ()), key=str.lower):
-        value = getattr(module, name)
-        home, defined = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
-        if home is not None and defined is not None and home.startswith("splatgraft"):
-            yield f"\n::: {home}.{defined}\n"
+    names = sorted(splatgraft.__all__, key=str.lower)
+    classes = [name for name in names if isinstance(getattr(splatgraft, name), type)]
+    for title, group in (("Functions", [name for name in names if name not in classes]), ("Values", classes)):
+        yield f"\n## {title}\n"
+        for name in group:
+            value = getattr(splatgraft, name)
+            # mkdocstrings reads the source, where only the place of a definition has it
+            yield f"\n::: {value.__module__}.{value.__qualname__}"
+            yield f"    options:\n      heading: {name}\n      toc_label: {name}\n"
