@@ -98,7 +98,9 @@ def relight(
     scene = prepare_scene(target, cameras, spheres=spheres, reach=options.reach, light=light, cache=cache)
     if isinstance(scene, NoLight):
         in_target = tuple(p.in_target() for p, _ in placed)
-        return unchanged(baked, is_object, objects=in_target, report=(f"{scene.reason} The object is pasted as it is.",))
+        return unchanged(
+            baked, is_object, objects=in_target, report=(f"{scene.reason} The object is pasted as it is.",)
+        )
     report = [scene.light.describe(estimate_up(cameras)) + (", as given." if light is not None else ".")]
     objects = []
     for i, (one, source) in enumerate(placed):
