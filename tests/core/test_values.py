@@ -1,8 +1,10 @@
-"""Values: SH rotation, similarity group laws, camera inverse."""
+"""Values: SH rotation, similarity group laws, camera inverse and even choice of cameras."""
 
+import pytest
 import torch
 
 from splatgraft.core import spherical_harmonics as harmonics
+from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
@@ -52,3 +54,10 @@ def test_similarity_moves_covariances_like_points():
     g = random_gaussians()
     expected = move.scale**2 * move.rotation @ g.covariances @ move.rotation.T
     assert torch.allclose(move.gaussians(g).covariances, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, [0]), (2, [0, 9]), (4, [0, 3, 6, 9]), (20, list(range(10)))])
+def test_spread_cameras_are_evenly_spaced(count, expected):
+    poses = look_at(torch.rand(10, 3) + 2, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    cameras = pinhole(poses, 50.0, width=8, height=8)
+    assert cameras.spread(count).names == tuple(cameras.names[i] for i in expected)
