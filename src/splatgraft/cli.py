@@ -84,17 +84,18 @@ def _dispatch(words: list[str]) -> int:
 
     import tyro
 
-    module = importlib.import_module(module_of(command))
+    from splatgraft.project.step import perform
+    from splatgraft.runtime.console import Console
+
+    console, module = Console(), importlib.import_module(module_of(command))
+    if hasattr(module, "current_arguments"):
+        rest = module.current_arguments(rest, console.say)
     options = tyro.cli(
         module.COMMAND,
         prog=f"splatgraft {' '.join(words[:length])}",
         args=rest,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff, tyro.conf.CascadeSubcommandArgs),
     )
-    from splatgraft.project.step import perform
-    from splatgraft.runtime.console import Console
-
-    console = Console()
     if hasattr(options, "execute"):
         return options.execute(console)
     console.result(perform(options, console))

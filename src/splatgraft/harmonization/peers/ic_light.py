@@ -21,7 +21,7 @@ from splatgraft.harmonization.flux.weights.library import read_tensors, unet_cla
 from splatgraft.harmonization.flux.weights.loading import load_autoencoder
 from splatgraft.harmonization.flux.weights.widening import widened
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import HarmonizerContext, ICLightOptions
 
 _BASE = "stablediffusionapi/realistic-vision-v51"
 _STEPS = 20
@@ -55,7 +55,7 @@ class ICLight:
         return Harmonized(image)
 
 
-def load_ic_light(options: HarmonizerOptions) -> ICLight:
+def load_ic_light(options: ICLightOptions, context: HarmonizerContext) -> ICLight:
     """The base model and IC-Light's difference to it, `iclight_sd15_fbc.safetensors`.
 
     Raises: ValueError where a file is missing or of other shapes.
@@ -65,16 +65,16 @@ def load_ic_light(options: HarmonizerOptions) -> ICLight:
             "harmonizer ic-light: expected --weights iclight_sd15_fbc.safetensors (hub: lllyasviel/ic-light), "
             f"found {options.weights or 'none'}"
         )
-    base = local_folder(options.base or _BASE, options.say)
+    base = local_folder(options.base or _BASE, context.say)
     beside = Path(options.weights).parent
     tokens = read_tensors(part(PROMPT_FILE, base, beside))["tokens"]
     unet = unet_class().from_pretrained(base / "unet")
     add_difference(unet, Path(options.weights))
     autoencoder = load_autoencoder(part("vae", base))
-    dtype = torch.float16 if options.device.type == "cuda" else torch.float32
-    unet.to(options.device, dtype).eval().requires_grad_(False)
-    autoencoder.network.to(options.device).eval().requires_grad_(False)
-    return ICLight(unet, autoencoder, tokens.to(options.device, dtype), options.seed)
+    dtype = torch.float16 if context.device.type == "cuda" else torch.float32
+    unet.to(context.device, dtype).eval().requires_grad_(False)
+    autoencoder.network.to(context.device).eval().requires_grad_(False)
+    return ICLight(unet, autoencoder, tokens.to(context.device, dtype), options.seed)
 
 
 def add_difference(unet: Any, path: Path) -> None:

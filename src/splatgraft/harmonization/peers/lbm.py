@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import HarmonizerContext, LbmOptions
 
 _WEIGHTS = "jasperai/LBM_relighting"
 
@@ -33,7 +33,7 @@ class LBM:
         return Harmonized(torch.lerp(view.composite, image, view.mask[..., None].clamp(0, 1)))
 
 
-def load_lbm(options: HarmonizerOptions) -> LBM:
+def load_lbm(options: LbmOptions, context: HarmonizerContext) -> LBM:
     """The network by `options.weights`, or the published one.
 
     Raises: ValueError where the package is missing.
@@ -46,6 +46,6 @@ def load_lbm(options: HarmonizerOptions) -> LBM:
     from lbm.inference import evaluate, get_model  # pyright: ignore
 
     weights = options.weights or _WEIGHTS
-    options.say(f"lbm: {weights}, licence CC BY-NC 4.0")
-    model = get_model(weights, torch_dtype=torch.bfloat16, device=str(options.device))
+    context.say(f"lbm: {weights}, licence CC BY-NC 4.0")
+    model = get_model(weights, torch_dtype=torch.bfloat16, device=str(context.device))
     return LBM(model, evaluate, 1)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatgraft.core.images import resize
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import MVCoLightOptions
 
 SIDE = 256
 """Pixels: what the network was trained at."""
@@ -77,7 +77,7 @@ def network_input(view: HarmonizerInputs) -> Float[Tensor, "7 256 256"]:
     return resize(pictures, SIDE, SIDE).permute(2, 0, 1).contiguous()
 
 
-def load_mv_colight(options: HarmonizerOptions) -> MVCoLight:
+def load_mv_colight(options: MVCoLightOptions) -> MVCoLight:
     """The adaptor, its folders found.
 
     Raises: ValueError where one is missing.

@@ -21,7 +21,7 @@ from splatgraft.fitting.perceptual_losses import lpips_vgg, windowed_fourier
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
-from splatgraft.harmonization import HARMONIZERS, HarmonizerOptions, make_harmonizer
+from splatgraft.harmonization import HarmonizerContext, harmonizer_options, make_harmonizer
 from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting import SourceScene, relight
@@ -164,8 +164,8 @@ class UpdateIteratively:
             device
         )
         cameras = read_cameras(self.cameras).to(device)
-        options = HarmonizerOptions(weights=self.model, device=device, say=context.console.say)
-        harmonizer = make_harmonizer(self.harmonizer, options)
+        options = harmonizer_options(self.harmonizer, weights=self.model)
+        harmonizer = make_harmonizer(options, HarmonizerContext(device=device, say=context.console.say))
 
         def harmonize_at(scene: Gaussians, strength: float) -> LazySequence:
             views = [view_of(composite, is_object, prior=scene, camera=camera) for camera in cameras]
@@ -198,9 +198,7 @@ def result_of(
         prior, seconds["relight"] = _prior_of(method.prior, ready, console)
     if method.harmonizer is None:
         return prior, seconds
-    if method.harmonizer not in HARMONIZERS:
-        expected = ", ".join(sorted(HARMONIZERS))
-        raise ValueError(f"harmonizer: expected one of {expected}, found {method.harmonizer!r}")
+    options = harmonizer_options(method.harmonizer, weights=model)
     out = ready.work / "methods" / method.folder_name
     if method.schedule != "once":
         step = UpdateIteratively(ready.composite, prior, ready.cameras, out / "result", device=device)
@@ -213,7 +211,7 @@ def result_of(
     draw = Render(composite, ready.cameras, views, is_object=ready.is_object, prior=prior, device=device)
     seconds["render"] = fresh(draw, console)
     harmonized = ready.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
-    seconds["harmonize"] = fresh(Harmonize(views, harmonized, method.harmonizer, weights=model, device=device), console)
+    seconds["harmonize"] = fresh(Harmonize(views, harmonized, options, device=device), console)
     fit = Consolidate(prior, views, harmonized, out / "result", loss=method.loss, lpips_weights=weights, device=device)
     seconds["consolidate"] = fresh(fit, console)
     return out / "result" / SCENE_FILE, seconds
