@@ -58,3 +58,6 @@ class TrainCompact:
         write_weights(self.out / SHIPPED.name, size, state, notes)
         console.say(f"{self.out / SHIPPED.name}")
         return 0
+
+
+COMMAND = TrainCompact

@@ -33,3 +33,6 @@ class TrainEmbed:
             embed_empty_prompt_stable_diffusion(self.base, self.out, say=console.say)
         console.result(self.out)
         return 0
+
+
+COMMAND = TrainEmbed
