@@ -5,6 +5,7 @@ import tomllib
 import types
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -54,6 +55,7 @@ def from_table(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
     return _build(kind, table, given)
 
 
+@cache
 def field_types(kind: type) -> dict[str, Any]:
     """The type of each field of a dataclass, without the annotations that tyro reads."""
     hints = get_type_hints(kind, include_extras=True)

@@ -26,6 +26,8 @@ def run_steps(
         ValueError: The project file or an input is bad, or another run works on the project.
     """
     flow = read_flow(project, out)
+    for line in flow.renamed_keys:
+        console.say(line)
     wanted = flow.up_to(to)
     forced = {step for name in force for step in flow.named(name)}
     with locked(flow.layout.root / "project"):
