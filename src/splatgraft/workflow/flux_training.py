@@ -17,6 +17,7 @@ from splatgraft.training.sources.relit import RelitPairs
 from splatgraft.training.sources.rendered import RenderedPairs
 from splatgraft.training.sources.source import split_mixture
 from splatgraft.training.trainer import Training, is_first_process, launched, train
+from splatgraft.workflow.image_size import parse_image_size
 from splatgraft.workflow.training_data import DataOptions
 
 
@@ -70,7 +71,7 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
     config = FluxFolder.open(folder).config
     width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
     doubles, singles = config.get("num_layers", 19), config.get("num_single_layers", 38)
-    pixels = math.prod(_pixels(options.data))
+    pixels = math.prod(parse_image_size(options.data.size, multiple_of=16))
     size = Size(
         # with the modulations that inference bakes: 6 a stream of a double block, 3 a single one
         parameters=width**2 * (36 * doubles + 15 * singles),
@@ -124,7 +125,7 @@ def _train(
     base: str,
     console: Console,
 ) -> Path | None:
-    width, height = _pixels(options.data)
+    width, height = parse_image_size(options.data.size, multiple_of=16)
     data = options.data
     sources = [RenderedPairs(folder) for folder in data.pairs]
     sources += [RelitPairs(folder) for folder in (*data.generated, *data.orida)]
@@ -140,17 +141,10 @@ def _train(
     cache = LatentCache(out / "latents", objective.encode, width=width, height=height, autoencoder=name)
     with console.bar("train") as progress:
         run = Training(objective, mixture, held_out, cache, options.loop, out, say, progress)
-        # of several processes the first holds the folder; the others write nothing but latents, whole files each
+        # the first of several processes locks the folder; the others write only latents, each file atomically
         with locked(out) if first else nullcontext():
             model = train(run)
     return model if first else None
-
-
-def _pixels(data: DataOptions) -> tuple[int, int]:
-    parts = data.size.split("x")
-    if len(parts) != 2 or not all(part.isdigit() and int(part) % 16 == 0 and int(part) for part in parts):
-        raise ValueError(f"--size: expected WIDTHxHEIGHT in multiples of 16, found {data.size}")
-    return int(parts[0]), int(parts[1])
 
 
 def _say_memory(size: Size, options: FluxTrainingOptions, console: Console) -> None:

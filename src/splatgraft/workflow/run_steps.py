@@ -1,4 +1,4 @@
-"""Performs the stale steps of a project in order."""
+"""Execution of the stale steps of a project, in order."""
 
 from pathlib import Path
 
@@ -13,14 +13,14 @@ from splatgraft.workflow.flow import read_flow
 def run_steps(
     project: Path, console: Console, *, out: Path | None = None, to: str | None = None, force: tuple[str, ...] = ()
 ) -> None:
-    """Perform what is stale up to the step `to`, and print the paths of the results.
+    """Perform the stale steps up to the step `to`, and print the paths of the results.
 
     Args:
         project: The project file, or its folder.
         console: Takes the progress and, on standard output, the paths.
         out: Root of the results; the project's folder where None.
         to: Last step, e.g. "reconstruct" (both captures) or "source/reconstruct"; all where None.
-        force: Steps that are performed even where they are fresh.
+        force: Steps that are performed even where they are up to date.
 
     Raises:
         ValueError: The project file or an input is bad, or another run works on the project.

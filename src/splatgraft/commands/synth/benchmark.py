@@ -20,7 +20,7 @@ class SynthBenchmark:
     """Render the benchmark scenes with ground truth; a killed run is continued."""
 
     out: Positional
-    """Folder for one folder a scene."""
+    """Folder for one folder per scene."""
     size: Literal["small", "paper"] = "small"
     """small: 352x248, 40 views, 16 samples. paper: 704x496, 200 views, 128 samples."""
     scenes: tuple[str, ...] = ()
@@ -36,12 +36,12 @@ class SynthBenchmark:
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:
-        """Render what is missing, lay scenes out as captures and check them; 1 where one failed."""
+        """Render what is missing, write the scenes as captures and check them; 1 where one failed."""
         chosen, size = self._chosen(), self._size()
         python = self.workers.python(console)
         with locked(self.out):
             failures = []
-            # what several turns of one object share is rendered once: with the first of them
+            # pictures that several rotations of one object share are rendered once, with the first of them
             first = [which for i, which in enumerate(chosen) if not set(chosen[:i]) & set(benchmark.twins(which))]
             for wave in (first, [which for which in chosen if which not in first]):
                 tasks = []

@@ -10,10 +10,10 @@ from splatgraft.workflow.rendered_data import check_pairs, write_failures
 
 @dataclass(frozen=True)
 class SynthCheck:
-    """Look at every picture of a folder of pairs or of benchmark scenes, and say which are broken or empty."""
+    """Check every picture of a folder of pairs or benchmark scenes, and list the damaged and empty ones."""
 
     out: Positional
-    """What `synth pairs` or `synth benchmark` made."""
+    """The folder that `synth pairs` or `synth benchmark` wrote."""
 
     def execute(self, console: Console) -> int:
         """Rewrite the manifest of pairs; 1 where something is faulty."""

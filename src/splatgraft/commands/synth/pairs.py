@@ -1,4 +1,4 @@
-"""The command `synth pairs`: training pairs rendered with Blender, the same object under two lights."""
+"""The command `synth pairs`: training pairs of objects in scenes, rendered with Blender."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,25 +22,25 @@ class SynthPairs:
     """Render training pairs for a harmoniser; a killed run is continued."""
 
     out: Positional
-    """Folder for one folder a scene, manifest.jsonl and, where something failed, failures.txt."""
+    """Folder for one folder per scene, manifest.jsonl and, where something failed, failures.txt."""
     scenes: int = 60
-    """How many scenes; each gives 5 cameras x objects x lights pairs."""
+    """Number of scenes; each gives 5 cameras x objects x lights pairs."""
     first: int = 0
     """Number of the first scene, so that several machines can share the work without Ray."""
     size: str = "704x496"
     """Pixels of a picture, WIDTHxHEIGHT."""
     samples: int = 128
-    """Light paths per pixel; 16 are enough for small sizes, the denoiser does the rest."""
+    """Light paths per pixel; with the denoiser 16 are enough for small sizes."""
     objects: int = 2
     """Per scene; the background is rendered once for all."""
     lights: int = 3
     """Environment maps per object."""
     seed: int = 0
-    """Everything follows from it."""
+    """Of all random choices."""
     maps: Path | None = None
     """Folder with .hdr and .exr environment maps; those that come with Blender where not given."""
     models: Path | None = None
-    """Folder with .glb, .gltf, .obj and .blend models that take turns with generated objects."""
+    """Folder with .glb, .gltf, .obj and .blend models that alternate with generated objects."""
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:

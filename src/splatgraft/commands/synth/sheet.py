@@ -12,10 +12,10 @@ from splatgraft.runtime.console import Console
 
 @dataclass(frozen=True)
 class SynthSheet:
-    """One picture with all scenes of a folder, to look at."""
+    """Write one picture with all scenes of a folder."""
 
     out: Positional
-    """What `synth pairs` or `synth benchmark` made."""
+    """The folder that `synth pairs` or `synth benchmark` wrote."""
     picture: Path | None = None
     """Where to write it; sheet.png in the folder where not given."""
     columns: int = 6
