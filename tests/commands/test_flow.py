@@ -19,9 +19,11 @@ from splatgraft.cli import main
 from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft.formats import read_gaussians
-from splatgraft.harmonization import FluxOptions
+from splatgraft.harmonization import HARMONIZERS, FluxOptions
 from splatgraft.project.checkpoint import FolderCheckpoint
+from splatgraft.project.record import read_record
 from splatgraft.project.step import job_of
+from splatgraft.runtime.settings import choices, field_types
 from splatgraft.workflow.flow import read_flow
 
 STEPS = ("segment", "compose", "relight", "render", "harmonize", "consolidate", "evaluate")
@@ -138,6 +140,29 @@ def test_a_project_that_cannot_be_says_so_in_one_line(project: Path, capsys: pyt
         printed = capsys.readouterr()
         assert printed.out == ""
         assert line in printed.err.splitlines()[-1]
+
+
+def test_the_recorded_options_of_harmonize_are_those_of_version_0_1_0(finished: Path) -> None:
+    record = read_record(read_flow(finished).layout.harmonized)
+    assert record is not None
+    # other options, or an option less, would make every result of that version stale
+    assert record.options == {
+        "method": "none",
+        "weights": None,
+        "base": None,
+        "lora": None,
+        "variant": "auto",
+        "checkout": None,
+        "seed": 0,
+        "sampling_steps": 4,
+        "strength": 1.0,
+        "detail": 0.0,
+        "precision": "auto",
+    }
+
+
+def test_every_harmoniser_is_a_sub_command() -> None:
+    assert choices(field_types(Harmonize)["method"]) == HARMONIZERS
 
 
 def test_a_method_s_keys_stand_beside_it_in_the_table(project: Path) -> None:
