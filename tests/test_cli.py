@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splatgraft.cli import COMMANDS, main, module_of
+from splatgraft.cli import COMMANDS, GROUPS, main, module_of
 from splatgraft.runtime.optional_dependencies import OPTIONAL_DEPENDENCIES, extra_providing
 
 ROOT = Path(__file__).parents[1]
@@ -18,6 +18,25 @@ def test_help_names_every_command_and_every_command_has_a_step(capsys: pytest.Ca
     for command in COMMANDS:
         assert f"  {command} " in printed
         assert hasattr(importlib.import_module(module_of(command)), "COMMAND")
+
+
+def test_every_file_in_commands_is_a_command() -> None:
+    folder = ROOT / "src" / "splatgraft" / "commands"
+    files = {path for path in folder.rglob("*.py") if path.name != "__init__.py"}
+    modules = {Path(importlib.import_module(module_of(command)).__file__ or "") for command in COMMANDS}
+    assert files == modules
+
+
+def test_a_group_lists_its_commands_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:
+    for group in GROUPS:
+        inner = [command for command in COMMANDS if command.startswith(f"{group} ")]
+        assert main([group, "--help"]) == 0
+        printed = capsys.readouterr().out
+        assert f"usage: splatgraft {group}" in printed
+        assert all(f"  {command} " in printed for command in inner)
+        assert main([group, "nonsense"]) == 2
+        assert f"found {group} nonsense" in capsys.readouterr().err
+        assert main([group]) == 2
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -94,14 +94,14 @@ def test_a_second_run_measures_nothing_again(measured):
     ],
 )
 def test_a_method_is_named_in_one_word(text, prior, harmonizer, loss, schedule):
-    found = Method.named(text)
+    found = Method.parse(text)
     assert (found.prior, found.harmonizer, found.loss, found.schedule) == (prior, harmonizer, loss, schedule)
 
 
 @pytest.mark.parametrize("text", ["transfre", "transfer/l1-dssim", "off+reinhard/l2", "lbm=nowhere", "=x"])
 def test_a_method_that_means_nothing_is_refused(text):
     with pytest.raises(ValueError, match="--methods: expected"):
-        Method.named(text)
+        Method.parse(text)
 
 
 def test_a_folder_without_scenes_is_one_line(tmp_path, capsys):

@@ -16,10 +16,14 @@ import torch
 from tiny_project import ball, photograph, plane, write_project
 
 from splatgraft.cli import main
+from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft.formats import read_gaussians
+from splatgraft.harmonization import HARMONIZERS, FluxOptions
 from splatgraft.project.checkpoint import FolderCheckpoint
+from splatgraft.project.record import read_record
 from splatgraft.project.step import job_of
+from splatgraft.runtime.settings import choices, field_types
 from splatgraft.workflow.flow import read_flow
 
 STEPS = ("segment", "compose", "relight", "render", "harmonize", "consolidate", "evaluate")
@@ -125,6 +129,8 @@ def test_a_project_that_cannot_be_says_so_in_one_line(project: Path, capsys: pyt
         (("[segment]", "[segments]"), "project.toml: expected tables among source, target, capture"),
         (("passes = 1", "pases = 1"), "project.toml [consolidate]: expected keys among"),
         (("passes = 1", 'method = "slow"'), "[consolidate] method: expected 'fast' or 'adam', found 'slow'"),
+        (("[consolidate]", "[harmonize]\nlora = 'a'\n[consolidate]"), 'ray with method = "none"; found lora'),
+        (("[consolidate]", "[harmonize]\nmethod = 'x'\n[consolidate]"), "[harmonize] method: expected one of compact"),
         (("budget = 400", "budget = 0"), "expected budget of at least 1, found 0"),
         (("../photos/source", "../photos/gone"), "gone: expected"),
     ):
@@ -134,6 +140,39 @@ def test_a_project_that_cannot_be_says_so_in_one_line(project: Path, capsys: pyt
         printed = capsys.readouterr()
         assert printed.out == ""
         assert line in printed.err.splitlines()[-1]
+
+
+def test_the_recorded_options_of_harmonize_are_those_of_version_0_1_0(finished: Path) -> None:
+    record = read_record(read_flow(finished).layout.harmonized)
+    assert record is not None
+    # other options, or an option less, would make every result of that version stale
+    assert record.options == {
+        "method": "none",
+        "weights": None,
+        "base": None,
+        "lora": None,
+        "variant": "auto",
+        "checkout": None,
+        "seed": 0,
+        "sampling_steps": 4,
+        "strength": 1.0,
+        "detail": 0.0,
+        "precision": "auto",
+    }
+
+
+def test_every_harmoniser_is_a_sub_command() -> None:
+    assert choices(field_types(Harmonize)["method"]) == HARMONIZERS
+
+
+def test_a_method_s_keys_stand_beside_it_in_the_table(project: Path) -> None:
+    text = project.read_text()
+    keys = '[harmonize]\nmethod = "flux"\nweights = "hub/id"\nlora = "a/lora.safetensors"\nprocesses = 2\n'
+    project.write_text(text + keys)
+    step = read_flow(project).steps["harmonize"]
+    assert isinstance(step, Harmonize)
+    lora = project.parent / "a/lora.safetensors"
+    assert (step.method, step.processes) == (FluxOptions(weights="hub/id", lora=lora), 2)
 
 
 def test_views_of_a_ground_truth_that_no_step_saw_are_measured_apart(project: Path) -> None:

@@ -36,7 +36,7 @@ LIGHT = Light(
 
 
 @pytest.fixture(scope="module")
-def composed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def apply_output(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("session")
     project = write_project(root, OPTIONS.replace('light = "gain"', 'light = "transfer"'))
     assert main(["run", str(project), "--to", "compose"]) == 0
@@ -44,8 +44,8 @@ def composed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def session(composed: Path, tmp_path: Path) -> Session:
-    shutil.copytree(composed.parents[1], tmp_path / "copy")
+def session(apply_output: Path, tmp_path: Path) -> Session:
+    shutil.copytree(apply_output.parents[1], tmp_path / "copy")
     return Session(FlowProject(tmp_path / "copy" / "project" / "project.toml"))
 
 

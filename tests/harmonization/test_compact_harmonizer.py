@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
-from splatgraft.harmonization import HarmonizerInputs, HarmonizerOptions, make_harmonizer
+from splatgraft.harmonization import CompactOptions, HarmonizerInputs, make_harmonizer
 from splatgraft.harmonization.compact.features import apply_output, compact_input
 from splatgraft.harmonization.compact.harmonizer import Compact
 from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
@@ -102,7 +102,7 @@ def test_weights_are_kept_as_halves_and_read_back(tmp_path):
     first, again = network(channels), read_weights(path)(channels)
     # float16 keeps 11 bits of every weight
     torch.testing.assert_close(again.scene_gain, first.scene_gain, rtol=0.02, atol=2e-3)
-    named = make_harmonizer("compact", HarmonizerOptions(weights=str(tmp_path)))
+    named = make_harmonizer(CompactOptions(weights=str(tmp_path)))
     assert named.harmonize(example()).image.shape == (45, 70, 3)
 
 
@@ -118,7 +118,7 @@ def test_other_weights_are_refused_in_a_line(tmp_path):
     ):
         write()
         with pytest.raises(ValueError, match=wanted) as failure:
-            make_harmonizer("compact", HarmonizerOptions(weights=str(path)))
+            make_harmonizer(CompactOptions(weights=str(path)))
         assert str(path) in str(failure.value)
 
 

@@ -10,7 +10,7 @@ pytest.importorskip("diffusers")
 
 from tiny_models import CHANNELS, flux_folder, quiet, tiny_transformer
 
-from splatgraft.harmonization import HarmonizerInputs, HarmonizerOptions, make_harmonizer
+from splatgraft.harmonization import FluxOptions, HarmonizerContext, HarmonizerInputs, make_harmonizer
 from splatgraft.harmonization.flux.detail import limit_material_change, restore_detail
 from splatgraft.harmonization.flux.weights.folder import FluxFolder
 from splatgraft.harmonization.flux.weights.loading import FluxWeights, load_flux, widen_transformer
@@ -31,26 +31,26 @@ def view(h=32, w=48, seed=0):
     return HarmonizerInputs(composite, background, mask, flat, torch.zeros(h, w, 3), composite)
 
 
-def options(folder, **other):
-    return HarmonizerOptions(weights=str(folder), **other)
+def flux(folder, say=lambda sentence: None, device=torch.device("cpu"), **other):
+    return make_harmonizer(FluxOptions(weights=str(folder), **other), HarmonizerContext(device=device, say=say))
 
 
 def test_a_harmonizer_keeps_size_and_range_and_is_the_same_twice(tmp_path):
     said = []
     folder = flux_folder(tmp_path / "image-mask", WIDE)
-    harmonizer = make_harmonizer("flux", options(folder, say=said.append))
+    harmonizer = flux(folder, say=said.append)
     first = harmonizer.harmonize(view(37, 50)).image
     assert first.shape == (37, 50, 3)
     assert first.min() >= 0
     assert first.max() <= 1
-    assert torch.equal(first, make_harmonizer("flux", options(folder)).harmonize(view(37, 50)).image)
-    assert not torch.equal(first, make_harmonizer("flux", options(folder, seed=1)).harmonize(view(37, 50)).image)
+    assert torch.equal(first, flux(folder).harmonize(view(37, 50)).image)
+    assert not torch.equal(first, flux(folder, seed=1).harmonize(view(37, 50)).image)
     assert any("float32 on cpu" in line for line in said)
 
 
 def test_a_padded_view_is_cropped_from_the_whole_and_a_legal_size_is_not_padded(tmp_path):
     folder = flux_folder(tmp_path / "image-mask", WIDE)
-    harmonizer = make_harmonizer("flux", options(folder))
+    harmonizer = flux(folder)
     small = view(31, 47)
 
     # what padding makes of it by hand: one more row and column, mirrored
@@ -65,8 +65,8 @@ def test_a_padded_view_is_cropped_from_the_whole_and_a_legal_size_is_not_padded(
 def test_views_at_once_are_those_one_by_one(tmp_path):
     folder = flux_folder(tmp_path / "image-mask", WIDE)
     views = [view(seed=i) for i in range(3)]
-    alone = [make_harmonizer("flux", options(folder)).harmonize(v).image for v in views]
-    together = make_harmonizer("flux", options(folder, batch=3)).harmonize_all(views)
+    alone = [flux(folder).harmonize(v).image for v in views]
+    together = flux(folder, batch=3).harmonize_all(views)
     for one, other in zip(alone, together, strict=True):
         # batched products round otherwise; four steps and a decoder of a tiny model amplify that little
         assert torch.allclose(one, other.image, atol=1e-4)
@@ -82,7 +82,7 @@ def test_the_variant_is_told_by_the_folder_and_changes_what_is_shown(tmp_path):
         FluxFolder.open(tmp_path / "other").variant("auto")
     with pytest.raises(ValueError, match=r"expected image-mask .--variant., found image-background"):
         named.variant("image-mask")
-    harmonizer = make_harmonizer("flux", options(tmp_path / "image-background"))
+    harmonizer = flux(tmp_path / "image-background")
     changed = replace(view(), background=torch.zeros(32, 48, 3))
     assert not torch.equal(harmonizer.harmonize(view()).image, harmonizer.harmonize(changed).image)
 
@@ -90,9 +90,9 @@ def test_the_variant_is_told_by_the_folder_and_changes_what_is_shown(tmp_path):
 def test_a_folder_that_is_the_transformer_itself_takes_the_rest_from_the_base(tmp_path):
     base = flux_folder(tmp_path / "base")
     tiny_transformer(WIDE).save_pretrained(tmp_path / "image-mask")
-    image = make_harmonizer("flux", options(tmp_path / "image-mask", base=str(base))).harmonize(view()).image
+    image = flux(tmp_path / "image-mask", base=str(base)).harmonize(view()).image
     whole = flux_folder(tmp_path / "whole" / "image-mask", WIDE)
-    assert torch.equal(image, make_harmonizer("flux", options(whole)).harmonize(view()).image)
+    assert torch.equal(image, flux(whole).harmonize(view()).image)
 
 
 def test_a_low_rank_adaptation_of_flux_is_a_harmonizer(tmp_path):
@@ -105,22 +105,22 @@ def test_a_low_rank_adaptation_of_flux_is_a_harmonizer(tmp_path):
     path = tmp_path / "lora" / "lora.safetensors"
     write_lora(path, adapted.state_dict(), {})
     said = []
-    image = make_harmonizer("flux", options(base, lora=path, say=said.append)).harmonize(view()).image
+    image = flux(base, lora=path, say=said.append).harmonize(view()).image
     assert any("22 layers adapted" in line for line in said)
     plain = flux_folder(tmp_path / "image-mask")
     widened_plain = tiny_transformer()
     widen_transformer(widened_plain)
     widened_plain.save_pretrained(plain / "transformer")
     # B is zero: the adaptation is the widened network itself
-    assert torch.equal(image, make_harmonizer("flux", options(plain)).harmonize(view()).image)
+    assert torch.equal(image, flux(plain).harmonize(view()).image)
 
 
 def test_weights_kept_in_eight_bits_give_about_the_same(tmp_path):
     folder = flux_folder(tmp_path / "image-mask", WIDE)
     said = []
-    image = make_harmonizer("flux", options(folder, precision="fp8", say=said.append)).harmonize(view()).image
+    image = flux(folder, precision="fp8", say=said.append).harmonize(view()).image
     assert "flux: fp8 on cpu, as requested" in said
-    full = make_harmonizer("flux", options(folder)).harmonize(view()).image
+    full = flux(folder).harmonize(view()).image
     # float8_e4m3 has 3 bits of mantissa: products are off by some percent
     assert (image - full).abs().mean() < 0.05
 
@@ -175,7 +175,7 @@ def test_a_broken_folder_is_one_line_that_names_the_file(tmp_path, name):
     how, line = REFUSED[name]
     folder = broken(tmp_path, how)
     with pytest.raises(ValueError, match=line) as error:
-        make_harmonizer("flux", options(folder))
+        flux(folder)
     assert "\n" not in str(error.value)
     assert str(folder) in str(error.value)
 
@@ -183,10 +183,10 @@ def test_a_broken_folder_is_one_line_that_names_the_file(tmp_path, name):
 def test_what_is_no_harmonizer_is_refused_with_both_shapes(tmp_path):
     plain = flux_folder(tmp_path / "image-mask")
     with pytest.raises(ValueError, match=r"expected a first layer of 48 channels, found 16: FLUX itself"):
-        make_harmonizer("flux", options(plain))
+        flux(plain)
     odd = flux_folder(tmp_path / "odd", CHANNELS * 8)
     with pytest.raises(ValueError, match=r"32 x 16 \(FLUX\) or 32 x 48 \(a harmoniser\), found 32 x 32"):
-        make_harmonizer("flux", options(odd))
+        flux(odd)
 
 
 @pytest.mark.parametrize(
@@ -195,11 +195,11 @@ def test_what_is_no_harmonizer_is_refused_with_both_shapes(tmp_path):
 )
 def test_missing_weights_are_said(weights, line):
     with pytest.raises(ValueError, match=line):
-        make_harmonizer("flux", HarmonizerOptions(weights=weights))
+        make_harmonizer(FluxOptions(weights=weights))
 
 
 def test_numbers_that_are_none_and_memory_that_does_not_do_are_said(tmp_path, monkeypatch):
-    harmonizer = make_harmonizer("flux", options(flux_folder(tmp_path / "image-mask", WIDE)))
+    harmonizer = flux(flux_folder(tmp_path / "image-mask", WIDE))
     with torch.no_grad():
         harmonizer.network.transformer.proj_out.bias.fill_(float("nan"))
     with pytest.raises(ValueError, match="harmonizer flux: expected finite latents, found NaN"):
@@ -215,13 +215,13 @@ def test_numbers_that_are_none_and_memory_that_does_not_do_are_said(tmp_path, mo
 
 def test_detail_and_strength_are_laid_on_what_the_network_makes(tmp_path):
     folder, shown = flux_folder(tmp_path / "image-mask", WIDE), view()
-    plain = make_harmonizer("flux", options(folder)).harmonize(shown).image
+    plain = flux(folder).harmonize(shown).image
     held = limit_material_change(plain, shown.composite, shown.mask, strength=0.3)
-    image = make_harmonizer("flux", options(folder, detail=0.7, strength=0.3)).harmonize(shown).image
+    image = flux(folder, detail=0.7, strength=0.3).harmonize(shown).image
     assert torch.equal(image, restore_detail(held, shown.composite, amount=0.7))
     for name in ("detail", "strength"):
         with pytest.raises(ValueError, match=f"--{name}: expected a number from 0 to 1, found 2.0"):
-            make_harmonizer("flux", options(folder, **{name: 2.0}))
+            flux(folder, **{name: 2.0})
 
 
 def test_the_authors_weights_are_fetched_by_id_and_their_licence_said(tmp_path, monkeypatch):
@@ -234,7 +234,7 @@ def test_the_authors_weights_are_fetched_by_id_and_their_licence_said(tmp_path, 
 
     monkeypatch.setattr("splatgraft.harmonization.flux.weights.folder.download", download)
     monkeypatch.setattr("splatgraft.harmonization.flux.weights.folder.licence_of", lambda repository: "other")
-    harmonizer = make_harmonizer("flux", options("nviolante/dot3d/image-background", say=said.append))
+    harmonizer = flux("nviolante/dot3d/image-background", say=said.append)
     assert harmonizer.network.variant == "image-background"
     assert asked[0][0] == "nviolante/dot3d"
     assert all(pattern.startswith("image-background/") for pattern in asked[0][1])
@@ -244,8 +244,8 @@ def test_the_authors_weights_are_fetched_by_id_and_their_licence_said(tmp_path, 
 def test_compiled_blocks_trace_whole_and_give_the_same(tmp_path):
     folder = flux_folder(tmp_path / "image-mask", WIDE)
     network = load_flux(FluxWeights(str(folder)), torch.device("cpu"), say=lambda line: None)
-    plain = make_harmonizer("flux", options(folder)).harmonize(view()).image
-    harmonizer = make_harmonizer("flux", options(folder))
+    plain = flux(folder).harmonize(view()).image
+    harmonizer = flux(folder)
     object.__setattr__(harmonizer, "network", network)
     # the tracer alone, which needs no compiler: a break in a block's graph would be an error
     network.transformer.compile_repeated_blocks(backend="eager", fullgraph=True)
@@ -262,7 +262,7 @@ def test_the_network_is_baked_when_it_is_loaded(tmp_path):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_on_cuda_in_bf16_it_is_about_that_of_the_cpu(tmp_path):
     folder = flux_folder(tmp_path / "image-mask", WIDE)
-    on_gpu = make_harmonizer("flux", options(folder, device=torch.device("cuda"))).harmonize(view()).image
-    on_cpu = make_harmonizer("flux", options(folder)).harmonize(view()).image
+    on_gpu = flux(folder, device=torch.device("cuda")).harmonize(view()).image
+    on_cpu = flux(folder).harmonize(view()).image
     # bfloat16 keeps 8 bits: percents after four steps
     assert (on_gpu - on_cpu).abs().mean() < 0.05

@@ -16,7 +16,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import read_rgb
 from splatgraft.folders.harmonized_views import Part, finished, harmonize_part, picture_folders
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import HarmonizerInputs
+from splatgraft.harmonization import FluxOptions, HarmonizerInputs
 from splatgraft.project.step import perform
 from splatgraft.runtime.console import Console
 
@@ -48,7 +48,8 @@ def weights(tmp_path) -> Path:
 
 
 def step(views, weights, out="out", **other) -> Harmonize:
-    return Harmonize(views, views.parent / out, method="flux", weights=str(weights), device="cpu", **other)
+    method = FluxOptions(weights=str(weights), batch=other.pop("batch", 1), seed=other.pop("seed", 0))
+    return Harmonize(views, views.parent / out, method, device="cpu", **other)
 
 
 def images(folder) -> list[bytes]:
@@ -57,13 +58,34 @@ def images(folder) -> list[bytes]:
 
 def test_one_option_names_the_method_and_its_weights(views, weights, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["harmonize", str(views), "--method", "flux", "--weights", str(weights), "--device", "cpu"]
+    words = ["harmonize", "flux", str(views), "--device", "cpu", "--weights", str(weights)]
     assert main(words) == 0
     assert [read_rgb(path).shape for path in sorted((tmp_path / "harmonized" / "images").iterdir())][2] == (16, 32, 3)
     assert "float32 on cpu" in capsys.readouterr().err
-    assert main([*words[:-4], "--weights", str(views)]) == 2
+    assert main([*words[:-1], str(views)]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert "views/config.json: expected the config of a FluxTransformer2DModel, found none" in lines[-1]
+
+
+def test_the_method_as_an_option_is_understood_and_the_new_form_is_said(views, weights, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["harmonize", str(views), "--method", "reinhard", "--out", "old"]) == 0
+    said = capsys.readouterr().err
+    assert "--method reinhard is now a sub-command: splatgraft harmonize reinhard VIEWS" in said
+    assert main(["harmonize", "reinhard", str(views), "--out", "new"]) == 0
+    assert images(tmp_path / "old") == images(tmp_path / "new")
+    assert main(["harmonize", str(views), "--method=magic"]) == 2
+    assert "--method: expected one of compact, flux" in capsys.readouterr().err
+
+
+def test_help_of_a_method_shows_its_options_and_no_others(capsys):
+    with pytest.raises(SystemExit):
+        main(["harmonize", "compact", "--help"])
+    shown = capsys.readouterr().out
+    for option in ("--out", "--weights", "--strength"):
+        assert option in shown
+    for option in ("--lora", "--checkout", "--max-cost", "--sampling-steps"):
+        assert option not in shown
 
 
 def test_batches_and_parts_give_the_views_that_one_by_one_gives(views, weights, tmp_path):
@@ -75,7 +97,7 @@ def test_batches_and_parts_give_the_views_that_one_by_one_gives(views, weights, 
     (tmp_path / "kept").mkdir()
     picture_folders(tmp_path / "kept")
     for number in range(2):
-        harmonize_part(Part(step(views, weights), tmp_path / "kept", number, 2, device="cpu"))
+        harmonize_part(Part(views, FluxOptions(weights=str(weights)), tmp_path / "kept", number, 2, device="cpu"))
         assert finished(tmp_path / "kept", ViewFolder.open(views)) == ({0, 2} if number == 0 else {0, 1, 2, 3})
     assert images(tmp_path / "kept") == images(whole)
 
@@ -112,8 +134,9 @@ def test_the_machine_does_not_make_a_result_stale(views, weights):
 
     done = step(views, weights)
     perform(done, Console())
-    assert why_stale(job_of(replace(done, batch=4, processes=2, ray="local"))) is None
-    assert why_stale(job_of(replace(done, seed=1))) == "seed is now 1, was 0"
+    other_machine = replace(done, method=replace(done.method, batch=4), processes=2, ray="local")
+    assert why_stale(job_of(other_machine)) is None
+    assert why_stale(job_of(replace(done, method=replace(done.method, seed=1)))) == "seed is now 1, was 0"
 
 
 def test_workers_of_ray_make_the_same_files(views, weights):

@@ -13,7 +13,13 @@ import pytest
 import torch
 from PIL import Image
 
-from splatgraft.harmonization import HarmonizerInputs, HarmonizerOptions, make_harmonizer
+from splatgraft.harmonization import (
+    HarmonizerContext,
+    HarmonizerInputs,
+    ICLightOptions,
+    ImageEditingOptions,
+    make_harmonizer,
+)
 from splatgraft.harmonization.peers.image_editing import PROMPT
 from splatgraft.harmonization.peers.mv_colight import MVCoLight, network_input
 
@@ -89,8 +95,8 @@ def service():
 
 def test_an_editing_service_is_sent_the_paper_s_prompt_composite_and_mask(service):
     said = []
-    options = HarmonizerOptions(weights=service, key="secret", views=3, max_cost=0.2, say=said.append)
-    image = make_harmonizer("image-editing", options).harmonize(view()).image
+    options = ImageEditingOptions(weights=service, max_cost=0.2)
+    image = make_harmonizer(options, HarmonizerContext(key="secret", views=3, say=said.append)).harmonize(view()).image
     assert (image - view().composite).abs().max() < 1 / 255  # the stand-in sends the composite back, in 8 bits
     key, body = Service.asked[0]
     text, _, mask = body["contents"][0]["parts"]
@@ -104,13 +110,13 @@ def test_an_editing_service_is_sent_the_paper_s_prompt_composite_and_mask(servic
 
 def test_an_editing_service_that_fails_or_has_no_key_is_one_line(service):
     Service.status = 429
-    options = HarmonizerOptions(weights=service, key="secret", max_cost=1.0)
+    options, context = ImageEditingOptions(weights=service, max_cost=1.0), HarmonizerContext(key="secret")
     with pytest.raises(ValueError, match=r"expected an answer, found status 429: .*quota"):
-        make_harmonizer("image-editing", options).harmonize(view())
+        make_harmonizer(options, context).harmonize(view())
     with pytest.raises(ValueError, match="expected a key in SPLATGRAFT_IMAGE_EDITING_KEY, found none"):
-        make_harmonizer("image-editing", HarmonizerOptions(weights=service, max_cost=1.0))
+        make_harmonizer(ImageEditingOptions(weights=service, max_cost=1.0))
     with pytest.raises(ValueError, match="expected --weights https://"):
-        make_harmonizer("image-editing", HarmonizerOptions(weights="ftp://x", max_cost=1.0))
+        make_harmonizer(ImageEditingOptions(weights="ftp://x", max_cost=1.0))
 
 
 def test_mv_colight_runs_in_its_own_python_and_its_change_is_laid_on_the_composite(tmp_path):
@@ -143,10 +149,10 @@ def test_ic_light_adds_its_difference_to_the_base(tmp_path):
     difference = {name: 0.01 * torch.randn(tensor.shape, generator=g) for name, tensor in weights.items()}
     path = tmp_path / "iclight_sd15_fbc.safetensors"
     write_tensors(path, difference)
-    options = HarmonizerOptions(weights=str(path), base=str(base))
-    image = make_harmonizer("ic-light", options).harmonize(view()).image
+    options = ICLightOptions(weights=str(path), base=str(base))
+    image = make_harmonizer(options).harmonize(view()).image
     assert image.shape == (40, 60, 3)
     assert bool(image.isfinite().all())
     write_tensors(path, {name: tensor for name, tensor in difference.items() if name != "conv_in.weight"})
     with pytest.raises(ValueError, match=r"iclight_sd15_fbc.safetensors: expected conv_in.weight of .*, found none"):
-        make_harmonizer("ic-light", options)
+        make_harmonizer(options)

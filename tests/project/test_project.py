@@ -1,4 +1,4 @@
-"""Staleness, whole folders, locks and checkpoints: what a killed, repeated or doubled run may and may not do."""
+"""Staleness, replacement of results, locks and checkpoints, for runs that are killed, repeated or started twice."""
 
 import json
 import os

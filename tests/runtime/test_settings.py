@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import pytest
 
@@ -25,6 +25,23 @@ class Outer:
     eval: bool = False
     names: tuple[str, ...] = ()
     options: Inner = field(default_factory=lambda: Inner(device="auto"))
+
+
+@dataclass(frozen=True)
+class Plain:
+    name: ClassVar[str] = "plain"
+
+
+@dataclass(frozen=True)
+class Fancy:
+    name: ClassVar[str] = "fancy"
+    shine: float = 1.0
+
+
+@dataclass(frozen=True)
+class Choosing:
+    kind: Plain | Fancy = field(default_factory=Plain)
+    count: int = 1
 
 
 def table(**values: object) -> Table:
@@ -57,6 +74,15 @@ def test_keys_of_nested_options_share_the_table_and_paths_are_relative_to_the_fi
 def test_what_does_not_fit_is_told_by_file_and_key(values: dict, message: str) -> None:
     with pytest.raises(ValueError, match=rf"^project.toml \[outer\].*{message}"):
         from_table(Outer, table(**{"capture": "c", **values}), {"out": Path("x")})
+
+
+def test_a_choice_is_a_key_and_the_keys_of_the_chosen_share_the_table() -> None:
+    assert from_table(Choosing, table(), {}) == Choosing()
+    assert from_table(Choosing, table(kind="fancy", shine=2, count=3), {}) == Choosing(Fancy(2.0), 3)
+    with pytest.raises(ValueError, match='expected keys among count, kind with kind = "plain"; found shine'):
+        from_table(Choosing, table(shine=2.0), {})
+    with pytest.raises(ValueError, match="kind: expected one of fancy, plain; found 'dull'"):
+        from_table(Choosing, table(kind="dull"), {})
 
 
 def test_a_missing_key_is_told() -> None:

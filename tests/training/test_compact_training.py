@@ -164,7 +164,7 @@ def test_the_command_makes_weights_that_the_harmoniser_loads(rendered, tmp_path,
     # two steps at the end of a schedule from where the first ended: near it, and not it
     apart = [(a - b).abs().max() for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True)]
     assert 0 < max(apart) < 0.01
-    assert "4 pairs to learn from, 4 held out" in capsys.readouterr().err
+    assert "4 pairs to train on, 4 held out" in capsys.readouterr().err
 
 
 def test_the_shipped_pairs_are_read_with_their_light(tmp_path):

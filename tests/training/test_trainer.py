@@ -13,7 +13,7 @@ from tiny_models import CHANNELS, flux_folder, quiet, removal_folder
 from tiny_pairs import relit_folder, rendered_folder
 
 from splatgraft.core.images import read_rgb
-from splatgraft.harmonization import HarmonizerInputs, HarmonizerOptions, make_harmonizer
+from splatgraft.harmonization import FluxOptions, HarmonizerInputs, make_harmonizer
 from splatgraft.training.flux_objective import FluxObjective, FluxTraining
 from splatgraft.training.latent_cache import LatentCache
 from splatgraft.training.loop_options import LoopOptions
@@ -83,7 +83,7 @@ def test_it_overfits_and_is_loaded_as_it_was(tmp_path):
     shown = run.objective.predict(
         run.objective.network.eval(), run.cache.encode_missing([loaded], run.objective.roles), 3
     )
-    harmonizer = make_harmonizer("flux", HarmonizerOptions(weights=str(model), seed=3))
+    harmonizer = make_harmonizer(FluxOptions(weights=str(model), seed=3))
     image = harmonizer.harmonize(inputs(crop_pair_to_size(sample.source.read(sample.index), 32, 32))).image
     # kept latents are rounded to bfloat16 (2^-9 of values of about one), fresh ones are not
     assert (image - shown[0].permute(1, 2, 0)).abs().max() < 0.02
@@ -113,9 +113,9 @@ def test_a_killed_training_goes_on_to_the_same_curve_and_weights(tmp_path, optio
 
 def test_a_trained_adaptation_changes_what_the_base_makes(tmp_path):
     model = train(training(tmp_path, "out", replace(QUICK, rate=0.05), lora=2))
-    options = HarmonizerOptions(weights=str(tmp_path / "base"), lora=model / "lora.safetensors")
+    options = FluxOptions(weights=str(tmp_path / "base"), lora=model / "lora.safetensors")
     pair = RelitPairs(tmp_path / "pairs").read(0)
-    image = make_harmonizer("flux", options).harmonize(inputs(pair)).image
+    image = make_harmonizer(options).harmonize(inputs(pair)).image
     assert image.shape == pair.target.shape
     assert json.loads((model / "harmonizer.json").read_text())["variant"] == "image-mask"
 
@@ -123,7 +123,7 @@ def test_a_trained_adaptation_changes_what_the_base_makes(tmp_path):
 def test_the_other_condition_is_trained_and_told(tmp_path):
     run = training(tmp_path, "out", condition="image-background", times="logit-normal", first_layer="zero")
     assert run.objective.roles == ("target", "composite", "background")
-    harmonizer = make_harmonizer("flux", HarmonizerOptions(weights=str(train(run))))
+    harmonizer = make_harmonizer(FluxOptions(weights=str(train(run))))
     assert harmonizer.network.variant == "image-background"
     with pytest.raises(ValueError, match=r"model: expected image-mask .--variant., found image-background"):
         FluxObjective(FluxTraining(str(tmp_path / "out" / "model")), silent)

@@ -1,1 +1,1 @@
-"""The command line's commands: one file per command; the steps of the flow are in `steps/`."""
+"""The commands of the command line, one file each; the steps of a project are in `steps/`."""

@@ -1,4 +1,4 @@
-"""The command `doctor`: what is installed, what is missing, and the command that brings it."""
+"""The command `doctor`: what is installed, what is missing, and the command that installs it."""
 
 import os
 import platform
@@ -8,19 +8,18 @@ from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
-from splatgraft import __version__
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.optional_dependencies import OPTIONAL_DEPENDENCIES
 
 
 @dataclass(frozen=True)
 class Doctor:
-    """Say what is there, what is missing and how to get it."""
+    """Say what is installed, what is missing and how to install it."""
 
     def execute(self, console: Console) -> int:
-        """Print one line per thing; nothing optional that is missing is an error."""
+        """Print one line per item; a missing optional dependency is no error."""
         lines = [
-            ("splatgraft", __version__),
+            ("splatgraft", version("splatgraft")),
             ("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
             ("torch", f"{torch.__version__}, {torch.get_num_threads()} threads"),
             ("numba", version("numba")),
@@ -55,7 +54,7 @@ def _memory() -> str:
     try:
         total, free = (os.sysconf(name) * os.sysconf("SC_PAGE_SIZE") for name in ("SC_PHYS_PAGES", "SC_AVPHYS_PAGES"))
     except (ValueError, OSError, AttributeError):
-        return "the system does not say"
+        return "unknown"
     return f"{total / 2**30:.1f} GiB, {free / 2**30:.1f} GiB of it unused"
 
 

@@ -12,6 +12,7 @@ from splatgraft.project.project_file import TEMPLATE
 from splatgraft.project.step import Positional
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
+from splatgraft.workflow.project_reference import full_project_text
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,11 @@ class Init:
     scene (.ply, .spz, .splat) without photographs."""
     target: Path
     """The capture or the scene that receives it."""
+    full: bool = False
+    """List every key of every table, with type, default and meaning."""
 
     def execute(self, console: Console) -> int:
-        """Write the file; one that is there is never replaced."""
+        """Write the file; an existing one is never replaced."""
         path = self.folder / PROJECT_FILE
         if path.exists():
             raise ValueError(f"{path}: expected no project here yet, found one")
@@ -35,9 +38,13 @@ class Init:
             if not capture.exists():
                 raise ValueError(f"{capture}: expected photos, a video, a posed capture or a scene, found nothing")
         self.folder.mkdir(parents=True, exist_ok=True)
-        text = TEMPLATE.replace("{source}", self._key(self.source)).replace("{target}", self._key(self.target))
+        source, target = self._key(self.source), self._key(self.target)
+        if self.full:
+            text = full_project_text(source=source, target=target)
+        else:
+            text = TEMPLATE.replace("{source}", source).replace("{target}", target)
         if is_scene(self.source):
-            # nothing but a box can say where the object is
+            # without photographs there are no masks: only a box tells where the object is
             text = with_keys(text, "segment", {"mask_source": "grabcut"})
         with atomic_write(path) as stream:
             stream.write(text.encode())

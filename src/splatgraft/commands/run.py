@@ -1,4 +1,4 @@
-"""The command `run`: everything in a project that is stale, in order."""
+"""The command `run`: the stale steps of a project, in order."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from splatgraft.workflow.run_steps import run_steps
 
 @dataclass(frozen=True)
 class Run:
-    """Do what is stale in a project; a step that was killed goes on from its last checkpoint."""
+    """Perform the stale steps of a project; a killed step continues from its last checkpoint."""
 
     project: Positional = Path("project.toml")
     """The project file, or its folder."""
@@ -19,12 +19,12 @@ class Run:
     to: str | None = None
     """Stop after this step (reconstruct, or source/reconstruct for one of the two)."""
     force: tuple[str, ...] = ()
-    """Do these steps even where they are fresh."""
+    """Perform these steps even where they are up to date."""
     accept_doubtful: bool = False
     """Go on after a capture whose poses are not plausible, as accept_doubtful = true in [source] or [target] does."""
 
     def execute(self, console: Console) -> int:
-        """Do the steps; the paths of what was wanted are the last lines of standard output."""
+        """Perform the steps; the paths of the results are the last lines of standard output."""
         run_steps(
             self.project,
             console,

@@ -1,4 +1,4 @@
-"""The command `status`: what is done in a project, what is stale and why."""
+"""The command `status`: which steps of a project are done, which are stale and why."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from splatgraft.workflow.staleness import reasons
 
 @dataclass(frozen=True)
 class Status:
-    """Say for every step of a project whether its result stands, and why not."""
+    """Say for every step of a project whether its result is up to date, and if not, why."""
 
     project: Positional = Path("project.toml")
     """The project file, or its folder."""
@@ -22,6 +22,8 @@ class Status:
     def execute(self, console: Console) -> int:
         """Print one line per step."""
         flow = read_flow(self.project, self.out)
+        for line in flow.renamed_keys:
+            console.say(line)
         console.result(f"{'step':<20} {'seconds':>8} {'memory':>9}  state")
         for name, reason in reasons(flow).items():
             seconds, memory = _cost(read_record(flow.steps[name].out))

@@ -1,6 +1,8 @@
 """Harmonization of rendered views: an image model corrects the light on an inserted object, one view at a time."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import get_args
 
 from splatgraft.harmonization.compact.factory import make_compact
 from splatgraft.harmonization.flux.factory import make_flux
@@ -8,49 +10,88 @@ from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize
 from splatgraft.harmonization.identity import IdentityHarmonizer
 from splatgraft.harmonization.inputs import render_views
 from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import (
+    CompactOptions,
+    FluxOptions,
+    HarmonizerContext,
+    HarmonizerOptions,
+    ICLightOptions,
+    ImageEditingOptions,
+    LbmOptions,
+    MVCoLightOptions,
+    NoneOptions,
+    ReinhardOptions,
+)
 from splatgraft.harmonization.peers.factory import make_ic_light, make_image_editing, make_lbm, make_mv_colight
 from splatgraft.harmonization.reinhard import Reinhard
 
 __all__ = [
     "HARMONIZERS",
     "BatchHarmonizer",
+    "CompactOptions",
+    "FluxOptions",
     "Harmonized",
     "HarmonizedViews",
     "Harmonizer",
+    "HarmonizerContext",
     "HarmonizerInputs",
     "HarmonizerOptions",
+    "ICLightOptions",
+    "ImageEditingOptions",
+    "LbmOptions",
+    "MVCoLightOptions",
+    "NoneOptions",
+    "ReinhardOptions",
     "harmonize",
+    "harmonizer_options",
     "make_harmonizer",
     "render_views",
 ]
 
-HARMONIZERS: dict[str, Callable[[HarmonizerOptions], Harmonizer]] = {
-    "none": lambda options: IdentityHarmonizer(),
-    "reinhard": lambda options: Reinhard(),
-    "compact": make_compact,
-    "flux": make_flux,
-    "lbm": make_lbm,
-    "ic-light": make_ic_light,
-    "mv-colight": make_mv_colight,
-    "image-editing": make_image_editing,
+HARMONIZERS: dict[str, type[HarmonizerOptions]] = {kind.name: kind for kind in get_args(HarmonizerOptions)}
+"""Name of a method to its options."""
+
+_FACTORIES: dict[type, Callable[..., Harmonizer]] = {
+    NoneOptions: lambda options, context: IdentityHarmonizer(),
+    ReinhardOptions: lambda options, context: Reinhard(),
+    CompactOptions: make_compact,
+    FluxOptions: make_flux,
+    LbmOptions: make_lbm,
+    ICLightOptions: make_ic_light,
+    MVCoLightOptions: make_mv_colight,
+    ImageEditingOptions: make_image_editing,
 }
-"""Name to factory function; a factory imports its heavy libraries only when it is called."""
+"""Options to the factory function, which imports its heavy libraries only when it is called."""
 
 
-def make_harmonizer(name: str, options: HarmonizerOptions | None = None) -> Harmonizer:
+def make_harmonizer(method: str | HarmonizerOptions, context: HarmonizerContext = HarmonizerContext()) -> Harmonizer:
     """Make a harmoniser.
 
     Args:
-        name: A key of `HARMONIZERS`.
-        options: Weights, device and the method's own settings.
-
-    Returns:
-        The harmoniser, with its weights loaded.
+        method: Its options, or its name for the default options.
+        context: Device, number and size of the views, and where messages go.
 
     Raises:
-        ValueError: There is no method of that name, or its weights or packages are missing.
+        ValueError: There is no method of that name (the message lists the names), or its weights or packages are
+            missing.
+    """
+    options = harmonizer_options(method) if isinstance(method, str) else method
+    return _FACTORIES[type(options)](options, context)
+
+
+def harmonizer_options(name: str, *, weights: str | None = None) -> HarmonizerOptions:
+    """Give the default options of a method.
+
+    Args:
+        name: A key of `HARMONIZERS`.
+        weights: Replaces the default weights; ignored by methods without weights.
+
+    Raises:
+        ValueError: There is no method of that name.
     """
     if name not in HARMONIZERS:
         raise ValueError(f"harmonizer: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
-    return HARMONIZERS[name](options or HarmonizerOptions())
+    options = HARMONIZERS[name]()
+    if weights is None or isinstance(options, NoneOptions | ReinhardOptions):
+        return options
+    return replace(options, weights=weights)

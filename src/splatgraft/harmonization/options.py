@@ -1,53 +1,144 @@
-"""What a harmoniser's maker may be told; each takes of it what it needs. Knows no harmoniser."""
+"""Options of the harmonisers, one class per method, and the context in which a harmoniser is made."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar, Literal
 
 import torch
 
 
-def _nobody(sentence: str) -> None:
-    """Tells nobody."""
+@dataclass(frozen=True)
+class NoneOptions:
+    """Keep the light transfer's result: no image model."""
+
+    name: ClassVar[str] = "none"
 
 
 @dataclass(frozen=True)
-class HarmonizerOptions:
-    """Weights, machine and taste."""
+class ReinhardOptions:
+    """Match the object's colour statistics to its surroundings (Reinhard et al. 2001); a baseline."""
+
+    name: ClassVar[str] = "reinhard"
+
+
+@dataclass(frozen=True)
+class CompactOptions:
+    """Correct the light transfer with the shipped network of 2.4 M parameters; runs on any CPU."""
+
+    name: ClassVar[str] = "compact"
 
     weights: str | None = None
-    """Folder, file or hub id of the weights."""
-    base: str | None = None
-    """Folder or hub id of what the weights were trained from, for parts that they lack."""
-    lora: Path | None = None
-    """A low-rank adaptation to merge into the weights."""
-    variant: str = "auto"
-    """What the network is given beside the composite, where its folder does not say."""
-    checkout: Path | None = None
-    """Folder of another project's code, where the method runs in that."""
-    seed: int = 0
-    """Of whatever is drawn at random."""
-    sampling_steps: int = 4
-    """Of a diffusion model."""
+    """A compact.safetensors, or the folder of a training; the shipped weights where not given."""
     strength: float = 1.0
-    """How far the object's material may change, in [0, 1]."""
+    """How much of the correction is applied, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class FluxOptions:
+    """The paper's image model: FLUX.1-schnell fine-tuned on pairs (Sec. 4)."""
+
+    name: ClassVar[str] = "flux"
+
+    weights: str | None = None
+    """Folder or hub id of the weights, such as nviolante/dot3d/image-mask; must be given."""
+    base: str | None = None
+    """Folder or hub id of the model that the weights were trained from, for the parts that they lack."""
+    lora: Path | None = None
+    """A low-rank adaptation (lora.safetensors) to merge into the weights."""
+    variant: Literal["auto", "image-mask", "image-background"] = "auto"
+    """The network's input beside the composite; auto reads it from the weights' folder."""
+    seed: int = 0
+    """Of the noise; the same for all views."""
+    sampling_steps: int = 4
+    """Steps of the diffusion sampling."""
+    strength: float = 1.0
+    """How far the object's material may change, in [0, 1]; 0 lets only its light change."""
     detail: float = 0.0
-    """How much of the result is the composite's own pixels under the model's light, in [0, 1]."""
-    device: torch.device = torch.device("cpu")  # noqa: RUF009
-    """Where the network runs."""
-    precision: str = "auto"
-    """Of its weights."""
+    """In [0, 1]: 1 applies the network's light to the composite's own pixels, 0 keeps the network's pixels."""
+    precision: Literal["auto", "bf16", "fp8", "nf4", "offload", "float32"] = "auto"
+    """Of the weights; auto takes the best that fits the free memory."""
     batch: int = 1
-    """Views at once."""
-    compiled: bool = False
-    """Compile the network first."""
-    views: int = 1
-    """How many will be asked for."""
-    pixels: int = 704 * 496
-    """Of each."""
+    """Views per pass."""
+    compile: bool = False
+    """Compile the network first; worth it from about twenty views on."""
+
+
+@dataclass(frozen=True)
+class LbmOptions:
+    """LBM relighting (Chadebec et al. 2025), run through your own installation of its package."""
+
+    name: ClassVar[str] = "lbm"
+
+    weights: str | None = None
+    """Folder or hub id of the weights; the published ones where not given."""
+
+
+@dataclass(frozen=True)
+class ICLightOptions:
+    """IC-Light, foreground and background (Zhang et al. 2024)."""
+
+    name: ClassVar[str] = "ic-light"
+
+    weights: str | None = None
+    """The file iclight_sd15_fbc.safetensors; must be given."""
+    base: str | None = None
+    """Folder or hub id of the Stable Diffusion 1.5 model that the weights change."""
+    seed: int = 0
+    """Of the noise; the same for all views."""
+
+
+@dataclass(frozen=True)
+class MVCoLightOptions:
+    """MV-CoLight's network for single pictures (Ren et al. 2025), run in your own checkout of its code."""
+
+    name: ClassVar[str] = "mv-colight"
+
+    weights: str | None = None
+    """Folder with config.py and model_step_N.pt; must be given."""
+    checkout: Path | None = None
+    """Folder of its code; must be given."""
+
+
+@dataclass(frozen=True)
+class ImageEditingOptions:
+    """An image-editing service over HTTP with the paper's prompt (Sec. 6); your pictures leave this machine."""
+
+    name: ClassVar[str] = "image-editing"
+
+    weights: str | None = None
+    """Address of the service; the paper's where not given."""
     max_cost: float = 0.0
     """US dollars that may be spent at most."""
+
+
+HarmonizerOptions = (
+    NoneOptions
+    | ReinhardOptions
+    | CompactOptions
+    | FluxOptions
+    | LbmOptions
+    | ICLightOptions
+    | MVCoLightOptions
+    | ImageEditingOptions
+)
+
+
+def _ignore(sentence: str) -> None:
+    """Discard a sentence."""
+
+
+@dataclass(frozen=True)
+class HarmonizerContext:
+    """Where a harmoniser runs and how much it will be asked to do."""
+
+    device: torch.device = torch.device("cpu")  # noqa: RUF009
+    """Where the network runs."""
+    views: int = 1
+    """How many views will be harmonised: the price of a service."""
+    pixels: int = 704 * 496
+    """Pixels per view: the memory of a network."""
     key: str | None = None
     """Of a service that asks for one."""
-    say: Callable[[str], None] = _nobody
-    """For sentences to the person who waits."""
+    say: Callable[[str], None] = _ignore
+    """Takes messages for the user, one line each."""

@@ -1,4 +1,4 @@
-"""project.toml: a table per capture and per step, whose keys are the options of the command. Knows no results."""
+"""project.toml: one table per capture and per step; the keys of a table are the options of the command."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,11 +14,12 @@ T = TypeVar("T")
 TEMPLATE = """\
 # A splatgraft project: `splatgraft run` does what is stale, `splatgraft status` says what that is.
 # Paths are relative to this file. Every table but the first two may be left out; keys are the options of the command
-# of the same name (splatgraft reconstruct --help), with _ for -.
+# of the same name (splatgraft reconstruct --help), with _ for -. `splatgraft init --full` lists every key.
 
 [source]
-# photos, a video, a COLMAP folder or a folder with transforms.json; masks/ beside images/ is found
-# or, beside it or instead of it: scene = "trained.ply" (.spz, .splat); without a capture, pictures are made of it
+# photos, a video, a COLMAP folder or a folder with transforms.json; masks are in masks/ beside images/
+# or, beside it or instead of it, a trained scene (.ply, .spz, .splat); without a capture, pictures are made of it:
+# scene = "trained.ply"
 {source}
 
 [target]
@@ -30,7 +31,7 @@ TEMPLATE = """\
 # [reconstruct]
 # iterations = 3000
 # budget = 40000             # most Gaussians at any moment
-# eval = true                # hold out every 8th view and say how well it is predicted
+# eval = true                # hold out every 8th view and measure how well it is predicted
 
 # [segment]
 # masks = "masks"            # where they are not beside the images
@@ -38,7 +39,7 @@ TEMPLATE = """\
 # box = [-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]
 
 # [compose]                  # placement.json beside this file, where there is one, comes first
-# at = [0.0, 0.0, 0.0]       # rest the object on the surface below or above this point of the target
+# point = [0.0, 0.0, 0.0]    # rest the object on the surface below or above this point of the target
 
 # [harmonize]
 # method = "none"
@@ -51,19 +52,34 @@ TEMPLATE = """\
 """
 
 
+RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
+    "compose": {"at": "point"},
+}
+"""Keys of earlier versions by table, with their present names; understood for one version."""
+
+
 @dataclass(frozen=True)
 class ProjectFile:
-    """What a project.toml says."""
+    """The content of a project.toml."""
 
     path: Path
     """The file, for messages and as the base of relative paths."""
     content: Mapping[str, Any]
-    """As read; tables are known, keys not yet checked."""
+    """As read, with renamed keys under their present names; tables are known, keys not yet checked."""
+    renamed: tuple[str, ...] = ()
+    """One line per key that was found under an earlier name."""
 
     def step(self, kind: type[T], given: Mapping[str, Path] | None = None, *, out: Path, side: Side | None = None) -> T:
-        """The step `kind` with its paths `given` and options from its table; those for one side alone win.
+        """Build the step `kind` from its table.
 
-        Raises: ValueError where a key is unknown or missing, or a value is not as expected.
+        Args:
+            kind: Dataclass of the step; its table has the class's name in lower case.
+            given: Default paths, by field; a path in the table replaces them.
+            out: Folder of the result.
+            side: Capture whose own table takes precedence.
+
+        Raises:
+            ValueError: A key is unknown or missing, or a value is not as expected.
         """
         name = kind.__name__.lower()
         values, where = dict(self.content.get(name, {})), f"{self.path} [{name}]"
@@ -72,28 +88,33 @@ class ProjectFile:
             is_capture = name == "capture"
             values |= self._of_capture(side) if is_capture else own.get(name, {})
             where = f"{self.path} [{side}]" if is_capture else where
-        # a path that the table names wins over the layout's, so that a step can take other files; results stay put
+        # a path in the table replaces the default one, so that a step can read other files; results keep their folders
         layout = {key: path for key, path in (given or {}).items() if key not in values} | {"out": out}
         return from_table(kind, Table(values, where, self.path.parent), layout)
 
     def scene(self, side: Side) -> Path | None:
-        """The scene that was trained already, where one is named."""
+        """The trained scene of a side, where one is named."""
         found = self.content[side].get("scene")
         return None if found is None else self.path.parent / Path(found).expanduser()
 
     def _of_capture(self, side: Side) -> dict[str, Any]:
-        """The keys of [source] or [target] that are options of `capture`; a scene alone is looked at."""
+        """The keys of [source] or [target] that are options of `capture`; of a scene alone, pictures are made."""
         own = {key: value for key, value in self.content[side].items() if not isinstance(value, dict)}
         scene = own.pop("scene", None)
         return own if scene is None else {"capture": scene} | own
 
 
 def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
-    """Read project.toml; `tables` may stand beside [source] and [target].
+    """Read project.toml.
 
-    Raises: ValueError where the file is missing or broken, or a table is unknown.
+    Args:
+        path: The file.
+        tables: Names of the tables that are allowed beside [source] and [target].
+
+    Raises:
+        ValueError: The file is missing or no TOML, or a table is unknown.
     """
-    content = read_toml(path)
+    content, renamed = _present_names(path, read_toml(path))
     known = ("source", "target", *tables)
     for name, table in content.items():
         if name not in known:
@@ -105,7 +126,21 @@ def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
         _check_side(path, side, content.get(side, {}))
         if inner := [k for k, v in content[side].items() if isinstance(v, dict) and k != "reconstruct"]:
             raise ValueError(f"{path}: expected no table in [{side}] but [{side}.reconstruct], found {inner[0]}")
-    return ProjectFile(path, content)
+    return ProjectFile(path, content, renamed)
+
+
+def _present_names(path: Path, content: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The content with renamed keys under their present names, and one line per such key."""
+    present, lines = dict(content), []
+    for name, keys in RENAMED_KEYS.items():
+        table: Any = content.get(name)
+        for old, new in keys.items():
+            if isinstance(table, dict) and old in table:
+                if new in table:
+                    raise ValueError(f"{path} [{name}]: expected {new} alone, found also {old}, its earlier name")
+                present[name] = {new if key == old else key: value for key, value in present[name].items()}
+                lines.append(f"{path} [{name}]: {old} is now called {new}; the next version refuses {old}")
+    return present, tuple(lines)
 
 
 def _check_side(path: Path, side: Side, table: Mapping[str, Any]) -> None:

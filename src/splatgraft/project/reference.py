@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
-from splatgraft.runtime.settings import field_types
+from splatgraft.runtime.settings import choices, field_types
 
 _TYPE_NAMES = {int: "integer", float: "number", bool: "true or false", str: "text", Path: "path"}
 _EXAMPLES = {int: "1", float: "1.0", bool: "true", str: '"text"', Path: '"path"'}
@@ -58,7 +58,12 @@ def describe_table(
         omitted: Fields that are no keys.
     """
     keys = tuple(key for key in _keys(kind, None, given or {}) if key.name not in omitted)
-    return KeyTable(name, _one_line(inspect.getdoc(kind)), keys)
+    variants = tuple(
+        KeyTable(choice, _one_line(inspect.getdoc(inner)), tuple(_keys(inner, None, {})))
+        for hint in field_types(kind).values()
+        for choice, inner in choices(hint).items()
+    )
+    return KeyTable(name, _one_line(inspect.getdoc(kind)), keys, variants)
 
 
 @cache
@@ -83,7 +88,10 @@ def _keys(kind: type, default: Any, given: Mapping[str, Path]) -> list[Key]:
     for field in fields(kind):
         hint = field_types(kind)[field.name]
         value = _default(field) if default is None else getattr(default, field.name)
-        if is_dataclass(hint):
+        if named := choices(hint):
+            words, meaning = " or ".join(map(json.dumps, named)), field_docstrings(kind).get(field.name, "")
+            found.append(Key(field.name, words, json.dumps(value.name), meaning, json.dumps(value.name)))
+        elif is_dataclass(hint):
             found += _keys(hint, None if value is MISSING else value, given)  # pyright: ignore[reportArgumentType]
         else:
             value = given.get(field.name, value)

@@ -4,9 +4,9 @@ import shutil
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 
-from splatgraft import __version__
 from splatgraft.project.folder_lock import locked
 from splatgraft.project.job import Job
 from splatgraft.project.record import STEP_FILE, Record, read_record, write_record
@@ -35,7 +35,7 @@ def replacing(job: Job) -> Generator[Path]:
         outputs = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
         record = Record(
             step=job.step,
-            version=__version__,
+            version=version("splatgraft"),
             options=job.options,
             inputs=inputs,
             outputs=tuple(outputs),

@@ -1,4 +1,4 @@
-"""What every step is, and the one way to do it: locked, timed, resumed, replaced whole. Knows no algorithm."""
+"""The interface of a step, and its execution: locked, timed, resumable, with the result replaced atomically."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
@@ -19,21 +19,21 @@ Positional = Annotated[Path, tyro.conf.Positional]
 Device = Literal["auto", "cpu", "cuda"]
 Inputs = Mapping[str, tuple[Path, ...]]
 _MACHINE = ("device", "batch", "compile", "processes", "ray", "max_cost", "accept_doubtful")
-"""Options that say where and how fast work is done, or whether to go on after it, not what comes out."""
+"""Options that change where and how fast a step runs, or whether a run goes on after it, not its result."""
 
 
 @dataclass(frozen=True)
 class Context:
-    """What a step is handed besides its own fields."""
+    """Arguments of a step besides its own fields."""
 
     progress: Progress
-    """Moves the bar."""
+    """Moves the progress bar."""
     checkpoint: FolderCheckpoint
-    """Survives a kill."""
+    """State that a killed run leaves to the next."""
     console: Console
-    """For sentences."""
+    """For messages."""
     earlier: Path
-    """The result's final place: what an earlier run left there is still whole while this one works."""
+    """The result's final folder; the earlier result stays there until this run is complete."""
 
 
 @runtime_checkable
@@ -57,9 +57,19 @@ class Step(Protocol):
         ...
 
 
+@runtime_checkable
+class RecordsOptions(Protocol):
+    """A step whose options in step.json are not just its fields."""
+
+    def recorded_options(self) -> dict[str, Any]:
+        """The options as plain JSON values."""
+        ...
+
+
 def job_of(step: Step) -> Job:
-    """What must be known of `step` to tell whether its result still stands."""
-    return Job(step=type(step).__name__.lower(), folder=step.out, inputs=step.inputs(), options=_options(step))
+    """The job of `step`: what its result depends on."""
+    options = step.recorded_options() if isinstance(step, RecordsOptions) else plain_options(vars(step))
+    return Job(step=type(step).__name__.lower(), folder=step.out, inputs=step.inputs(), options=options)
 
 
 def path_fields(step: Step) -> list[Path]:
@@ -99,13 +109,15 @@ def choose_device(wanted: str, console: Console) -> torch.device:
     return torch.device(device)
 
 
-def _options(value: Any) -> dict[str, Any]:
-    """All settings as plain JSON: neither paths, whose content counts, nor the machine, which only changes rounding."""
+def plain_options(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as plain JSON, with the fields of nested dataclasses beside the others.
+
+    Left out are paths, whose content counts instead, and the machine's settings, which change only rounding.
+    """
     options: dict[str, Any] = {}
-    for field in fields(value):
-        item = getattr(value, field.name)
+    for name, item in values.items():
         if is_dataclass(item):
-            options |= _options(item)
-        elif field.name not in _MACHINE and not isinstance(item, Path):
-            options[field.name] = list(item) if isinstance(item, tuple) else item
+            options |= plain_options(vars(item))
+        elif name not in _MACHINE and not isinstance(item, Path):
+            options[name] = list(item) if isinstance(item, tuple) else item
     return options

@@ -1,4 +1,4 @@
-"""What a person sees while steps run: one bar per step and plain sentences. Knows nothing about what the steps do."""
+"""Console output while steps run: one progress bar per step and messages of one line."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ from splatgraft.runtime.progress import Progress
 
 
 class Console:
-    """Speaks on standard error; standard output is for the paths of results."""
+    """Messages and bars on standard error, paths of results on standard output."""
 
     def __init__(self) -> None:
         """Open standard error."""
@@ -19,16 +19,20 @@ class Console:
         self._results = rich.console.Console(highlight=False, soft_wrap=True)
 
     def say(self, sentence: str) -> None:
-        """One line for the person who waits."""
+        """Print one line on standard error."""
         self._errors.print(sentence, markup=False, soft_wrap=True)
 
     def result(self, text: object) -> None:
-        """One line for whoever reads standard output."""
+        """Print one line on standard output."""
         self._results.print(str(text), markup=False)
 
     @contextmanager
     def bar(self, name: str) -> Generator[Progress]:
-        """A bar called `name` that the given function moves; where there is no terminal, one line at the end."""
+        """Show a progress bar; without a terminal, one line at its end.
+
+        Yields:
+            The function that moves the bar: steps done, steps in all, and a short text.
+        """
         columns = (
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),

@@ -1,4 +1,4 @@
-"""The optional parts: what each is for and which modules it brings. Imports none of them."""
+"""The optional dependencies of the package: purpose, modules and the extra that installs them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class OptionalDependency:
-    """One optional part of the package, installed by `pip install 'splatgraft[name]'`."""
+    """One extra of the package, installed by `pip install 'splatgraft[name]'`."""
 
     purpose: str
     """What it adds."""
     packages: Mapping[str, str]
-    """Module to the package that brings it."""
+    """Module name to the package that provides it."""
 
 
 OPTIONAL_DEPENDENCIES = {
@@ -22,7 +22,7 @@ OPTIONAL_DEPENDENCIES = {
         {"diffusers": "diffusers", "accelerate": "accelerate"},
     ),
     "text": OptionalDependency("text encoders, to embed the empty prompt once", {"transformers": "transformers"}),
-    "blender": OptionalDependency("made-up scenes with ground truth", {"bpy": "bpy"}),
+    "blender": OptionalDependency("synthetic scenes with ground truth", {"bpy": "bpy"}),
     "ray": OptionalDependency("rendering and evaluating on many machines", {"ray": "ray"}),
     "birefnet": OptionalDependency(
         "object masks from a network", {"onnxruntime": "onnxruntime", "huggingface_hub": "huggingface_hub"}
@@ -31,6 +31,6 @@ OPTIONAL_DEPENDENCIES = {
 
 
 def extra_providing(module: str) -> str | None:
-    """The extra that brings `module`, or None."""
+    """The name of the extra that installs `module`, or None."""
     top = module.split(".", maxsplit=1)[0]
     return next((name for name, extra in OPTIONAL_DEPENDENCIES.items() if top in extra.packages), None)

@@ -1,9 +1,11 @@
-"""TOML tables become frozen dataclasses; what does not fit is told by file and key. Knows no particular key."""
+"""Construction of frozen dataclasses from TOML tables, with one-line errors that name the file and the key."""
 
+import json
 import tomllib
 import types
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -19,13 +21,14 @@ class Table:
     where: str
     """For messages: the file and the name of the table."""
     folder: Path
-    """What paths in it are relative to."""
+    """The folder that its paths are relative to."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file.
+    """Read a TOML file.
 
-    Raises: ValueError where there is no such file or it is not TOML.
+    Raises:
+        ValueError: There is no such file, or it is not TOML.
     """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
@@ -36,33 +39,81 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def from_table(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
-    """A `kind` whose fields are `given`, or keys of the table, or defaults; nested dataclasses share the same table.
+    """Build a `kind` from `given` values, keys of the table and defaults, in this order of precedence.
 
-    Raises: ValueError where a key is unknown or missing, or a value has the wrong type.
+    The fields of nested dataclasses are keys of the same table. A field whose type is a union of dataclasses, each with
+    a class variable `name`, is a key whose value is one of these names; the fields of that class are further keys.
+
+    Raises:
+        ValueError: A key is unknown or missing, or a value has the wrong type.
     """
-    known = _keys(kind) - set(given)
+    known = _keys(kind, table) - set(given)
     if unknown := sorted(set(table.values) - known):
-        raise ValueError(f"{table.where}: expected keys among {', '.join(sorted(known))}; found {', '.join(unknown)}")
+        chosen = [f" with {key} = {json.dumps(value.name)}" for key, value in _choices(kind, table).items()]
+        expected = f"expected keys among {', '.join(sorted(known))}{''.join(chosen)}"
+        raise ValueError(f"{table.where}: {expected}; found {', '.join(unknown)}")
     return _build(kind, table, given)
 
 
-def _keys(kind: type) -> set[str]:
-    hints = field_types(kind)
-    nested = [name for name, hint in hints.items() if is_dataclass(hint)]
-    return (set(hints) - set(nested)).union(*(_keys(hints[name]) for name in nested))
+@cache
+def field_types(kind: type) -> dict[str, Any]:
+    """The type of each field of a dataclass, without the annotations that tyro reads."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: _bare(hints[field.name]) for field in fields(kind)}
+
+
+def choices(hint: Any) -> dict[str, Any]:
+    """The dataclasses of a union of named dataclasses, by name; nothing for any other type."""
+    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else ()
+    return {kind.name: kind for kind in kinds} if all(map(is_dataclass, kinds)) else {}
+
+
+def _bare(hint: Any) -> Any:
+    if get_origin(hint) is Annotated:
+        return _bare(get_args(hint)[0])
+    if get_origin(hint) in (Union, types.UnionType):
+        return Union[tuple(_bare(each) for each in get_args(hint))]  # noqa: UP007
+    return hint
+
+
+def _choices(kind: type, table: Table) -> dict[str, Any]:
+    """The dataclass that the table, or else the default, chooses for each field with a choice."""
+    found: dict[str, Any] = {}
+    for field in fields(kind):
+        if named := choices(field_types(kind)[field.name]):
+            name = table.values.get(field.name, getattr(_default(field), "name", None))
+            if name not in named:
+                wanted = ", ".join(sorted(named))
+                raise ValueError(f"{table.where} {field.name}: expected one of {wanted}; found {name!r}")
+            found[field.name] = named[name]
+    return found
+
+
+def _keys(kind: type, table: Table) -> set[str]:
+    hints, chosen = field_types(kind), _choices(kind, table)
+    nested: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    return (set(hints) - set(nested)).union(*(_keys(inner, table) for inner in (*nested.values(), *chosen.values())))
+
+
+def _default(field: "Field[Any]") -> Any:
+    return field.default_factory() if field.default_factory is not MISSING else field.default
 
 
 def _build(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
     values: dict[str, Any] = {}
+    chosen_kinds = _choices(kind, table)
     for field in fields(kind):  # pyright: ignore[reportArgumentType]
         hint = field_types(kind)[field.name]
         if field.name in given:
             values[field.name] = given[field.name]
+        elif field.name in chosen_kinds:
+            values[field.name] = _build(chosen_kinds[field.name], table, {})
         elif is_dataclass(hint):
             nested = field.default_factory() if field.default_factory is not MISSING else None
-            # what the outer class chose for the inner one stands where the table is silent
-            chosen = {key: getattr(nested, key) for key in _keys(type(nested)) - set(table.values)} if nested else {}
-            values[field.name] = _build(hint, table, chosen)  # pyright: ignore[reportArgumentType]
+            # what the outer class chose for the inner one holds where the table is silent
+            inner = field_types(type(nested)) if nested else {}
+            keys = {key for key, kept in inner.items() if not is_dataclass(kept)} - set(table.values)
+            values[field.name] = _build(hint, table, {key: getattr(nested, key) for key in keys})  # pyright: ignore
         elif field.name in table.values:
             values[field.name] = _convert(table.values[field.name], hint, table, field.name)
         elif field.default is MISSING and field.default_factory is MISSING:
@@ -70,18 +121,8 @@ def _build(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
     return kind(**values)
 
 
-def field_types(kind: type) -> dict[str, Any]:
-    """The type of each field of a dataclass, without the annotations that tyro reads."""
-    hints = get_type_hints(kind, include_extras=True)
-    return {
-        field.name: get_args(hint)[0] if get_origin(hint) is Annotated else hint
-        for field in fields(kind)  # pyright: ignore[reportArgumentType]
-        if (hint := hints[field.name]) is not None
-    }
-
-
 def _convert(value: Any, hint: Any, table: Table, key: str) -> Any:
-    """`value` as `hint` wants it."""
+    """Convert `value` to the type `hint`."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         return _convert_any(value, [a for a in arguments if a is not types.NoneType], table, key)
@@ -100,7 +141,7 @@ def _convert(value: Any, hint: Any, table: Table, key: str) -> Any:
 
 
 def _convert_any(value: Any, hints: list[Any], table: Table, key: str) -> Any:
-    """`value` as the first of `hints` that it fits."""
+    """Convert `value` to the first of the types that it fits."""
     for hint in hints[:-1]:
         try:
             return _convert(value, hint, table, key)

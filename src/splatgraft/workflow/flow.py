@@ -43,6 +43,8 @@ class Flow:
     """Where their results are."""
     steps: Mapping[str, Step]
     """By name: the command, with source/ or target/ before it where both captures need it."""
+    renamed_keys: tuple[str, ...] = ()
+    """One line per key of the project file that has a new name."""
 
     def __iter__(self) -> Iterator[tuple[str, Step]]:
         return iter(self.steps.items())
@@ -53,9 +55,10 @@ class Flow:
         return [other for other, step in self if any(path.is_relative_to(step.out) for path in paths)]
 
     def named(self, name: str) -> set[str]:
-        """The steps that `name` means: reconstruct is both source/reconstruct and target/reconstruct.
+        """The steps of that name: reconstruct is both source/reconstruct and target/reconstruct.
 
-        Raises: ValueError where there is none.
+        Raises:
+            ValueError: There is no such step.
         """
         found = {step for step in self.steps if name in (step, step.split("/")[-1])}
         if not found:
@@ -63,9 +66,10 @@ class Flow:
         return found
 
     def up_to(self, name: str | None) -> dict[str, Step]:
-        """What must be fresh for `name` to be, itself last; everything where it is None.
+        """The steps that `name` depends on, and itself last; all steps where it is None.
 
-        Raises: ValueError where there is no such step.
+        Raises:
+            ValueError: There is no such step.
         """
         wanted = set(self.steps) if name is None else self.named(name)
         for other in reversed(list(self.steps)):
@@ -73,7 +77,7 @@ class Flow:
         return {other: step for other, step in self if other in wanted}
 
     def results(self) -> list[tuple[str, Path]]:
-        """What a person wants to open in the end, by the step that makes it."""
+        """The files that a user opens in the end, by the step that writes them."""
         return [
             ("consolidate", self.layout.result / SCENE_FILE),
             ("evaluate", self.layout.report / REPORT_FILE),
@@ -81,9 +85,14 @@ class Flow:
 
 
 def read_flow(project: Path, out: Path | None = None) -> Flow:
-    """The steps of the project file (or of the one in the folder) `project`, with results under `out` or beside it.
+    """Read the steps of a project.
 
-    Raises: ValueError where the file is missing, or one of its keys or values is not as expected.
+    Args:
+        project: The project file, or its folder.
+        out: Root of the results; the folder of the project file where None.
+
+    Raises:
+        ValueError: The file is missing, or one of its keys or values is not as expected.
     """
     path = project / PROJECT_FILE if project.is_dir() else project
     file = read_project_file(path, tables=tuple(kind.__name__.lower() for kind in STEPS))
@@ -93,11 +102,11 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
     for side in sides:
         steps[f"{side}/capture"] = file.step(Capture, out=layout.capture(side), side=side)
         given = {"capture": layout.capture(side)}
-        # a scene that was trained already stands where a reconstruction would
+        # a trained scene replaces the reconstruction
         trained = file.scene(side)
         kind, given = (Reconstruct, given) if trained is None else (Adopt, given | {"scene": trained})
         steps[f"{side}/reconstruct"] = file.step(kind, given, out=layout.scene(side), side=side)
-    return Flow(layout, steps | _joint_steps(file, layout))
+    return Flow(layout, steps | _joint_steps(file, layout), file.renamed)
 
 
 def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:

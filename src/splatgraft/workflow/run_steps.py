@@ -1,4 +1,4 @@
-"""Performs the stale steps of a project in order."""
+"""Execution of the stale steps of a project, in order."""
 
 from pathlib import Path
 
@@ -20,14 +20,14 @@ def run_steps(
     force: tuple[str, ...] = (),
     accept_doubtful: bool = False,
 ) -> None:
-    """Perform what is stale up to the step `to`, and print the paths of the results.
+    """Perform the stale steps up to the step `to`, and print the paths of the results.
 
     Args:
         project: The project file, or its folder.
         console: Takes the progress and, on standard output, the paths.
         out: Root of the results; the project's folder where None.
         to: Last step, e.g. "reconstruct" (both captures) or "source/reconstruct"; all where None.
-        force: Steps that are performed even where they are fresh.
+        force: Steps that are performed even where they are up to date.
         accept_doubtful: Whether to go on after a capture whose poses are not plausible.
 
     Raises:
@@ -35,6 +35,8 @@ def run_steps(
             not plausible and this was not accepted.
     """
     flow = read_flow(project, out)
+    for line in flow.renamed_keys:
+        console.say(line)
     wanted = flow.up_to(to)
     forced = {step for name in force for step in flow.named(name)}
     with locked(flow.layout.root / "project"):

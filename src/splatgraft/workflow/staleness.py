@@ -6,7 +6,7 @@ from splatgraft.workflow.flow import Flow
 
 
 def reasons(flow: Flow) -> dict[str, str | None]:
-    """Why each step is stale, or None; one that waits for a stale one says for which."""
+    """The reason why each step is stale, or None; a step after a stale step waits for that step."""
     found: dict[str, str | None] = {}
     for name, step in flow:
         waits = [other for other in flow.before(name) if found[other] is not None]

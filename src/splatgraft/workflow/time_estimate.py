@@ -1,7 +1,4 @@
-"""How long each step of a run will take, before it has begun: as it took last time, or as such steps usually do.
-
-Measures nothing; a guess is marked as one.
-"""
+"""Time estimate of the steps of a run, from their earlier runs, or else from typical times of such steps."""
 
 from collections.abc import Iterable
 
@@ -10,7 +7,7 @@ from splatgraft.project.record import read_record
 from splatgraft.project.step import Step
 from splatgraft.workflow.flow import Flow
 
-_USUAL = {
+_TYPICAL_SECONDS = {
     "capture": 1.0,
     "adopt": 0.2,
     "reconstruct": 28.0,
@@ -22,17 +19,27 @@ _USUAL = {
     "consolidate": 0.8,
     "evaluate": 1.7,
 }
-"""Seconds, of `make demo` on two cores. Other projects differ by a factor, which measured steps tell."""
+"""Seconds in `make demo` on two cores. Another project differs by a factor, which its finished steps give."""
 
 
 def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, ...]:
-    """The steps in `stale`, each with the seconds that it will roughly take."""
+    """Estimate the seconds of each step.
+
+    Args:
+        flow: All steps of the project; finished ones give the factor to the typical times.
+        stale: Names of the steps that will run.
+
+    Returns:
+        One entry per stale step; `is_measured` is false where the seconds are a guess.
+    """
     measured = {name: found.seconds for name, step in flow if (found := read_record(step.out)) is not None}
-    usual = {name: _USUAL[_kind(step)] for name, step in flow}
+    typical = {name: _TYPICAL_SECONDS[_kind(step)] for name, step in flow}
     known = [name for name in measured if measured[name] > 0]
-    factor = sum(measured[name] for name in known) / sum(usual[name] for name in known) if known else 1.0
+    factor = sum(measured[name] for name in known) / sum(typical[name] for name in known) if known else 1.0
     return tuple(
-        PlannedStep(name, measured[name], True) if name in measured else PlannedStep(name, factor * usual[name], False)
+        PlannedStep(name, measured[name], True)
+        if name in measured
+        else PlannedStep(name, factor * typical[name], False)
         for name in stale
     )
 

@@ -1,4 +1,4 @@
-"""Which pairs `train flux` and `train removal` are given. Does no work."""
+"""Options of the training data of `train flux` and `train removal`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class DataOptions:
-    """Which pairs, how they are mixed and how large they are."""
+    """Folders of pairs, their mixture and their size."""
 
     pairs: tuple[Path, ...] = ()
     """Folders that `splatgraft synth pairs` rendered."""
@@ -15,7 +15,7 @@ class DataOptions:
     orida: tuple[Path, ...] = ()
     """Folders that `splatgraft synth orida` made."""
     weights: tuple[float, ...] = ()
-    """How often each folder is drawn from, in the order above; by their numbers of pairs where not given."""
+    """Relative frequency of each folder, in the order above; the numbers of pairs where not given."""
     size: str = "704x496"
     """Pixels of a training picture, WIDTHxHEIGHT, multiples of 16."""
     held_out: float = 0.05

@@ -1,1 +1,1 @@
-"""The steps of the flow, in its order: each reads folders, calls one stage and writes one folder."""
+"""The steps of a project, one file each: a step reads folders, calls one stage and writes one folder."""

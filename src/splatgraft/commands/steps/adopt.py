@@ -1,4 +1,4 @@
-"""The command `adopt`: a scene that was trained elsewhere takes the place of a reconstruction."""
+"""The command `adopt`: a scene that was trained elsewhere replaces a reconstruction."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +10,14 @@ from splatgraft.project.step import Context, Inputs, Positional
 
 @dataclass(frozen=True)
 class Adopt:
-    """Take over a trained scene as it is."""
+    """Take over a trained scene unchanged."""
 
     scene: Positional
     """A .ply, .spz or .splat, in the frame of its capture where there is one."""
     out: Path = Path("scene")
     """Folder for scene.ply."""
     capture: Path | None = None
-    """Where its cameras are; a project makes them first. Nothing is read of them."""
+    """Folder of its cameras, which a project makes first; it is not read."""
 
     def inputs(self) -> Inputs:
         """The scene."""
@@ -27,7 +27,7 @@ class Adopt:
         """Make scene.ply."""
         scene = read_gaussians(self.scene)
         write_gaussians(folder / SCENE_FILE, scene)
-        context.console.say(f"{self.scene}: {scene.count:,} Gaussians, taken over as they are")
+        context.console.say(f"{self.scene}: {scene.count:,} Gaussians, taken over unchanged")
 
 
 COMMAND = Adopt

@@ -1,4 +1,4 @@
-"""The command `consolidate`: harmonised views become one scene again, by colours alone."""
+"""The command `consolidate`: the colours of a scene are fitted to harmonised views."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,19 +29,19 @@ class Consolidate:
     out: Path = Path("result")
     """Folder for scene.ply."""
     method: Literal["fast", "adam"] = "fast"
-    """fast: normal equations, then a short descent. adam: the paper's descent from the start."""
+    """fast: normal equations, then a short gradient descent. adam: the paper's gradient descent from the start."""
     loss: Literal["fourier", "l1-dssim", "lpips"] = "fourier"
-    """What the descent makes small: windowed Fourier magnitudes, 3DGS's own, or LPIPS (VGG; needs its weights)."""
+    """Loss of the gradient descent: windowed Fourier magnitudes, that of 3DGS, or LPIPS (VGG; needs its weights)."""
     nuisance: Literal["tint-flow", "none"] = "tint-flow"
-    """What each view may get wrong by itself, solved beside the colours (fast only)."""
+    """Errors of each single view that are solved for together with the colours (fast only)."""
     iterations: int = 10_000
-    """Of adam."""
+    """Steps of adam."""
     passes: int = 12
-    """Of fast's descent over all views."""
+    """Passes of the gradient descent of fast over all views."""
     lpips_weights: Path | None = None
     """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache where not given."""
     low_pass: Literal["classic", "antialiased"] = "classic"
-    """As the scene was trained."""
+    """As the scene was trained: `antialiased` for mip-splatting and for gsplat's antialiased mode."""
     device: Device = "auto"
     """Where to compute."""
 

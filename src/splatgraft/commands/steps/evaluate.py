@@ -1,4 +1,4 @@
-"""The command `evaluate`: pictures before and after, figures where there is a truth, and the page that shows them."""
+"""The command `evaluate`: pictures before and after, metrics where there is ground truth, and a page with both."""
 
 import os
 import platform
@@ -31,7 +31,7 @@ from splatgraft.project.step import Context, Device, Inputs, choose_device
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare the result with copy-paste and, where there is one, with the truth; write pictures and index.html."""
+    """Compare the result with copy-paste and, where it exists, with ground truth; write pictures and index.html."""
 
     result: Path
     """The consolidated scene, a .ply."""
@@ -42,15 +42,15 @@ class Evaluate:
     out: Path = Path("report")
     """Folder for index.html, pictures and metrics.json."""
     ground_truth: Path | None = None
-    """A capture of the target with the object really in it, with masks; its views are compared."""
+    """A capture of the target with the real object in it, with masks; its views are compared."""
     target_capture: Path | None = None
-    """The target's own images, without the object; needed beside a ground truth."""
+    """The target's images, without the object; needed with a ground truth."""
     views: Path | None = None
-    """The folder of views that were harmonised: views of the truth that are not among them are held out."""
+    """The folder of harmonised views: views of the ground truth that are not among them count as held out."""
     light: Path | None = None
-    """A text in which the light transfer explains itself."""
+    """The report of the light transfer, a text file."""
     project: Path | None = None
-    """The folder of all results: the page then says what each step took."""
+    """The folder of all results: the page then shows the time of each step."""
     lpips_weights: Path | None = None
     """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache where not given."""
     pictured: int = 8
@@ -124,7 +124,7 @@ _LIMITS = (
 
 
 def _spread(count: int, wanted: int) -> list[int]:
-    """At most `wanted` of `count` indices, evenly taken."""
+    """At most `wanted` of `count` indices, evenly spaced."""
     return sorted({round(i) for i in torch.linspace(0, count - 1, min(count, wanted)).tolist()})
 
 

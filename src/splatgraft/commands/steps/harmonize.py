@@ -2,79 +2,82 @@
 
 import os
 import shutil
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any
 
-from splatgraft.folders.harmonized_views import Part, finished, harmonize_part, harmonize_parts, picture_folders
+from tyro.conf import subcommand
+
+from splatgraft.folders.harmonized_views import Part, finished, harmonize_part, picture_folders
+from splatgraft.folders.parallel_harmonization import harmonize_with_processes, harmonize_with_ray
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import HARMONIZERS
-from splatgraft.project.step import Context, Device, Inputs, Positional
+from splatgraft.harmonization import (
+    HARMONIZERS,
+    CompactOptions,
+    FluxOptions,
+    ICLightOptions,
+    ImageEditingOptions,
+    LbmOptions,
+    MVCoLightOptions,
+    NoneOptions,
+    ReinhardOptions,
+)
+from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
 
 _KEY_VARIABLE = "SPLATGRAFT_IMAGE_EDITING_KEY"
 
 
 @dataclass(frozen=True)
 class Harmonize:
-    """Make the light of each view agree; views that a killed run finished are kept."""
+    """Make the light of each view agree with an image model; views that a killed run finished are kept."""
 
     views: Positional
     """The folder that `splatgraft render` wrote for a composite."""
     out: Path = Path("harmonized")
-    """Folder for images/, and confidence/ where the method says how far it trusts itself."""
-    method: str = "none"
-    """none (keeps the prior), compact (a small network of ours), reinhard (a baseline), flux (the paper's); lbm,
-    ic-light, mv-colight, image-editing."""
-    weights: str | None = None
-    """Folder, file or hub id of the method's weights, such as nviolante/dot3d/image-mask for flux."""
-    base: str | None = None
-    """Folder or hub id of the model that the weights were trained from, for what they lack."""
-    lora: Path | None = None
-    """flux: a low-rank adaptation (lora.safetensors) to merge in."""
-    variant: Literal["auto", "image-mask", "image-background"] = "auto"
-    """flux: what the network is given beside the composite; by the weights' folder where auto."""
-    checkout: Path | None = None
-    """mv-colight: the folder of its code."""
-    seed: int = 0
-    """Of what is drawn at random; the same for all views."""
-    sampling_steps: int = 4
-    """flux: of the sampling."""
-    strength: float = 1.0
-    """flux: how far the object's material may change; 0 lets only its light change. compact: how much is corrected."""
-    detail: float = 0.0
-    """flux: 1 lays the network's light onto the composite's own pixels, 0 keeps the network's pixels."""
-    precision: Literal["auto", "bf16", "fp8", "nf4", "offload", "float32"] = "auto"
-    """flux: of the weights; auto takes the best that fits the free memory."""
+    """Folder for images/, and confidence/ where the method estimates its reliability per pixel."""
+    method: (
+        Annotated[NoneOptions, subcommand("none")]
+        | Annotated[ReinhardOptions, subcommand("reinhard")]
+        | Annotated[CompactOptions, subcommand("compact")]
+        | Annotated[FluxOptions, subcommand("flux")]
+        | Annotated[LbmOptions, subcommand("lbm")]
+        | Annotated[ICLightOptions, subcommand("ic-light")]
+        | Annotated[MVCoLightOptions, subcommand("mv-colight")]
+        | Annotated[ImageEditingOptions, subcommand("image-editing")]
+    ) = field(default_factory=NoneOptions)
+    """The image model; its options are further keys of the table, or options of the sub-command."""
     device: Device = "auto"
-    batch: int = 1
-    """Views at once, where the method can."""
-    compile: bool = False
-    """flux: compile the network first; pays from some twenty views on."""
+    """Where to compute."""
     processes: int = 1
     """GPUs of this machine, or with --ray workers anywhere, over which the views are split."""
     ray: str | None = None
     """Address of a Ray cluster whose machines all see the folders."""
-    max_cost: float = 0.0
-    """image-editing: US dollars that may be spent at most."""
 
     def inputs(self) -> Inputs:
-        """All pictures of all views, and what small files say which weights these are."""
+        """All pictures of all views, and the small files that identify the weights."""
         files: dict[str, tuple[Path, ...]] = {"views": ViewFolder.open(self.views).files()}
-        if self.lora is not None:
-            files["lora"] = (self.lora,)
-        if self.weights is not None and Path(self.weights).is_dir():
-            files["weights"] = tuple(sorted(Path(self.weights).glob("**/*.json")))
+        lora, weights = getattr(self.method, "lora", None), getattr(self.method, "weights", None)
+        if lora is not None:
+            files["lora"] = (lora,)
+        if weights is not None and Path(weights).is_dir():
+            files["weights"] = tuple(sorted(Path(weights).glob("**/*.json")))
         return files
+
+    def recorded_options(self) -> dict[str, Any]:
+        """The options in step.json: those of all methods, so that results made by version 0.1.0 stay up to date."""
+        defaults = {key: value for kind in HARMONIZERS.values() for key, value in vars(kind()).items()}
+        return plain_options({"method": self.method.name, **defaults, **vars(self.method)})
 
     def write(self, folder: Path, context: Context) -> None:
         """Make one image per view."""
-        if self.method not in HARMONIZERS:
-            raise ValueError(f"--method: expected one of {', '.join(sorted(HARMONIZERS))}, found {self.method!r}")
         kept, views = context.checkpoint.folder, ViewFolder.open(self.views)
         picture_folders(kept)
-        whole = Part(self, kept, key=os.environ.get(_KEY_VARIABLE))
-        if self.processes > 1 or self.ray is not None:
-            harmonize_parts(whole, console=context.console, progress=context.progress)
+        whole = Part(self.views, self.method, kept, device=self.device, key=os.environ.get(_KEY_VARIABLE))
+        if self.ray is not None:
+            harmonize_with_ray(whole, self.processes, address=self.ray, progress=context.progress)
+        elif self.processes > 1:
+            harmonize_with_processes(whole, self.processes, console=context.console, progress=context.progress)
         else:
             harmonize_part(whole, context.console.say, context.progress)
         missing = len(views) - len(finished(kept, views))
@@ -83,6 +86,23 @@ class Harmonize:
         for name in ("images", "confidence"):
             if any((kept / name).iterdir()):
                 shutil.copytree(kept / name, folder / name)
+
+
+def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
+    """Arguments in the present form: `--method NAME`, the form of version 0.1.0, becomes the sub-command NAME.
+
+    Raises:
+        ValueError: There is no method of that name.
+    """
+    words = [part for word in words for part in (word.split("=", 1) if word.startswith("--method=") else [word])]
+    if "--method" not in words[:-1]:
+        return words
+    at = words.index("--method")
+    name = words[at + 1]
+    if name not in HARMONIZERS:
+        raise ValueError(f"--method: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
+    say(f"--method {name} is now a sub-command: splatgraft harmonize {name} VIEWS; the next version drops --method")
+    return [name, *words[:at], *words[at + 2 :]]
 
 
 COMMAND = Harmonize

@@ -18,7 +18,7 @@ from splatgraft.reconstruction import ReconstructOptions, predict_memory, recons
 from splatgraft.rendering import RenderOptions, render
 
 EVAL_EVERY = 8
-"""As in 3DGS."""
+"""Every 8th view, as in 3DGS."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Reconstruct:
     out: Path = Path("scene")
     """Folder for scene.ply."""
     eval: bool = False
-    """Hold out every 8th view and measure how well the scene predicts it: --eval-every 8."""
+    """Hold out every 8th view and measure how well the scene predicts it; the same as --eval-every 8."""
     options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(device="auto"))
 
     def inputs(self) -> Inputs:

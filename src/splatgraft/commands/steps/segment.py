@@ -58,7 +58,7 @@ class Segment:
     corrections: Path | None = None
     """A .npy with one int8 per Gaussian of the scene, as the editor writes it: 1 adds it to the object, -1 removes."""
     solidify: int = SolidifyOptions.iterations
-    """Steps that make the object look whole when it stands alone; 0 leaves its Gaussians as they are in the scene."""
+    """Optimisation steps that make the object opaque when it is rendered alone; 0 keeps its Gaussians unchanged."""
     device: Device = "auto"
     """Where to compute."""
     options: LiftOptions = field(default_factory=LiftOptions)

@@ -1,1 +1,1 @@
-"""The commands `synth ...`: scenes and training pairs with a known truth."""
+"""The commands `synth ...`, one file each: synthetic training pairs and benchmark scenes."""

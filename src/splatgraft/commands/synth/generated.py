@@ -1,4 +1,4 @@
-"""The command `synth generated`: training pairs from pictures that FLUX paints (paper, Sec. 4.2 and 4.3)."""
+"""The command `synth generated`: training pairs from pictures that FLUX generates (paper, Sec. 4.2 and 4.3)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,14 +15,15 @@ from splatgraft.runtime.console import Console
 from splatgraft.training.sources.generate import SamplePlan, UnrelitSample, generate
 from splatgraft.training.sources.prompts import prompt
 from splatgraft.training.sources.relighting_options import RelightingOptions
+from splatgraft.workflow.image_size import parse_image_size
 
 
 @dataclass(frozen=True)
-class Generated:
-    """Paint pictures of objects in rooms, take the objects out, relight them; goes on where it was killed."""
+class GeneratedPairs:
+    """Generate pictures of objects in rooms, remove the objects, relight the pictures; a killed run is continued."""
 
     out: Positional
-    """Folder for one folder a sample, manifest.jsonl and sheet.png to look at."""
+    """Folder for one folder per sample, manifest.jsonl and sheet.png with all samples."""
     removal: Path
     """The folder model/ that `splatgraft train removal` wrote."""
     relighting: RelightingOptions = field(default_factory=RelightingOptions)
@@ -31,21 +32,22 @@ class Generated:
     masks: str | None = None
     """BiRefNet's .onnx file or hub id; the published one where not given."""
     number: int = 1600
-    """Targets to make."""
+    """Number of samples."""
     size: str = "704x496"
     """Pixels, WIDTHxHEIGHT, multiples of 16."""
     seed: int = 0
-    """Everything follows from it."""
+    """Of the prompts, the pictures and the lights."""
     device: Device = "auto"
+    """Where to compute."""
 
     def execute(self, console: Console) -> int:
-        """Make what is missing."""
+        """Make the missing samples."""
         from splatgraft.harmonization.flux.weights.diffusers_library import text_to_image_pipeline
         from splatgraft.segmentation.birefnet import DEFAULT_REPOSITORY, load_birefnet
         from splatgraft.training.sources.object_removal import ObjectRemover
         from splatgraft.training.sources.text_to_image import TextToImage
 
-        width, height = _pixels(self.size)
+        width, height = parse_image_size(self.size, multiple_of=16)
         lighting = self.relighting.open(self.seed)
         device = choose_device(self.device, console)
         remover = ObjectRemover(self.removal, device, console.say, seed=self.seed)
@@ -74,11 +76,4 @@ class Generated:
             yield SamplePlan(f"flux_{self.seed}_{number:06d}", words.object, partial(make, words.text, number), record)
 
 
-def _pixels(size: str) -> tuple[int, int]:
-    parts = size.split("x")
-    if len(parts) != 2 or not all(part.isdigit() and int(part) and int(part) % 16 == 0 for part in parts):
-        raise ValueError(f"--size: expected WIDTHxHEIGHT in multiples of 16, found {size}")
-    return int(parts[0]), int(parts[1])
-
-
-COMMAND = Generated
+COMMAND = GeneratedPairs

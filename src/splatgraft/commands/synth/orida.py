@@ -13,36 +13,35 @@ from splatgraft.training.sources.generate import SamplePlan, UnrelitSample, gene
 from splatgraft.training.sources.orida import LICENCE, Photograph, choose_balanced, read_orida
 from splatgraft.training.sources.pair_source import crop_to_size
 from splatgraft.training.sources.relighting_options import RelightingOptions
+from splatgraft.workflow.image_size import parse_image_size
 
 
 @dataclass(frozen=True)
 class OridaPairs:
-    """Choose photographs of ORIDa, balanced by object and scene, and relight them; goes on where it was killed."""
+    """Choose photographs of ORIDa, balanced by object and scene, and relight them; a killed run is continued."""
 
     out: Positional
-    """Folder for one folder a photograph, manifest.jsonl and sheet.png to look at."""
+    """Folder for one folder per photograph, manifest.jsonl and sheet.png with all samples."""
     orida: Path
     """A folder with index.csv (image, mask, background, object, scene), or OBJECT/SCENE/images, masks, background.*."""
     relighting: RelightingOptions = field(default_factory=RelightingOptions)
     number: int = 2000
-    """Photographs to choose."""
+    """Number of photographs."""
     size: str = "704x496"
-    """Pixels, WIDTHxHEIGHT; the middle is kept where the shape differs."""
+    """Pixels, WIDTHxHEIGHT; photographs of another shape are cropped to the centre."""
     seed: int = 0
-    """The choice and the lights follow from it."""
+    """Of the choice and the lights."""
 
     def execute(self, console: Console) -> int:
-        """Make what is missing."""
-        parts = self.size.split("x")
-        if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
-            raise ValueError(f"--size: expected WIDTHxHEIGHT, found {self.size}")
+        """Make the missing samples."""
+        width, height = parse_image_size(self.size)
         there = read_orida(self.orida)
         chosen = choose_balanced(there, self.number, self.seed)
         objects, scenes = len({p.object for p in chosen}), len({p.scene for p in chosen})
         console.say(f"{len(chosen)} of {len(there)} photographs, {objects} objects in {scenes} scenes")
         lighting = self.relighting.open(self.seed)
         with locked(self.out), console.bar("orida") as progress:
-            wanted = _wanted(chosen, int(parts[0]), int(parts[1]), self.seed)
+            wanted = _wanted(chosen, width, height, self.seed)
             made = generate(self.out, wanted, lighting, total=len(chosen), progress=progress)
         console.say(f"{made} samples; look at sheet.png")
         console.result(self.out / "manifest.jsonl")

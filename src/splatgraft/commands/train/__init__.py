@@ -1,1 +1,1 @@
-"""The commands `train ...`: image models trained on pairs."""
+"""The commands `train ...`, one file each: training of image models on pairs."""

@@ -1,4 +1,4 @@
-"""The command `train compact`: rendered pairs become the small harmoniser that is shipped."""
+"""The command `train compact`: rendered pairs become the compact harmoniser that is shipped."""
 
 import json
 from dataclasses import dataclass, field, replace
@@ -14,7 +14,7 @@ from splatgraft.training.compact.priors import write_priors
 
 @dataclass(frozen=True)
 class TrainCompact:
-    """Train the compact harmoniser; goes on where it was killed."""
+    """Train the compact harmoniser; a killed run is continued."""
 
     out: Positional
     """Folder for compact.safetensors, priors/, state, log and validation pictures."""
@@ -23,13 +23,14 @@ class TrainCompact:
     loop: CompactLoopOptions = field(default_factory=CompactLoopOptions)
     held_out: HeldOutOptions = field(default_factory=HeldOutOptions)
     variants: int = 1
-    """Wrong lights per pair; each more adds 0.25 MB a pair at 240x160."""
+    """Perturbed lights per pair; each adds 0.25 MB per pair at 240x160."""
     start: Path | None = None
-    """Weights to begin from, a compact.safetensors: to go on with other pairs, or with your own."""
+    """Initial weights, a compact.safetensors, to continue the training with other pairs."""
     device: Device = "auto"
+    """Where to compute."""
 
     def execute(self, console: Console) -> int:
-        """Make the priors that are missing, train, write the weights."""
+        """Write the missing priors, train, write the weights."""
         from splatgraft.harmonization.compact.factory import SHIPPED
         from splatgraft.harmonization.compact.weights import read_weights, write_weights
 
@@ -45,7 +46,7 @@ class TrainCompact:
                 write_priors(folders, folder, seed=loop.seed + variant, progress=progress)
         with console.bar("read") as progress:
             pairs = CompactPairs(self.pairs, priors, self.held_out, progress)
-        console.say(f"{len(pairs.training)} pairs to learn from, {len(pairs.validation)} held out")
+        console.say(f"{len(pairs.training)} pairs to train on, {len(pairs.validation)} held out")
         with console.bar("train") as progress:
             run = CompactTraining(pairs, loop, self.out, device, console.say, progress)
             run = run if begin is None else replace(run, begin=begin.state_dict())
@@ -58,3 +59,6 @@ class TrainCompact:
         write_weights(self.out / SHIPPED.name, size, state, notes)
         console.say(f"{self.out / SHIPPED.name}")
         return 0
+
+
+COMMAND = TrainCompact

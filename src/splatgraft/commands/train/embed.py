@@ -1,4 +1,4 @@
-"""The command `train embed`: the empty prompt, embedded once and kept, so that no text encoder is loaded."""
+"""The command `train embed`: the empty prompt's embeddings as a file, so that no text encoder is loaded later."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -9,16 +9,16 @@ from splatgraft.runtime.console import Console
 
 @dataclass(frozen=True)
 class TrainEmbed:
-    """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or of Stable Diffusion; needs transformers, once."""
+    """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or of Stable Diffusion; needs transformers."""
 
     out: Positional
-    """File to write: empty_prompt.safetensors; beside the weights it is found by itself."""
+    """File to write: empty_prompt.safetensors; a file beside the weights is found without an option."""
     base: str = "black-forest-labs/FLUX.1-schnell"
     """Folder or hub id with the text encoders and tokenizers."""
     tokens: int = 256
     """Length of FLUX's text sequence; schnell was distilled at 256."""
     kind: Literal["flux", "stable-diffusion"] = "flux"
-    """Which text encoders."""
+    """The model whose text encoders are used."""
 
     def execute(self, console: Console) -> int:
         """Write the file."""
@@ -33,3 +33,6 @@ class TrainEmbed:
             embed_empty_prompt_stable_diffusion(self.base, self.out, say=console.say)
         console.result(self.out)
         return 0
+
+
+COMMAND = TrainEmbed

@@ -1,17 +1,18 @@
-"""Makes the harmoniser `compact` from options. Imports nothing heavy before it is called."""
+"""Factory of the harmoniser `compact`; heavy modules are imported when it is called."""
 
 from pathlib import Path
 
 from splatgraft.harmonization.interface import Harmonizer
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import CompactOptions, HarmonizerContext
 
 SHIPPED = Path(__file__).parent / "compact.safetensors"
 
 
-def make_compact(options: HarmonizerOptions) -> Harmonizer:
-    """With the weights named (a file, or the folder of a training), else those that are shipped.
+def make_compact(options: CompactOptions, context: HarmonizerContext) -> Harmonizer:
+    """Load the compact network.
 
-    Raises: ValueError where there are none, they are of something else, or the strength is none.
+    Raises:
+        ValueError: The weights are missing or of another network, or the strength is out of range.
     """
     from splatgraft.harmonization.compact.harmonizer import Compact
     from splatgraft.harmonization.compact.weights import read_weights
@@ -20,4 +21,4 @@ def make_compact(options: HarmonizerOptions) -> Harmonizer:
         raise ValueError(f"--strength: expected a number from 0 to 1, found {options.strength}")
     path = SHIPPED if options.weights is None else Path(options.weights)
     network = read_weights(path / SHIPPED.name if path.is_dir() else path)
-    return Compact(network, device=options.device, strength=options.strength)
+    return Compact(network, device=context.device, strength=options.strength)

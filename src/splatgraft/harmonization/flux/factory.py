@@ -1,15 +1,16 @@
-"""Makes the harmoniser `flux` from options. Imports nothing heavy before it is called."""
+"""Factory of the harmoniser `flux`; heavy modules are imported when it is called."""
 
 from splatgraft.harmonization.interface import Harmonizer
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import FluxOptions, HarmonizerContext
 
 AUTHORS_LINE = "nviolante/dot3d/image-mask"
 
 
-def make_flux(options: HarmonizerOptions) -> Harmonizer:
-    """The paper's image model, loaded.
+def make_flux(options: FluxOptions, context: HarmonizerContext) -> Harmonizer:
+    """Load the paper's image model.
 
-    Raises: ValueError where no weights are named or they do not fit.
+    Raises:
+        ValueError: No weights are named, they do not fit, or an option is out of range.
     """
     from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer, FluxSettings
     from splatgraft.harmonization.flux.weights.loading import FluxWeights, load_flux
@@ -28,10 +29,10 @@ def make_flux(options: HarmonizerOptions) -> Harmonizer:
         lora=options.lora,
         variant=options.variant,
         precision=options.precision,
-        compiled=options.compiled,
+        compiled=options.compile,
         steps=options.sampling_steps,
     )
-    network = load_flux(wanted, options.device, say=options.say, pixels=options.pixels, views=options.batch)
+    network = load_flux(wanted, context.device, say=context.say, pixels=context.pixels, views=options.batch)
     settings = FluxSettings(
         seed=options.seed,
         steps=options.sampling_steps,

@@ -22,7 +22,7 @@ from splatgraft.harmonization.flux.weights.loading import load_autoencoder
 from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
 from splatgraft.harmonization.flux.weights.widening import widen_layer
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import HarmonizerContext, ICLightOptions
 
 _BASE = "stablediffusionapi/realistic-vision-v51"
 _STEPS = 20
@@ -60,8 +60,8 @@ class ICLight:
         return Harmonized(image)
 
 
-def load_ic_light(options: HarmonizerOptions) -> ICLight:
-    """Load the base model and add IC-Light's weight differences, `iclight_sd15_fbc.safetensors`.
+def load_ic_light(options: ICLightOptions, context: HarmonizerContext) -> ICLight:
+    """The base model and IC-Light's difference to it, `iclight_sd15_fbc.safetensors`.
 
     Raises:
         ValueError: a file is missing or has other shapes.
@@ -71,16 +71,16 @@ def load_ic_light(options: HarmonizerOptions) -> ICLight:
             "harmonizer ic-light: expected --weights iclight_sd15_fbc.safetensors (hub: lllyasviel/ic-light), "
             f"found {options.weights or 'none'}"
         )
-    base = local_folder(options.base or _BASE, options.say)
+    base = local_folder(options.base or _BASE, context.say)
     beside = Path(options.weights).parent
     tokens = read_tensors(find_part(PROMPT_FILE, base, beside))["tokens"]
     unet = unet_class().from_pretrained(base / "unet")
     add_difference(unet, Path(options.weights))
     autoencoder = load_autoencoder(find_part("vae", base))
-    dtype = torch.float16 if options.device.type == "cuda" else torch.float32
-    unet.to(options.device, dtype).eval().requires_grad_(False)
-    autoencoder.network.to(options.device).eval().requires_grad_(False)
-    return ICLight(unet, autoencoder, tokens.to(options.device, dtype), options.seed)
+    dtype = torch.float16 if context.device.type == "cuda" else torch.float32
+    unet.to(context.device, dtype).eval().requires_grad_(False)
+    autoencoder.network.to(context.device).eval().requires_grad_(False)
+    return ICLight(unet, autoencoder, tokens.to(context.device, dtype), options.seed)
 
 
 def add_difference(unet: Any, path: Path) -> None:

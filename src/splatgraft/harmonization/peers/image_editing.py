@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatgraft.core.images import resize
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import HarmonizerContext, ImageEditingOptions
 
 KEY_VARIABLE = "SPLATGRAFT_IMAGE_EDITING_KEY"
 DOLLARS_PER_VIEW = 0.04
@@ -57,10 +57,10 @@ class ImageEditing:
         answer = self._request({"contents": [{"parts": parts}]})
         try:
             made = next(
-                part["inlineData"]["data"]
+                find_part["inlineData"]["data"]
                 for candidate in answer["candidates"]
-                for part in candidate["content"]["parts"]
-                if "inlineData" in part
+                for find_part in candidate["content"]["parts"]
+                if "inlineData" in find_part
             )
             image = Image.open(io.BytesIO(base64.b64decode(made))).convert("RGB")
         except (KeyError, TypeError, StopIteration, OSError, ValueError) as error:
@@ -82,8 +82,8 @@ class ImageEditing:
             raise ValueError(f"{self.url}: expected an answer, found {error}") from error
 
 
-def connect_image_editing(options: HarmonizerOptions) -> ImageEditing:
-    """Prepare the service at `options.weights` (a URL), or the paper's.
+def connect_image_editing(options: ImageEditingOptions, context: HarmonizerContext) -> ImageEditing:
+    """The service at `options.weights` (a URL), or the paper's.
 
     Raises:
         ValueError: the key is missing, or the expected cost exceeds `options.max_cost`.
@@ -91,13 +91,13 @@ def connect_image_editing(options: HarmonizerOptions) -> ImageEditing:
     url = options.weights or _URL
     if not url.startswith(("https://", "http://127.0.0.1", "http://localhost")):
         raise ValueError(f"harmonizer image-editing: expected --weights https://..., found {url}")
-    cost = options.views * DOLLARS_PER_VIEW
-    options.say(f"image-editing: {options.views} views to {url}, about {cost:.2f} US dollars; your images are uploaded")
+    cost = context.views * DOLLARS_PER_VIEW
+    context.say(f"image-editing: {context.views} views to {url}, about {cost:.2f} US dollars; your images are uploaded")
     if cost > options.max_cost:
         raise ValueError(f"--max-cost: expected at least {cost:.2f} US dollars, found {options.max_cost:.2f}")
-    if not options.key:
+    if not context.key:
         raise ValueError(f"harmonizer image-editing: expected a key in {KEY_VARIABLE}, found none")
-    return ImageEditing(url, options.key)
+    return ImageEditing(url, context.key)
 
 
 def _png(picture: Float[Tensor, "h w 3"]) -> str:

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import HarmonizerContext, LbmOptions
 
 _WEIGHTS = "jasperai/LBM_relighting"
 
@@ -34,8 +34,8 @@ class LBM:
         return Harmonized(torch.lerp(view.composite, image, view.mask[..., None].clamp(0, 1)))
 
 
-def load_lbm(options: HarmonizerOptions) -> LBM:
-    """Load the network named by `options.weights`, or the published one.
+def load_lbm(options: LbmOptions, context: HarmonizerContext) -> LBM:
+    """The network by `options.weights`, or the published one.
 
     Raises:
         ValueError: the package is missing.
@@ -48,6 +48,6 @@ def load_lbm(options: HarmonizerOptions) -> LBM:
     from lbm.inference import evaluate, get_model  # pyright: ignore
 
     weights = options.weights or _WEIGHTS
-    options.say(f"lbm: {weights}, licence CC BY-NC 4.0")
-    model = get_model(weights, torch_dtype=torch.bfloat16, device=str(options.device))
+    context.say(f"lbm: {weights}, licence CC BY-NC 4.0")
+    model = get_model(weights, torch_dtype=torch.bfloat16, device=str(context.device))
     return LBM(model, evaluate, 1)

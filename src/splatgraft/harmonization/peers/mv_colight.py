@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatgraft.core.images import resize
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.harmonization.options import HarmonizerOptions
+from splatgraft.harmonization.options import MVCoLightOptions
 from splatgraft.runtime.child_process import last_line, run_logged
 
 SIDE = 256
@@ -80,8 +80,8 @@ def network_input(view: HarmonizerInputs) -> Float[Tensor, "7 256 256"]:
     return resize(pictures, SIDE, SIDE).permute(2, 0, 1).contiguous()
 
 
-def load_mv_colight(options: HarmonizerOptions) -> MVCoLight:
-    """Find the code and weights that `options` name.
+def load_mv_colight(options: MVCoLightOptions) -> MVCoLight:
+    """The adaptor, its folders found.
 
     Raises:
         ValueError: one is missing.

@@ -1,1 +1,1 @@
-"""Runs of the benchmark: scenes made ready, methods applied to them, and their pictures measured."""
+"""Runs of the benchmark: scenes are composed, methods applied to them, and their pictures measured."""

@@ -1,4 +1,4 @@
-"""A method's pictures of one scene beside the truth, measured and kept. Knows no method from inside."""
+"""Metrics of a method on one scene: its pictures of the held-out views are compared with the ground truth."""
 
 import json
 import math
@@ -32,9 +32,9 @@ class MeasureMethod:
     truth: Path
     """Capture with the object, with masks."""
     photographs: Path
-    """Capture without it, from the same cameras."""
+    """Capture without the object, from the same cameras."""
     target: Path
-    """The reconstruction without it, a .ply: what the method's shadow is measured against."""
+    """The reconstruction without the object, a .ply: the reference of the method's shadow."""
     out: Path
     """Folder for metrics.json and pictures/."""
     result: Path | None = None
@@ -73,7 +73,7 @@ class MeasureMethod:
             stem = Path(truth.cameras.names[index]).stem
             write_image(folder / "pictures" / f"{stem}.png", images[index])
             without = _picture(background, truth, index)
-            rows[stem] = _row(images[index], truth_of(truth, photographs, index), without, perceptual)
+            rows[stem] = _row(images[index], true_view(truth, photographs, index), without, perceptual)
             context.progress(done, len(chosen), stem)
         values = {name: _mean([row[name] for row in rows.values()]) for name in next(iter(rows.values()))}
         consistency = _consistency(self.truth, truth, images)
@@ -83,7 +83,7 @@ class MeasureMethod:
     def _images(
         self, scene: Gaussians | None, truth: PosedImages, chosen: list[int]
     ) -> Mapping[int, Float[Tensor, "h w 3"]]:
-        """Of a scene every view, for consistency; of a folder what it holds, but every held-out view."""
+        """Pictures by view: of a scene all, for consistency; of a folder those that exist, at least the held out."""
         if scene is not None:
             return {index: _picture(scene, truth, index) for index in range(len(truth))}
         assert self.pictures is not None
@@ -101,10 +101,11 @@ class MeasureMethod:
         return found
 
 
-def truth_of(truth: PosedImages, photographs: PosedImages, index: int) -> Truth:
-    """One view as it should look and as it looked before.
+def true_view(truth: PosedImages, photographs: PosedImages, index: int) -> Truth:
+    """The true picture of a view, its picture without the object, and the object's mask.
 
-    Raises: ValueError where the view has no mask.
+    Raises:
+        ValueError: The view has no mask.
     """
     mask = truth.mask(index)
     if mask is None:
@@ -135,14 +136,14 @@ def _picture(scene: Gaussians, truth: PosedImages, index: int) -> Float[Tensor, 
 def _consistency(
     folder: Path, truth: PosedImages, images: Mapping[int, Float[Tensor, "h w 3"]]
 ) -> dict[str, float | None]:
-    """Disagreement of the method's neighbouring views, and of the truth's own; None where depth is not known."""
+    """Disagreement of neighbouring views of the method and of the ground truth; None where depth is unknown."""
     paths = [folder / "depth" / f"{Path(name).stem}.npy" for name in truth.cameras.names]
     if not all(path.is_file() for path in paths):
         return {"disagreement": None, "disagreement_truth": None}
     depths = [torch.from_numpy(np.load(path, allow_pickle=False).astype(np.float32)) for path in paths]
     masks = [mask for mask in (truth.mask(index) for index in range(len(truth))) if mask is not None]
-    own = {index: truth.image(index) for index in images}
+    true_images = {index: truth.image(index) for index in images}
     return {
         "disagreement": disagreement(images, depths, masks, truth.cameras),
-        "disagreement_truth": disagreement(own, depths, masks, truth.cameras),
+        "disagreement_truth": disagreement(true_images, depths, masks, truth.cameras),
     }

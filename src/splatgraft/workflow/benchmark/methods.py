@@ -1,4 +1,4 @@
-"""What can be measured: a light prior, a harmoniser, a way to consolidate, or pictures of another program."""
+"""Methods of the benchmark: a light transfer, a harmoniser and a consolidation, or pictures of another program."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,14 +20,14 @@ from splatgraft.fitting.perceptual_losses import lpips_vgg, windowed_fourier
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
-from splatgraft.harmonization import HARMONIZERS, HarmonizerOptions, make_harmonizer, render_views
+from splatgraft.harmonization import HarmonizerContext, harmonizer_options, make_harmonizer, render_views
 from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting import SourceScene, relight
 from splatgraft.relighting.light.light import light_to_json
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.lazy_sequence import LazySequence
-from splatgraft.workflow.benchmark.scene import ReadyScene, fresh
+from splatgraft.workflow.benchmark.scene import ComposedScene, perform_if_stale
 from splatgraft.workflow.benchmark.true_light_file import read_true_light
 
 Prior = Literal["off", "gain", "transfer", "true-light"]
@@ -39,13 +39,13 @@ _GRAMMAR = "PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], NAME=FOLDER, or " + ", ".join(
 
 @dataclass(frozen=True)
 class Method:
-    """One way to move light, as the command line names it."""
+    """One method, as the command line names it."""
 
     name: str
     prior: Prior = "off"
     """The light transfer in 3D: none, exposure alone, the physical one, or the same with the true light given."""
     harmonizer: str | None = None
-    """The image model; where there is none, the prior is the result."""
+    """The image model; without one, the prior is the result."""
     loss: Loss = "fourier"
     """Of the consolidation."""
     schedule: Schedule = "once"
@@ -54,10 +54,11 @@ class Method:
     """Folder of another program's results: SCENE/VIEW.png, named as the views of the ground truth."""
 
     @staticmethod
-    def named(text: str) -> "Method":
-        """The method that a text such as `transfer+compact/l1-dssim@linear` or `lbm=results/lbm` means.
+    def parse(text: str) -> "Method":
+        """Parse a name such as `transfer+compact/l1-dssim@linear` or `lbm=results/lbm`.
 
-        Raises: ValueError where it means none.
+        Raises:
+            ValueError: The text names no method.
         """
         if "=" in text:
             name, folder = text.split("=", 1)
@@ -79,16 +80,16 @@ class Method:
 
     @property
     def folder_name(self) -> str:
-        """The name without what a folder's name cannot hold."""
+        """The name without the characters that a folder's name cannot hold."""
         return self.name.replace("/", "-")
 
 
 @dataclass(frozen=True)
 class RelightWithTrueLight:
-    """The physical transfer with the true light given instead of an estimate: what a perfect estimate would reach."""
+    """The physical transfer with the true light instead of an estimate: an upper bound for the light estimate."""
 
     target: Path
-    """The place, a .ply."""
+    """The target scene, a .ply."""
     placement: Path
     """Of the composite."""
     cameras: Path
@@ -103,7 +104,7 @@ class RelightWithTrueLight:
     """Folder for scene.ply."""
 
     def inputs(self) -> Inputs:
-        """Everything that is read."""
+        """All files that are read."""
         scenes = (self.target, self.surroundings)
         cameras = (self.cameras, self.object_cameras)
         return {"scenes": scenes, "placement": placement_files(self.placement), "rest": (*cameras, self.light)}
@@ -127,22 +128,23 @@ class RelightWithTrueLight:
 
 @dataclass(frozen=True)
 class UpdateIteratively:
-    """Harmonise and consolidate five times, each time from renders of the scene so far.
+    """Harmonise and consolidate five times, each time from renders of the current scene (Iterative Dataset Update).
 
     The strengths of the schedule are the shares of noise that a diffusion model would start from; a harmoniser without
-    noise sees the renders of the scene so far as its prior, whatever the strength.
+    noise takes the renders of the current scene as its prior at every strength.
     """
 
     composite: Path
     """Folder of the copy-paste result."""
     prior: Path
-    """The scene to start from, a .ply."""
+    """The initial scene, a .ply."""
     cameras: Path
-    """That methods may see."""
+    """The cameras that methods may use."""
     out: Path
     """Folder for scene.ply."""
     harmonizer: str = "reinhard"
     loss: Loss = "fourier"
+    """Of the consolidation."""
     schedule: Schedule = "linear"
     weights: Path | None = None
     """Folder of LPIPS's weights."""
@@ -162,8 +164,8 @@ class UpdateIteratively:
             device
         )
         cameras = read_cameras(self.cameras).to(device)
-        options = HarmonizerOptions(weights=self.model, device=device, say=context.console.say)
-        harmonizer = make_harmonizer(self.harmonizer, options)
+        options = harmonizer_options(self.harmonizer, weights=self.model)
+        harmonizer = make_harmonizer(options, HarmonizerContext(device=device, say=context.console.say))
 
         def harmonize_at(scene: Gaussians, strength: float) -> LazySequence:
             views = render_views(composite, is_object, cameras, prior=scene)
@@ -177,72 +179,91 @@ class UpdateIteratively:
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
 
 
-def result_of(
+def run_method(
     method: Method,
-    ready: ReadyScene,
+    scene: ComposedScene,
     *,
     weights: Path | None,
     model: str | None,
     device: Device,
     console: Console,
 ) -> tuple[Path, dict[str, float]]:
-    """The method's scene and the seconds that its own steps took; what is fresh is kept, what methods share as well.
+    """Run the stale steps of a method on a scene.
 
-    Raises: ValueError where the method cannot run here, with the reason.
+    Args:
+        method: The method.
+        scene: The composite and its cameras.
+        weights: Folder of LPIPS's weights.
+        model: Weights of the harmoniser: folder, file or hub id.
+        device: Where to compute.
+        console: Takes progress and messages.
+
+    Returns:
+        The resulting scene, a .ply, and the seconds of each of the method's own steps.
+
+    Raises:
+        ValueError: The method cannot run here, with the reason.
     """
     seconds: dict[str, float] = {}
-    prior = ready.composite / SCENE_FILE
+    prior = scene.composite / SCENE_FILE
     if method.prior != "off":
-        prior, seconds["relight"] = _prior_of(method.prior, ready, console)
+        prior, seconds["relight"] = _relit_scene(method.prior, scene, console)
     if method.harmonizer is None:
         return prior, seconds
-    if method.harmonizer not in HARMONIZERS:
-        expected = ", ".join(sorted(HARMONIZERS))
-        raise ValueError(f"harmonizer: expected one of {expected}, found {method.harmonizer!r}")
-    out = ready.work / "methods" / method.folder_name
+    options = harmonizer_options(method.harmonizer, weights=model)
+    result = scene.work / "methods" / method.folder_name / "result"
     if method.schedule != "once":
-        step = UpdateIteratively(ready.composite, prior, ready.cameras, out / "result", device=device)
-        chosen = {"harmonizer": method.harmonizer, "loss": method.loss, "schedule": method.schedule}
-        update = type(step)(**{**vars(step), **chosen, "weights": weights, "model": model})
-        seconds["update"] = fresh(update, console)
-        return out / "result" / SCENE_FILE, seconds
-    views = ready.work / "views" / method.prior
-    composite = ready.composite / SCENE_FILE
+        update = UpdateIteratively(
+            scene.composite,
+            prior,
+            scene.cameras,
+            result,
+            harmonizer=method.harmonizer,
+            loss=method.loss,
+            schedule=method.schedule,
+            weights=weights,
+            model=model,
+            device=device,
+        )
+        seconds["update"] = perform_if_stale(update, console)
+        return result / SCENE_FILE, seconds
+    views = scene.work / "views" / method.prior
+    composite = scene.composite / SCENE_FILE
     # a prior without a transfer has no light, and a failed transfer found none
     light = path if (path := prior.parent / LIGHT_FILE).is_file() else None
-    draw = Render(composite, ready.cameras, views, is_object=ready.is_object, prior=prior, light=light, device=device)
-    seconds["render"] = fresh(draw, console)
-    harmonized = ready.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
-    seconds["harmonize"] = fresh(Harmonize(views, harmonized, method.harmonizer, weights=model, device=device), console)
-    fit = Consolidate(prior, views, harmonized, out / "result", loss=method.loss, lpips_weights=weights, device=device)
-    seconds["consolidate"] = fresh(fit, console)
-    return out / "result" / SCENE_FILE, seconds
+    render = Render(composite, scene.cameras, views, is_object=scene.is_object, prior=prior, light=light, device=device)
+    seconds["render"] = perform_if_stale(render, console)
+    harmonized = scene.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
+    seconds["harmonize"] = perform_if_stale(Harmonize(views, harmonized, options, device=device), console)
+    consolidate = Consolidate(prior, views, harmonized, result, loss=method.loss, lpips_weights=weights, device=device)
+    seconds["consolidate"] = perform_if_stale(consolidate, console)
+    return result / SCENE_FILE, seconds
 
 
-def _prior_of(prior: Prior, ready: ReadyScene, console: Console) -> tuple[Path, float]:
-    out = ready.work / "priors" / prior
-    placement = ready.composite / PLACEMENT_FILE
+def _relit_scene(prior: Prior, scene: ComposedScene, console: Console) -> tuple[Path, float]:
+    out = scene.work / "priors" / prior
+    placement = scene.composite / PLACEMENT_FILE
     if prior == "true-light":
-        if ready.given.light is None:
-            raise ValueError(f"{ready.given.name}: expected a true light, found none")
-        truly = RelightWithTrueLight(
-            ready.target,
+        if scene.ground_truth.light is None:
+            raise ValueError(f"{scene.ground_truth.name}: expected a true light, found none")
+        with_true_light = RelightWithTrueLight(
+            scene.target,
             placement,
-            ready.cameras,
-            light=ready.given.light,
+            scene.cameras,
+            light=scene.ground_truth.light,
             out=out,
-            surroundings=ready.surroundings,
-            object_cameras=ready.source_cameras,
+            surroundings=scene.surroundings,
+            object_cameras=scene.source_cameras,
         )
-        return out / SCENE_FILE, fresh(truly, console)
+        return out / SCENE_FILE, perform_if_stale(with_true_light, console)
     kind = "gain" if prior == "gain" else "transfer"
     step = Relight(
-        ready.target,
+        scene.target,
         placement,
-        ready.cameras,
+        scene.cameras,
         out,
         light=kind,
-        surroundings=ready.surroundings,
-        object_cameras=ready.source_cameras,
+        surroundings=scene.surroundings,
+        object_cameras=scene.source_cameras,
     )
-    return out / SCENE_FILE, fresh(step, console)
+    return out / SCENE_FILE, perform_if_stale(step, console)

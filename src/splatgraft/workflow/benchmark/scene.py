@@ -1,4 +1,4 @@
-"""One benchmark scene made ready for all methods: reconstructed, segmented, composed. Holds no method and no metric."""
+"""One benchmark scene reconstructed, segmented and composed, which are the steps that all methods share."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,30 +25,31 @@ from splatgraft.runtime.console import Console
 from splatgraft.workflow.benchmark.true_light_file import TRUE_LIGHT_FILE
 
 HELD_OUT_EVERY = 8
-"""Views kept from reconstruction, harmonisation and consolidation alike, from the first."""
+"""Every 8th view, from the first, is held out of reconstruction, harmonisation and consolidation."""
 
 
 @dataclass(frozen=True)
-class GivenScene:
-    """Where the parts of one scene with ground truth lie."""
+class GroundTruthScene:
+    """The files of one scene with ground truth."""
 
     name: str
     source: Path
     """Capture of the object with masks."""
     target: Path
-    """Capture of the place without it."""
+    """Capture of the target without the object."""
     truth: Path
-    """Capture with it, with masks, from the target's cameras; depth/NAME.npy where depth is known."""
+    """Capture with the object, with masks, from the target's cameras; depth/NAME.npy where depth is known."""
     placement: Path
-    """placement.json: where the object stands."""
+    """placement.json with the object's true pose."""
     light: Path | None = None
     """light.json with the true light, where it is known."""
 
     @staticmethod
-    def of(folder: Path) -> "GivenScene":
-        """A scene that `synth benchmark` made.
+    def from_folder(folder: Path) -> "GroundTruthScene":
+        """Find the files of a scene that `synth benchmark` rendered.
 
-        Raises: ValueError where a part is missing.
+        Raises:
+            ValueError: A part is missing.
         """
         parts = {name: folder / name for name in ("source", "target", "ground_truth", PLACEMENT_FILE)}
         if missing := [str(path) for path in parts.values() if not path.exists()]:
@@ -56,43 +57,44 @@ class GivenScene:
         light = folder / TRUE_LIGHT_FILE
         known = light if light.is_file() else None
         source, target, truth, placement = parts.values()
-        return GivenScene(folder.name, source, target, truth, placement, known)
+        return GroundTruthScene(folder.name, source, target, truth, placement, known)
 
     @staticmethod
-    def of_published(scene: PublishedScene) -> "GivenScene":
-        """A scene of a published data set.
+    def from_published(scene: PublishedScene) -> "GroundTruthScene":
+        """Find the files of a scene of a published data set.
 
-        Raises: ValueError where it has no ground truth or no placement.
+        Raises:
+            ValueError: It has no ground truth or no placement.
         """
         folder = scene.target.parent
         if scene.truth is None or not (folder / PLACEMENT_FILE).is_file():
             raise ValueError(f"{folder}: expected images with the object and {PLACEMENT_FILE}, found none")
-        return GivenScene(scene.name, scene.source, scene.target, scene.truth, folder / PLACEMENT_FILE)
+        return GroundTruthScene(scene.name, scene.source, scene.target, scene.truth, folder / PLACEMENT_FILE)
 
 
 @dataclass(frozen=True)
-class ReadyScene:
-    """A scene that methods can be run on."""
+class ComposedScene:
+    """The composite of a benchmark scene, on which methods are run."""
 
-    given: GivenScene
+    ground_truth: GroundTruthScene
     work: Path
-    """Folder of everything that is made of it."""
+    """Folder of all results."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Of the steps that all methods share."""
 
     @property
     def cameras(self) -> Path:
-        """The target's cameras that methods may see."""
+        """The target's cameras without the held-out ones."""
         return self.work / "target" / "capture" / CAMERAS_FILE
 
     @property
     def source_cameras(self) -> Path:
-        """Those that saw the object."""
+        """The cameras of the object's capture."""
         return self.work / "source" / "capture" / CAMERAS_FILE
 
     @property
     def target(self) -> Path:
-        """The reconstruction of the place."""
+        """The reconstruction of the target."""
         return self.work / "target" / "scene" / SCENE_FILE
 
     @property
@@ -102,17 +104,17 @@ class ReadyScene:
 
     @property
     def composite(self) -> Path:
-        """Folder of the copy-paste result."""
+        """Folder of the copy-paste composite."""
         return self.work / "composite"
 
     @property
     def is_object(self) -> Path:
-        """Which of the composite's Gaussians are the object's."""
+        """is_object.npy: which Gaussians of the composite belong to the object."""
         return self.composite / IS_OBJECT_FILE
 
 
-def fresh(step: Step, console: Console) -> float:
-    """Do a step where its result is stale; how long it took, now or then."""
+def perform_if_stale(step: Step, console: Console) -> float:
+    """Perform a step where its result is stale; returns the seconds that the result took."""
     if why_stale(job_of(step)):
         perform(step, console)
     record = read_record(step.out)
@@ -120,15 +122,23 @@ def fresh(step: Step, console: Console) -> float:
     return record.seconds
 
 
-def ready_scene(
-    given: GivenScene, work: Path, options: ReconstructOptions, *, device: Device, console: Console
-) -> ReadyScene:
-    """Reconstruct both captures without the held-out views, cut the object out and put it where it belongs.
+def compose_scene(
+    ground_truth: GroundTruthScene, work: Path, options: ReconstructOptions, *, device: Device, console: Console
+) -> ComposedScene:
+    """Reconstruct both captures without the held-out views, segment the object and place it at its true pose.
 
-    Raises: ValueError where a part of the scene is missing or broken.
+    Args:
+        ground_truth: The files of the scene.
+        work: Folder of all results.
+        options: Of both reconstructions.
+        device: Where to segment.
+        console: Takes progress and messages.
+
+    Raises:
+        ValueError: A part of the scene is missing or damaged.
     """
     seconds: dict[str, float] = {}
-    for side, path in (("source", given.source), ("target", given.target)):
+    for side, path in (("source", ground_truth.source), ("target", ground_truth.target)):
         capture = read_capture(path)
         if side == "target":
             capture = capture.select(~held_out(len(capture), HELD_OUT_EVERY))
@@ -136,11 +146,11 @@ def ready_scene(
         folder.mkdir(parents=True, exist_ok=True)
         write_capture(folder, capture)
         step = Reconstruct(folder, work / side / "scene", options=options)
-        seconds[f"reconstruct {side}"] = fresh(step, console)
+        seconds[f"reconstruct {side}"] = perform_if_stale(step, console)
     source = work / "source" / "scene" / SCENE_FILE
-    cut = Segment(source, work / "source" / "capture", work / "object", device=device)
-    seconds["segment"] = fresh(cut, console)
-    made = ReadyScene(given, work, seconds)
-    place = Compose(made.target, work / "object" / OBJECT_FILE, made.composite, placement=given.placement)
-    seconds["compose"] = fresh(place, console)
-    return made
+    segment = Segment(source, work / "source" / "capture", work / "object", device=device)
+    seconds["segment"] = perform_if_stale(segment, console)
+    scene = ComposedScene(ground_truth, work, seconds)
+    compose = Compose(scene.target, work / "object" / OBJECT_FILE, scene.composite, placement=ground_truth.placement)
+    seconds["compose"] = perform_if_stale(compose, console)
+    return scene

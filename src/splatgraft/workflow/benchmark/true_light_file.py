@@ -1,4 +1,4 @@
-"""The true light of a benchmark scene as a light.json that `relight` takes: from a rendered panorama and its suns."""
+"""The true light of a benchmark scene as a light.json, from its rendered panorama and its suns."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,8 @@ TRUE_LIGHT_FILE = "true_light.json"
 def write_true_light(scene: Path) -> None:
     """Write true_light.json from probe.npy and suns.json of a gathered scene.
 
-    Raises: ValueError where one is missing or broken.
+    Raises:
+        ValueError: One of the two is missing or damaged.
     """
     try:
         panorama = torch.from_numpy(np.load(scene / "probe.npy", allow_pickle=False))
@@ -26,9 +27,10 @@ def write_true_light(scene: Path) -> None:
 
 
 def read_true_light(path: Path) -> Light:
-    """The true light that `write_true_light` wrote.
+    """Read true_light.json.
 
-    Raises: ValueError where there is none.
+    Raises:
+        ValueError: There is no such file.
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected the scene's true light, found none")
