@@ -36,7 +36,7 @@ def reconstruct(
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
-    """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023; density control after 3DGS-MCMC).
+    """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023; their number as in Taming 3DGS).
 
     Args:
         capture: Posed images; sparse points are the start where there are at least 100.
