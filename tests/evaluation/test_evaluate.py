@@ -63,4 +63,4 @@ def test_true_views_are_paired_by_name(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="an image of the target named b as in the truth"):
         true_views(truth, target.select(torch.tensor([True, True, False])))
     with pytest.raises(ValueError, match=r"b\.jpg: expected a mask of the object, found none"):
-        true_views(target.select(torch.tensor([False, False, True])), truth)[0]
+        true_views(target.select(torch.tensor([False, False, True])), truth)
