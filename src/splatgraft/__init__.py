@@ -13,7 +13,7 @@ Every name is loaded when it is first used: `import splatgraft` itself imports n
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from splatgraft.composition import Placed, PlaceOptions, compose, place_object
@@ -186,12 +186,14 @@ _SOURCES = {
 """Where each name of `__all__` is defined, below splatgraft; the imports above are for type checkers."""
 
 
-def __getattr__(name: str) -> Any:
-    """Load a public name when it is first used (PEP 562)."""
-    if name not in _SOURCES:
-        raise AttributeError(f"module 'splatgraft' has no attribute {name!r}")
-    module, _, own = _SOURCES[name].rpartition(".")
-    return getattr(import_module(f"splatgraft.{module}"), own)
+if not TYPE_CHECKING:  # a type checker would take every unknown name for one of these
+
+    def __getattr__(name: str) -> object:
+        """Load a public name when it is first used (PEP 562)."""
+        if name not in _SOURCES:
+            raise AttributeError(f"module 'splatgraft' has no attribute {name!r}")
+        module, _, own = _SOURCES[name].rpartition(".")
+        return getattr(import_module(f"splatgraft.{module}"), own)
 
 
 def __dir__() -> list[str]:

@@ -72,6 +72,9 @@ def true_views(truth: PosedImages, target: PosedImages) -> LazySequence[Truth]:
     Raises:
         ValueError: A view of the truth has no mask, or no image of the same name in the target.
     """
+    for index, path in enumerate(truth.mask_paths or (None,) * len(truth)):
+        if path is None:
+            raise ValueError(f"{truth.image_paths[index]}: expected a mask of the object, found none")
     index_of = {Path(name).stem: index for index, name in enumerate(target.cameras.names)}
     stems = [Path(name).stem for name in truth.cameras.names]
     if missing := [stem for stem in stems if stem not in index_of]:
@@ -79,8 +82,7 @@ def true_views(truth: PosedImages, target: PosedImages) -> LazySequence[Truth]:
 
     def read(index: int) -> Truth:
         mask = truth.mask(index)
-        if mask is None:
-            raise ValueError(f"{truth.image_paths[index]}: expected a mask of the object, found none")
+        assert mask is not None
         return Truth(image=truth.image(index), background=target.image(index_of[stems[index]]), mask=mask)
 
     return LazySequence(len(truth), read)

@@ -1,1 +1,1 @@
-"""Reading and writing the result folders that several steps share: composites, rendered views, masks."""
+"""Reading and writing of the folders and files that several steps share: composites, rendered views, masks."""

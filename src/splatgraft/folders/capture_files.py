@@ -1,4 +1,4 @@
-"""Which files a capture is made of, for telling whether it changed. Knows nothing about what is done with them."""
+"""The files that a capture consists of, from which steps detect that it changed."""
 
 from pathlib import Path
 
@@ -7,13 +7,13 @@ from splatgraft.formats.captures.colmap import is_colmap
 
 
 def has_poses(path: Path) -> bool:
-    """Whether `path` describes cameras, rather than being photos or a video."""
+    """Whether `path` has camera poses, and is not only photos or a video."""
     names = ("transforms.json", "transforms_train.json")
     return path.suffix == ".json" or any((path / name).is_file() for name in names) or is_colmap(path)
 
 
 def description_files(path: Path) -> tuple[Path, ...]:
-    """The files that hold poses and points: everything in the folder but its images and what is hidden.
+    """The files with poses and points: all in the folder except images, step.json and hidden files.
 
     Raises: ValueError where there is nothing at `path`.
     """

@@ -47,12 +47,12 @@ def composite_of(
 
     Raises: ValueError where an object's file is missing or broken, or what is erased belongs to another target.
     """
-    read = dict(known)
+    read, objects = dict(known), []
     for item in placement.objects:
         assert item.object_path is not None
         if item.object_path not in read:
             read[item.object_path] = read_gaussians(item.object_path)
-    objects = [read[item.object_path] for item in placement.objects if item.object_path is not None]
+        objects.append(read[item.object_path])
     moves = [item.target_from_object for item in placement.objects]
     return compose(target, objects, target_from_objects=moves, erased=placement.erased)
 

@@ -1,4 +1,4 @@
-"""Result, composite and target as pictures of the same views, with the truth beside them where there is one."""
+"""Pictures of the same views of result, composite and target, and of the ground truth where there is one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from splatgraft.rendering import render
 
 @dataclass(frozen=True)
 class Pictures:
-    """One view, before and after; sRGB in [0, 1]."""
+    """One view before and after the transfer; sRGB in [0, 1]."""
 
     name: str
     """The view's name."""
@@ -34,14 +34,14 @@ class Pictures:
     mask: Float[Tensor, "h w"]
     """The object's coverage."""
     truth: Float[Tensor, "h w 3"] | None = None
-    """The object really there."""
+    """The image with the object really there; None where there is no ground truth."""
     held_out: bool = False
-    """Whether no step has seen a harmonised image of this view."""
+    """Whether the consolidation used no image of this view."""
 
 
 @dataclass(frozen=True)
 class EvaluatedScenes:
-    """The scenes that are compared, on one device."""
+    """The compared scenes, on one device."""
 
     result: Gaussians
     """After consolidation."""
@@ -54,7 +54,10 @@ class EvaluatedScenes:
 
     @staticmethod
     def read(result: Path, composite: Path, cameras: Path, *, device: torch.device) -> "EvaluatedScenes":
-        """Raises: ValueError where a file is missing or broken, or they do not belong together."""
+        """Read all scenes.
+
+        Raises: ValueError where a file is missing or broken, or they do not belong together.
+        """
         scene = read_gaussians(composite / SCENE_FILE)
         is_object = read_selection(composite / IS_OBJECT_FILE, scene.count, composite / SCENE_FILE)
         return EvaluatedScenes(
@@ -72,12 +75,12 @@ class EvaluatedScenes:
 
     @property
     def object_center(self) -> Float[Tensor, "3"]:
-        """The median of the object's Gaussians; of all where there is no object."""
+        """The median of the centres of the object's Gaussians; of all Gaussians where there is no object."""
         chosen = self.composite.select(self.is_object) if bool(self.is_object.any()) else self.composite
         return chosen.means.median(0).values
 
     def picture(self, scene: Gaussians, camera: Cameras) -> Float[Tensor, "h w 3"]:
-        """One view of one scene, on the CPU."""
+        """One view of one scene, clamped to [0, 1], on the CPU."""
         color = render(scene, camera).color
         return color[0].cpu().clamp(0, 1)
 
@@ -98,12 +101,15 @@ class EvaluatedScenes:
 
 
 class TrueViews(Sequence[ComparedView]):
-    """Every view of the truth beside renders of the same camera, made when asked for."""
+    """Every view of the truth with renders from the same camera, made when asked for."""
 
     def __init__(
         self, scenes: EvaluatedScenes, truth: Path, *, target_capture: Path | None, harmonized: Path | None
     ) -> None:
-        """Raises: ValueError where the truth has no masks or the target no image of the same name."""
+        """Match the views of the truth with the target's.
+
+        Raises: ValueError where the truth has no masks or the target no image of the same name.
+        """
         self._scenes, self._truth = scenes, read_images(truth)
         if target_capture is None:
             raise ValueError("--ground-truth: expected --target-capture, the images without the object, found none")
@@ -111,12 +117,12 @@ class TrueViews(Sequence[ComparedView]):
             raise ValueError(f"{truth}: expected a mask for every view of the ground truth, found some missing")
         self._target = read_images(target_capture)
         self._backgrounds = _matched(self._truth, self._target, target_capture)
-        seen = read_cameras(harmonized / CAMERAS_FILE).names if harmonized is not None else self._target.cameras.names
-        self._seen = {Path(name).stem for name in seen}
+        used = read_cameras(harmonized / CAMERAS_FILE).names if harmonized is not None else self._target.cameras.names
+        self._harmonized_stems = {Path(name).stem for name in used}
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the views."""
+        """Names of the views."""
         return self._truth.cameras.names
 
     def __len__(self) -> int:
@@ -142,7 +148,7 @@ class TrueViews(Sequence[ComparedView]):
         """One view with its truth."""
         camera = self._truth.cameras[index].to(self._scenes.result.device)
         shown = self._scenes.pictures_from(camera)
-        held_out = Path(shown.name).stem not in self._seen
+        held_out = Path(shown.name).stem not in self._harmonized_stems
         return Pictures(**{**vars(shown), "truth": self._truth.image(index), "held_out": held_out})
 
 
@@ -157,7 +163,7 @@ def truth_files(truth: Path | None, target_capture: Path | None) -> tuple[Path, 
 
 
 def _matched(truth: PosedImages, target: PosedImages, folder: Path) -> list[int]:
-    """For each view of the truth the target's view of the same name."""
+    """For each view of the truth the index of the target's view of the same name."""
     places = {Path(name).stem: index for index, name in enumerate(target.cameras.names)}
     stems = [Path(name).stem for name in truth.cameras.names]
     if missing := [stem for stem in stems if stem not in places]:

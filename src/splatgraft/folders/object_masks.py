@@ -1,4 +1,4 @@
-"""Where `segment` gets its 2D masks from: files, GrabCut in a box, or a network. Knows nothing about lifting them."""
+"""The sources of 2D masks for `segment`: files, GrabCut in a box, or the network BiRefNet."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -21,9 +21,9 @@ MaskSource = Literal["files", "grabcut", "birefnet", "box"]
 
 
 def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> PosedImages:
-    """The views of `capture` that have a mask: in `folder` by name, or as the capture itself says.
+    """The views of `capture` that have a mask: in `folder` by name, or the capture's own.
 
-    Raises: ValueError where none has.
+    Raises: ValueError where no view has one.
     """
     paths = capture.mask_paths
     if folder is not None:
@@ -42,7 +42,7 @@ def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> P
 
 
 def read_masks(capture: PosedImages) -> LazySequence[Tensor]:
-    """The masks of a capture whose views all have one, read when asked for."""
+    """The masks of a capture in which every view has one, read when asked for."""
 
     def read(index: int) -> Tensor:
         mask = capture.mask(index)
@@ -55,9 +55,9 @@ def read_masks(capture: PosedImages) -> LazySequence[Tensor]:
 def cut_masks(
     capture: PosedImages, scene: Gaussians, *, box: Box | None, folder: Path, progress: Progress
 ) -> PosedImages:
-    """The capture with masks that GrabCut finds, written to `folder`: first in a box, then as the views agree.
+    """The capture with masks from GrabCut in a box, refined until the views agree, and written to `folder`.
 
-    Raises: ValueError where the box is not seen, or none can be guessed.
+    Raises: ValueError where no view shows the box, or no box can be guessed.
     """
     images = LazySequence(len(capture), capture.image)
     box = default_box(capture) if box is None else box
@@ -66,7 +66,7 @@ def cut_masks(
 
 
 def network_masks(capture: PosedImages, *, weights: Path | None, folder: Path, progress: Progress) -> PosedImages:
-    """The capture with masks of what BiRefNet takes for the foreground, written to `folder`.
+    """The capture with masks of the foreground from BiRefNet, written to `folder`.
 
     Raises: ValueError where a package or the weights are missing.
     """

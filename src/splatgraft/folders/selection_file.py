@@ -1,4 +1,4 @@
-"""Files with one bool per Gaussian of a scene. Knows nothing about what was selected."""
+"""Files with one bool per Gaussian of a scene."""
 
 from pathlib import Path
 
@@ -22,6 +22,6 @@ def read_selection(path: Path, count: int, scene: Path) -> Bool[Tensor, "n"]:
 
 
 def write_selection(path: Path, flags: Bool[Tensor, "n"]) -> None:
-    """Write a .npy of bools."""
+    """Write the flags as a .npy."""
     with atomic_write(path) as stream:
         np.save(stream, flags.cpu().numpy())

@@ -1,9 +1,7 @@
 """A folder of rendered views: one file per picture and camera, as `render` writes and later steps read them.
 
-    transforms.json  composite/NAME.png  background/  prior/  mask/  normal/NAME.png  depth/NAME.npy
-    prior.json       how far the light behind prior/ may be believed
-
-Knows nothing about how pictures are made or used.
+transforms.json  composite/NAME.png  background/  prior/  mask/  normal/NAME.png  depth/NAME.npy
+prior.json       confidence of the light behind prior/, 0 to 1, under the key "trust"
 """
 
 import json
@@ -27,9 +25,9 @@ PICTURES = ("composite", "background", "prior", "mask", "normal", "depth")
 
 
 def file_stems(cameras: Cameras) -> tuple[str, ...]:
-    """A file name without suffix for each camera: its own name, flattened.
+    """A file name without suffix for each camera, made of the camera's name and its last folder.
 
-    Raises: ValueError where two cameras would share one.
+    Raises: ValueError where two cameras would get the same.
     """
     stems = tuple("_".join(PurePosixPath(name).with_suffix("").parts[-2:]) for name in cameras.names)
     stems = tuple(stem.removeprefix("images_") for stem in stems)
@@ -41,10 +39,10 @@ def file_stems(cameras: Cameras) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ViewFolder:
-    """The pictures of one composite from all its cameras, read one view at a time."""
+    """The pictures of a composite from all its cameras, read one view at a time."""
 
     folder: Path
-    """Where they are."""
+    """Folder of the pictures."""
     cameras: Cameras
     """One per view."""
     stems: tuple[str, ...]
@@ -52,7 +50,7 @@ class ViewFolder:
 
     @staticmethod
     def create(folder: Path, cameras: Cameras, *, prior_confidence: float = 0.0) -> "ViewFolder":
-        """An empty one with its cameras, sub-folders, and the trust in [0, 1] in the light behind its priors."""
+        """Make an empty folder of views for `cameras`; `prior_confidence`, in [0, 1], is that of the priors' light."""
         for name in PICTURES:
             (folder / name).mkdir(parents=True, exist_ok=True)
         write_cameras(folder / CAMERAS_FILE, cameras)
@@ -61,9 +59,9 @@ class ViewFolder:
 
     @staticmethod
     def open(folder: Path) -> "ViewFolder":
-        """One that `create` and `write` made.
+        """Open a folder that `create` and `write` made.
 
-        Raises: ValueError where there is none.
+        Raises: ValueError where `folder` is none.
         """
         cameras = read_cameras(folder / CAMERAS_FILE)
         return ViewFolder(folder, cameras, file_stems(cameras))
@@ -76,7 +74,7 @@ class ViewFolder:
         return self.folder / picture / f"{self.stems[index]}{'.npy' if picture == 'depth' else '.png'}"
 
     def files(self) -> tuple[Path, ...]:
-        """All of them, for telling whether one changed."""
+        """All files of the folder."""
         pictures = [self.path(name, i) for name in PICTURES for i in range(len(self))]
         prior = self.folder / _PRIOR_FILE
         return (self.folder / CAMERAS_FILE, *pictures, *((prior,) if prior.is_file() else ()))
@@ -115,7 +113,7 @@ class ViewFolder:
         )
 
     def _prior_confidence(self) -> float:
-        """In the light behind the priors; 0 in folders of versions that did not say."""
+        """Confidence of the priors' light; 0 in folders of versions that did not write it."""
         path = self.folder / _PRIOR_FILE
         if not path.is_file():
             return 0.0
@@ -126,7 +124,7 @@ class ViewFolder:
 
 
 def _normal_from_rgb(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Unit normals of 8-bit pictures; the grey of no surface becomes zero."""
+    """Unit normals of 8-bit pictures; grey, which means no surface, becomes zero."""
     normal = image * 2 - 1
     length = normal.norm(dim=-1, keepdim=True)
     # grey is off zero by half a level per channel, a normal by less than that from length 1

@@ -1,0 +1,65 @@
+"""The step `render`: how reliable the prior is comes from the light file that it is handed, and from nowhere else."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_project import ball, photograph, plane
+
+from splatgraft.commands.steps.render import Render
+from splatgraft.core.gaussians import concatenate
+from splatgraft.folders.selection_file import write_selection
+from splatgraft.formats import write_gaussians
+from splatgraft.project.step import job_of, perform
+from splatgraft.relighting import Light, LightSource, light_to_json
+from splatgraft.relighting.light.confidence import light_confidence
+from splatgraft.runtime.console import Console
+
+LIGHT = Light((LightSource((0.0, 0.0, 1.0), (2.0, 2.0, 2.0), confidence=0.5),), torch.full((9, 3), 0.1), coverage=0.8)
+
+
+@pytest.fixture
+def step(tmp_path: Path) -> Render:
+    """A composite and, in another folder, a prior."""
+    scene = concatenate([plane((0.5, 0.5, 0.5)), ball()])
+    photograph(tmp_path / "target", plane((0.5, 0.5, 0.5)), None)
+    (tmp_path / "relit").mkdir()
+    for name in ("scene.ply", "relit/scene.ply"):
+        write_gaussians(tmp_path / name, scene)
+    write_selection(tmp_path / "is_object.npy", torch.arange(scene.count) >= scene.count - ball().count)
+    return Render(
+        tmp_path / "scene.ply",
+        tmp_path / "target",
+        tmp_path / "views",
+        is_object=tmp_path / "is_object.npy",
+        prior=tmp_path / "relit" / "scene.ply",
+        light=tmp_path / "relit" / "light.json",
+        device="cpu",
+    )
+
+
+def confidence(step: Render) -> float:
+    return json.loads((perform(step, Console()) / "prior.json").read_text())["trust"]
+
+
+def test_the_confidence_is_that_of_the_light_which_is_handed_over(step: Render) -> None:
+    assert step.light is not None
+    step.light.write_text(light_to_json(LIGHT))
+    # prior.json has four decimals
+    assert confidence(step) == round(light_confidence(LIGHT), 4) > 0
+    assert job_of(step).inputs["light"] == (step.light,)
+    # a light.json that only lies beside the prior is not looked for
+    assert confidence(Render(**{**vars(step), "light": None})) == 0
+
+
+def test_a_transfer_that_found_no_light_has_no_confidence(step: Render) -> None:
+    assert step.light is not None
+    step.light.with_name("light.txt").write_text("No object is placed: nothing to light.\n")
+    assert confidence(step) == 0
+    assert "light" not in job_of(step).inputs
+
+
+def test_a_light_file_that_relight_did_not_leave_out_must_be_there(step: Render) -> None:
+    with pytest.raises(ValueError, match=r"light.json: expected the light.json that relight wrote, found no such file"):
+        perform(step, Console())

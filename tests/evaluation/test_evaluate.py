@@ -1,0 +1,66 @@
+"""`evaluate`: means over views, as the report has them; `true_views` pairs images by name."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from test_measure import example_truth, view
+
+from splatgraft.core.cameras import pinhole
+from splatgraft.core.images import write_image
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.evaluation import evaluate, measure, true_views
+
+TRUTHS = [example_truth(shadow, seed) for seed, shadow in enumerate((0.5, 0.97, 0.6))]
+
+
+def noisy(seed: int) -> torch.Tensor:
+    noise = 0.02 * torch.randn(80, 120, 3, generator=torch.Generator().manual_seed(seed))
+    return (TRUTHS[seed].image + noise).clamp(0, 1)
+
+
+def test_the_means_are_the_report_s() -> None:
+    images = [noisy(i) for i in range(3)]
+    found = evaluate(images, TRUTHS, backgrounds=[truth.background for truth in TRUTHS])
+    views = [
+        view(truth, result=image, name=str(i)) for i, (truth, image) in enumerate(zip(TRUTHS, images, strict=True))
+    ]
+    assert found == measure(views)["result"]
+    # noise of deviation 0.02 has 34 dB
+    assert found["psnr"] == pytest.approx(34.0, abs=0.2)
+
+
+def test_a_region_that_no_view_has_is_none() -> None:
+    truth = replace(TRUTHS[0], image=TRUTHS[0].background, mask=torch.zeros(80, 120))
+    found = evaluate([noisy(0)], [truth], backgrounds=[truth.background])
+    assert found["object_psnr"] is None
+    assert found["shadow_psnr"] is None
+    assert found["rest_psnr"] is not None
+
+
+def test_other_numbers_of_truths_are_refused() -> None:
+    with pytest.raises(ValueError, match="found 1 images, 3 truths and 1 backgrounds"):
+        evaluate([noisy(0)], TRUTHS, backgrounds=[noisy(0)])
+
+
+def capture(folder: Path, names: tuple[str, ...], levels: tuple[float, ...], masks: bool) -> PosedImages:
+    folder.mkdir()
+    for name, level in zip(names, levels, strict=True):
+        write_image(folder / name, torch.full((4, 6, 3), level))
+    cameras = replace(pinhole(torch.eye(4).repeat(len(names), 1, 1), 5.0, width=6, height=4), names=names)
+    paths, none = tuple(folder / name for name in names), torch.zeros(0, 3)
+    return PosedImages(paths, cameras, none, none, mask_paths=paths if masks else ())
+
+
+def test_true_views_are_paired_by_name(tmp_path: Path) -> None:
+    truth = capture(tmp_path / "truth", ("b.png", "a.png"), (0.2, 0.4), masks=True)
+    target = capture(tmp_path / "target", ("a.jpg", "c.png", "b.jpg"), (0.6, 0.0, 0.8), masks=False)
+    views = true_views(truth, target)
+    # 8 bits, and JPEG of one flat colour: half a level each, and some rounding
+    assert [round(float(one.image.mean()), 2) for one in views] == [0.2, 0.4]
+    assert [round(float(one.background.mean()), 2) for one in views] == [0.8, 0.6]
+    with pytest.raises(ValueError, match="an image of the target named b as in the truth"):
+        true_views(truth, target.select(torch.tensor([True, True, False])))
+    with pytest.raises(ValueError, match=r"b\.jpg: expected a mask of the object, found none"):
+        true_views(target.select(torch.tensor([False, False, True])), truth)

@@ -1,0 +1,91 @@
+"""Views of a composite: what `render_views` renders of it, and `harmonize` on all of them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.spherical_harmonics import dc_from_rgb
+from splatgraft.harmonization import harmonize, make_harmonizer, render_views
+from splatgraft.harmonization.harmonize import _batches
+from splatgraft.rendering import render
+
+
+def spheres(count: int, seed: int, rgb: tuple[float, float, float]) -> Gaussians:
+    means = 0.4 * torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
+    return Gaussians(
+        means=means,
+        log_scales=torch.full((count, 3), -2.5),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        opacity_logits=torch.full((count,), 2.0),
+        sh=dc_from_rgb(torch.tensor(rgb)).repeat(count, 1)[:, None],
+    )
+
+
+def cameras() -> Cameras:
+    eyes = torch.tensor([[2.0, 0, 0.5], [0, 2.0, 0.5], [-2.0, 0, 0.5]])
+    return pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 0, 1])), 40.0, width=40, height=32)
+
+
+def scene() -> tuple[Gaussians, torch.Tensor]:
+    """A composite of 60 Gaussians, of which the last 20 are the object's."""
+    whole = concatenate([spheres(40, 0, (0.2, 0.5, 0.7)), spheres(20, 1, (0.9, 0.3, 0.1))])
+    return whole, torch.arange(60) >= 40
+
+
+def test_a_view_shows_composite_background_object_and_prior() -> None:
+    composite, is_object = scene()
+    prior = replace(composite, sh=composite.sh - 0.1)
+    views = render_views(composite, is_object, cameras(), prior=prior, prior_confidence=0.4)
+    assert len(views) == 3
+    for view, camera in zip(views, cameras(), strict=True):
+        drawn = render(composite, camera, outputs=frozenset({"color", "depth", "normal"}))
+        assert torch.equal(view.composite, drawn.color[0].clamp(0, 1))
+        assert torch.equal(view.depth, drawn.depth[0])
+        assert torch.equal(view.normal, drawn.normal[0])
+        assert torch.equal(view.background, render(composite.select(~is_object), camera).color[0].clamp(0, 1))
+        assert torch.equal(view.prior, render(prior, camera).color[0].clamp(0, 1))
+        covered = render(composite, camera, outputs=frozenset(), features=is_object[:, None].float()).features
+        assert torch.equal(view.mask, covered[0, ..., 0].clamp(0, 1))
+        assert view.prior_confidence == 0.4
+
+
+def test_without_a_prior_it_is_the_composite() -> None:
+    for view in render_views(*scene(), cameras()):
+        assert torch.equal(view.prior, view.composite)
+        assert view.prior_confidence == 0
+
+
+def test_flags_of_another_scene_are_refused() -> None:
+    composite, is_object = scene()
+    with pytest.raises(ValueError, match="expected one flag for each of 60 Gaussians, found 59"):
+        render_views(composite, is_object[1:], cameras())
+
+
+@pytest.mark.parametrize(("name", "has_confidence"), [("none", False), ("reinhard", False), ("compact", True)])
+def test_all_views_are_harmonised_as_each_alone(name: str, has_confidence: bool) -> None:
+    views, harmonizer = render_views(*scene(), cameras()), make_harmonizer(name)
+    calls: list[tuple[int, int]] = []
+    found = harmonize(views, name, progress=lambda done, total, text: calls.append((done, total)))
+    expected = [harmonizer.harmonize(view) for view in views]
+    assert all(torch.equal(image, one.image) for image, one in zip(found.images, expected, strict=True))
+    assert (found.confidence is not None) == has_confidence
+    for weight, one in zip(found.confidence or (), expected, strict=has_confidence):
+        assert one.confidence is not None
+        assert torch.equal(weight, one.confidence)
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert len(harmonize(views, harmonizer)) == 3
+
+
+def test_batches_hold_consecutive_views_of_one_size() -> None:
+    small, large = (list(render_views(*scene(), cameras().resized(factor))) for factor in (0.5, 1.0))
+    batches = list(_batches([*small, large[0], *small], 2))
+    assert [len(batch) for batch in batches] == [2, 1, 1, 2, 1]
+    assert [view.composite.shape[1] for batch in batches for view in batch] == [20, 20, 20, 40, 20, 20, 20]
+
+
+def test_an_unknown_method_is_refused_with_those_there_are() -> None:
+    with pytest.raises(ValueError, match=r"expected one of .*compact.*found 'magic'"):
+        harmonize(render_views(*scene(), cameras()), "magic")
