@@ -1,7 +1,9 @@
-"""Puts this folder on the path, so that every test can import the tiny models; marks tests that use a browser.
+"""Puts this folder on the path, so that every test can import the tiny models; marks browser tests and slow tests.
 
 No test may fail because the machine is slow or busy: time limits (pyproject.toml) are there against hangs alone.
 """
+
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -10,9 +12,33 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
+SLOW = (
+    "capture/test_pose_photos.py",
+    "commands",
+    "consolidation/test_consolidate.py",
+    "editor/test_editor_session.py",
+    "editor/test_scenes_without_photos.py",
+    "editor/test_server_and_windows.py",
+    "harmonization/test_flux_views.py",
+    "reconstruction/test_training.py",
+    "relighting/test_edges.py",
+    "relighting/test_threads.py",
+    "relighting/test_transfer.py",
+    "synthesis",
+    "training",
+)
+"""Folders and files of tests that train, run whole steps or start servers."""
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests that use a browser."""
+    """Mark tests that use a browser, and slow tests."""
+    here = Path(__file__).parent
+    missing = [name for name in SLOW if not (here / name).exists()]
+    if missing:
+        raise pytest.UsageError(f"{__file__}: expected the slow tests {', '.join(missing)}, found no such file")
+    slow = tuple(here / name for name in SLOW)
     for item in items:
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.browser)
+        if any(item.path.is_relative_to(path) for path in slow):
+            item.add_marker(pytest.mark.slow)
