@@ -65,7 +65,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
         return tyro.extras.get_parser(
             module.COMMAND,
             prog=f"splatgraft {name}",
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff, tyro.conf.CascadeSubcommandArgs),
         )
 
 
@@ -73,9 +73,12 @@ def _anchor(name: str) -> str:
     return "command-" + name.replace(" ", "-")
 
 
-def _parser_section(parser: argparse.ArgumentParser, purpose: str) -> Iterator[str]:
+def _parser_section(
+    parser: argparse.ArgumentParser, purpose: str, known: frozenset[str] = frozenset()
+) -> Iterator[str]:
+    """Description and options of a command, then of its sub-commands, without the options that are `known`."""
     yield (parser.description or purpose[:1].upper() + purpose[1:] + ".").strip() + "\n"
-    actions = [action for action in parser._actions if action.dest != "help"]
+    actions = [action for action in parser._actions if action.dest != "help" and action.dest not in known]
     nested = [action for action in actions if isinstance(action.choices, dict)]
     plain = [action for action in actions if action not in nested]
     if plain:
@@ -87,7 +90,7 @@ def _parser_section(parser: argparse.ArgumentParser, purpose: str) -> Iterator[s
     for action in nested:
         for name, inner in (action.choices or {}).items():
             yield f"\n### {inner.prog.strip() or name}\n"
-            yield from _parser_section(inner, name)
+            yield from _parser_section(inner, name, known | {action.dest for action in plain})
 
 
 def _option_row(action: argparse.Action) -> str:
