@@ -57,7 +57,7 @@ def _commands_page() -> Iterator[str]:
         yield from _parser_section(_parser(name), purpose)
 
 
-def _parser(name: str) -> argparse.ArgumentParser:
+def _parser(name: str) -> Any:
     module = importlib.import_module(module_of(name))
     with warnings.catch_warnings():
         # tyro has no other public way to its options; constraints.txt pins its version
