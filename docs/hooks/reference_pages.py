@@ -57,7 +57,7 @@ def _commands_page() -> Iterator[str]:
         yield from _parser_section(_parser(name), purpose)
 
 
-def _parser(name: str) -> argparse.ArgumentParser:
+def _parser(name: str) -> Any:
     module = importlib.import_module(module_of(name))
     with warnings.catch_warnings():
         # tyro has no other public way to its options; constraints.txt pins its version
@@ -65,7 +65,7 @@ def _parser(name: str) -> argparse.ArgumentParser:
         return tyro.extras.get_parser(
             module.COMMAND,
             prog=f"splatgraft {name}",
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff, tyro.conf.CascadeSubcommandArgs),
         )
 
 
@@ -74,20 +74,27 @@ def _anchor(name: str) -> str:
 
 
 def _parser_section(parser: argparse.ArgumentParser, purpose: str) -> Iterator[str]:
+    """Description and options of a command, then of its sub-commands; options that all of them take come first."""
     yield (parser.description or purpose[:1].upper() + purpose[1:] + ".").strip() + "\n"
     actions = [action for action in parser._actions if action.dest != "help"]
-    nested = [action for action in actions if isinstance(action.choices, dict)]
-    plain = [action for action in actions if action not in nested]
-    if plain:
+    inner = {
+        name: sub for action in actions if isinstance(action.choices, dict) for name, sub in action.choices.items()
+    }
+    shared = set.intersection(*({action.dest for action in sub._actions} for sub in inner.values())) if inner else set()
+    first = next(iter(inner.values()))._actions if inner else []
+    plain = [action for action in actions if not isinstance(action.choices, dict)]
+    yield from _option_table([*plain, *(action for action in first if action.dest in shared - {"help"})])
+    for name, sub in inner.items():
+        yield f"\n### {sub.prog.strip() or name}\n\n{(sub.description or '').strip()}\n"
+        yield from _option_table([action for action in sub._actions if action.dest not in shared])
+
+
+def _option_table(actions: Sequence[argparse.Action]) -> Iterator[str]:
+    if actions:
         yield _STACKED
         yield "| option | value | default | meaning |\n| --- | --- | --- | --- |"
-        for action in plain:
-            yield _option_row(action)
+        yield from map(_option_row, actions)
         yield "\n</div>\n"
-    for action in nested:
-        for name, inner in (action.choices or {}).items():
-            yield f"\n### {inner.prog.strip() or name}\n"
-            yield from _parser_section(inner, name)
 
 
 def _option_row(action: argparse.Action) -> str:
