@@ -3,7 +3,7 @@
     python data/render_table.py build/table --blender-python .venv-blender/bin/python
 
 A room of the generator (kitchen, seed 71000) whose window gets a sun that shines onto the table; 28 cameras around the
-table at three heights, 576x400, 20 samples and the denoiser; 20 CPU-minutes. Writes a capture of JPEG files.
+table at three heights, 576x400, 20 samples and the denoiser; about 22 CPU-minutes. Writes a capture of JPEG files.
 """
 
 import argparse
@@ -16,8 +16,8 @@ from PIL import Image
 
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats import write_capture
-from splatgraft.synthesis import views
 from splatgraft.synthesis.benchmark import rendered_cameras, sparse_points
+from splatgraft.synthesis.cameras import capture_cameras
 from splatgraft.synthesis.jobs import Job, RenderSize, Take, render_job
 from splatgraft.synthesis.pairs import make_scene
 from splatgraft.synthesis.scene import Lamp, Scene
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--blender-python", type=Path, required=True)
     arguments = parser.parse_args()
     scene = kitchen()
-    cameras = views.capture(scene, scene.places[0], OBJECT_HEIGHT, VIEWS, SEED)
+    cameras = capture_cameras(scene, scene.places[0], OBJECT_HEIGHT, VIEWS, SEED)
     takes = (Take("target", scene=True, passes=("color", "depth")),)
     job = Job(scene=scene, objects={}, cameras=cameras, takes=takes, size=RenderSize(576, 400, 20))
     rendered = arguments.out / "render"

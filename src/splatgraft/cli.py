@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 _TABLE = (
     # command, module in splatgraft.commands, summary
+    ("demo", "demo", "run a whole transfer on captures that come with the package"),
     ("init", "init", "write a commented project.toml for two captures"),
     ("edit", "edit", "place the object and see the light, in the browser"),
     ("run", "run", "do what is stale in a project, resuming what was killed"),

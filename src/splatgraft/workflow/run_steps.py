@@ -9,6 +9,8 @@ from splatgraft.project.replacement import clear_leftovers
 from splatgraft.project.step import job_of, perform
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.flow import read_flow
+from splatgraft.workflow.staleness import reasons
+from splatgraft.workflow.time_estimate import describe_estimate, estimate_step_times
 
 
 def run_steps(
@@ -40,6 +42,10 @@ def run_steps(
     wanted = flow.up_to(to)
     forced = {step for name in force for step in flow.named(name)}
     with locked(flow.layout.root / "project"):
+        why = reasons(flow)
+        planned = estimate_step_times(flow, [name for name in wanted if name in forced or why[name] is not None])
+        if planned:
+            console.say(describe_estimate(planned))
         for name, step in wanted.items():
             reason = "asked for" if name in forced else why_stale(job_of(step))
             console.say(f"{name:<20} {reason or 'up to date'}")

@@ -1,6 +1,6 @@
 """Time estimate of the steps of a run, from their earlier runs, or else from typical times of such steps."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from splatgraft.editor.jobs.jobs import PlannedStep
 from splatgraft.project.record import read_record
@@ -42,6 +42,15 @@ def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, 
         else PlannedStep(name, factor * typical[name], False)
         for name in stale
     )
+
+
+def describe_estimate(planned: Sequence[PlannedStep]) -> str:
+    """One line on how many steps will run and how long they take."""
+    seconds = sum(step.seconds for step in planned)
+    duration = f"{max(1, round(seconds / 5)) * 5:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} minutes"
+    measured = all(step.is_measured for step in planned)
+    basis = "as before" if measured else "a guess from the demo on two cores"
+    return f"{len(planned)} step{'s' if len(planned) > 1 else ''} to run: about {duration} ({basis})"
 
 
 def _kind(step: Step) -> str:
