@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.directions import tangents
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def turntable_cameras(
         Cameras with the size of the first captured one and the median focal length times `options.zoom`.
     """
     up = torch.nn.functional.normalize(up.double(), dim=0)
-    across, along = _horizontal_axes(up)
+    across, along = tangents(up)
     offset = cameras.centers.double() - center.double()
     x, y, height = offset @ across, offset @ along, offset @ up
     distance, azimuth = torch.hypot(x, y), torch.atan2(y, x)
@@ -74,9 +75,3 @@ def _loop_of_angles(azimuth: Float[Tensor, "v"], options: TurntableOptions) -> F
     arc = 2 * math.pi - float(gaps[widest])
     # a cosine, so that the motion slows down at both ends
     return start + arc * (1 - (2 * math.pi * phase).cos()) / 2
-
-
-def _horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    other = torch.eye(3, dtype=up.dtype)[int(up.abs().argmin())]
-    across = torch.nn.functional.normalize(torch.linalg.cross(up, other), dim=0)
-    return across, torch.linalg.cross(up, across)

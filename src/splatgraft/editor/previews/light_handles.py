@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.core.directions import tangents
 from splatgraft.relighting import Light, LightSource
 
 _RING_SEGMENTS = 48
@@ -21,9 +22,7 @@ def arrow_points(source: LightSource, centre: Float[Tensor, "3"], length: float)
 def uncertainty_ring_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "s 2 3"]:
     """Line segments of a circle around the arrow's tail; its angular radius is the uncertainty of the direction."""
     direction = torch.tensor(source.direction)
-    axis = torch.eye(3)[int(direction.abs().argmin())]
-    across = torch.nn.functional.normalize(torch.linalg.cross(direction, axis), dim=0)
-    along = torch.linalg.cross(direction, across)
+    across, along = tangents(direction)
     radius = length * math.tan(math.radians(min(60.0, max(0.5, source.uncertainty_deg))))
     angle = torch.linspace(0, 2 * math.pi, _RING_SEGMENTS + 1)
     points = centre + length * direction + radius * (angle.cos()[:, None] * across + angle.sin()[:, None] * along)
