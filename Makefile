@@ -18,7 +18,7 @@ install: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "make: expected Python 3.11 or newer, found " + sys.version.split()[0] + "; name one with PYTHON=...")'
-	@echo "installing splatgraft into .venv: about 1.3 GB on disk with PyTorch for the CPU, usually 1 to 2 minutes"
+	@echo "installing splatgraft into .venv: a download of about 390 MB, 1.6 GB on disk with PyTorch for the CPU, usually 1 to 2 minutes"
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
 	@touch $@
@@ -27,7 +27,7 @@ $(STAMP): pyproject.toml constraints.txt
 dev: $(DEV_STAMP)
 
 $(DEV_STAMP): $(STAMP)
-	@echo "installing what the checks need into .venv: about 1.4 GB more on disk, usually 2 minutes"
+	@echo "installing what the checks need into .venv: a download of about 330 MB, 1.1 GB more on disk, usually 1 to 2 minutes"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
 
