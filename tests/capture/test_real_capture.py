@@ -14,7 +14,7 @@ from splatgraft.capture import PoseOptions, pose_photos
 from splatgraft.core.images import list_images
 from splatgraft.formats import read_capture
 
-BANANAS = Path(__file__).parents[2] / "data" / "bananas"
+BANANAS = Path(__file__).parents[2] / "src" / "splatgraft" / "demo_captures" / "bananas"
 
 
 @pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is an optional extra")

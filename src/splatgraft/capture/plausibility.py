@@ -58,7 +58,7 @@ class Plausible:
     min_registered: float = 0.9
     """Share of photos with a pose: one in ten may be blurred or apart from the rest."""
     min_explained: float = 0.5
-    """Share of verified matches: more than half. Models of data/room, data/vase, data/bananas: 0.59 to 0.87."""
+    """Share of verified matches: more than half. Models of the shipped room, vase and bananas: 0.59 to 0.87."""
     max_reprojection_px: float = 1.0
     """Pixels: three times the third of a pixel to which SIFT places a feature (Lowe 2004)."""
     min_observations: float = 100
