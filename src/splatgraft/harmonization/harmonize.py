@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
+from splatgraft.harmonization.methods import make_harmonizer
 from splatgraft.runtime.progress import Progress, silent
 
 
@@ -40,9 +41,6 @@ def harmonize(
     Raises:
         ValueError: There is no method of that name, or its weights or packages are missing.
     """
-    # the package imports this module
-    from splatgraft.harmonization import make_harmonizer
-
     harmonizer = make_harmonizer(method) if isinstance(method, str) else method
     made: list[Harmonized] = []
     for batch in _batches(views, harmonizer.views_at_once if isinstance(harmonizer, BatchHarmonizer) else 1):
