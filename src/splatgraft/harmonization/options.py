@@ -36,7 +36,7 @@ class CompactOptions:
 
 @dataclass(frozen=True)
 class FluxOptions:
-    """The paper's image model: FLUX.1-schnell fine-tuned on pairs (Sec. 4)."""
+    """The paper's image model: FLUX.1-schnell fine-tuned on pairs (Sec. 5)."""
 
     name: ClassVar[str] = "flux"
 
@@ -102,7 +102,7 @@ class MVCoLightOptions:
 
 @dataclass(frozen=True)
 class ImageEditingOptions:
-    """An image-editing service over HTTP with the paper's prompt (Sec. 6); your pictures leave this machine."""
+    """An image-editing service over HTTP with the paper's prompt (Sec. 7); your pictures leave this machine."""
 
     name: ClassVar[str] = "image-editing"
 

@@ -2,7 +2,7 @@
 
 A view's mask m is modelled as the blend W f of the values f. The closed form is the weighted average W^T m / W^T 1
 (FlashSplat, ECCV 2024, for one bit; Splat Feature Solver, ICLR 2026, for any feature). The paper's method
-(section 3.1) trains a logit per Gaussian with binary cross-entropy on its blend.
+(Sec. 4) trains a logit per Gaussian with binary cross-entropy on its blend.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ def lift_masks(
     """Lift masks of images to one number per Gaussian, its share in the masked object.
 
     `closed_form` computes the share of the Gaussian's blending weight that falls inside the masks; only Gaussians at
-    the outline of the object have less than 1. `bce` trains a logit per Gaussian (section 3.1 of the paper) and gives
+    the outline of the object have less than 1. `bce` trains a logit per Gaussian (paper, Sec. 4) and gives
     its sigmoid. Both are compared with the same threshold, the paper's 0.75.
 
     Args:

@@ -22,7 +22,7 @@ class SelectOptions:
     """What makes a Gaussian part of the object."""
 
     threshold: float = 0.75
-    """Least feature (section 3.1 of the paper, after its sigmoid)."""
+    """Least feature (paper, Sec. 4: 0.75 after the sigmoid)."""
     box: Box | None = None
     """Where centres must lie, world units."""
     keep: Keep = "substantial"

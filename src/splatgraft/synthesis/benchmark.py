@@ -1,4 +1,4 @@
-"""Nine benchmark scenes with ground truth (paper, Sec. 6): six indoor, three outdoor.
+"""Nine benchmark scenes with ground truth (paper, Sec. 7): six indoor, three outdoor.
 
 Each scene is rendered by two jobs and then laid out as captures in `<out>/<scene>/`: `source/` (the object on a
 pedestal in another light), `target/` (the scene without it), `ground_truth/` (the scene with it, from the target's

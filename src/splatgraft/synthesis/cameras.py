@@ -6,7 +6,7 @@ import random
 from splatgraft.synthesis.scene import Camera, Number, Place, Scene, Vector
 
 ARC_LENGTH = 5
-"""Views per camera arc (paper, Sec. 4.2)."""
+"""Views per camera arc (paper, Sec. 5.2)."""
 
 
 _OBSTACLE_MARGIN = 0.12
@@ -33,7 +33,7 @@ def _eye(target: Vector, azimuth: Number, elevation: Number, distance: Number) -
 
 
 def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> tuple[Camera, ...]:
-    """Place five cameras on a random short arc that look at the object's place (paper, Sec. 4.2).
+    """Place five cameras on a random short arc that look at the object's place (paper, Sec. 5.2).
 
     Args:
         scene: gives bounds and obstacles.

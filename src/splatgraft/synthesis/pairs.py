@@ -1,4 +1,4 @@
-"""Training pairs (paper, Sec. 4.1 and 4.2): planned as render jobs, and read as composite and target.
+"""Training pairs (paper, Sec. 5.1 and 5.2): planned as render jobs, and read as composite and target.
 
 One folder per scene and camera arc, `<out>/<scene>_<arc>/`:
 
@@ -153,7 +153,7 @@ class Pair:
 def match_statistics(
     relit: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """Shift and scale the relit object to the mean and deviation per channel of the object in the scene (Sec. 4.2).
+    """Shift and scale the relit object to the mean and deviation per channel of the object in the scene (Sec. 5.2).
 
     Args:
         relit: the object in another light, sRGB.

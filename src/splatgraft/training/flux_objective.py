@@ -1,4 +1,4 @@
-"""Training of FLUX as a harmoniser: rectified flow matching on the velocity (paper, Sec. 4, Eq. 1)."""
+"""Training of FLUX as a harmoniser: rectified flow matching on the velocity (paper, Sec. 5, Eq. 1)."""
 
 import shutil
 from collections.abc import Sequence

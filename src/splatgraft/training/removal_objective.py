@@ -1,4 +1,4 @@
-"""Training of Stable Diffusion 2 for object removal, shadows included (paper, Sec. 4.2 and 4.3).
+"""Training of Stable Diffusion 2 for object removal, shadows included (paper, Sec. 5.2 and 5.3).
 
 The UNet's first layer takes the latents of image and mask beside the noisy latent; it predicts the velocity.
 """

@@ -23,7 +23,7 @@ from splatgraft.workflow.training_data import DataOptions
 
 @dataclass(frozen=True)
 class FluxTrainingOptions:
-    """Options of the training of the FLUX harmoniser (paper, Sec. 4)."""
+    """Options of the training of the FLUX harmoniser (paper, Sec. 5)."""
 
     base: str = "black-forest-labs/FLUX.1-schnell"
     """Folder or hub id with transformer/ and vae/; the folder of a harmoniser continues its training."""
@@ -45,7 +45,7 @@ class FluxTrainingOptions:
 
 @dataclass(frozen=True)
 class RemovalTrainingOptions:
-    """Options of the training of the object removal (paper, Sec. 4.2 and 4.3)."""
+    """Options of the training of the object removal (paper, Sec. 5.2 and 5.3)."""
 
     base: str = "stabilityai/stable-diffusion-2"
     """Folder or hub id with unet/ and vae/."""

@@ -1,4 +1,4 @@
-"""The command `synth generated`: training pairs from pictures that FLUX generates (paper, Sec. 4.2 and 4.3)."""
+"""The command `synth generated`: training pairs from pictures that FLUX generates (paper, Sec. 5.2 and 5.3)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field

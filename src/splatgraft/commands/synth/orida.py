@@ -1,4 +1,4 @@
-"""The command `synth orida`: training pairs from ORIDa's photographs (paper, Sec. 4.2)."""
+"""The command `synth orida`: training pairs from ORIDa's photographs (paper, Sec. 5.2)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field

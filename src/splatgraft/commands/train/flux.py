@@ -1,4 +1,4 @@
-"""The command `train flux`: pairs become a harmoniser of FLUX.1-schnell (paper, Sec. 4)."""
+"""The command `train flux`: pairs become a harmoniser of FLUX.1-schnell (paper, Sec. 5)."""
 
 from dataclasses import dataclass, field
 

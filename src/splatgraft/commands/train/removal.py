@@ -1,4 +1,4 @@
-"""The command `train removal`: pairs become a network that takes objects out of pictures (paper, Sec. 4.2 and 4.3)."""
+"""The command `train removal`: pairs become a network that takes objects out of pictures (paper, Sec. 5.2 and 5.3)."""
 
 from dataclasses import dataclass, field
 

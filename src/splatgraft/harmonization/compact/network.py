@@ -1,6 +1,6 @@
 """The compact network: a U-Net of ConvNeXt blocks (Liu et al. 2022) with global attention at its coarsest level.
 
-It predicts the harmonised view from the prior in one step, which is the large model's rectified flow (paper, Sec. 4.1)
+It predicts the harmonised view from the prior in one step, which is the large model's rectified flow (paper, Sec. 5)
 at a fixed time, from the prior to the ground truth. The output heads are initialised to zero, where the result is the
 prior itself. Attribute names are the tensor names in weights files and must not change.
 """

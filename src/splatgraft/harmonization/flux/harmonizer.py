@@ -1,4 +1,4 @@
-"""The harmoniser `flux`: FLUX conditioned on composite and mask, sampled in four steps (paper, Sec. 4)."""
+"""The harmoniser `flux`: FLUX conditioned on composite and mask, sampled in four steps (paper, Sec. 5)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 MULTIPLE = 16
-"""Image sides are multiples of this, pixels: 8 for the autoencoder times 2 for the packing (paper, Sec. 4.3)."""
+"""Image sides are multiples of this, pixels: 8 for the autoencoder times 2 for the packing (paper, Sec. 5.3)."""
 
 
 def pack(latents: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n d"]:

@@ -63,7 +63,7 @@ def velocity(
 
     Args:
         transformer: a `FluxTransformer2DModel`.
-        latents: noisy latent, composite and condition, concatenated along channels (paper, Sec. 4); k = 3 c.
+        latents: noisy latent, composite and condition, concatenated along channels (paper, Sec. 5); k = 3 c.
         level: noise levels in [0, 1].
         prompt: text embeddings, the same for all samples.
     """

@@ -30,7 +30,7 @@ def noise(size: tuple[int, int, int], seed: int) -> Float[Tensor, "c h w"]:
 def noisy(
     clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], level: Float[Tensor, " b"]
 ) -> Float[Tensor, "b c h w"]:
-    """Noisy latents z_t = (1 - t) z_0 + t eps (paper, Sec. 4)."""
+    """Noisy latents z_t = (1 - t) z_0 + t eps (paper, Sec. 5)."""
     t = level[:, None, None, None]
     return (1 - t) * clean + t * noise
 

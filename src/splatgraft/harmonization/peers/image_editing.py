@@ -1,4 +1,4 @@
-"""An image-editing service over HTTP with the paper's prompt (Sec. 6); used only on request, with a limit on its cost.
+"""An image-editing service over HTTP with the paper's prompt (Sec. 7); used only on request, with a limit on its cost.
 
 The protocol is that of Google's `generateContent` (the paper's Nano Banana is gemini-2.5-flash-image).
 """

@@ -1,4 +1,4 @@
-"""Removes an object from an image by the network of `train removal` (paper, Sec. 4.2)."""
+"""Removes an object from an image by the network of `train removal` (paper, Sec. 5.2)."""
 
 from collections.abc import Callable
 from pathlib import Path

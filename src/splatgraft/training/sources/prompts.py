@@ -1,4 +1,4 @@
-"""Prompts of generated images: the paper's sentence (Sec. 4.3) filled from own lists of words.
+"""Prompts of generated images: the paper's sentence (Sec. 5.3) filled from own lists of words.
 
 Objects are movable things of many materials. Environments include the surface that objects stand on. Lightings name a
 direction or hardness, which a harmoniser must recognise. Camera angles keep the floor in view.

@@ -1,4 +1,4 @@
-"""The source of pairs made of relit images: generated ones and photographs (paper, Sec. 4.2).
+"""The source of pairs made of relit images: generated ones and photographs (paper, Sec. 5.2).
 
 manifest.jsonl                 one line per sample: folder, group, relit (number of lights), provenance
 NAME/target.png  background.png  mask.png  relit_0.png ..  record.json

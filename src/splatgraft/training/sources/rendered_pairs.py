@@ -1,4 +1,4 @@
-"""The source of pairs rendered by Blender (`splatgraft synth pairs`; paper, Sec. 4.2)."""
+"""The source of pairs rendered by Blender (`splatgraft synth pairs`; paper, Sec. 5.2)."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Images from prompts by the stock FLUX.1-schnell pipeline: 4 steps, guidance 1 (paper, Sec. 4.3).
+"""Images from prompts by the stock FLUX.1-schnell pipeline: 4 steps, guidance 1 (paper, Sec. 5.3).
 
 Untested with the real weights.
 """

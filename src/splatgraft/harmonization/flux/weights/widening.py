@@ -1,4 +1,4 @@
-"""Widens a network's first layer, so that it also takes condition latents (paper, Sec. 4)."""
+"""Widens a network's first layer, so that it also takes condition latents (paper, Sec. 5)."""
 
 from typing import Literal, TypeVar
 
