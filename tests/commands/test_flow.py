@@ -142,6 +142,20 @@ def test_a_project_that_cannot_be_says_so_in_one_line(project: Path, capsys: pyt
         assert line in printed.err.splitlines()[-1]
 
 
+def test_a_run_up_to_a_step_needs_only_the_inputs_of_that_step(
+    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "transforms.json").write_text("{")
+    before, after = project.read_text().split("[target]\ncapture = ")
+    project.write_text(f"{before}[target]\ncapture = {str(broken)!r}\n{after.split(chr(10), 1)[1]}")
+    assert main(["run", str(project), "--to", "source/reconstruct"]) == 0
+    capsys.readouterr()
+    assert main(["run", str(project)]) == 2
+    assert "transforms.json: expected" in capsys.readouterr().err
+
+
 def test_the_recorded_options_of_harmonize_are_those_of_version_0_1_0(finished: Path) -> None:
     record = read_record(read_flow(finished).layout.harmonized)
     assert record is not None

@@ -302,7 +302,7 @@ def test_planned_steps_use_measured_durations(session: Session) -> None:
     assert record is not None
     assert planned[0].seconds == record.seconds
     # what was not measured keeps its usual share
-    assert planned[1].seconds / planned[2].seconds == pytest.approx(2.7 / 3.7)
+    assert planned[1].seconds / planned[2].seconds == pytest.approx(15.0 / 6.0)
 
 
 def test_a_light_is_read_back_as_written() -> None:

@@ -1,6 +1,5 @@
 """The command `demo`: a whole transfer on two captures that come with the package."""
 
-import shutil
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -75,7 +74,8 @@ def copy_captures(folder: Path) -> None:
             target = folder / source.relative_to(shipped)
             if source.is_file() and not target.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source, target)
+                with atomic_write(target) as stream:
+                    stream.write(source.read_bytes())
 
 
 COMMAND = Demo

@@ -95,8 +95,8 @@ def _plan(project: Path, out: Path | None, to: str) -> tuple[PlannedStep, ...]:
 
     try:
         flow = read_flow(project, out)
-        why = reasons(flow)
-        return estimate_step_times(flow, [name for name in flow.up_to(to) if why[name] is not None])
+        why = reasons(flow, flow.up_to(to))
+        return estimate_step_times(flow, [name for name, reason in why.items() if reason is not None])
     except ValueError:
         return ()  # the run itself reports the error
 

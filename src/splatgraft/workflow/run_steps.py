@@ -42,7 +42,7 @@ def run_steps(
     wanted = flow.up_to(to)
     forced = {step for name in force for step in flow.named(name)}
     with locked(flow.layout.root / "project"):
-        why = reasons(flow)
+        why = reasons(flow, wanted)
         planned = estimate_step_times(flow, [name for name in wanted if name in forced or why[name] is not None])
         if planned:
             console.say(describe_estimate(planned))

@@ -10,16 +10,18 @@ from splatgraft.workflow.flow import Flow
 _TYPICAL_SECONDS = {
     "capture": 1.0,
     "adopt": 0.2,
-    "reconstruct": 28.0,
-    "segment": 4.3,
+    "reconstruct": 56.0,
+    "segment": 6.0,
     "compose": 0.2,
-    "relight": 2.7,
-    "render": 3.7,
+    "relight": 15.0,
+    "render": 6.0,
     "harmonize": 1.1,
-    "consolidate": 0.8,
-    "evaluate": 1.7,
+    "consolidate": 2.0,
+    "evaluate": 3.0,
 }
-"""Seconds in `make demo` on two cores. Another project differs by a factor, which its finished steps give."""
+"""Seconds in a first `splatgraft demo` on two cores, compilation of kernels included.
+
+Another project differs by a factor, which its finished steps give."""
 
 
 def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, ...]:
