@@ -11,12 +11,16 @@ from mathutils import Vector
 WIDTH, HEIGHT = 128, 64
 _SAMPLES = 64
 """Light paths per pixel of the panorama."""
+_DISC_MARGIN = 2.5 * math.pi / HEIGHT
+"""Radians around the sun's disc, 2.5 pixels: the pixel filter spreads the disc that far."""
 _SUN_PIXELS = 24
 """Width of the image from which the sky's sun is measured."""
 
 
 def measure(scene, world, point, things):
-    """Render the radiance (64, 128, 3) around `point` without suns, and list the suns that reach it; Blender's units.
+    """Render the radiance (64, 128, 3) around `point` without the suns' discs, and list the suns that reach it.
+
+    In Blender's units. Surfaces are lit by the suns.
 
     Row 0 looks up, the middle column along +x; columns run to the right as seen from inside (towards -y).
     """
@@ -24,17 +28,37 @@ def measure(scene, world, point, things):
     lamps = [thing for thing in things if thing.type == "LIGHT"]
     for thing in lamps:
         thing.visible_camera = True
-    layer.world = scene_builder.make_world({**world, "sun_disc": False})
     layer.render.resolution_x, layer.render.resolution_y = WIDTH, HEIGHT
     layer.render.film_transparent = False  # otherwise the world is not rendered
     cycles.samples = _SAMPLES
-    panorama = passes.render(_panoramic(point), ["color"])["color"][..., :3].astype(np.float64)
+    camera = _panoramic(point)
+    panorama = _panorama(camera, {**world, "sun_disc": False})
+    if world["kind"] == "sky":
+        # what the sun lights is part of the panorama; its disc alone is not
+        cycles.use_denoising = False  # it would spread the disc over its neighbours
+        with_sun = _panorama(camera, {**world, "sun_disc": True})
+        cycles.use_denoising = True
+        disc = _around(_towards_sun(world), 0.5 * world["sun_size"] + _DISC_MARGIN)
+        panorama = np.where(disc[..., None], panorama, with_sun)
     for thing in lamps:
         thing.visible_camera = False
     suns = [_lamp_sun(lamp) for lamp in scene["lamps"] if lamp["kind"] == "sun"]
     if world["kind"] == "sky":
         suns.append(_sky_sun(world, things))
     return panorama, [sun for sun in suns if _reaches(point, sun["direction"])]
+
+
+def _panorama(camera, world):
+    bpy.context.scene.world = scene_builder.make_world(world)
+    return passes.render(camera, ["color"])["color"][..., :3].astype(np.float64)
+
+
+def _around(towards, angle):
+    """The panorama's pixels (64, 128) within `angle`, radians, of a unit direction."""
+    height = math.pi * (0.5 - (np.arange(HEIGHT) + 0.5) / HEIGHT)[:, None]
+    turn = -2 * math.pi * ((np.arange(WIDTH) + 0.5) / WIDTH - 0.5)[None]
+    x, y, z = np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height) + 0 * turn
+    return x * towards[0] + y * towards[1] + z * towards[2] > math.cos(angle)
 
 
 def _panoramic(point):
@@ -54,12 +78,14 @@ def _lamp_sun(lamp):
     return {"direction": list(towards), "irradiance": irradiance, "angular_radius": 0.5 * lamp["size"]}
 
 
+def _towards_sun(world):
+    flat, turn = math.cos(world["sun_elevation"]), world["sun_azimuth"]
+    return Vector((flat * math.cos(turn), flat * math.sin(turn), math.sin(world["sun_elevation"])))
+
+
 def _sky_sun(world, things):
     """The sun of the Nishita sky, measured by a narrow camera with and without the sun's disc."""
-    flat = math.cos(world["sun_elevation"])
-    towards = Vector(
-        (flat * math.cos(world["sun_azimuth"]), flat * math.sin(world["sun_azimuth"]), math.sin(world["sun_elevation"]))
-    )
+    towards = _towards_sun(world)
     angle = 2.0 * world["sun_size"]
     camera = scene_builder.add_camera(
         {"location": (0, 0, 0), "target": tuple(towards), "field_of_view": angle}, "towards the sun"
