@@ -52,6 +52,8 @@ class Relit:
     """View dependence, world axes: its product with the unit vector from the camera is added to shadow and bounce."""
     gloss: Float[Tensor, "m k 3"]
     """Coefficients that are added to the harmonics after shading."""
+    bands_replaced: Bool[Tensor, "m"]
+    """Whose own higher bands `gloss` replaces: they show what reflected the old light."""
     objects: tuple[Gaussians, ...]
     """The placed objects, target's frame."""
     light: Light | None
@@ -87,6 +89,7 @@ class Relit:
             color = spherical_harmonics.rgb_from_dc(self.gaussians.sh[sloped, 0])
             slope = _srgb_slope(color, ratio[sloped], weights.shadow * self.slope[sloped])
             sh[sloped, 1:4] += spherical_harmonics.band_from_slope(slope)
+        sh[self.bands_replaced, 1:] *= 1 - weights.gloss
         glossy = (self.gloss != 0).flatten(1).any(1).nonzero()[:, 0]
         sh[glossy, : self.gloss.shape[1]] += weights.gloss * self.gloss[glossy]
         return replace(self.gaussians, sh=sh)
@@ -125,6 +128,7 @@ def unchanged(
         bounce=torch.zeros_like(ones),
         slope=torch.zeros_like(ones),
         gloss=torch.zeros_like(gaussians.sh),
+        bands_replaced=torch.zeros(gaussians.count, dtype=torch.bool),
         objects=objects,
         light=None,
         report=report,

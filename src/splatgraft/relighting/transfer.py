@@ -24,7 +24,6 @@ from splatgraft.relighting.prepared_object import PreparedObject, SourceScene, p
 from splatgraft.relighting.prepared_scene import PreparedScene, prepare_scene
 from splatgraft.relighting.shading.irradiance import irradiance, shade_ratio, unknown_origin_ratio
 from splatgraft.relighting.shading.normals import raised
-from splatgraft.relighting.shading.reflection import gloss_layer
 from splatgraft.relighting.shadows.receivers import RIM, Receivers, shade_receivers
 from splatgraft.relighting.shadows.scene_ratio import SceneRatio, reachable, scene_ratio, scene_visibility
 from splatgraft.runtime.memo import Memo
@@ -123,9 +122,9 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
     received = irradiance(scene.samples, normals.vectors, sample_visibility=shares)
     source = prepared.source_lighting
     if source is None:
-        return _LitObject(prepared, visibility, unknown_origin_ratio(received, normals, opacities))
-    coverage = 0.5 * (scene.light.coverage + source.light.coverage)
-    shade = shade_ratio(received, source.irradiance, normals, opacities, coverage=coverage)
+        shade = unknown_origin_ratio(received, opacities)
+    else:
+        shade = shade_ratio(received, source.irradiance, opacities)
     return _LitObject(prepared, visibility, shade)
 
 
@@ -140,7 +139,7 @@ def _assembled(
     rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
     on_objects = [_on_object(i, objects) for i in range(len(objects))]
-    glosses = [_gloss(one, scene.light, baked.sh_degree) for one in objects]
+    replaced = [torch.full((o.prepared.gaussians.count,), o.prepared.source_lighting is not None) for o in objects]
     object_rows = torch.arange(scene_count, baked.count)
     gaussians = concatenate([baked.select(rest_index), receivers.gaussians, baked.select(object_rows)])
     count = gaussians.count - len(object_rows)
@@ -155,7 +154,8 @@ def _assembled(
         shadow=torch.cat([ones, ratio.shadow, *[r.shadow for r in on_objects]])[order],
         bounce=torch.cat([zeros, ratio.bounce, *[r.bounce for r in on_objects]])[order],
         slope=torch.cat([zeros, ratio.slope, *[r.slope for r in on_objects]])[order],
-        gloss=torch.cat([torch.zeros_like(gaussians.sh[:count]), *glosses])[order],
+        gloss=torch.zeros_like(gaussians.sh),
+        bands_replaced=torch.cat([torch.zeros(count, dtype=torch.bool), *replaced])[order],
         objects=tuple(one.prepared.gaussians for one in objects),
         light=scene.light,
         report=tuple(report),
@@ -191,14 +191,6 @@ def _on_scene(
         )
     assert total is not None
     return receivers, total
-
-
-def _gloss(one: _LitObject, light: Light, degree: int) -> Float[Tensor, "n k 3"]:
-    """The gloss layer of an object; zero where its source light is not known."""
-    gaussians, source = one.prepared.gaussians.with_sh_degree(degree), one.prepared.source_lighting
-    if source is None:
-        return torch.zeros_like(gaussians.sh)
-    return gloss_layer(gaussians, one.prepared.normals, source.light, light, ratio=one.shade)
 
 
 def _on_object(index: int, objects: list[_LitObject]) -> SceneRatio:
