@@ -43,11 +43,13 @@ class Spread:
 
 def summarize_row(row: str, results: Sequence[SceneResult]) -> RowSummary:
     """One row against pasting."""
-    both = [(r.rows[row], r.rows["paste"]) for r in results if row in r.rows and "paste" in r.rows]
-    gains = [one["object"] - paste["object"] for one, paste in both if _known(one, paste, "object")]
-    shares = [1 - one["shadow"] / paste["shadow"] for one, paste in both if _known(one, paste, "shadow")]
-    worse = sum(one["whole"] < paste["whole"] for one, paste in both if _known(one, paste, "whole"))
-    return RowSummary(len(both), _mean(gains), _mean(shares), worse)
+    objects, wholes, shadows = (_beside_paste(row, results, metric) for metric in ("object", "whole", "shadow"))
+    return RowSummary(
+        scenes=len(wholes),
+        object_gain=_mean([value - paste for value, paste in objects]),
+        shadow_removed=_mean([1 - value / paste for value, paste in shadows]),
+        worse=sum(value < paste for value, paste in wholes),
+    )
 
 
 def summarize_light(results: Sequence[SceneResult]) -> dict[str, Spread | None]:
@@ -114,8 +116,14 @@ def _text(value: float | None, name: str) -> str:
     return f"{value:.3f}" if name == "shadow" else f"{value:.1f}" if name == "direction_deg" else f"{value:.2f}"
 
 
-def _known(one: dict[str, float | None], other: dict[str, float | None], name: str) -> bool:
-    return one[name] is not None and other[name] is not None
+def _beside_paste(row: str, results: Sequence[SceneResult], metric: str) -> list[tuple[float, float]]:
+    """A row's value and that of pasting, of the scenes that have both."""
+    out = []
+    for one in results:
+        value, paste = (one.rows.get(name, {}).get(metric) for name in (row, "paste"))
+        if value is not None and paste is not None:
+            out.append((value, paste))
+    return out
 
 
 def _mean(values: Sequence[float]) -> float | None:
