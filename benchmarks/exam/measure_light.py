@@ -4,7 +4,7 @@ import math
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.directions import even_directions
@@ -48,7 +48,7 @@ def light_errors(estimated: Light, truth: Light) -> dict[str, float]:
 
 def nearest_normals(points: Float[Tensor, "n 3"], surface: Float[Tensor, "m 6"]) -> Float[Tensor, "n 3"]:
     """The outward normal of the nearest of m surface points (position and unit normal) to each point."""
-    nearest = cKDTree(surface[:, :3].numpy()).query(points.numpy())[1]
+    nearest = KDTree(surface[:, :3].numpy()).query(points.numpy())[1]
     return surface[torch.from_numpy(nearest), 3:].contiguous()
 
 
