@@ -12,6 +12,7 @@ from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.splitting import split_wide_around
 from splatgraft.relighting.light.confidence import light_confidence
 from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.prepared_object import PreparedObject
 from splatgraft.relighting.shading.gain import apply_gain
 
 _MOST_VIEW_CHANGE = 0.9
@@ -60,6 +61,8 @@ class Relit:
     """At the objects' place; None where there was no transfer."""
     report: tuple[str, ...]
     """Sentences: the lights that were found and their uncertainty, and what was not done and why."""
+    prepared: tuple[PreparedObject, ...] = ()
+    """Per object its normals and the light that it was captured in; empty where there was no transfer."""
 
     @property
     def confidence(self) -> float:

@@ -33,6 +33,10 @@ class SourceScene:
     """In the object's own frame."""
     cameras: Cameras
     """Of the capture, in the same frame."""
+    light: Light | None = None
+    """At the object's place, in the same frame, where it is known; otherwise it is estimated."""
+    normals: Float[Tensor, "n 3"] | None = None
+    """Unit, of the object's Gaussians, outward, in the same frame, where they are known; otherwise estimated."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,9 @@ def prepare_object(
         light: At the new place.
         index: Of the object among all placed ones; part of the cache's keys.
         cache: Reused where only the object's position changed.
+
+    Raises:
+        ValueError: The source tells normals, and not one for each of the object's Gaussians.
     """
     samples = sample_light(light)
     name, key = f"prepared object {index}", (placed.gaussians, source, cameras, light.sources)
@@ -87,7 +94,7 @@ def prepare_object(
         return _moved(cached, placed, samples)
     gaussians = placed.in_target()
     sphere = bounding_sphere(gaussians)
-    normals = estimate_normals(gaussians, cameras)
+    normals = _normals(placed, source, gaussians, cameras)
     maps = object_shadow_maps(gaussians, sphere, samples)
     source_lighting, notes = None, None
     if source is not None:
@@ -95,7 +102,8 @@ def prepare_object(
         if isinstance(source_light, NoLight):
             notes = source_light.reason
         else:
-            notes = source_light.describe(estimate_up(source.cameras)) + "."
+            notes = source_light.describe(estimate_up(source.cameras))
+            notes += "." if source.light is None else ", as given."
             source_light = source_light.rotated(placed.target_from_object.rotation)
             source_samples = sample_light(source_light)
             shares = self_visibility(maps, gaussians, normals.vectors, source_samples)
@@ -113,6 +121,17 @@ def prepare_object(
     )
     cache.put(name, key, prepared)
     return prepared
+
+
+def _normals(placed: PlacedObject, source: SourceScene | None, in_target: Gaussians, cameras: Cameras) -> Normals:
+    """The object's normals in the target's frame: those that the source tells, or an estimate."""
+    if source is None or source.normals is None:
+        return estimate_normals(in_target, cameras)
+    if len(source.normals) != in_target.count:
+        raise ValueError(f"relight: expected {in_target.count} normals, found {len(source.normals)}")
+    turned = source.normals @ placed.target_from_object.rotation.to(source.normals).T
+    known = torch.ones(in_target.count)
+    return Normals(vectors=turned, confidence=known, seen=known > 0)
 
 
 def _same_pose(one: Similarity, other: Similarity) -> bool:
@@ -139,7 +158,9 @@ def _moved(prepared: PreparedObject, placed: PlacedObject, samples: LightSamples
 
 
 def _source_light(gaussians: Gaussians, source: SourceScene, index: int, cache: Memo) -> Light | NoLight:
-    """The light that object `index` was captured in, estimated once for all copies of one object."""
+    """The light that object `index` was captured in: as told, or estimated once for all copies of one object."""
+    if source.light is not None:
+        return source.light
     for earlier in range(index):
         cached = cache.peek(f"source light {earlier}", (gaussians, source))
         if cached is not None:

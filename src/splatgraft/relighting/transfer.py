@@ -81,7 +81,7 @@ def relight(
         and `report` gives the reason.
 
     Raises:
-        ValueError: `sources` is neither empty nor one per object.
+        ValueError: `sources` is neither empty nor one per object, or tells normals of another number of Gaussians.
     """
     if len(sources) not in (0, len(composite.objects)):
         raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")
@@ -159,6 +159,7 @@ def _assembled(
         objects=tuple(one.prepared.gaussians for one in objects),
         light=scene.light,
         report=tuple(report),
+        prepared=tuple(one.prepared for one in objects),
     )
 
 
