@@ -14,9 +14,8 @@ from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.estimate import EstimatedLights, NoLight, estimate_lights, panorama_at
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
 from splatgraft.relighting.light.light import Light
-from splatgraft.relighting.light.panorama_sources import light_from_panorama
 from splatgraft.relighting.light.sun_visibility import observed_sun_visibility
 from splatgraft.relighting.shading.irradiance import irradiance
 from splatgraft.relighting.shading.normals import Normals, estimate_normals, raised
@@ -151,22 +150,18 @@ def _receiver_indices(
 def _estimated_light(
     scene: Gaussians, cameras: Cameras, place: BoundingSphere, region: BoundingSphere, cache: Memo
 ) -> Light | NoLight:
-    """The light at `place`; after a move within the region the sources are kept and the ambient light is new."""
-    cached: EstimatedLights | None = cache.peek("light", (scene, region))
-    if cached is None:
-        lights = estimate_lights(scene, place, cameras)
-        if isinstance(lights, NoLight):
-            return lights
-        cache.put("light", (scene, region), lights)
-        return lights.leveled
-    panorama = panorama_at(scene, place)
-    if isinstance(panorama, NoLight):
-        return panorama
-    # the sources keep their brightness too: shadow maps and the object's own shading are cached with them
-    leveled = cached.leveled
-    factor = float(leveled.ambient[0].sum() / cached.by_panorama.ambient[0].sum().clamp_min(1e-9))
-    here = light_from_panorama(panorama, estimate_up(cameras))
-    return replace(here, sources=leveled.sources, ambient=factor * here.ambient)
+    """The light at `place`; after a move within the region the sources are kept and the ambient light is new.
+
+    Shadow maps and the object's own shading are cached with the sources.
+    """
+    cached: EstimatedLight | None = cache.peek("light", (scene, region))
+    if cached is not None:
+        return cached.at(scene, cameras, place)
+    found = fit_light(scene, place, cameras)
+    if isinstance(found, NoLight):
+        return found
+    cache.put("light", (scene, region), found)
+    return found.light
 
 
 def _with_observed_sun(
