@@ -12,7 +12,6 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
 from splatgraft.relighting.light.light import Light

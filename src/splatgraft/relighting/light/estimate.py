@@ -15,10 +15,9 @@ from splatgraft.relighting.light.highlight_evidence import HighlightSettings, fi
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.light_from_radiance import PeakSettings, ambient_of, split_peaks
 from splatgraft.relighting.light.panorama import Panorama, cube_cameras, render_panorama
-from splatgraft.relighting.light.radiance_model import RadianceSettings, radiance_problem, seen_sky
+from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem, seen_sky
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, SearchSettings, search_radiance
 from splatgraft.relighting.light.shading_evidence import (
-    ShadingEvidence,
     ShadingEvidenceSettings,
     find_shading_evidence,
 )
@@ -98,16 +97,10 @@ class EstimatedLight:
     light: Light
     hidden: RadianceEstimate
     """What no camera recorded."""
-    far: Surroundings
-    """What surrounds the region."""
-    around: Surroundings
-    """What surrounds the object."""
+    evidence: LightEvidence
+    """What the estimate rests on."""
     sky: Float[Tensor, "3"]
     """Mean linear rgb radiance of what was seen above the horizon."""
-    up: Float[Tensor, "3"]
-    """Unit, world frame."""
-    evidence: ShadingEvidence
-    """The surfaces that were compared with the light."""
 
     def radiance(self, around: Surroundings) -> Float[Tensor, "k 3"]:
         """Linear rgb radiance from all `DIRECTIONS` at a place with other near surroundings."""
@@ -118,7 +111,7 @@ class EstimatedLight:
 
     def visible_sources(self, around: Surroundings) -> Float[Tensor, "k"]:
         """Share of each direction that is clipped and lies outside of the region, in [0, 1]."""
-        return torch.minimum(around.clipped, self.far.clipped)
+        return torch.minimum(around.clipped, self.evidence.far.clipped)
 
     def at(
         self,
@@ -135,7 +128,7 @@ class EstimatedLight:
         around = surroundings_at(scene, cameras, place.center, nearest=settings.nearest * place.radius)
         clipped = self.visible_sources(around)
         _, rest = split_peaks(self.radiance(around), clipped, around, within=math.inf)
-        return replace(self.light, ambient=ambient_of(rest), **_seen_shares(around, self.up))
+        return replace(self.light, ambient=ambient_of(rest), **_seen_shares(around, self.evidence.up))
 
 
 def estimate_light(
@@ -182,27 +175,23 @@ def fit_light(
         whole = concatenate([scene.with_sh_degree(degree), object_gaussians.with_sh_degree(degree)])
     part = whole.select((whole.means - region.center).norm(dim=1) < settings.scene_within * region.radius)
     normals = estimate_normals(part, cameras)
-    evidence = find_shading_evidence(part, normals, region=region, settings=settings.shading)
+    surfaces = find_shading_evidence(part, normals, region=region, settings=settings.shading)
     near = BoundingSphere(region.center, settings.highlights_within * region.radius)
     highlights = find_highlights(part, normals, cameras, region=near, settings=settings.highlights)
-    far = surroundings_at(scene, cameras, place.center, nearest=settings.far * region.radius)
-    around = surroundings_at(scene, cameras, place.center, nearest=settings.place.nearest * place.radius)
-    by_highlights = None if highlights is None else highlights.evidence()
-    problem = radiance_problem(evidence, by_highlights, far, around, up, settings=settings.radiance)
-    hidden = search_radiance(problem, settings=settings.search)
-    mean = (evidence.weights[:, None] * evidence.colors).sum(0)
-    found = EstimatedLight(
-        light=Light((), torch.zeros(9, 3)),
-        hidden=hidden,
-        far=far,
-        around=around,
-        sky=seen_sky(far, up, mean.clamp_min(1e-3)),
+    evidence = LightEvidence(
+        surfaces=surfaces,
+        highlights=None if highlights is None else highlights.evidence(),
+        far=surroundings_at(scene, cameras, place.center, nearest=settings.far * region.radius),
+        around=surroundings_at(scene, cameras, place.center, nearest=settings.place.nearest * place.radius),
         up=up,
-        evidence=evidence,
     )
-    clipped = found.visible_sources(around)
+    hidden = search_radiance(radiance_problem(evidence, settings=settings.radiance), settings=settings.search)
+    mean = (surfaces.weights[:, None] * surfaces.colors).sum(0)
+    sky = seen_sky(evidence.far, up, mean.clamp_min(1e-3))
+    found = EstimatedLight(Light((), torch.zeros(9, 3)), hidden, evidence, sky)
+    around = evidence.around
     sources, rest = split_peaks(
-        found.radiance(around), clipped, around, within=region.radius, settings=settings.peaks
+        found.radiance(around), found.visible_sources(around), around, within=region.radius, settings=settings.peaks
     )
     light = Light(sources, ambient_of(rest), **_seen_shares(around, up))
     return replace(found, light=_with_distances(light, scene, place, settings))

@@ -60,7 +60,7 @@ def split_peaks(
     luminance = radiance @ _LUMINANCE
     is_peak = luminance > settings.over_median * luminance.median()
     is_peak &= luminance > settings.least_share * luminance.sum()
-    near = DIRECTIONS @ DIRECTIONS.T > math.cos(settings.radius)
+    near = math.cos(settings.radius) < DIRECTIONS @ DIRECTIONS.T
     left, rest, sources = is_peak.clone(), radiance.clone(), []
     while bool(left.any()) and len(sources) < settings.most:
         i = int((luminance * left).argmax())

@@ -79,6 +79,22 @@ class RadianceSettings:
 
 
 @dataclass(frozen=True)
+class LightEvidence:
+    """What is known of the light at a place."""
+
+    surfaces: ShadingEvidence
+    """Of a region around the place."""
+    highlights: HighlightEvidence | None
+    """On the same surfaces; None without view-dependent colours."""
+    far: Surroundings
+    """What surrounds the region."""
+    around: Surroundings
+    """What surrounds the object, near things included."""
+    up: Float[Tensor, "3"]
+    """Unit, world frame."""
+
+
+@dataclass(frozen=True)
 class Patch:
     """A connected clipped part of the surroundings that may be a source."""
 
@@ -169,26 +185,16 @@ class RadianceProblem:
 
 
 def radiance_problem(
-    evidence: ShadingEvidence,
-    highlights: HighlightEvidence | None,
-    far: Surroundings,
-    around: Surroundings,
-    up: Float[Tensor, "3"],
-    *,
-    most_patches: int = 5,
-    settings: RadianceSettings = RadianceSettings(),
+    found: LightEvidence, *, most_patches: int = 5, settings: RadianceSettings = RadianceSettings()
 ) -> RadianceProblem:
     """Set up the density at one place.
 
     Args:
-        evidence: The receivers.
-        highlights: Of the same surfaces.
-        far: What surrounds the receivers: nothing nearer than they are.
-        around: What surrounds the object.
-        up: Unit, world frame.
+        found: What is known.
         most_patches: Clipped patches that may be sources; the search tries all their combinations.
         settings: The numbers.
     """
+    evidence, far, around, up = found.surfaces, found.far, found.around, found.up
     s = settings
     unseen = (torch.maximum(1 - far.seen, 1 - around.seen) > _UNSEEN).nonzero()[:, 0]
     clipped = (far.clipped > _PRESENT).nonzero()[:, 0]
@@ -205,7 +211,7 @@ def radiance_problem(
     material_weights *= min(1.0, s.materials / max(float(material_weights.sum()), 1e-9))
     return RadianceProblem(
         evidence=evidence,
-        highlights=highlights,
+        highlights=found.highlights,
         around=around,
         settings=s,
         unseen=unseen,
@@ -332,9 +338,7 @@ def _by_material(problem: RadianceProblem, values: Float[Tensor, "m ..."]) -> Fl
     return out.index_add_(0, problem.evidence.material, values)
 
 
-def _step(
-    problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], damping: float
-) -> Float[Tensor, "s"]:
+def _step(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], damping: float) -> Float[Tensor, "s"]:
     """One damped Gauss-Newton step."""
     p, s = problem, problem.settings
     level, radiances, albedo = p.split(x)

@@ -109,9 +109,7 @@ def _polished(problem: RadianceProblem, at: Maximum) -> Maximum:
     return _at(problem, prior, polish(problem, prior, at.state), at.sources)
 
 
-def _at(
-    problem: RadianceProblem, prior: ClippedPrior, state: Float[Tensor, "s"], sources: tuple[bool, ...]
-) -> Maximum:
+def _at(problem: RadianceProblem, prior: ClippedPrior, state: Float[Tensor, "s"], sources: tuple[bool, ...]) -> Maximum:
     return Maximum(cost(problem, prior, state) + problem.highlight_cost(state), state, sources)
 
 
