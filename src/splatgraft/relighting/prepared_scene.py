@@ -17,6 +17,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.light.estimate import EstimatedLights, NoLight, estimate_lights, panorama_at
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama_sources import light_from_panorama
+from splatgraft.relighting.light.source_distance import with_source_distances
 from splatgraft.relighting.light.sun_visibility import observed_sun_visibility
 from splatgraft.relighting.shading.irradiance import irradiance
 from splatgraft.relighting.shading.normals import Normals, estimate_normals, raised
@@ -79,13 +80,16 @@ def prepare_scene(
         cameras: Of its capture.
         spheres: Of the objects, at least one.
         reach: Object radii to which shadows are computed.
-        light: At the objects' place; None to estimate it.
+        light: At the objects' place, its sources seen from there; None to estimate it.
         cache: Reused where the scene is the same and the place has moved little.
     """
     center = torch.stack([sphere.center for sphere in spheres]).mean(0)
     place = BoundingSphere(center, max(sphere.radius for sphere in spheres))
     region = _region(scene, place, reach, cache)
-    known = _estimated_light(scene, cameras, place, region, cache) if light is None else light
+    if light is None:
+        known = _estimated_light(scene, cameras, place, region, cache)
+    else:
+        known = cache.get("told light", (scene, region, light), lambda: with_source_distances(light, scene, place))
     if isinstance(known, NoLight):
         return known
     samples = sample_light(known)

@@ -3,12 +3,11 @@
 import math
 from dataclasses import dataclass, field, replace
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
-from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb
@@ -18,6 +17,7 @@ from splatgraft.relighting.light.fusion import LightFusionSettings, fuse_light
 from splatgraft.relighting.light.highlight_evidence import HighlightSettings, find_highlights
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import Panorama, cube_cameras, render_panorama
+from splatgraft.relighting.light.source_distance import with_source_distances
 from splatgraft.relighting.shading.normals import estimate_normals
 from splatgraft.rendering import render
 
@@ -100,12 +100,6 @@ class LightEstimateSettings:
     """Radii of the surroundings within which Gaussians may cast shadows; set by hand."""
     highlights_within: float = 0.5
     """Radii of the surroundings within which highlights count; set by hand."""
-    window_image: tuple[float, int] = (32.0, 16)
-    """Focal length and width, pixels, of the depth image towards a visible source; set by hand."""
-    window_quantile: float = 0.25
-    """Of the depths in that image: the distance to the source; set by hand."""
-    window_distance: float = 0.7
-    """Share of that distance within which occluders block the source; set by hand."""
 
 
 def estimate_light(
@@ -161,7 +155,7 @@ def estimate_lights(
     light = fuse_light(
         panorama, estimate, up, estimated_within=surroundings.radius, reflected=reflected, settings=settings.fusion
     )
-    light = _with_distances(light, scene, place, settings)
+    light = with_source_distances(light, scene, place)
     return EstimatedLights(light, _leveled(light, reflected, up, settings.level))
 
 
@@ -225,30 +219,6 @@ def _reflected_irradiance(
         return None
     reflected = linear_from_srgb(rgb_from_dc(part.sh[:, 0]).clamp(settings.darkest, 1)).mean(1)
     return math.pi * float((area * reflected).sum() / area.sum()) / settings.albedo
-
-
-def _with_distances(light: Light, scene: Gaussians, place: BoundingSphere, settings: LightEstimateSettings) -> Light:
-    """Sources that the panorama shows get `blockers_within` from the depth towards them.
-
-    A window's pane, or the wall around it, does not block its light.
-    """
-    sources = []
-    focal, width = settings.window_image
-    for source in light.sources:
-        if math.isfinite(source.blockers_within):
-            sources.append(source)
-            continue
-        direction = torch.tensor(source.direction)
-        # not core.directions.perpendicular: another roll of the camera would change results
-        up = torch.tensor([0.0, 0.0, 1.0]) if abs(source.direction[2]) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
-        pose = look_at(place.center[None], place.center + direction, up)
-        rendered = render(scene, pinhole(pose, focal, width=width, height=width), outputs=frozenset({"depth"}))
-        visible = (rendered.alpha > _SURFACE_ALPHA) & (rendered.depth > place.radius)
-        distance = (
-            float(rendered.depth[visible].quantile(settings.window_quantile)) if bool(visible.any()) else math.inf
-        )
-        sources.append(replace(source, blockers_within=settings.window_distance * distance))
-    return replace(light, sources=tuple(sources))
 
 
 def panorama_at(
