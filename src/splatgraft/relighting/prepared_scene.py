@@ -20,7 +20,7 @@ from splatgraft.relighting.light.panorama_sources import light_from_panorama
 from splatgraft.relighting.light.source_distance import with_source_distances
 from splatgraft.relighting.light.sun_visibility import observed_sun_visibility
 from splatgraft.relighting.shading.irradiance import irradiance
-from splatgraft.relighting.shading.normals import Normals, estimate_normals, raised
+from splatgraft.relighting.shading.normals import Normals, estimate_normals
 from splatgraft.relighting.shadows.light_sampling import LightSamples, main_source_samples, sample_light
 from splatgraft.relighting.shadows.receivers import RIM
 from splatgraft.relighting.shadows.scene_ratio import (
@@ -31,6 +31,7 @@ from splatgraft.relighting.shadows.scene_ratio import (
     scene_visibility,
 )
 from splatgraft.relighting.shadows.shadow_maps import thinned
+from splatgraft.relighting.shadows.surface_layer import above_layer
 from splatgraft.runtime.memo import Memo
 
 # set by hand
@@ -100,7 +101,7 @@ def prepare_scene(
     occluders = cache.get("occluders", (scene, region), lambda: thinned(scene, width=width))
     normals = cache.get("normals", (receivers, cameras), lambda: estimate_normals(receivers, cameras, among=occluders))
     maps = cache.get("maps", (scene, region, known.sources), lambda: scene_shadow_maps(scene, region, samples))
-    points = cache.get("points", (normals,), lambda: raised(receivers, normals.vectors))
+    points = cache.get("points", (normals,), lambda: above_layer(receivers, normals.vectors))
     sample_visibility = cache.get(
         "sample visibility",
         (maps, normals),
