@@ -15,9 +15,10 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
 from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.source_distance import with_source_distances
 from splatgraft.relighting.light.sun_visibility import observed_sun_visibility
 from splatgraft.relighting.shading.irradiance import irradiance
-from splatgraft.relighting.shading.normals import Normals, estimate_normals, raised
+from splatgraft.relighting.shading.normals import Normals, estimate_normals
 from splatgraft.relighting.shadows.light_sampling import LightSamples, main_source_samples, sample_light
 from splatgraft.relighting.shadows.receivers import RIM
 from splatgraft.relighting.shadows.scene_ratio import (
@@ -28,6 +29,7 @@ from splatgraft.relighting.shadows.scene_ratio import (
     scene_visibility,
 )
 from splatgraft.relighting.shadows.shadow_maps import thinned
+from splatgraft.relighting.shadows.surface_layer import above_layer
 from splatgraft.runtime.memo import Memo
 
 # set by hand
@@ -77,13 +79,16 @@ def prepare_scene(
         cameras: Of its capture.
         spheres: Of the objects, at least one.
         reach: Object radii to which shadows are computed.
-        light: At the objects' place; None to estimate it.
+        light: At the objects' place, its sources seen from there; None to estimate it.
         cache: Reused where the scene is the same and the place has moved little.
     """
     center = torch.stack([sphere.center for sphere in spheres]).mean(0)
     place = BoundingSphere(center, max(sphere.radius for sphere in spheres))
     region = _region(scene, place, reach, cache)
-    known = _estimated_light(scene, cameras, place, region, cache) if light is None else light
+    if light is None:
+        known = _estimated_light(scene, cameras, place, region, cache)
+    else:
+        known = cache.get("told light", (scene, region, light), lambda: with_source_distances(light, scene, place))
     if isinstance(known, NoLight):
         return known
     samples = sample_light(known)
@@ -94,7 +99,7 @@ def prepare_scene(
     occluders = cache.get("occluders", (scene, region), lambda: thinned(scene, width=width))
     normals = cache.get("normals", (receivers, cameras), lambda: estimate_normals(receivers, cameras, among=occluders))
     maps = cache.get("maps", (scene, region, known.sources), lambda: scene_shadow_maps(scene, region, samples))
-    points = cache.get("points", (normals,), lambda: raised(receivers, normals.vectors))
+    points = cache.get("points", (normals,), lambda: above_layer(receivers, normals.vectors))
     sample_visibility = cache.get(
         "sample visibility",
         (maps, normals),

@@ -3,12 +3,11 @@
 import math
 from dataclasses import dataclass, field, replace
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
-from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.light.highlight_evidence import HighlightSettings, find_highlights
@@ -21,6 +20,7 @@ from splatgraft.relighting.light.shading_evidence import (
     ShadingEvidenceSettings,
     find_shading_evidence,
 )
+from splatgraft.relighting.light.source_distance import with_source_distances
 from splatgraft.relighting.light.surroundings import DIRECTIONS, Surroundings, surroundings_at
 from splatgraft.relighting.shading.normals import estimate_normals
 from splatgraft.rendering import render
@@ -82,12 +82,6 @@ class LightEstimateSettings:
     """Radii of the surroundings within which highlights count."""
     far: float = 0.9
     """Radii of the surroundings from which on light counts as coming from outside of them."""
-    window_image: tuple[float, int] = (32.0, 16)
-    """Focal length and width, pixels, of the depth image towards a visible source."""
-    window_quantile: float = 0.25
-    """Of the depths in that image: the distance to the source."""
-    window_distance: float = 0.7
-    """Share of that distance within which occluders block the source."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +188,7 @@ def fit_light(
         found.radiance(around), found.visible_sources(around), around, within=region.radius, settings=settings.peaks
     )
     light = Light(sources, ambient_of(rest), **_seen_shares(around, up))
-    return replace(found, light=_with_distances(light, scene, place, settings))
+    return replace(found, light=with_source_distances(light, scene, place))
 
 
 def _seen_shares(around: Surroundings, up: Float[Tensor, "3"]) -> dict[str, float]:
@@ -204,30 +198,6 @@ def _seen_shares(around: Surroundings, up: Float[Tensor, "3"]) -> dict[str, floa
 
 _OVERHEAD = 0.5
 """Cosine to the up direction of what counts as ceiling, 60 degrees."""
-
-
-def _with_distances(light: Light, scene: Gaussians, place: BoundingSphere, settings: LightEstimateSettings) -> Light:
-    """Sources that the panorama shows get `blockers_within` from the depth towards them.
-
-    A window's pane, or the wall around it, does not block its light.
-    """
-    sources = []
-    focal, width = settings.window_image
-    for source in light.sources:
-        if math.isfinite(source.blockers_within):
-            sources.append(source)
-            continue
-        direction = torch.tensor(source.direction)
-        # not core.directions.perpendicular: another roll of the camera would change results
-        up = torch.tensor([0.0, 0.0, 1.0]) if abs(source.direction[2]) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
-        pose = look_at(place.center[None], place.center + direction, up)
-        rendered = render(scene, pinhole(pose, focal, width=width, height=width), outputs=frozenset({"depth"}))
-        visible = (rendered.alpha > _SURFACE_ALPHA) & (rendered.depth > place.radius)
-        distance = (
-            float(rendered.depth[visible].quantile(settings.window_quantile)) if bool(visible.any()) else math.inf
-        )
-        sources.append(replace(source, blockers_within=settings.window_distance * distance))
-    return replace(light, sources=tuple(sources))
 
 
 def panorama_at(
