@@ -55,6 +55,8 @@ class PreparedScene:
     """Of the receivers."""
     light: Light
     """At the objects' place."""
+    estimate: EstimatedLight | None
+    """What `light` rests on; None where it was told."""
     samples: LightSamples
     """k samples of `light`."""
     maps: SceneShadowMaps
@@ -86,11 +88,13 @@ def prepare_scene(
     place = BoundingSphere(center, max(sphere.radius for sphere in spheres))
     region = _region(scene, place, reach, cache)
     if light is None:
-        known = _estimated_light(scene, cameras, place, region, cache)
+        estimate = _estimated_light(scene, cameras, place, region, cache)
+        if isinstance(estimate, NoLight):
+            return estimate
+        known = estimate.light
     else:
+        estimate = None
         known = cache.get("told light", (scene, region, light), lambda: with_source_distances(light, scene, place))
-    if isinstance(known, NoLight):
-        return known
     samples = sample_light(known)
     indices = _receiver_indices(scene, region, spheres, known, cache)
     receivers = cache.get("receivers", (indices,), lambda: scene.select(indices))
@@ -111,6 +115,7 @@ def prepare_scene(
         receivers=receivers,
         normals=normals,
         light=known,
+        estimate=estimate,
         samples=samples,
         maps=maps,
         sample_visibility=sample_visibility,
@@ -153,7 +158,7 @@ def _receiver_indices(
 
 def _estimated_light(
     scene: Gaussians, cameras: Cameras, place: BoundingSphere, region: BoundingSphere, cache: Memo
-) -> Light | NoLight:
+) -> EstimatedLight | NoLight:
     """The light at `place`; after a move within the region the sources are kept and the ambient light is new.
 
     Shadow maps and the object's own shading are cached with the sources.
@@ -162,10 +167,9 @@ def _estimated_light(
     if cached is not None:
         return cached.at(scene, cameras, place)
     found = fit_light(scene, place, cameras)
-    if isinstance(found, NoLight):
-        return found
-    cache.put("light", (scene, region), found)
-    return found.light
+    if not isinstance(found, NoLight):
+        cache.put("light", (scene, region), found)
+    return found
 
 
 def _with_observed_sun(

@@ -50,6 +50,8 @@ class _LitObject:
     prepared: PreparedObject
     sample_visibility: Float[Tensor, "n k"]
     """Share of every light sample that reaches it past the scene, in [0, 1]."""
+    received: Float[Tensor, "n 3"]
+    """Linear rgb irradiance at the new place."""
     shade: Float[Tensor, "n 3"]
     """Factor on linear rgb by its own shading."""
 
@@ -125,7 +127,7 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
         shade = unknown_origin_ratio(received, opacities)
     else:
         shade = shade_ratio(received, source.irradiance, opacities)
-    return _LitObject(prepared, visibility, shade)
+    return _LitObject(prepared, visibility, received, shade)
 
 
 def _assembled(
@@ -159,6 +161,8 @@ def _assembled(
         objects=tuple(one.prepared.gaussians for one in objects),
         light=scene.light,
         report=tuple(report),
+        estimate=scene.estimate,
+        received=tuple(one.received for one in objects),
         prepared=tuple(one.prepared for one in objects),
     )
 

@@ -115,15 +115,16 @@ class EstimatedLight:
         place: BoundingSphere,
         *,
         settings: PlaceSettings = PlaceSettings(),
-    ) -> Light | NoLight:
-        """The light at a place in the same region: the same sources, and ambient light with what is near there."""
+    ) -> "EstimatedLight | NoLight":
+        """At a place in the same region: the same sources, and ambient light with what is near there."""
         panorama = panorama_at(scene, place, settings=settings)
         if isinstance(panorama, NoLight):
             return panorama
         around = surroundings_at(scene, cameras, place.center, nearest=settings.nearest * place.radius)
         clipped = self.visible_sources(around)
         _, rest = split_peaks(self.radiance(around), clipped, around, within=math.inf)
-        return replace(self.light, ambient=ambient_of(rest), **_seen_shares(around, self.evidence.up))
+        light = replace(self.light, ambient=ambient_of(rest), **_seen_shares(around, self.evidence.up))
+        return replace(self, light=light, evidence=replace(self.evidence, around=around))
 
 
 def estimate_light(

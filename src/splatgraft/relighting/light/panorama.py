@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras, pinhole
@@ -69,6 +69,16 @@ def cube_directions(size: int) -> tuple[Float[Tensor, "6 s s 3"], Float[Tensor, 
     corner = torch.atan2(ex * ey, (1 + ex * ex + ey * ey).sqrt())
     area = corner[1:, 1:] - corner[:-1, 1:] - corner[1:, :-1] + corner[:-1, :-1]
     return directions.float(), area.expand(6, size, size).float()
+
+
+def cube_pixels(directions: Float[Tensor, "n 3"], size: int) -> Int[Tensor, "n"]:
+    """The pixel of a cube map, in the order of its flattened faces, that each direction falls into."""
+    across, down, along = torch.einsum("ni,fji->jnf", directions, _FACES.to(directions)).unbind(0)
+    face = along.argmax(1)
+    row = torch.arange(len(directions))
+    depth = along[row, face]
+    u, v = (((axis[row, face] / depth + 1) * 0.5 * size).long().clamp(0, size - 1) for axis in (across, down))
+    return (face * size + v) * size + u
 
 
 def far_enough(scene: Gaussians, center: Float[Tensor, "3"], nearest: float) -> Gaussians:

@@ -39,7 +39,7 @@ _TOUCHING = math.cos(math.radians(15))
 class RadianceSettings:
     """The numbers of the density, fitted together over training scenes by benchmarks/fit_light.py."""
 
-    albedo: float = 0.28
+    albedo: float = 0.296
     """Median linear albedo of a material."""
     albedo_sd: float = 0.3
     """Standard deviation of its logarithm."""
@@ -54,17 +54,17 @@ class RadianceSettings:
     near: float = 0.66
     """Radii of the surroundings: standard deviation of the weight of surfaces by their distance; the light is that at
     the object."""
-    highlights: float = 100.0
+    highlights: float = 105.0
     """Independent view-dependent colours that all are worth."""
     sky_bias: float = -0.07
     """Mean log radiance of unseen directions over that of the seen ones above the horizon: zeniths are brighter."""
-    sky_sd: float = 0.43
+    sky_sd: float = 0.415
     """Standard deviation of that difference between scenes."""
     unseen_sd: float = 1.13
     """Scale of the logarithm of one unseen direction around their common level."""
-    unseen_nu: float = 1.9
+    unseen_nu: float = 1.64
     """Degrees of freedom: the lower, the likelier is a lamp among them."""
-    source: float = 91.0
+    source: float = 77.4
     """Median radiance of a clipped source, where the camera's white is 1."""
     source_sd: float = 0.6
     """Standard deviation of its logarithm."""
@@ -72,9 +72,9 @@ class RadianceSettings:
     """Median radiance of a clipped bright surface beyond white."""
     surface_sd: float = 0.77
     """Standard deviation of its logarithm."""
-    within_patch_sd: float = 0.13
+    within_patch_sd: float = 0.212
     """Standard deviation of log radiance within a patch."""
-    source_odds: float = 3.0
+    source_odds: float = 4.61
     """Log odds that a clipped patch above the horizon is a source."""
 
 
