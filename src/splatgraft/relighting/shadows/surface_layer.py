@@ -40,6 +40,7 @@ def above_layer(
     heights = ((gaussians.means[near] - gaussians.means[:, None]) * normals[:, None]).sum(-1)
     along = torch.einsum("nij,ni->nj", gaussians.rotations, normals) * gaussians.scales
     own = (along**2).sum(1)
-    deviation = (heights.var(1, correction=0) + own[near].mean(1)).sqrt()
+    variance = (heights - heights.mean(1, keepdim=True)).square().mean(1)
+    deviation = (variance + own[near].mean(1)).sqrt()
     top = heights.mean(1) + settings.deviations * deviation
     return gaussians.means + top[:, None] * normals
