@@ -40,6 +40,8 @@ class Exam:
     """What is to be measured, and where."""
 
     out: Path
+    work: Path
+    """Folder of all reconstructions."""
     rows: tuple[str, ...]
     options: ReconstructOptions
     """Of all reconstructions."""
@@ -58,7 +60,7 @@ class Exam:
         if file.is_file() and (record := json.loads(file.read_text()))["key"] == key:
             return SceneResult.from_json(record["result"])
         started = time.perf_counter()
-        scene = read_scene(folder, self.out / "work" / folder.name, self.options, console)
+        scene = read_scene(folder, self.work / folder.name, self.options, console)
         composed = time.perf_counter()
         found = evaluate_scene(scene, self.rows, self.out / "pictures" / f"{folder.name}.png")
         console.say(
@@ -76,7 +78,7 @@ def main() -> int:
     asked = _parse()
     console = Console()
     options = ReconstructOptions(iterations=asked.iterations, budget=asked.budget)
-    exam = Exam(asked.out, tuple(row for row in ROWS if row in asked.rows), options)
+    exam = Exam(asked.out, asked.work or asked.out / "work", tuple(row for row in ROWS if row in asked.rows), options)
     results, failures = [], []
     for name, make_folder in _scene_folders(asked):
         try:
@@ -153,6 +155,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--scenes", type=int, help="number of scenes (12, or all that are given)")
     parser.add_argument("--scenes-from", type=Path, help="folder of rendered scenes, instead of a number")
     parser.add_argument("--out", type=Path, help="folder of everything that is made (build/exam/NUMBER)")
+    parser.add_argument("--work", type=Path, help="folder of the reconstructions, to be shared by runs (OUT/work)")
     parser.add_argument("--iterations", type=int, default=1000, help="of each reconstruction (1000)")
     parser.add_argument("--budget", type=int, default=20_000, help="Gaussians of each reconstruction (20000)")
     parser.add_argument("--jobs", type=int, default=2, help="Blender processes at a time (2)")

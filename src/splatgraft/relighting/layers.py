@@ -11,6 +11,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.splitting import split_wide_around
 from splatgraft.relighting.light.confidence import light_confidence
+from splatgraft.relighting.light.estimate import EstimatedLight
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.prepared_object import PreparedObject
 from splatgraft.relighting.shading.gain import apply_gain
@@ -61,6 +62,10 @@ class Relit:
     """At the objects' place; None where there was no transfer."""
     report: tuple[str, ...]
     """Sentences: the lights that were found and their uncertainty, and what was not done and why."""
+    estimate: EstimatedLight | None = None
+    """What `light` rests on; None where it was told or there was no transfer."""
+    received: tuple[Float[Tensor, "n 3"], ...] = ()
+    """Linear rgb irradiance on the Gaussians of each object at the new place."""
     prepared: tuple[PreparedObject, ...] = ()
     """Per object its normals and the light that it was captured in; empty where there was no transfer."""
 

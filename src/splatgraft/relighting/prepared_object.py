@@ -16,7 +16,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
-from splatgraft.relighting.light.estimate import NoLight, estimate_light
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.shading.depth_normals import fuse_normals
 from splatgraft.relighting.shading.irradiance import irradiance
@@ -54,6 +54,8 @@ class SourceLighting:
     """Target's frame."""
     irradiance: Float[Tensor, "n 3"]
     """Linear rgb on each Gaussian under that light."""
+    estimate: EstimatedLight | None
+    """What the light rests on, source's frame; None where it was told."""
     materials: Materials
     """What of the object's colours is matt and what is gloss, in units of that light."""
 
@@ -110,10 +112,12 @@ def prepare_object(
     maps = object_shadow_maps(gaussians, sphere, samples)
     source_lighting, notes = None, None
     if source is not None:
-        source_light = _source_light(placed.gaussians, source, index, cache)
-        if isinstance(source_light, NoLight):
-            notes = source_light.reason
+        found = source.light or _source_light(placed.gaussians, source, index, cache)
+        if isinstance(found, NoLight):
+            notes = found.reason
         else:
+            estimate = found if isinstance(found, EstimatedLight) else None
+            source_light = found.light if isinstance(found, EstimatedLight) else found
             notes = source_light.describe(estimate_up(source.cameras))
             notes += "." if source.light is None else ", as given."
             source_light = source_light.rotated(placed.target_from_object.rotation)
@@ -123,7 +127,7 @@ def prepare_object(
             reflected = reflected_light(source_light, source_samples, shares)
             materials = estimate_materials(gaussians, normals.vectors, views, reflected)
             notes += _gloss_note(materials, gaussians)
-            source_lighting = SourceLighting(source_light, received, materials)
+            source_lighting = SourceLighting(source_light, received, estimate, materials)
     prepared = PreparedObject(
         gaussians=gaussians,
         target_from_object=placed.target_from_object,
@@ -190,18 +194,16 @@ def _moved(prepared: PreparedObject, placed: PlacedObject, samples: LightSamples
     )
 
 
-def _source_light(gaussians: Gaussians, source: SourceScene, index: int, cache: Memo) -> Light | NoLight:
-    """The light that object `index` was captured in: as told, or estimated once for all copies of one object."""
-    if source.light is not None:
-        return source.light
+def _source_light(gaussians: Gaussians, source: SourceScene, index: int, cache: Memo) -> EstimatedLight | NoLight:
+    """The light that object `index` was captured in, estimated once for all copies of one object."""
     for earlier in range(index):
         cached = cache.peek(f"source light {earlier}", (gaussians, source))
         if cached is not None:
             return cached
 
-    def estimate() -> Light | NoLight:
+    def estimate() -> EstimatedLight | NoLight:
         # the object's shadow in its capture is evidence too
         place = bounding_sphere(gaussians)
-        return estimate_light(source.gaussians, place, source.cameras, object_gaussians=gaussians)
+        return fit_light(source.gaussians, place, source.cameras, object_gaussians=gaussians)
 
     return cache.get(f"source light {index}", (gaussians, source), estimate)

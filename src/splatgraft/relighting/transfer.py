@@ -53,6 +53,8 @@ class _LitObject:
     prepared: PreparedObject
     sample_visibility: Float[Tensor, "n k"]
     """Share of every light sample that reaches it past the scene, in [0, 1]."""
+    received: Float[Tensor, "n 3"]
+    """Linear rgb irradiance at the new place."""
     shade: Float[Tensor, "n 3"]
     """Factor on linear rgb by its own shading."""
     gloss: Float[Tensor, "n 16 3"] | None
@@ -127,14 +129,14 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
     received = irradiance(scene.samples, normals.vectors, sample_visibility=shares)
     source = prepared.source_lighting
     if source is None:
-        return _LitObject(prepared, visibility, unknown_origin_ratio(received, opacities), None)
+        return _LitObject(prepared, visibility, received, unknown_origin_ratio(received, opacities), None)
     shade = shade_ratio(received, source.irradiance, opacities)
     if not bool(source.materials.glossy.any()):
-        return _LitObject(prepared, visibility, shade, None)
+        return _LitObject(prepared, visibility, received, shade, None)
     scale = light_scale(received, source.irradiance, opacities)
     reflected = reflected_light(scene.light, scene.samples, shares).scaled(scale)
     gloss = gloss_bands(prepared.gaussians, normals.vectors, source.materials, reflected, shade=shade)
-    return _LitObject(prepared, visibility, shade, gloss)
+    return _LitObject(prepared, visibility, received, shade, gloss)
 
 
 def _assembled(
@@ -168,6 +170,8 @@ def _assembled(
         objects=tuple(one.prepared.gaussians for one in objects),
         light=scene.light,
         report=tuple(report),
+        estimate=scene.estimate,
+        received=tuple(one.received for one in objects),
         prepared=tuple(one.prepared for one in objects),
     )
 

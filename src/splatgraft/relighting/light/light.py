@@ -19,10 +19,13 @@ shadows of a right direction too pale."""
 _LEAST_AMBIENT = 1e-3
 """Share of the largest ambient coefficient below which ambient irradiance does not fall: expansions may be negative."""
 
+_LEAST_DISTANCE = 1e-4
+"""World units; least distance of a source in a light.json, whose numbers have four decimals."""
+
 
 @dataclass(frozen=True)
 class LightSource:
-    """One distant, bright, round light."""
+    """One bright, round light."""
 
     direction: tuple[float, float, float]
     """Unit vector from the place towards the light, world frame."""
@@ -38,6 +41,9 @@ class LightSource:
     """Shown in reports: sun, window, lamp."""
     blockers_within: float = math.inf
     """World units; occluders farther away do not block it, such as the window that it comes through."""
+    distance: float = math.inf
+    """World units from the middle of the lit object, above 0; infinite for the sun. Shadows spread and light falls off
+    from where it stands."""
 
     @property
     def softness(self) -> float:
@@ -121,7 +127,7 @@ def light_to_json(light: Light) -> str:
             "uncertainty_deg": round(s.uncertainty_deg, 4),
             "confidence": round(s.confidence, 4),
         }
-        | ({"blockers_within": round(s.blockers_within, 4)} if math.isfinite(s.blockers_within) else {})
+        | {k: round(v, 4) for k, v in _lengths(s).items() if math.isfinite(v)}
         for s in light.sources
     ]
     record = {
@@ -182,6 +188,7 @@ def _source(entry: object, where: str) -> LightSource:
         "uncertainty_deg",
         "confidence",
         "blockers_within",
+        "distance",
     }
     unknown = sorted(set(entry) - known)
     if unknown:
@@ -202,7 +209,13 @@ def _source(entry: object, where: str) -> LightSource:
         confidence=_scalar(entry, "confidence", 1.0, (0.0, 1.0), where),
         name=name,
         blockers_within=_scalar(entry, "blockers_within", math.inf, (0.0, math.inf), where),
+        distance=_scalar(entry, "distance", math.inf, (_LEAST_DISTANCE, math.inf), where),
     )
+
+
+def _lengths(source: LightSource) -> dict[str, float]:
+    """What a light.json leaves out where it is infinite."""
+    return {"blockers_within": source.blockers_within, "distance": source.distance}
 
 
 def _scalar(entry: dict, key: str, default: float, bounds: tuple[float, float], where: str) -> float:

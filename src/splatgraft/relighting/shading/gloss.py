@@ -20,8 +20,8 @@ from splatgraft.relighting.shading.reflected_light import ReflectedLight
 
 _CHUNK = 4096
 """Gaussians at a time; bounds memory."""
-_VIEWS = 96
-"""Directions over the sphere: three times as many as are needed to integrate products of degree 3 without error."""
+_VIEWS = 64
+"""Directions over the sphere; twice as many as are needed to integrate products of degree 3 without error."""
 _BRIGHTEST = 1.5
 """Linear; brighter reflections are clipped, which keeps bands from ringing over the whole object."""
 

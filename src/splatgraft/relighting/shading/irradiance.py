@@ -22,7 +22,7 @@ class ShadeSettings:
     """Most factor by which a Gaussian's ratio may differ from the object's mean ratio; set by hand."""
     floor: float = 0.08
     """Share of the mean irradiance that is added to all: interreflections that no sample follows; set by hand."""
-    level_share: float = 0.0
+    level_share: float = 0.75
     """Share, in [0, 1], of the mean's gray part (in logarithms) that is applied. 0: both captures were exposed for
     their own light, and the level of an estimated ratio is wrong by more than it is worth (0.9 stops)."""
     tint_share: float = 1.0

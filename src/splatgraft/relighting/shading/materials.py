@@ -18,6 +18,8 @@ from splatgraft.relighting.shading.reflected_light import ReflectedLight
 
 _CHUNK = 8192
 """Gaussians at a time; bounds memory."""
+_MOST_FITTED = 8192
+"""Gaussians that lobes are fitted to, spread over the object; more add time and change nothing."""
 
 
 @dataclass(frozen=True)
@@ -185,11 +187,11 @@ class _Record:
         """Mean colour over the views, linear rgb."""
         return (self.weight[..., None] * self.colors).sum(1)
 
-    def mirrored(self, rows: slice) -> Float[Tensor, "m v 3"]:
+    def mirrored(self, rows: slice | Int[Tensor, "m"]) -> Float[Tensor, "m v 3"]:
         """View directions mirrored by the surface."""
         return self.directions[rows] + 2 * self.cosine[rows][..., None] * self.normals[rows][:, None]
 
-    def centred(self, values: Float[Tensor, "m v 3"], rows: slice) -> Float[Tensor, "m v 3"]:
+    def centred(self, values: Float[Tensor, "m v 3"], rows: slice | Int[Tensor, "m"]) -> Float[Tensor, "m v 3"]:
         """Values without each Gaussian's mean over the views."""
         return values - (self.weight[rows][..., None] * values).sum(1, keepdim=True)
 
@@ -249,8 +251,8 @@ def _fitted(
     shapes = [(value, kind) for value in settings.concentrations for kind in (False, True)]
     count = int(cluster.max()) + 1
     own, cross, square = (torch.zeros(len(shapes), count, 3) for _ in range(3))
-    for start in range(0, len(cluster), _CHUNK):
-        rows = slice(start, start + _CHUNK)
+    fitted = torch.arange(0, len(cluster), -(-len(cluster) // _MOST_FITTED))
+    for rows in fitted.split(_CHUNK // 4):
         weight = (record.pixels[rows, None] * record.weight[rows])[..., None]
         seen, mirrored, here = record.centred(record.colors[rows], rows), record.mirrored(rows), light.select(rows)
         fresnel = _schlick(record.cosine[rows], settings.facing)[..., None]

@@ -27,7 +27,7 @@ class ObjectViewSettings:
     """Width of a view in pixels, per square root of the number of Gaussians: a Gaussian in front then covers a few."""
     least_width: int = 48
     """Pixels."""
-    most_width: int = 192
+    most_width: int = 128
     """Pixels; bounds the time."""
     filled: float = 0.95
     """Share of the width that the bounding sphere fills."""

@@ -28,7 +28,7 @@ class LightSamplingSettings:
 
 @dataclass(frozen=True)
 class LightSamples:
-    """k directional samples that together are the light at a place; those of the sources come first."""
+    """k samples that together are the light at a place; those of the sources come first."""
 
     directions: Float[Tensor, "k 3"]
     """Unit, towards the light."""
@@ -40,6 +40,8 @@ class LightSamples:
     """True for a sample of a source, False for one of the ambient light."""
     blockers_within: tuple[float, ...]
     """World units; occluders farther away towards the light do not block the sample."""
+    distances: Float[Tensor, "k"]
+    """World units from the middle of the place; infinite for directional samples."""
 
     def __len__(self) -> int:
         """Number of samples k."""
@@ -52,13 +54,14 @@ def sample_light(light: Light, *, settings: LightSamplingSettings = LightSamplin
     A source of confidence c gives c of its irradiance to its own samples and the rest to the ambient ones, so a source
     that may not exist casts a weaker shadow.
     """
-    directions, irradiance, softness, within = [], [], [], []
+    directions, irradiance, softness, within, distances = [], [], [], [], []
     for source, count in zip(light.sources, _sample_counts(light, settings), strict=False):
         rgb = torch.tensor(source.irradiance) * source.confidence / count
         for direction in _cone_directions(source, count):
             directions.append(direction)
             irradiance.append(rgb)
             within.append(source.blockers_within)
+            distances.append(source.distance)
             softness.append(source.softness / math.sqrt(count) if count > 1 else source.softness)
     unsure = sum((torch.tensor(s.irradiance) * (1 - s.confidence) for s in light.sources), torch.zeros(3))
     n = settings.ambient_samples
@@ -72,6 +75,7 @@ def sample_light(light: Light, *, settings: LightSamplingSettings = LightSamplin
         softness=torch.tensor(softness + [math.acos(1 - 2 / n)] * n),
         is_source=(True,) * len(directions) + (False,) * n,
         blockers_within=(*within, *(math.inf,) * n),
+        distances=torch.tensor(distances + [math.inf] * n),
     )
 
 
@@ -111,6 +115,7 @@ def _pairs(samples: LightSamples, *, source: bool) -> tuple[LightSamples, Int[Te
         softness=samples.softness[which],
         is_source=(source,) * count,
         blockers_within=tuple(samples.blockers_within[int(i)] for i in which.nonzero()[:, 0]),
+        distances=samples.distances[which],
     )
     front = torch.arange(count)
     return part, front, front + count if source else (front + count // 2) % max(count, 1)

@@ -49,6 +49,8 @@ class Occlusion:
     """Half the width of the maps, world units."""
     frames: Float[Tensor, "k 3 3"]
     """Rows right, down, away from the light."""
+    nearness: Float[Tensor, "k"]
+    """One over the light's distance from the centre; 0 for directional samples."""
     texels: Float[Tensor, "k p 6"]
     """All p texels, finest level first, premultiplied by alpha: alpha, depth of the lit side, depth of the middle,
     linear rgb of the unlit side."""
@@ -56,7 +58,9 @@ class Occlusion:
     """Width of the finest level, pixels."""
 
 
-def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tensor, "k"]) -> Occlusion:
+def occlusion_from_maps(
+    maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tensor, "k"], *, brightest: Float[Tensor, "k 3"]
+) -> Occlusion:
     """Mip pyramids of some depth maps.
 
     Args:
@@ -64,6 +68,7 @@ def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tens
         front: Position in `maps` of each sample's map.
         back: Position of the map from the opposite direction, which shows the unlit side (mirrored in u, depth
             negated).
+        brightest: Linear rgb radiance that the unlit side does not exceed.
     """
     alpha = maps.alpha[front]
     first = torch.where(maps.first < float(FAR) / 2, maps.first, maps.mean)
@@ -71,6 +76,7 @@ def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tens
     far_side = torch.maximum(-first[back].flip(2), lit_side)
     planes = [alpha, alpha * lit_side, alpha * 0.5 * (lit_side + far_side)]
     unlit = (maps.color[back] / maps.alpha[back][:, None].clamp_min(1e-3)).flip(3)
+    unlit = torch.minimum(unlit, brightest[:, :, None, None])
     planes += [alpha * unlit[:, channel] for channel in range(3)]
     level = torch.stack(planes, 1)
     levels = []
@@ -84,6 +90,7 @@ def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tens
         center=window.center,
         radius=window.radius,
         frames=window.frames[front],
+        nearness=torch.zeros(len(front)) if window.nearness is None else window.nearness[front],
         texels=torch.cat(levels, 1).contiguous(),
         size=maps.first.shape[1],
     )
@@ -113,7 +120,15 @@ def occluded_irradiance(
     """
     arrays = [
         np.ascontiguousarray(t.numpy(), dtype=np.float32)
-        for t in (occlusion.frames, samples.irradiance, samples.softness, points, normals, sample_visibility)
+        for t in (
+            occlusion.frames,
+            occlusion.nearness,
+            samples.irradiance,
+            samples.softness,
+            points,
+            normals,
+            sample_visibility,
+        )
     ]
     out = np.zeros((3, len(points), 3), np.float32)
     place = np.array([*occlusion.center.tolist(), occlusion.radius, bias], np.float32)
@@ -138,7 +153,7 @@ def _soft_cosine(cosine, softness):
 @njit(cache=True, parallel=True, fastmath=True)
 @no_type_check
 def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one kernel: search, filter, sums)
-    frames, irradiance, softness, points, normals, sample_visibility = arrays
+    frames, nearness, irradiance, softness, points, normals, sample_visibility = arrays
     radius, bias = place[3], place[4]
     texel = 2 * radius / size
     search, taps = _SEARCH_TAPS, _SOURCE_TAPS if len(frames) < _FEW_SAMPLES else _AMBIENT_TAPS
@@ -151,21 +166,27 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
     for i in prange(len(points)):
         x, y, z = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
         for k in range(len(frames)):
-            f = frames[k]
-            cosine = -(f[2, 0] * normals[i, 0] + f[2, 1] * normals[i, 1] + f[2, 2] * normals[i, 2])
-            weight = _soft_cosine(cosine, softness[k]) * sample_visibility[i, k]
+            f, near = frames[k], nearness[k]
+            # towards the light, in units of its distance from the centre
+            lx, ly, lz = -f[2, 0] - near * x, -f[2, 1] - near * y, -f[2, 2] - near * z
+            square = max(lx * lx + ly * ly + lz * lz, np.float32(1e-6))
+            cosine = (lx * normals[i, 0] + ly * normals[i, 1] + lz * normals[i, 2]) / np.sqrt(square)
+            weight = _soft_cosine(cosine, softness[k]) * sample_visibility[i, k] / square
             if weight <= 0:
                 continue
             for c in range(3):
                 out[0, i, c] += weight * irradiance[k, c]
-            u, v = f[0, 0] * x + f[0, 1] * y + f[0, 2] * z, f[1, 0] * x + f[1, 1] * y + f[1, 2] * z
             depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
+            # in the plane through the centre, seen from the light
+            zoom = np.float32(1) / max(np.float32(1) + near * depth, np.float32(1e-3))
+            u = zoom * (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z)
+            v = zoom * (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z)
             spread = np.tan(min(softness[k], _WIDEST_CONE))
             # change of the cosine over the cone: directions below the surface give no light
             tilt_u = spread * (f[0, 0] * normals[i, 0] + f[0, 1] * normals[i, 1] + f[0, 2] * normals[i, 2])
             tilt_v = spread * (f[1, 0] * normals[i, 0] + f[1, 1] * normals[i, 1] + f[1, 2] * normals[i, 2])
             facing = np.float32(0)
-            width = spread * max(np.float32(0), depth + radius)
+            width = spread * zoom * max(np.float32(0), depth + radius) / (np.float32(1) - near * radius)
             blocked, red, green, blue = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
             if depth > -radius and abs(u) < radius + width and abs(v) < radius + width:
                 found, distance = np.float32(0), np.float32(0)
@@ -173,7 +194,8 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
                     if t == search:
                         if found < _LEAST_ALPHA:
                             break
-                        width = spread * max(np.float32(0), distance / found)
+                        behind = max(np.float32(0), distance / found)
+                        width = spread * zoom * behind / (np.float32(1) + near * (depth - behind))
                     tap_cosine = max(np.float32(0), cosine + disk[t, 0] * tilt_u + disk[t, 1] * tilt_v)
                     if t >= search:
                         facing += tap_cosine

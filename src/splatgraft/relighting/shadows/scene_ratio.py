@@ -3,6 +3,7 @@
 Differential rendering (Debevec 1998): the ratio of irradiance with the object to irradiance without it.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.directions import frames_along
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.relighting.shading.irradiance import irradiance
 from splatgraft.relighting.shading.normals import raised
 from splatgraft.relighting.shadows.light_sampling import LightSamples, ambient_pairs, source_pairs
 from splatgraft.relighting.shadows.occlusion import Occlusion, occluded_irradiance, occlusion_from_maps
@@ -45,6 +47,11 @@ class ShadowMapSettings:
     """Share of an ambient sample that still arrives where the scene blocks it; set by hand."""
     blockers_around: float = 1.5
     """Radii of the region within which the scene's Gaussians block light; set by hand."""
+    whitest: float = 0.8
+    """Most albedo of an object: its unlit side is no brighter than the light on it allows, whatever light it was
+    captured in; fresh snow and white paint have about this."""
+    nearest_source: float = 1.5
+    """Object radii; a nearer source counts as this far from the object's middle; set by hand."""
 
 
 @dataclass(frozen=True)
@@ -91,14 +98,24 @@ def object_shadow_maps(
     ambient, ambient_front, ambient_back = ambient_pairs(samples)
     source_bias, ambient_bias = settings.object_bias
     occlusions = []
+
+    def unlit(part: LightSamples) -> Float[Tensor, "k 3"]:
+        facing = irradiance(samples, -part.directions, sample_visibility=torch.ones(len(part), len(samples)))
+        return settings.whitest * facing / math.pi
+
     if len(sources):
         both = torch.cat([sources.directions, -sources.directions])
-        window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(both))
+        nearness = 1 / sources.distances.clamp_min(settings.nearest_source * sphere.radius)
+        # from a near light the sphere's rim is seen farther out than its radius
+        rim = sphere.radius / math.sqrt(1 - (float(nearness.max()) * sphere.radius) ** 2)
+        window = Window(sphere.center, rim, frames_along(both), torch.cat([nearness, -nearness]))
         maps = splat_depth_maps(occluders, window, size=settings.source_size, with_color=True)
-        occlusions.append((sources, occlusion_from_maps(maps, front, back), source_bias * maps.texel))
+        occlusion = occlusion_from_maps(maps, front, back, brightest=unlit(sources))
+        occlusions.append((sources, occlusion, source_bias * maps.texel))
     window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(ambient.directions))
     maps = splat_depth_maps(occluders, window, size=settings.ambient_size, with_color=True)
-    occlusions.append((ambient, occlusion_from_maps(maps, ambient_front, ambient_back), ambient_bias * maps.texel))
+    occlusion = occlusion_from_maps(maps, ambient_front, ambient_back, brightest=unlit(ambient))
+    occlusions.append((ambient, occlusion, ambient_bias * maps.texel))
     return ObjectShadowMaps(maps, tuple(occlusions))
 
 
@@ -291,10 +308,13 @@ def reachable(
     away = points - sphere.center
     distance = away.norm(dim=1)
     near = distance - rims < settings.near_reach * sphere.radius
-    for direction, softness, source in zip(samples.directions, samples.softness, samples.is_source, strict=True):
+    parts = zip(samples.directions, samples.softness, samples.is_source, samples.distances, strict=True)
+    for direction, softness, source, light_distance in parts:
         if source:
             along = -(away @ direction)
             aside = (distance**2 - along**2).clamp_min(0).sqrt()
             spread = torch.tan(softness.clamp_max(settings.widest_cone)) * (along + sphere.radius).clamp_min(0)
-            near |= (along + rims > -sphere.radius) & (aside - rims < sphere.radius + spread)
+            # the shadow of a near light widens with the distance
+            wider = 1 + along.clamp_min(0) / (light_distance - sphere.radius).clamp_min(0.5 * sphere.radius)
+            near |= (along + rims > -sphere.radius) & (aside - rims < wider * (sphere.radius + spread))
     return near & (distance - rims < farthest)

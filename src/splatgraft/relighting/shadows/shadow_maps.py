@@ -1,4 +1,4 @@
-"""Shadow maps: orthographic depth maps splatted from Gaussians along many directions, and visibility from them.
+"""Shadow maps: depth maps splatted from Gaussians along many directions, and visibility from them.
 
 Visibility by percentage-closer filtering (Reeves et al. 1987) with an offset along the normal.
 """
@@ -39,6 +39,8 @@ _DILATION = np.float32(0.15)
 """Pixels squared, added to the variance of a splat's footprint against aliasing."""
 _LIFT = np.float32(1.5)
 """Pixels; a receiver is looked up this far above its surface, along the normal."""
+_NEAREST_TO_LIGHT = np.float32(0.05)
+"""Share of a near light's distance; occluders nearer to it are left out."""
 _FLATTEST = np.float32(0.2)
 """Cosine of incidence below which the slope-dependent bias grows no further."""
 
@@ -53,6 +55,9 @@ class Window:
     """Half the width of every map, world units."""
     frames: Float[Tensor, "k 3 3"]
     """Rotations with rows right, down, away from the light: x_in_light = frame @ (x_in_world - center)."""
+    nearness: Float[Tensor, "k"] | None = None
+    """One over the light's distance from the centre (perspective maps; negative for a light behind), 0 or None for
+    orthographic ones: (u, v, depth) in the light's frame is seen at (u, v) / (1 + nearness * depth)."""
 
     @property
     def directions(self) -> Float[Tensor, "k 3"]:
@@ -99,7 +104,7 @@ def thinned(gaussians: Gaussians, *, width: float) -> Gaussians:
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """Orthographic depth maps of some occluders, s x s pixels each, from k directions."""
+    """Depth maps of some occluders, s x s pixels each, from k directions."""
 
     window: Window
     """What the maps cover."""
@@ -138,8 +143,9 @@ def splat_depth_maps(
     geometry = (_array(occluders.means), _array(occluders.covariances), _array(occluders.opacities))
     view = (_array(window.frames), _array(window.center), np.float32(window.radius))
     limits = _array(nearest) if nearest is not None else np.full(k, -FAR, np.float32)
+    nearness = _array(window.nearness) if window.nearness is not None else np.zeros(k, np.float32)
     planes = (first, transmittance, mean, color)
-    _splat(geometry, _array(occluders.linear_rgb), view, limits, planes, get_num_threads())
+    _splat(geometry, _array(occluders.linear_rgb), view, (limits, nearness), planes, get_num_threads())
     first[transmittance >= _HALF] = FAR
     alpha = np.subtract(np.float32(1), transmittance, out=transmittance)
     mean /= np.maximum(alpha[:c], np.float32(1e-6))
@@ -177,10 +183,11 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 @njit(cache=True, fastmath=True)
 @no_type_check
-def _project(frame, geometry, view, nearest, splats):  # noqa: PLR0915  (one kernel: culling, sorting, projection)
+def _project(frame, geometry, view, limits, splats):  # noqa: PLR0915  (one kernel: culling, sorting, projection)
     """Write the splats that touch a map into the rows of `splats`, sorted by depth, and return their number."""
     means, covariances, opacities = geometry
     center, radius, size = view
+    nearest, nearness = limits
     f = frame
     per_unit = np.float32(size / (2 * radius))
     square = per_unit * per_unit
@@ -190,12 +197,14 @@ def _project(frame, geometry, view, nearest, splats):  # noqa: PLR0915  (one ker
     for i in range(len(means)):
         x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
-        if opacities[i] < _FAINTEST or depth < nearest:
+        closer = np.float32(1) + nearness * depth
+        if opacities[i] < _FAINTEST or depth < nearest or closer < _NEAREST_TO_LIGHT:
             continue
         c = covariances[i]
-        reach = _CUTOFF * np.sqrt(c[0, 0] + c[1, 1] + c[2, 2]) + np.float32(1) / per_unit
-        u = f[0, 0] * x + f[0, 1] * y + f[0, 2] * z
-        v = f[1, 0] * x + f[1, 1] * y + f[1, 2] * z
+        scale = np.float32(1) / closer
+        reach = scale * _CUTOFF * np.sqrt(c[0, 0] + c[1, 1] + c[2, 2]) + np.float32(1) / per_unit
+        u = scale * (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z)
+        v = scale * (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z)
         if abs(u) > radius + reach or abs(v) > radius + reach:
             continue
         depths[count], kept[count] = depth, i
@@ -215,21 +224,27 @@ def _project(frame, geometry, view, nearest, splats):  # noqa: PLR0915  (one ker
         start[b] += 1
         x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         c = covariances[i]
-        # rows of F C, then F C F^T for (u, v) and the depth column
-        a0 = f[0, 0] * c[0, 0] + f[0, 1] * c[1, 0] + f[0, 2] * c[2, 0]
-        a1 = f[0, 0] * c[0, 1] + f[0, 1] * c[1, 1] + f[0, 2] * c[2, 1]
-        a2 = f[0, 0] * c[0, 2] + f[0, 1] * c[1, 2] + f[0, 2] * c[2, 2]
-        b0 = f[1, 0] * c[0, 0] + f[1, 1] * c[1, 0] + f[1, 2] * c[2, 0]
-        b1 = f[1, 0] * c[0, 1] + f[1, 1] * c[1, 1] + f[1, 2] * c[2, 1]
-        b2 = f[1, 0] * c[0, 2] + f[1, 1] * c[1, 2] + f[1, 2] * c[2, 2]
-        uu = (a0 * f[0, 0] + a1 * f[0, 1] + a2 * f[0, 2]) * square + _DILATION
-        uv = (a0 * f[1, 0] + a1 * f[1, 1] + a2 * f[1, 2]) * square
-        vv = (b0 * f[1, 0] + b1 * f[1, 1] + b2 * f[1, 2]) * square + _DILATION
+        # rows of the projection's Jacobian J (EWA, Zwicker et al. 2001); those of F where the light is far
+        scale = np.float32(1) / (np.float32(1) + nearness * depths[j])
+        u = scale * (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z)
+        v = scale * (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z)
+        du, dv = scale * nearness * u, scale * nearness * v
+        j0, j1, j2 = scale * f[0, 0] - du * f[2, 0], scale * f[0, 1] - du * f[2, 1], scale * f[0, 2] - du * f[2, 2]
+        k0, k1, k2 = scale * f[1, 0] - dv * f[2, 0], scale * f[1, 1] - dv * f[2, 1], scale * f[1, 2] - dv * f[2, 2]
+        # rows of J C, then J C J^T for (u, v) and the depth column
+        a0 = j0 * c[0, 0] + j1 * c[1, 0] + j2 * c[2, 0]
+        a1 = j0 * c[0, 1] + j1 * c[1, 1] + j2 * c[2, 1]
+        a2 = j0 * c[0, 2] + j1 * c[1, 2] + j2 * c[2, 2]
+        b0 = k0 * c[0, 0] + k1 * c[1, 0] + k2 * c[2, 0]
+        b1 = k0 * c[0, 1] + k1 * c[1, 1] + k2 * c[2, 1]
+        b2 = k0 * c[0, 2] + k1 * c[1, 2] + k2 * c[2, 2]
+        uu = (a0 * j0 + a1 * j1 + a2 * j2) * square + _DILATION
+        uv = (a0 * k0 + a1 * k1 + a2 * k2) * square
+        vv = (b0 * k0 + b1 * k1 + b2 * k2) * square + _DILATION
         uz = (a0 * f[2, 0] + a1 * f[2, 1] + a2 * f[2, 2]) * per_unit
         vz = (b0 * f[2, 0] + b1 * f[2, 1] + b2 * f[2, 2]) * per_unit
         inverse = np.float32(1) / (uu * vv - uv * uv)
-        s[0] = (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z + radius) * per_unit
-        s[1] = (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z + radius) * per_unit
+        s[0], s[1] = (u + radius) * per_unit, (v + radius) * per_unit
         s[2] = depths[j]
         s[3], s[4], s[5] = vv * inverse, -uv * inverse, uu * inverse
         s[6], s[7] = s[3] * uz + s[4] * vz, s[4] * uz + s[5] * vz
@@ -268,12 +283,13 @@ def _blend(splat, at, dv, du, maps):
 @no_type_check
 def _splat(geometry, rgb, view, limits, maps, threads):
     frames, center, radius = view
+    nearest, nearness = limits
     first, transmittances, mean, color = maps
     size = first.shape[1]
     for thread in prange(threads):
         splats = np.empty((len(geometry[0]), 12), np.float32)
         for k in range(thread, len(frames), threads):
-            count = _project(frames[k], geometry, (center, radius, size), limits[k], splats)
+            count = _project(frames[k], geometry, (center, radius, size), (nearest[k], nearness[k]), splats)
             finished = np.zeros((size, size // LANES), np.bool_)
             near, transmittance = first[k], transmittances[k]
             for j in range(count):
