@@ -1,6 +1,7 @@
 # make install: the package in .venv; make demo: a whole transfer on shipped captures;
 # make dev: also what the checks need; make test: all checks; make test-fast: those that take a minute;
 # make blender: Blender as a Python module in .venv-blender, for `splatgraft synth --blender-python`;
+# make exam NUMBER=...: the light transfer measured on new scenes drawn from a number that no exam has used;
 # make browser: Chromium, for the editor's tests.
 SHELL := /bin/bash
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -44,6 +45,12 @@ blender: .venv-blender/.installed
 	$(BLENDER_PYTHON) -m venv .venv-blender
 	.venv-blender/bin/python -m pip install --quiet --disable-pip-version-check 'bpy==4.2.23' numpy==2.4.6
 	@touch $@
+
+# an exam of the light transfer on new scenes: about 3 CPU-minutes a scene to render, 3 to reconstruct, 1 to measure
+.PHONY: exam
+exam: install blender
+	@test -n "$(NUMBER)" || { echo "make: expected NUMBER=..., a number that no exam has used, found none"; exit 1; }
+	$(BIN)/python benchmarks/exam $(NUMBER)
 
 # Debian's Chromium with software OpenGL, for the stories of the editor; apt is used by root alone
 browser:

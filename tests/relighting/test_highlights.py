@@ -12,8 +12,8 @@ from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.core.rotations import quaternion_from_rotation
-from splatgraft.relighting.light.direction_estimate import estimate_direction
 from splatgraft.relighting.light.highlight_evidence import find_highlights
+from splatgraft.relighting.light.surroundings import DIRECTIONS
 from splatgraft.relighting.shading.normals import estimate_normals
 
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -54,13 +54,17 @@ def test_highlights_on_a_bare_table_give_the_direction(azimuth):
     normals = estimate_normals(scene, views())
     highlights = find_highlights(scene, normals, views(), region=REGION)
     assert highlights is not None
-    found = estimate_direction(scene, normals, region=REGION, up=UP, highlights=highlights)
-    assert found is not None
-    off = math.degrees(math.acos(float(found.direction @ sun)))
-    # tried directions lie 4 degrees apart near the best; harmonics of degree 3 shift the peak of the lobe by up to 6
-    assert off < 10
-    assert found.highlight_evidence > 0.5
-    assert found.confidence > 0.5
+    evidence = highlights.evidence()
+    single = torch.eye(len(DIRECTIONS))
+    explained = torch.tensor([evidence.explained(light) for light in single])
+    best = DIRECTIONS[explained.argmax()]
+    # directions lie 11 degrees apart; harmonics of degree 3 shift the peak of the lobe by up to 6
+    assert math.degrees(math.acos(float(best @ sun))) < 12
+    assert float(explained.max()) > 0.5
+    # a light beside it changes the share as when it is computed anew
+    both = 2 * single[explained.argmax()] + 3 * single
+    more = evidence.explained_with_more(2 * single[explained.argmax()], torch.arange(len(single)), 3 * torch.ones(320))
+    assert torch.allclose(more, torch.tensor([evidence.explained(light) for light in both]), atol=1e-4)
 
 
 def test_a_matt_table_has_no_highlights():

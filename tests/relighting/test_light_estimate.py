@@ -1,25 +1,27 @@
-"""The estimated light in scenes of known light: shadow evidence, patches of a panorama, normals, splits."""
+"""The estimated light in scenes of known light: shadows, clipped patches, nothing to see; normals, splits."""
 
 import math
+from dataclasses import replace
 
+import pytest
 import torch
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.composite import PlacedObject
 from splatgraft.core.directions import even_directions, fit_sh, frames_along
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.core.rotations import quaternion_from_rotation
+from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.core.splitting import split_along
-from splatgraft.relighting.light.direction_estimate import estimate_direction
 from splatgraft.relighting.light.estimate import estimate_light
 from splatgraft.relighting.light.light import Light, fit_ambient
 from splatgraft.relighting.shading.normals import estimate_normals
 from splatgraft.rendering import render
 
 UP = torch.tensor([0.0, 0.0, 1.0])
-REGION = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.0)
 
 
 def colored(points, normals, width, rgb) -> Gaussians:
@@ -33,10 +35,12 @@ def colored(points, normals, width, rgb) -> Gaussians:
     )
 
 
-def views():
+def views(levels=(0.0,)):
+    """Twelve cameras around the middle, for each level that they look at."""
     turn = torch.arange(12) / 12 * 2 * math.pi
     eyes = torch.stack([2.5 * turn.cos(), 2.5 * turn.sin(), torch.full((12,), 1.5)], 1)
-    return pinhole(look_at(eyes, torch.zeros(3), UP), 100.0, width=128, height=96)
+    poses = torch.cat([look_at(eyes, torch.tensor([0.0, 0.0, level]), UP) for level in levels])
+    return pinhole(poses, 100.0, width=128, height=96)
 
 
 def sunlit_scene(sun, strength):
@@ -63,36 +67,75 @@ def sunlit_scene(sun, strength):
     return colored(point[keep], normal[keep], 0.03, srgb_from_linear(gray)[keep, None].repeat(1, 3))
 
 
-def test_shadows_give_the_direction_and_strength_of_the_sun():
-    sun = torch.nn.functional.normalize(torch.tensor([0.6, -0.5, 0.8]), dim=0)
-    scene = sunlit_scene(sun, strength=3.0)
-    found = estimate_direction(scene, estimate_normals(scene, views()), region=REGION, up=UP)
-    assert found is not None
-    # tried directions lie 8 degrees apart, the finer ones 2
-    assert math.degrees(math.acos(float(found.direction @ sun))) < 6
-    assert found.confidence > 0.5
-    # within a factor of two: more is not needed for the shadow (and edges of low maps take some of it)
-    assert 1.5 < float(found.strength.mean()) < 6
+def estimated(scene, cameras=None) -> Light:
+    place = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
+    found = estimate_light(scene, place, views() if cameras is None else cameras)
+    assert isinstance(found, Light)
+    return found
 
 
-def test_an_even_sky_gives_no_confident_sun():
-    scene = sunlit_scene(UP, strength=0.0)
-    found = estimate_direction(scene, estimate_normals(scene, views()), region=REGION, up=UP)
-    assert found is None or found.confidence < 0.3 or float(found.strength.mean()) < 0.2
+def main_direction(light):
+    """Of most irradiance."""
+    normals = even_directions(2000)
+    return normals[light.irradiance(normals).sum(1).argmax()]
 
 
-def test_a_bright_window_is_found_in_the_panorama():
+@pytest.mark.parametrize("azimuth", [0.0, 2.1, 4.2])
+def test_shadows_give_the_direction_of_a_sun_that_no_camera_saw(azimuth):
+    sun = torch.nn.functional.normalize(torch.tensor([0.78 * math.cos(azimuth), 0.78 * math.sin(azimuth), 0.8]), dim=0)
+    light = estimated(sunlit_scene(sun, strength=3.0))
+    # directions lie 11 degrees apart
+    assert math.degrees(math.acos(float(torch.tensor(light.sources[0].direction) @ sun))) < 11
+    facing, away = light.irradiance(torch.stack([sun, torch.tensor([-1.0, -1.0, 1.0]) * sun])).mean(1)
+    # sky 1, sun 3: the true ratio is 1 + 3 over about 1 + 3 max(0, cos); within a factor of two
+    truth = 4 / (1 + 3 * max(0.0, float(sun[2] ** 2 - sun[0] ** 2 - sun[1] ** 2)))
+    assert truth / 2 < float(facing / away) < truth * 2
+
+
+def test_an_even_sky_gives_an_even_light():
+    light = estimated(sunlit_scene(UP, strength=0.0))
+    up, side = light.irradiance(torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])).mean(1)
+    # the ground takes half of the sky from a wall
+    assert float(up / side) < 3
+
+
+@pytest.mark.parametrize("white", [1.0, 0.99])
+def test_a_clipped_window_is_a_source_where_it_was_photographed(white):
     shell = even_directions(6000)
-    window = torch.nn.functional.normalize(torch.tensor([0.8, 0.3, 0.5]), dim=0)
+    window = torch.nn.functional.normalize(torch.tensor([0.8, 0.3, 0.15]), dim=0)
     bright = shell @ window > math.cos(math.radians(10))
-    rgb = torch.where(bright[:, None], 1.0, 0.4).repeat(1, 3)
-    scene = colored(20 * shell, -shell, 0.6, rgb)
-    light = estimate_light(scene, BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3), views())
-    assert isinstance(light, Light)
+    rgb = torch.where(bright[:, None], white, 0.4).repeat(1, 3)
+    room = colored(20 * shell, -shell, 0.6, rgb)
+    floor = sunlit_scene(window, strength=3.0)
+    light = estimated(concatenate([room, floor]), views((0.0, 1.5)))
     main = light.sources[0]
     # half the patch's radius: its edge is ragged by the splats' width, 3 degrees
     assert math.degrees(math.acos(min(1.0, float(torch.tensor(main.direction) @ window)))) < 5
-    assert main.confidence < 0.7  # no shadow is evidence for it
+    # brighter than the camera recorded: white over its solid angle is 0.095
+    assert main.luminance > 0.2
+
+
+def test_without_surfaces_to_compare_the_light_is_what_was_photographed():
+    shell = even_directions(6000)
+    light = estimated(colored(20 * shell, -shell, 0.6, torch.full((6000, 3), 0.5)), views((0.0, 1.5)))
+    normals = even_directions(50)
+    # sRGB 0.5 is 0.214
+    assert torch.allclose(light.irradiance(normals), torch.full((50, 3), 0.214 * math.pi), rtol=0.25)
+
+
+def test_the_estimate_does_not_depend_on_the_world_axes():
+    sun = torch.nn.functional.normalize(torch.tensor([0.6, -0.5, 0.8]), dim=0)
+    scene = sunlit_scene(sun, strength=3.0)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2))).Q
+    turn = turn * torch.linalg.det(turn)
+    turned_scene = PlacedObject(scene, Similarity(1.0, turn, torch.zeros(3))).in_target()
+    cameras = views()
+    poses = cameras.world_from_camera.clone()
+    poses[:, :3] = turn @ poses[:, :3]
+    place = BoundingSphere(turn @ torch.tensor([0.0, 0.0, 0.3]), 0.3)
+    found = estimate_light(turned_scene, place, replace(cameras, world_from_camera=poses))
+    assert isinstance(found, Light)
+    assert math.degrees(math.acos(min(1.0, float(torch.tensor(found.sources[0].direction) @ (turn @ sun))))) < 11
 
 
 def test_a_harmonic_fit_of_half_the_sphere_recovers_an_even_light():

@@ -213,6 +213,13 @@ def test_a_benchmark_scene_is_laid_out_sound_with_its_true_light(tmp_path):
     found = torch.tensor(light.sources[0].direction)
     # the sun is written with five digits
     assert float(found @ towards / towards.norm()) > 1 - 1e-4
+    assert np.load(out / "old_light" / "0000.npy").min() >= 0
+    surface = np.load(out / "surface.npy")
+    assert np.allclose(np.linalg.norm(surface[:, 3:], axis=1), 1, atol=1e-5)  # float32
+    # its normals point outward: on the whole away from the object's axis
+    flat = surface[:, :2] - place.location[:2]
+    assert (flat * surface[:, 3:5]).sum(1).mean() > 0
+    assert abs(float(surface[:, 2].min()) - place.location[2]) < 0.03  # a blob is sunk by 4% of its height
 
 
 def test_a_turned_object_stands_as_the_placement_says():

@@ -11,7 +11,9 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.splitting import split_wide_around
 from splatgraft.relighting.light.confidence import light_confidence
+from splatgraft.relighting.light.estimate import EstimatedLight
 from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.prepared_object import PreparedObject
 from splatgraft.relighting.shading.gain import apply_gain
 
 _MOST_VIEW_CHANGE = 0.9
@@ -52,12 +54,20 @@ class Relit:
     """View dependence, world axes: its product with the unit vector from the camera is added to shadow and bounce."""
     gloss: Float[Tensor, "m k 3"]
     """Coefficients that are added to the harmonics after shading."""
+    bands_replaced: Bool[Tensor, "m"]
+    """Whose own higher bands `gloss` replaces: they show what reflected the old light."""
     objects: tuple[Gaussians, ...]
     """The placed objects, target's frame."""
     light: Light | None
     """At the objects' place; None where there was no transfer."""
     report: tuple[str, ...]
     """Sentences: the lights that were found and their uncertainty, and what was not done and why."""
+    estimate: EstimatedLight | None = None
+    """What `light` rests on; None where it was told or there was no transfer."""
+    received: tuple[Float[Tensor, "n 3"], ...] = ()
+    """Linear rgb irradiance on the Gaussians of each object at the new place."""
+    prepared: tuple[PreparedObject, ...] = ()
+    """Per object its normals and the light that it was captured in; empty where there was no transfer."""
 
     @property
     def confidence(self) -> float:
@@ -87,6 +97,7 @@ class Relit:
             color = spherical_harmonics.rgb_from_dc(self.gaussians.sh[sloped, 0])
             slope = _srgb_slope(color, ratio[sloped], weights.shadow * self.slope[sloped])
             sh[sloped, 1:4] += spherical_harmonics.band_from_slope(slope)
+        sh[self.bands_replaced, 1:] *= 1 - weights.gloss
         glossy = (self.gloss != 0).flatten(1).any(1).nonzero()[:, 0]
         sh[glossy, : self.gloss.shape[1]] += weights.gloss * self.gloss[glossy]
         return replace(self.gaussians, sh=sh)
@@ -125,6 +136,7 @@ def unchanged(
         bounce=torch.zeros_like(ones),
         slope=torch.zeros_like(ones),
         gloss=torch.zeros_like(gaussians.sh),
+        bands_replaced=torch.zeros(gaussians.count, dtype=torch.bool),
         objects=objects,
         light=None,
         report=report,

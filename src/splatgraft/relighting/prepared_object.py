@@ -16,7 +16,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
-from splatgraft.relighting.light.estimate import NoLight, estimate_light
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.shading.irradiance import irradiance
 from splatgraft.relighting.shading.normals import Normals, estimate_normals
@@ -33,6 +33,10 @@ class SourceScene:
     """In the object's own frame."""
     cameras: Cameras
     """Of the capture, in the same frame."""
+    light: Light | None = None
+    """At the object's place, in the same frame, where it is known; otherwise it is estimated."""
+    normals: Float[Tensor, "n 3"] | None = None
+    """Unit, of the object's Gaussians, outward, in the same frame, where they are known; otherwise estimated."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,8 @@ class SourceLighting:
     """Target's frame."""
     irradiance: Float[Tensor, "n 3"]
     """Linear rgb on each Gaussian under that light."""
+    estimate: EstimatedLight | None
+    """What the light rests on, source's frame; None where it was told."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,9 @@ def prepare_object(
         light: At the new place.
         index: Of the object among all placed ones; part of the cache's keys.
         cache: Reused where only the object's position changed.
+
+    Raises:
+        ValueError: The source tells normals, and not one for each of the object's Gaussians.
     """
     samples = sample_light(light)
     name, key = f"prepared object {index}", (placed.gaussians, source, cameras, light.sources)
@@ -87,20 +96,23 @@ def prepare_object(
         return _moved(cached, placed, samples)
     gaussians = placed.in_target()
     sphere = bounding_sphere(gaussians)
-    normals = estimate_normals(gaussians, cameras)
+    normals = _normals(placed, source, gaussians, cameras)
     maps = object_shadow_maps(gaussians, sphere, samples)
     source_lighting, notes = None, None
     if source is not None:
-        source_light = _source_light(placed.gaussians, source, index, cache)
-        if isinstance(source_light, NoLight):
-            notes = source_light.reason
+        found = source.light or _source_light(placed.gaussians, source, index, cache)
+        if isinstance(found, NoLight):
+            notes = found.reason
         else:
-            notes = source_light.describe(estimate_up(source.cameras)) + "."
+            estimate = found if isinstance(found, EstimatedLight) else None
+            source_light = found.light if isinstance(found, EstimatedLight) else found
+            notes = source_light.describe(estimate_up(source.cameras))
+            notes += "." if source.light is None else ", as given."
             source_light = source_light.rotated(placed.target_from_object.rotation)
             source_samples = sample_light(source_light)
             shares = self_visibility(maps, gaussians, normals.vectors, source_samples)
             received = irradiance(source_samples, normals.vectors, sample_visibility=shares)
-            source_lighting = SourceLighting(source_light, received)
+            source_lighting = SourceLighting(source_light, received, estimate)
     prepared = PreparedObject(
         gaussians=gaussians,
         target_from_object=placed.target_from_object,
@@ -113,6 +125,17 @@ def prepare_object(
     )
     cache.put(name, key, prepared)
     return prepared
+
+
+def _normals(placed: PlacedObject, source: SourceScene | None, in_target: Gaussians, cameras: Cameras) -> Normals:
+    """The object's normals in the target's frame: those that the source tells, or an estimate."""
+    if source is None or source.normals is None:
+        return estimate_normals(in_target, cameras)
+    if len(source.normals) != in_target.count:
+        raise ValueError(f"relight: expected {in_target.count} normals, found {len(source.normals)}")
+    turned = source.normals @ placed.target_from_object.rotation.to(source.normals).T
+    known = torch.ones(in_target.count)
+    return Normals(vectors=turned, confidence=known, seen=known > 0)
 
 
 def _same_pose(one: Similarity, other: Similarity) -> bool:
@@ -138,16 +161,16 @@ def _moved(prepared: PreparedObject, placed: PlacedObject, samples: LightSamples
     )
 
 
-def _source_light(gaussians: Gaussians, source: SourceScene, index: int, cache: Memo) -> Light | NoLight:
+def _source_light(gaussians: Gaussians, source: SourceScene, index: int, cache: Memo) -> EstimatedLight | NoLight:
     """The light that object `index` was captured in, estimated once for all copies of one object."""
     for earlier in range(index):
         cached = cache.peek(f"source light {earlier}", (gaussians, source))
         if cached is not None:
             return cached
 
-    def estimate() -> Light | NoLight:
+    def estimate() -> EstimatedLight | NoLight:
         # the object's shadow in its capture is evidence too
         place = bounding_sphere(gaussians)
-        return estimate_light(source.gaussians, place, source.cameras, object_gaussians=gaussians)
+        return fit_light(source.gaussians, place, source.cameras, object_gaussians=gaussians)
 
     return cache.get(f"source light {index}", (gaussians, source), estimate)

@@ -12,11 +12,9 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.estimate import EstimatedLights, NoLight, estimate_lights, panorama_at
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
 from splatgraft.relighting.light.light import Light
-from splatgraft.relighting.light.panorama_sources import light_from_panorama
 from splatgraft.relighting.light.source_distance import with_source_distances
 from splatgraft.relighting.light.sun_visibility import observed_sun_visibility
 from splatgraft.relighting.shading.irradiance import irradiance
@@ -57,6 +55,8 @@ class PreparedScene:
     """Of the receivers."""
     light: Light
     """At the objects' place."""
+    estimate: EstimatedLight | None
+    """What `light` rests on; None where it was told."""
     samples: LightSamples
     """k samples of `light`."""
     maps: SceneShadowMaps
@@ -90,11 +90,13 @@ def prepare_scene(
     place = BoundingSphere(center, max(sphere.radius for sphere in spheres))
     region = _region(scene, place, reach, cache)
     if light is None:
-        known = _estimated_light(scene, cameras, place, region, cache)
+        estimate = _estimated_light(scene, cameras, place, region, cache)
+        if isinstance(estimate, NoLight):
+            return estimate
+        known = estimate.light
     else:
+        estimate = None
         known = cache.get("told light", (scene, region, light), lambda: with_source_distances(light, scene, place))
-    if isinstance(known, NoLight):
-        return known
     samples = sample_light(known)
     indices = _receiver_indices(scene, region, spheres, known, cache)
     receivers = cache.get("receivers", (indices,), lambda: scene.select(indices))
@@ -115,6 +117,7 @@ def prepare_scene(
         receivers=receivers,
         normals=normals,
         light=known,
+        estimate=estimate,
         samples=samples,
         maps=maps,
         surface=cache.get("surface", (normals,), lambda: layer_middle(receivers, normals.vectors)),
@@ -158,23 +161,18 @@ def _receiver_indices(
 
 def _estimated_light(
     scene: Gaussians, cameras: Cameras, place: BoundingSphere, region: BoundingSphere, cache: Memo
-) -> Light | NoLight:
-    """The light at `place`; after a move within the region the sources are kept and the ambient light is new."""
-    cached: EstimatedLights | None = cache.peek("light", (scene, region))
-    if cached is None:
-        lights = estimate_lights(scene, place, cameras)
-        if isinstance(lights, NoLight):
-            return lights
-        cache.put("light", (scene, region), lights)
-        return lights.leveled
-    panorama = panorama_at(scene, place)
-    if isinstance(panorama, NoLight):
-        return panorama
-    # the sources keep their brightness too: shadow maps and the object's own shading are cached with them
-    leveled = cached.leveled
-    factor = float(leveled.ambient[0].sum() / cached.by_panorama.ambient[0].sum().clamp_min(1e-9))
-    here = light_from_panorama(panorama, estimate_up(cameras))
-    return replace(here, sources=leveled.sources, ambient=factor * here.ambient)
+) -> EstimatedLight | NoLight:
+    """The light at `place`; after a move within the region the sources are kept and the ambient light is new.
+
+    Shadow maps and the object's own shading are cached with the sources.
+    """
+    cached: EstimatedLight | None = cache.peek("light", (scene, region))
+    if cached is not None:
+        return cached.at(scene, cameras, place)
+    found = fit_light(scene, place, cameras)
+    if not isinstance(found, NoLight):
+        cache.put("light", (scene, region), found)
+    return found
 
 
 def _with_observed_sun(

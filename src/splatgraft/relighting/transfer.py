@@ -24,7 +24,6 @@ from splatgraft.relighting.prepared_object import PreparedObject, SourceScene, p
 from splatgraft.relighting.prepared_scene import PreparedScene, prepare_scene
 from splatgraft.relighting.shading.irradiance import irradiance, shade_ratio, unknown_origin_ratio
 from splatgraft.relighting.shading.normals import raised
-from splatgraft.relighting.shading.reflection import gloss_layer
 from splatgraft.relighting.shadows.receivers import RIM, Receivers, shade_receivers
 from splatgraft.relighting.shadows.scene_ratio import (
     SceneRatio,
@@ -61,6 +60,8 @@ class _LitObject:
     prepared: PreparedObject
     sample_visibility: Float[Tensor, "n k"]
     """Share of every light sample that reaches it past the scene, in [0, 1]."""
+    received: Float[Tensor, "n 3"]
+    """Linear rgb irradiance at the new place."""
     shade: Float[Tensor, "n 3"]
     """Factor on linear rgb by its own shading."""
 
@@ -92,7 +93,7 @@ def relight(
         and `report` gives the reason.
 
     Raises:
-        ValueError: `sources` is neither empty nor one per object.
+        ValueError: `sources` is neither empty nor one per object, or tells normals of another number of Gaussians.
     """
     if len(sources) not in (0, len(composite.objects)):
         raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")
@@ -133,10 +134,10 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
     received = irradiance(scene.samples, normals.vectors, sample_visibility=shares)
     source = prepared.source_lighting
     if source is None:
-        return _LitObject(prepared, visibility, unknown_origin_ratio(received, normals, opacities))
-    coverage = 0.5 * (scene.light.coverage + source.light.coverage)
-    shade = shade_ratio(received, source.irradiance, normals, opacities, coverage=coverage)
-    return _LitObject(prepared, visibility, shade)
+        shade = unknown_origin_ratio(received, opacities)
+    else:
+        shade = shade_ratio(received, source.irradiance, opacities)
+    return _LitObject(prepared, visibility, received, shade)
 
 
 def _assembled(
@@ -156,7 +157,7 @@ def _assembled(
     rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
     on_objects = [_on_object(i, objects) for i in range(len(objects))]
-    glosses = [_gloss(one, scene.light, baked.sh_degree) for one in objects]
+    replaced = [torch.full((o.prepared.gaussians.count,), o.prepared.source_lighting is not None) for o in objects]
     object_rows = torch.arange(scene_count, baked.count)
     gaussians = concatenate([baked.select(rest_index), receivers.gaussians, baked.select(object_rows)])
     count = gaussians.count - len(object_rows)
@@ -171,10 +172,14 @@ def _assembled(
         shadow=torch.cat([ones, ratio.shadow, *[r.shadow for r in on_objects]])[order],
         bounce=torch.cat([zeros, ratio.bounce, *[r.bounce for r in on_objects]])[order],
         slope=torch.cat([zeros, ratio.slope, *[r.slope for r in on_objects]])[order],
-        gloss=torch.cat([torch.zeros_like(gaussians.sh[:count]), *glosses])[order],
+        gloss=torch.zeros_like(gaussians.sh),
+        bands_replaced=torch.cat([torch.zeros(count, dtype=torch.bool), *replaced])[order],
         objects=tuple(one.prepared.gaussians for one in objects),
         light=scene.light,
         report=tuple(report),
+        estimate=scene.estimate,
+        received=tuple(one.received for one in objects),
+        prepared=tuple(one.prepared for one in objects),
     )
 
 
@@ -226,14 +231,6 @@ def _on_scene(
     rest = torch.ones(scene.scene.count, dtype=torch.bool)
     rest[receivers.origin] = False
     return receivers, fit_to_views(receivers, total, scene.scene.select(rest), cameras, ratio_at=ratio_at)
-
-
-def _gloss(one: _LitObject, light: Light, degree: int) -> Float[Tensor, "n k 3"]:
-    """The gloss layer of an object; zero where its source light is not known."""
-    gaussians, source = one.prepared.gaussians.with_sh_degree(degree), one.prepared.source_lighting
-    if source is None:
-        return torch.zeros_like(gaussians.sh)
-    return gloss_layer(gaussians, one.prepared.normals, source.light, light, ratio=one.shade)
 
 
 def _on_object(index: int, objects: list[_LitObject]) -> SceneRatio:

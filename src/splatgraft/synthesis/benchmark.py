@@ -27,12 +27,16 @@ from splatgraft.formats import read_capture, write_capture
 from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.synthesis import furniture, objects
 from splatgraft.synthesis.cameras import capture_cameras
-from splatgraft.synthesis.jobs import Job, RenderSize, Take
+from splatgraft.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take
 from splatgraft.synthesis.outdoors import SUPPLIED_MAPS
 from splatgraft.synthesis.pairs import make_scene
 from splatgraft.synthesis.palette import Palette
 from splatgraft.synthesis.scene import Material, Part, Place, Scene, World
 
+_OBJECT_POINTS = 40_000
+"""Sampled points on the object, from which its true normals follow."""
+_SURFACE_RADIUS = 8.0
+"""Metres around the object's middle within which its surface is sampled: all of it."""
 POSES_DEG = (0.0, 120.0, 240.0)
 """P0, P1, P2: the object's rotations in the illumination-consistency scenes (paper, Table 2)."""
 
@@ -131,7 +135,11 @@ def pedestal_scene(seed: int, place: Place) -> Scene:
 
 
 def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
-    """Plan the job in the target scene (target, ground truth, light probe) and the job on the pedestal (source)."""
+    """Plan the job in the target scene (target, ground truth, light) and that on the pedestal (source, light, surface).
+
+    Raises:
+        ValueError: the scene leaves no room for the cameras.
+    """
     scene = make_scene(which.kind, which.seed)
     place = scene.places[0]
     parts = objects.make(which.object_seed, place)
@@ -140,6 +148,7 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
     source_parts = objects.standing_at(parts, place.location, yaw)
     target_parts = objects.standing_at(parts, place.location, yaw + math.radians(which.pose_deg))
     object_passes: tuple[str, ...] = ("color", "mask", "depth")
+    middle = (place.location[0], place.location[1], place.location[2] + height / 2)
     provenance = {"scene": which.name, "pose_deg": str(which.pose_deg), "licence": "own render"}
     target = Job(
         scene=scene,
@@ -148,7 +157,7 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
         takes=(
             Take("target", scene=True, passes=("color", "depth")),
             Take("ground_truth", scene=True, object="object", passes=object_passes),
-            Take("light", scene=True, probe=(place.location[0], place.location[1], place.location[2] + height / 2)),
+            Take("light", scene=True, probe=middle),
         ),
         size=size.render,
         provenance=provenance,
@@ -158,7 +167,16 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
         scene=pedestal,
         objects={"object": source_parts},
         cameras=capture_cameras(pedestal, place, height, size.views, which.object_seed),
-        takes=(Take("source", scene=True, object="object", passes=object_passes),),
+        takes=(
+            Take("source", scene=True, object="object", passes=object_passes),
+            Take("old_light", scene=True, probe=middle),
+            Take(
+                "surface",
+                scene=False,
+                object="object",
+                surface=SurfaceSampling(_OBJECT_POINTS, middle, _SURFACE_RADIUS),
+            ),
+        ),
         size=size.render,
         provenance=provenance,
     )
@@ -236,7 +254,7 @@ _PASS_FILES = (("images", ".png", ".png"), ("masks", "_mask.png", ".png"), ("dep
 
 
 def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out: Path) -> None:
-    """Write one rendered scene as captures, with its placement and its true light."""
+    """Write one rendered scene as captures, with its placement, its true lights and the object's true surface."""
     _gather(source_render, "source", out / "source", passes=("images", "masks"), points=True)
     _gather(target_render, "target", out / "target", passes=("images",), points=True)
     _gather(target_render, "ground_truth", out / "ground_truth", passes=("images", "masks", "depth"), points=False)
@@ -249,6 +267,10 @@ def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out:
     write_placement(out / "placement.json", Placement((ObjectPlacement(moved),)))
     shutil.copyfile(target_render / "light" / "0000.npy", out / "probe.npy")
     shutil.copyfile(target_render / "light" / "suns.json", out / "suns.json")
+    (out / "old_light").mkdir(exist_ok=True)
+    for name in ("0000.npy", "suns.json"):
+        shutil.copyfile(source_render / "old_light" / name, out / "old_light" / name)
+    shutil.copyfile(source_render / "surface" / "0000.npy", out / "surface.npy")
     record = {"kind": which.kind, "pose_deg": which.pose_deg, "seed": which.seed, **scene.notes}
     (out / "scene.json").write_text(json.dumps(record, indent=1) + "\n")
 

@@ -1,18 +1,25 @@
 """The command `relight`: light the objects of a composite by the target scene, and add their shadows to it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import torch
+
+from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.composite import Composite
+from splatgraft.core.images import write_image
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
-from splatgraft.project.layout import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_TEXT_FILE, SCENE_FILE
+from splatgraft.project.layout import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_PICTURE, LIGHT_TEXT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Inputs
 from splatgraft.relighting.gain_transfer import relight_by_gain
-from splatgraft.relighting.layers import LayerWeights
+from splatgraft.relighting.layers import LayerWeights, Relit
 from splatgraft.relighting.light.light import Light, light_from_json, light_to_json
+from splatgraft.relighting.light.light_picture import draw_light
 from splatgraft.relighting.transfer import RelightOptions, SourceScene, relight
 
 
@@ -27,7 +34,8 @@ class Relight:
     cameras: Path
     """The target's cameras, a transforms.json: from them follows the up direction."""
     out: Path = Path("relit")
-    """Folder for scene.ply, is_object.npy, light.json, and light.txt, which describes the light in words."""
+    """Folder for scene.ply, is_object.npy, light.json, light.txt, which describes the light in words, and light.png and
+    source_light_N.png, which show it."""
     surroundings: Path | None = None
     """The source without its object, a .ply: from it the light on the object at capture is estimated and divided out.
     Objects of other files, and all of them without it, keep their mean brightness."""
@@ -66,6 +74,7 @@ class Relight:
             relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
             found = relit.light
             (gaussians, is_object), sentences = relit.bake(self.weights), relit.report
+            _draw_lights(folder, relit, composite, sources)
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_selection(folder / IS_OBJECT_FILE, is_object)
         (folder / LIGHT_TEXT_FILE).write_text("\n".join(sentences) + "\n")
@@ -93,6 +102,19 @@ class Relight:
             return [None] * len(paths)
         # all copies of the object have this source; objects of other files have none, as the report says
         return [source if path is not None and path.resolve() == taken.resolve() else None for path in paths]
+
+
+def _draw_lights(folder: Path, relit: Relit, composite: Composite, sources: Sequence[SourceScene | None]) -> None:
+    """Write pictures of the estimated lights: at the new place, and at the old place of each object."""
+    if relit.estimate is not None and relit.objects:
+        center = torch.stack([bounding_sphere(one).center for one in relit.objects]).mean(0)
+        write_image(folder / LIGHT_PICTURE, draw_light(relit.estimate, composite.target, center))
+    for i, (one, placed, source) in enumerate(zip(relit.prepared, composite.objects, sources, strict=False), start=1):
+        lighting = one.source_lighting
+        if source is not None and lighting is not None and lighting.estimate is not None:
+            center = bounding_sphere(placed.gaussians).center
+            picture = draw_light(lighting.estimate, source.gaussians, center)
+            write_image(folder / f"source_light_{i}.png", picture)
 
 
 COMMAND = Relight

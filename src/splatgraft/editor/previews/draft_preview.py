@@ -74,6 +74,7 @@ def upsample_light(relit: Relit, composite: Composite, parts: Sequence[CoarseGau
         bounce=relit.bounce[row],
         slope=torch.zeros_like(relit.slope[row]),  # valid over the width of a coarse Gaussian only
         gloss=relit.gloss[row],
+        bands_replaced=relit.bands_replaced[row],
         objects=tuple(placed.in_target() for placed in composite.objects),
         light=relit.light,
         report=relit.report,

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -10,14 +11,18 @@ from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.core.images import linear_from_srgb
-from splatgraft.core.spherical_harmonics import rgb_from_dc
-from splatgraft.relighting.light.direction_estimate import DirectionEstimate, DirectionSettings, estimate_direction
-from splatgraft.relighting.light.fusion import LightFusionSettings, fuse_light
 from splatgraft.relighting.light.highlight_evidence import HighlightSettings, find_highlights
 from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.light_from_radiance import PeakSettings, ambient_of, split_peaks
 from splatgraft.relighting.light.panorama import Panorama, cube_cameras, render_panorama
+from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem, seen_sky
+from splatgraft.relighting.light.radiance_search import RadianceEstimate, SearchSettings, search_radiance
+from splatgraft.relighting.light.shading_evidence import (
+    ShadingEvidenceSettings,
+    find_shading_evidence,
+)
 from splatgraft.relighting.light.source_distance import with_source_distances
+from splatgraft.relighting.light.surroundings import DIRECTIONS, Surroundings, surroundings_at
 from splatgraft.relighting.shading.normals import estimate_normals
 from splatgraft.rendering import render
 
@@ -54,52 +59,72 @@ class PlaceSettings:
 
 
 @dataclass(frozen=True)
-class LevelSettings:
-    """Brightness of the light from what the surfaces around reflect."""
-
-    within: float = 3.0
-    """Object radii within which surfaces count; set by hand."""
-    faintest: float = 0.3
-    """Opacity below which a Gaussian is left out; set by hand."""
-    fewest: tuple[int, int] = (50, 30)
-    """Gaussians, and upward ones among them; with fewer nothing is measured; set by hand."""
-    upward: float = 0.7
-    """Cosine between normal and up, at least, of a surface that faces up; set by hand."""
-    albedo: float = 0.4
-    """Linear albedo of a mean surface; an assumption."""
-    darkest: float = 0.002
-    """sRGB; darker channels count as this."""
-    unseen: float = 0.25
-    """Share of the surroundings; where so much is missing, surfaces count as much as the panorama; set by hand."""
-    most: float = 9.0
-    """Most factor between the two that is believed; set by hand."""
-
-
-@dataclass(frozen=True)
 class LightEstimateSettings:
     """All settings of `estimate_light`."""
 
     place: PlaceSettings = field(default_factory=PlaceSettings)
-    """Of the panorama."""
-    level: LevelSettings = field(default_factory=LevelSettings)
-    """Of the brightness."""
-    direction: DirectionSettings = field(default_factory=DirectionSettings)
-    """Of shadows, and of both kinds of evidence together."""
+    """Of the panorama that tests the place."""
+    radiance: RadianceSettings = field(default_factory=RadianceSettings)
+    """The density of the light: the numbers that are fitted."""
+    search: SearchSettings = field(default_factory=SearchSettings)
+    """Of its maxima."""
+    shading: ShadingEvidenceSettings = field(default_factory=ShadingEvidenceSettings)
+    """Of the surfaces around."""
     highlights: HighlightSettings = field(default_factory=HighlightSettings)
-    """Of highlights."""
-    fusion: LightFusionSettings = field(default_factory=LightFusionSettings)
-    """Of panorama and evidence."""
+    """Of highlights on them."""
+    peaks: PeakSettings = field(default_factory=PeakSettings)
+    """Of sources."""
     radius: tuple[float, float] = (3.0, 8.0)
-    """Object radii: limits of the radius of the surroundings; between them it is the cameras' median distance; set by
-    hand."""
-    wider: float = 1.5
-    """Factor on that radius for a second look where the near surroundings have little evidence; set by hand."""
-    clear: float = 0.35
-    """Confidence above which there is no second look; set by hand."""
-    occluders_within: float = 1.4
-    """Radii of the surroundings within which Gaussians may cast shadows; set by hand."""
+    """Object radii: limits of the radius of the surroundings that are evidence; between them it is the cameras' median
+    distance."""
+    scene_within: float = 1.4
+    """Radii of the surroundings within which Gaussians may cast shadows."""
     highlights_within: float = 0.5
-    """Radii of the surroundings within which highlights count; set by hand."""
+    """Radii of the surroundings within which highlights count."""
+    far: float = 0.9
+    """Radii of the surroundings from which on light counts as coming from outside of them."""
+
+
+@dataclass(frozen=True)
+class EstimatedLight:
+    """The light at a place of a scene, and what is needed to have it at places nearby."""
+
+    light: Light
+    hidden: RadianceEstimate
+    """What no camera recorded."""
+    evidence: LightEvidence
+    """What the estimate rests on."""
+    sky: Float[Tensor, "3"]
+    """Mean linear rgb radiance of what was seen above the horizon."""
+
+    def radiance(self, around: Surroundings) -> Float[Tensor, "k 3"]:
+        """Linear rgb radiance from all `DIRECTIONS` at a place with other near surroundings."""
+        tint = self.sky / self.sky.mean().clamp_min(1e-6)
+        unseen = ((1 - around.seen).clamp_min(0) * self.hidden.unseen)[:, None] * tint
+        # clipped parts are white: their own tint was lost
+        return around.radiance + unseen + (self.visible_sources(around) * self.hidden.clipped)[:, None]
+
+    def visible_sources(self, around: Surroundings) -> Float[Tensor, "k"]:
+        """Share of each direction that is clipped and lies outside of the region, in [0, 1]."""
+        return torch.minimum(around.clipped, self.evidence.far.clipped)
+
+    def at(
+        self,
+        scene: Gaussians,
+        cameras: Cameras,
+        place: BoundingSphere,
+        *,
+        settings: PlaceSettings = PlaceSettings(),
+    ) -> "EstimatedLight | NoLight":
+        """At a place in the same region: the same sources, and ambient light with what is near there."""
+        panorama = panorama_at(scene, place, settings=settings)
+        if isinstance(panorama, NoLight):
+            return panorama
+        around = surroundings_at(scene, cameras, place.center, nearest=settings.nearest * place.radius)
+        clipped = self.visible_sources(around)
+        _, rest = split_peaks(self.radiance(around), clipped, around, within=math.inf)
+        light = replace(self.light, ambient=ambient_of(rest), **_seen_shares(around, self.evidence.up))
+        return replace(self, light=light, evidence=replace(self.evidence, around=around))
 
 
 def estimate_light(
@@ -110,115 +135,71 @@ def estimate_light(
     object_gaussians: Gaussians | None = None,
     settings: LightEstimateSettings = LightEstimateSettings(),
 ) -> Light | NoLight:
-    """Estimate the light in the middle of `place`.
-
-    Args:
-        scene: All Gaussians, without the object.
-        place: The object's bounding sphere.
-        cameras: Of the scene's capture.
-        object_gaussians: The object itself, if it stands there: it casts shadows, but is not part of the panorama.
-        settings: Of all methods.
-    """
-    lights = estimate_lights(scene, place, cameras, object_gaussians=object_gaussians, settings=settings)
-    return lights if isinstance(lights, NoLight) else lights.leveled
+    """Estimate the light in the middle of `place`; arguments as of `fit_light`."""
+    found = fit_light(scene, place, cameras, object_gaussians=object_gaussians, settings=settings)
+    return found if isinstance(found, NoLight) else found.light
 
 
-@dataclass(frozen=True)
-class EstimatedLights:
-    """The light at a place in two brightnesses."""
-
-    by_panorama: Light
-    """As bright as what was captured."""
-    leveled: Light
-    """As bright as panorama and surfaces around suggest together."""
-
-
-def estimate_lights(
+def fit_light(
     scene: Gaussians,
     place: BoundingSphere,
     cameras: Cameras,
     *,
     object_gaussians: Gaussians | None = None,
     settings: LightEstimateSettings = LightEstimateSettings(),
-) -> EstimatedLights | NoLight:
-    """As `estimate_light`, with the light before its brightness is leveled too."""
+) -> EstimatedLight | NoLight:
+    """Estimate the light in the middle of `place`, with what it rests on.
+
+    Args:
+        scene: All Gaussians, without the object.
+        place: The object's bounding sphere.
+        cameras: Of the scene's capture.
+        object_gaussians: The object itself, if it stands there: its shading and its shadow are evidence, but it is not
+            part of the surroundings.
+        settings: Of all parts.
+    """
     panorama = panorama_at(scene, place, settings=settings.place)
     if isinstance(panorama, NoLight):
         return panorama
     up = estimate_up(cameras)
-    whole = scene if object_gaussians is None else concatenate([scene, object_gaussians])
     distance = float((cameras.centers - place.center).norm(dim=1).median())
     least, most = settings.radius
-    surroundings = BoundingSphere(place.center, max(least * place.radius, min(distance, most * place.radius)))
-    estimate, surroundings = _direction_around(whole, cameras, surroundings, up, settings)
-    reflected = _reflected_irradiance(scene, place, cameras, settings.level)
-    light = fuse_light(
-        panorama, estimate, up, estimated_within=surroundings.radius, reflected=reflected, settings=settings.fusion
+    region = BoundingSphere(place.center, max(least * place.radius, min(distance, most * place.radius)))
+    whole = scene
+    if object_gaussians is not None:
+        degree = max(scene.sh_degree, object_gaussians.sh_degree)
+        whole = concatenate([scene.with_sh_degree(degree), object_gaussians.with_sh_degree(degree)])
+    part = whole.select((whole.means - region.center).norm(dim=1) < settings.scene_within * region.radius)
+    normals = estimate_normals(part, cameras)
+    surfaces = find_shading_evidence(part, normals, region=region, settings=settings.shading)
+    near = BoundingSphere(region.center, settings.highlights_within * region.radius)
+    highlights = find_highlights(part, normals, cameras, region=near, settings=settings.highlights)
+    evidence = LightEvidence(
+        surfaces=surfaces,
+        highlights=None if highlights is None else highlights.evidence(),
+        far=surroundings_at(scene, cameras, place.center, nearest=settings.far * region.radius),
+        around=surroundings_at(scene, cameras, place.center, nearest=settings.place.nearest * place.radius),
+        up=up,
     )
-    light = with_source_distances(light, scene, place)
-    return EstimatedLights(light, _leveled(light, reflected, up, settings.level))
+    hidden = search_radiance(radiance_problem(evidence, settings=settings.radiance), settings=settings.search)
+    mean = (surfaces.weights[:, None] * surfaces.colors).sum(0)
+    sky = seen_sky(evidence.far, up, mean.clamp_min(1e-3))
+    found = EstimatedLight(Light((), torch.zeros(9, 3)), hidden, evidence, sky)
+    around = evidence.around
+    sources, rest = split_peaks(
+        found.radiance(around), found.visible_sources(around), around, within=region.radius, settings=settings.peaks
+    )
+    light = Light(sources, ambient_of(rest), **_seen_shares(around, up))
+    return replace(found, light=with_source_distances(light, scene, place))
 
 
-def _direction_around(
-    whole: Gaussians,
-    cameras: Cameras,
-    surroundings: BoundingSphere,
-    up: Float[Tensor, "3"],
-    settings: LightEstimateSettings,
-) -> tuple[DirectionEstimate | None, BoundingSphere]:
-    """The estimate from the surroundings, or from wider ones where those have little evidence; and which were used.
-
-    Near shadows are the best evidence for the light that reaches the place, but a bare table has none.
-    """
-    found: tuple[DirectionEstimate | None, BoundingSphere] = (None, surroundings)
-    center, radius = surroundings.center, surroundings.radius
-    for wide in (radius, settings.wider * radius):
-        part = whole.select((whole.means - center).norm(dim=1) < settings.occluders_within * wide)
-        normals = estimate_normals(part, cameras)
-        near, region = BoundingSphere(center, settings.highlights_within * wide), BoundingSphere(center, wide)
-        highlights = find_highlights(part, normals, cameras, region=near, settings=settings.highlights)
-        estimate = estimate_direction(
-            part, normals, region=region, up=up, highlights=highlights, settings=settings.direction
-        )
-        if estimate is not None and (found[0] is None or estimate.confidence > found[0].confidence):
-            found = (estimate, region)
-        if estimate is not None and estimate.confidence > settings.clear:
-            break
-    return found
+def _seen_shares(around: Surroundings, up: Float[Tensor, "3"]) -> dict[str, float]:
+    overhead = DIRECTIONS @ up > _OVERHEAD
+    return {"coverage": float(around.seen.mean()), "unseen_up": float(1 - around.seen[overhead].mean())}
 
 
-def _leveled(light: Light, reflected: float | None, up: Float[Tensor, "3"], settings: LevelSettings) -> Light:
-    """`light` scaled towards the irradiance that surfaces around reflect (weighted geometric mean).
-
-    Much of the light on a place comes from parts that were never captured, so the panorama alone is off by a factor of
-    two or more. The surfaces around reflect all of it. They count as much as the panorama where `settings.unseen` of
-    it is missing, and not at all where it is complete.
-    """
-    if reflected is None:
-        return light
-    captured = float(light.irradiance(up[None]).mean())
-    share = 0.5 * min(1.0, (1 - light.coverage) / settings.unseen)
-    most = math.log(settings.most)
-    factor = math.exp(share * max(-most, min(most, math.log(reflected / max(captured, 1e-9)))))
-    sources = [replace(s, irradiance=tuple(factor * v for v in s.irradiance)) for s in light.sources]
-    return replace(light, sources=tuple(sources), ambient=factor * light.ambient)
-
-
-def _reflected_irradiance(
-    scene: Gaussians, place: BoundingSphere, cameras: Cameras, settings: LevelSettings
-) -> float | None:
-    """Gray irradiance on the upward surfaces around, if their albedo is that of a mean surface; None without any."""
-    near = (scene.means - place.center).norm(dim=1) < settings.within * place.radius
-    part = scene.select(near & (scene.opacities > settings.faintest))
-    fewest, fewest_upward = settings.fewest
-    if part.count < fewest:
-        return None
-    upward = estimate_normals(part, cameras).vectors @ estimate_up(cameras) > settings.upward
-    area = part.opacities * part.scales.sort(1).values[:, 1:].prod(1) * upward
-    if int(upward.sum()) < fewest_upward:
-        return None
-    reflected = linear_from_srgb(rgb_from_dc(part.sh[:, 0]).clamp(settings.darkest, 1)).mean(1)
-    return math.pi * float((area * reflected).sum() / area.sum()) / settings.albedo
+_OVERHEAD = 0.5
+"""Cosine to the up direction of what counts as ceiling, 60 degrees."""
 
 
 def panorama_at(

@@ -1,14 +1,14 @@
-"""Evidence for the direction of a scene's dominant light from highlights.
+"""Evidence for the light from highlights.
 
 Almost every surface is slightly glossy: it is brighter where it mirrors the light into the camera. The change of each
-Gaussian's colour from view to view is correlated with the lobe of a light in each candidate direction. Works without
+Gaussian's colour from view to view is compared with the lobes of the light from all directions. Works without
 shadows, on a bare table top.
 """
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
@@ -16,11 +16,14 @@ from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
+from splatgraft.relighting.light.surroundings import DIRECTIONS
 from splatgraft.relighting.shading.normals import Normals
 from splatgraft.relighting.shadows.camera_visibility import seen_from, spread_over
 
-_CHUNK = 16
-"""Directions at a time; bounds memory."""
+_CHUNK = 250
+"""Gaussians at a time; bounds memory."""
+_MOST_EXPLAINED = 0.98
+"""Most share of the change that a light is said to explain."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,6 @@ class HighlightSettings:
     squarings: int = 3
     """The lobe is cos^(2^squarings), by default cos^8: 24 degrees wide at half height, as narrow as harmonics of degree
     3 can be, and wide enough for windows."""
-    most_explained: float = 0.99
-    """Most share of the variance that one direction is said to explain; set by hand."""
 
 
 @dataclass(frozen=True)
@@ -61,19 +62,50 @@ class Highlights:
     settings: HighlightSettings
     """Of the lobe."""
 
-    def explained(self, directions: Float[Tensor, "d 3"]) -> Float[Tensor, "d"]:
-        """Share of all variance from view to view that a single light in each unit direction explains, in [0, 1]."""
-        total = (self.weight * self.change**2).sum().clamp_min(1e-12)
-        shares = []
-        for chunk in directions.split(_CHUNK):
-            lobe = (self.mirrored @ chunk.T).clamp_min(0)
+    def evidence(self) -> "HighlightEvidence":
+        """How much of all change from view to view any distribution of light over the `DIRECTIONS` explains."""
+        k = len(DIRECTIONS)
+        squares, products = torch.zeros(k, k), torch.zeros(k)
+        for rows in torch.arange(len(self.weight)).split(_CHUNK):
+            weight = self.weight[rows][..., None]
+            lobe = (self.mirrored[rows] @ DIRECTIONS.T).clamp_min(0)
             for _ in range(self.settings.squarings):
                 lobe = lobe * lobe
-            lobe = lobe - _mean(lobe, self.weight[..., None])
-            covariance = (self.weight[..., None] * lobe * self.change[..., None]).sum((0, 1)).clamp_min(0)
-            variance = (self.weight[..., None] * lobe * lobe).sum((0, 1)).clamp_min(1e-12)
-            shares.append(covariance**2 / (variance * total))
-        return torch.cat(shares).clamp(0, self.settings.most_explained)
+            lobe = (lobe - _mean(lobe, weight)).reshape(-1, k)
+            weighted = weight.reshape(-1, 1) * lobe
+            squares += lobe.T @ weighted
+            products += (weighted * self.change[rows].reshape(-1, 1)).sum(0)
+        return HighlightEvidence(squares, products, float((self.weight * self.change**2).sum().clamp_min(1e-12)))
+
+
+@dataclass(frozen=True)
+class HighlightEvidence:
+    """Highlights as a quadratic form of the luminance l from the k `DIRECTIONS`."""
+
+    squares: Float[Tensor, "k k"]
+    """Covariances of the directions' lobes over all Gaussians and cameras."""
+    products: Float[Tensor, "k"]
+    """Covariances of the lobes with the observed change of brightness."""
+    variance: float
+    """Of that change."""
+
+    def explained(self, light: Float[Tensor, "k"]) -> float:
+        """Share of the change from view to view that such a light explains, in [0, 1]."""
+        light = light.to(self.products)
+        return float(self._share(light @ self.products, light @ self.squares @ light))
+
+    def explained_with_more(
+        self, light: Float[Tensor, "k"], index: Int[Tensor, "c"], more: Float[Tensor, "c"]
+    ) -> Float[Tensor, "c"]:
+        """The same for c lights, each with `more` from the direction `index` alone."""
+        light, more = light.to(self.products), more.to(self.products)
+        reflected = self.squares @ light
+        squares = light @ reflected + 2 * more * reflected[index] + more**2 * self.squares.diag()[index]
+        return self._share(light @ self.products + more * self.products[index], squares)
+
+    def _share(self, product: Tensor, square: Tensor) -> Tensor:
+        share = product.clamp_min(0) ** 2 / (square * self.variance).clamp_min(1e-12)
+        return share.clamp(0, _MOST_EXPLAINED)
 
 
 def find_highlights(

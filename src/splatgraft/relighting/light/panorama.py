@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras, pinhole
@@ -71,6 +71,22 @@ def cube_directions(size: int) -> tuple[Float[Tensor, "6 s s 3"], Float[Tensor, 
     return directions.float(), area.expand(6, size, size).float()
 
 
+def cube_pixels(directions: Float[Tensor, "n 3"], size: int) -> Int[Tensor, "n"]:
+    """The pixel of a cube map, in the order of its flattened faces, that each direction falls into."""
+    across, down, along = torch.einsum("ni,fji->jnf", directions, _FACES.to(directions)).unbind(0)
+    face = along.argmax(1)
+    row = torch.arange(len(directions))
+    depth = along[row, face]
+    u, v = (((axis[row, face] / depth + 1) * 0.5 * size).long().clamp(0, size - 1) for axis in (across, down))
+    return (face * size + v) * size + u
+
+
+def far_enough(scene: Gaussians, center: Float[Tensor, "3"], nearest: float) -> Gaussians:
+    """The Gaussians at least `nearest` world units from `center` that are not too wide for their distance."""
+    distance = (scene.means - center.to(scene.means)).norm(dim=-1)
+    return scene.select((distance >= nearest) & (scene.scales.max(1).values < _WIDEST * distance))
+
+
 def render_panorama(scene: Gaussians, center: Float[Tensor, "3"], *, size: int = 64, nearest: float = 0.0) -> Panorama:
     """Render the panorama of `scene` from `center`.
 
@@ -80,11 +96,9 @@ def render_panorama(scene: Gaussians, center: Float[Tensor, "3"], *, size: int =
         size: Width of a face, pixels.
         nearest: World units; Gaussians whose centre is nearer are left out.
     """
-    distance = (scene.means - center.to(scene.means)).norm(dim=-1)
-    far_enough = (distance >= nearest) & (scene.scales.max(1).values < _WIDEST * distance)
     # the near plane of each face only removes what is behind it: near Gaussians are already left out
     near = max(nearest / math.sqrt(3), 1e-6)
-    rendered = render(scene.select(far_enough), cube_cameras(center, size), options=RenderOptions(near=near))
+    rendered = render(far_enough(scene, center, nearest), cube_cameras(center, size), options=RenderOptions(near=near))
     alpha = rendered.alpha.detach().clamp(0, 1)
     # Gaussians are blended in sRGB, so alpha is divided out before the conversion to linear light
     color = rendered.color.detach().clamp_min(0) / alpha.clamp_min(_FAINTEST)[..., None]

@@ -1,7 +1,11 @@
-"""The true light at a place of a synthetic scene: a rendered panorama and the suns that it leaves out."""
+"""The true light at a place of a synthetic scene: a rendered panorama and the suns that it leaves out.
+
+The panorama is not clipped, as a photograph is: the sun of an environment map, or a studio's lamp, is some hundred
+times as bright as the rest. Such peaks become sources first; what is left is divided as a photograph's panorama.
+"""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -15,14 +19,32 @@ _FACE = 64
 """Pixels; width of a face of the cube map."""
 
 
-def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Light:
+@dataclass(frozen=True)
+class PeakSettings:
+    """What of a panorama is a peak. Set by hand: suns and lamps of environment maps are 100 to 1000 times the mean."""
+
+    brightest: float = 50.0
+    """Times the mean gray radiance; a pixel above it makes a peak. Windows of rooms stay below."""
+    around: float = 5.0
+    """Times the mean; above it pixels near that pixel belong to the peak."""
+    near_deg: float = 15.0
+    """Degrees from the brightest pixel to what belongs to its peak."""
+    most: int = 6
+    """Peaks."""
+
+
+def light_from_probe(
+    panorama: Float[Tensor, "h w 3"], suns: list[dict], *, settings: PeakSettings = PeakSettings()
+) -> Light:
     """A light from a rendered panorama and a list of suns.
 
     Args:
         panorama: Equirectangular linear radiance; row 0 is up (+z), the middle column +x, to the right -y.
         suns: Entries of suns.json: direction (unit, towards the sun), irradiance (linear rgb) and angular_radius
             (radians).
+        settings: Which parts of the panorama are sources of their own.
     """
+    panorama, peaks = _without_peaks(panorama, settings)
     directions, solid_angles = cube_directions(_FACE)
     cube = Panorama(
         radiance=_sampled(panorama, directions),
@@ -41,8 +63,53 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
         for sun in suns
     ]
     patches = [replace(source, uncertainty_deg=0.0) for source in captured.sources]
-    ordered = sorted([*sources, *patches], key=lambda source: -source.luminance)
+    ordered = sorted([*sources, *peaks, *patches], key=lambda source: -source.luminance)
     return Light(sources=tuple(ordered), ambient=captured.ambient, coverage=1.0, unseen_up=0.0)
+
+
+def _without_peaks(
+    panorama: Float[Tensor, "h w 3"], settings: PeakSettings
+) -> tuple[Float[Tensor, "h w 3"], list[LightSource]]:
+    """The panorama with its peaks replaced by the median of what is near them, and the peaks as sources."""
+    directions, solid_angles = _pixels(panorama)
+    mean = float((panorama.mean(-1) * solid_angles).sum()) / (4 * math.pi)
+    rest, peaks = panorama.clone(), []
+    while len(peaks) < settings.most:
+        gray = rest.mean(-1)
+        brightest = int(gray.argmax())
+        if float(gray.flatten()[brightest]) <= settings.brightest * mean:
+            break
+        near = directions @ directions.reshape(-1, 3)[brightest] > math.cos(math.radians(settings.near_deg))
+        peak = near & (gray > settings.around * mean)
+        around = rest[near & ~peak] if bool((near & ~peak).any()) else rest[~peak]
+        peaks.append(_source(rest[peak], directions[peak], solid_angles[peak]))
+        rest[peak] = around.median(0).values
+    return rest, peaks
+
+
+def _source(
+    radiance: Float[Tensor, "k 3"], directions: Float[Tensor, "k 3"], solid_angles: Float[Tensor, "k"]
+) -> LightSource:
+    """Pixels as one round source: as much irradiance, from their mean direction, of their effective solid angle."""
+    power = radiance * solid_angles[:, None]
+    gray = power.mean(1)
+    extent = float(gray.sum() ** 2 / (gray * radiance.mean(1)).sum())
+    return LightSource(
+        direction=_triple(torch.nn.functional.normalize((gray[:, None] * directions).sum(0), dim=0).tolist()),
+        irradiance=_triple(power.sum(0).tolist()),
+        angular_radius_deg=math.degrees(math.acos(1 - extent / (2 * math.pi))),
+        name="bright peak",
+    )
+
+
+def _pixels(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+    """Unit directions and solid angles of the pixels of an equirectangular panorama."""
+    h, w = panorama.shape[:2]
+    down = (torch.arange(h) + 0.5) / h * math.pi
+    turn = (2 * math.pi * (0.5 - (torch.arange(w) + 0.5) / w)).expand(h, w)
+    flat, up = down.sin()[:, None].expand(h, w), down.cos()[:, None].expand(h, w)
+    directions = torch.stack([flat * turn.cos(), flat * turn.sin(), up], -1)
+    return directions, flat * (math.pi / h) * (2 * math.pi / w)
 
 
 def _sampled(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, "6 s s 3"]) -> Float[Tensor, "6 s s 3"]:

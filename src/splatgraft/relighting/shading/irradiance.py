@@ -1,6 +1,7 @@
 """Irradiance of Gaussians under light samples, and the ratio of two lights' irradiance as a factor on linear colours.
 
-The ratio is limited, and its mean is shrunk where the lights were seen in part (ratio images, Debevec 1998).
+The ratio's variation over the object is applied in full; of its mean only a stated share is (ratio images, Debevec
+1998).
 """
 
 import math
@@ -10,7 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.relighting.shading.normals import Normals
 from splatgraft.relighting.shadows.light_sampling import LightSamples
 
 
@@ -22,12 +22,11 @@ class ShadeSettings:
     """Most factor by which a Gaussian's ratio may differ from the object's mean ratio; set by hand."""
     floor: float = 0.08
     """Share of the mean irradiance that is added to all: interreflections that no sample follows; set by hand."""
-    confidence_gain: float = 1.6
-    """Factor on the confidence of normals; 1 and more means fully believed; set by hand."""
-    gray_power: float = 0.5
-    """The mean's gray part is scaled by coverage to this power; near least squares over rendered scenes."""
-    tint_power: float = 3.0
-    """The same for the mean's tint."""
+    level_share: float = 0.75
+    """Share, in [0, 1], of the mean's gray part (in logarithms) that is applied. 0: both captures were exposed for
+    their own light, and the level of an estimated ratio is wrong by more than it is worth (0.9 stops)."""
+    tint_share: float = 1.0
+    """Share, in [0, 1], of the mean's tint that is applied."""
     unknown_share: float = 0.5
     """Share of the new light's variation that an object of unknown source light takes on; set by hand."""
 
@@ -55,36 +54,30 @@ def irradiance(
 def shade_ratio(
     target: Float[Tensor, "n 3"],
     source: Float[Tensor, "n 3"],
-    normals: Normals,
     opacities: Float[Tensor, "n"],
     *,
-    coverage: float = 1.0,
     settings: ShadeSettings = ShadeSettings(),
 ) -> Float[Tensor, "n 3"]:
     """Factor on an object's linear colours: irradiance at the new place over irradiance at the old one.
 
-    Floored, limited around the object's mean, and reduced to that mean where normals are unsure. The mean, and its
-    tint even more, is moved towards 1 as `coverage` falls: both captures were exposed and white balanced for their
-    own light.
+    Floored, and limited around the object's mean. Of the mean itself, a geometric one, the settings' shares are
+    applied.
 
     Args:
         target: Linear irradiance at the new place.
         source: Linear irradiance at the old place.
-        normals: Of the object's Gaussians.
         opacities: Weights of the means, in [0, 1].
-        coverage: Share of both lights' surroundings that was captured, in [0, 1].
-        settings: Limits.
+        settings: Limits and shares.
     """
     log_ratio = (_floored(target, opacities, settings) / _floored(source, opacities, settings)).log()
     mean = _mean(log_ratio, opacities)
     gray = mean.mean()
-    gray_share, tint_share = coverage**settings.gray_power, coverage**settings.tint_power
-    return _limited(log_ratio - mean + gray_share * gray + tint_share * (mean - gray), normals, opacities, settings)
+    kept = settings.level_share * gray + settings.tint_share * (mean - gray)
+    return _limited(log_ratio - mean + kept, opacities, settings)
 
 
 def unknown_origin_ratio(
     target: Float[Tensor, "n 3"],
-    normals: Normals,
     opacities: Float[Tensor, "n"],
     *,
     settings: ShadeSettings = ShadeSettings(),
@@ -93,12 +86,11 @@ def unknown_origin_ratio(
 
     Args:
         target: Linear irradiance at the new place.
-        normals: Of the object's Gaussians.
         opacities: Weights of the mean, in [0, 1].
         settings: Limits.
     """
     log_ratio = settings.unknown_share * _floored(target, opacities, settings).log()
-    return _limited(log_ratio - _mean(log_ratio, opacities), normals, opacities, settings)
+    return _limited(log_ratio - _mean(log_ratio, opacities), opacities, settings)
 
 
 def _mean(values: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Float[Tensor, "1 3"]:
@@ -113,10 +105,8 @@ def _floored(
 
 
 def _limited(
-    log_ratio: Float[Tensor, "n 3"], normals: Normals, opacities: Float[Tensor, "n"], settings: ShadeSettings
+    log_ratio: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], settings: ShadeSettings
 ) -> Float[Tensor, "n 3"]:
-    """The ratio of which the variation is scaled by the normals' confidence and limited."""
-    mean = _mean(log_ratio, opacities)
-    believed = (settings.confidence_gain * normals.confidence).clamp(0, 1)[:, None]
-    span = math.log(settings.span)
-    return (mean + ((log_ratio - mean) * believed).clamp(-span, span)).exp()
+    """The ratio with its variation around the mean limited."""
+    mean, span = _mean(log_ratio, opacities), math.log(settings.span)
+    return (mean + (log_ratio - mean).clamp(-span, span)).exp()

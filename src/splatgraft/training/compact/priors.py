@@ -21,7 +21,6 @@ from splatgraft.relighting.light.confidence import light_confidence
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.true_light import light_from_probe
 from splatgraft.relighting.shading.irradiance import irradiance, shade_ratio
-from splatgraft.relighting.shading.normals import Normals
 from splatgraft.relighting.shadows.light_sampling import sample_light
 from splatgraft.relighting.shadows.scene_ratio import (
     object_shadow_maps,
@@ -159,7 +158,6 @@ class _PairTransfer:
         target_light: Light,
     ) -> None:
         self._pixels, self._source_light = pixels, source_light
-        self._coverage = 0.5 * (target_light.coverage + source_light.coverage)
         self._samples = sample_light(target_light)
         self._sphere = bounding_sphere(object_surfels)
         radius = SETTINGS.region_margin * SETTINGS.reach * self._sphere.radius
@@ -181,11 +179,8 @@ class _PairTransfer:
         source_samples = sample_light(self._source_light)
         self_visible = self_visibility(self._object_maps, points, normals, source_samples)
         source = irradiance(source_samples, normals, sample_visibility=self_visible)
-        certain = Normals(normals, torch.ones(len(normals)), torch.ones(len(normals), dtype=torch.bool))
         log_ratio = torch.zeros(*inside.shape, 3)
-        log_ratio[inside] = shade_ratio(
-            target, source, certain, torch.ones(len(normals)), coverage=self._coverage
-        ).log()
+        log_ratio[inside] = shade_ratio(target, source, torch.ones(len(normals))).log()
         return log_ratio
 
     def scene_log_ratio(self) -> Float[Tensor, "v h w 3"]:

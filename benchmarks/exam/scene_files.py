@@ -1,0 +1,111 @@
+"""One scene of an exam in memory: its composite, its held-out views, and what is true of its light and its object."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from exam.measure_light import nearest_normals
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.composite import Composite
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.posed_images import held_out
+from splatgraft.evaluation import Truth
+from splatgraft.folders.composite_folder import read_composite
+from splatgraft.formats import read_cameras, read_capture, read_gaussians
+from splatgraft.project.layout import PLACEMENT_FILE
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.relighting import Light, SourceScene
+from splatgraft.relighting.light.true_light import light_from_probe
+from splatgraft.rendering import render
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.benchmark.measure_method import true_view
+from splatgraft.workflow.benchmark.scene import HELD_OUT_EVERY, GroundTruthScene, compose_scene
+
+
+@dataclass(frozen=True)
+class HeldOutView:
+    """One view that nothing was fitted to."""
+
+    camera: Cameras
+    truth: Truth
+    background: Float[Tensor, "h w 3"]
+    """The reconstructed target without the object, sRGB in [0, 1]."""
+
+    def picture(self, scene: Gaussians) -> Float[Tensor, "h w 3"]:
+        """A scene from this view, sRGB in [0, 1]."""
+        return render(scene, self.camera).color[0].clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class ExamScene:
+    """One scene with what is true of it; n Gaussians of the object."""
+
+    name: str
+    composite: Composite
+    cameras: Cameras
+    """The target's, without the held-out ones."""
+    source: SourceScene
+    """The source without the object; nothing is told."""
+    views: tuple[HeldOutView, ...]
+    new_light: Light
+    """True, at the object's place in the target, target's frame."""
+    old_light: Light
+    """True, at its place in the source, source's frame."""
+    normals: Float[Tensor, "n 3"] | None
+    """True, of the object's Gaussians, source's frame; None where the object's surface is not known."""
+
+
+def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: Console) -> ExamScene:
+    """Reconstruct and compose a rendered scene where that is not done yet, and read it.
+
+    Args:
+        folder: As `render_scene` leaves it; without surface.npy no normals are known.
+        work: Receives both reconstructions, the object and the composite.
+        options: Of both reconstructions.
+        console: Takes progress.
+
+    Raises:
+        ValueError: A file is missing or damaged.
+    """
+    files = GroundTruthScene.from_folder(folder)
+    composed = compose_scene(files, work, options, device="cpu", console=console)
+    composite = read_composite(composed.target, composed.composite / PLACEMENT_FILE)
+    return ExamScene(
+        name=folder.name,
+        composite=composite,
+        cameras=read_cameras(composed.cameras),
+        source=SourceScene(read_gaussians(composed.surroundings), read_cameras(composed.source_cameras)),
+        views=_held_out_views(files, composite.target),
+        new_light=_read_light(folder / "probe.npy", folder / "suns.json"),
+        old_light=_read_light(folder / "old_light" / "0000.npy", folder / "old_light" / "suns.json"),
+        normals=_read_normals(folder / "surface.npy", composite.objects[0].gaussians),
+    )
+
+
+def _held_out_views(files: GroundTruthScene, target: Gaussians) -> tuple[HeldOutView, ...]:
+    truth, photographs = read_capture(files.truth), read_capture(files.target)
+    views = []
+    for index in torch.nonzero(held_out(len(truth), HELD_OUT_EVERY)).flatten().tolist():
+        camera = truth.cameras[index]
+        background = render(target, camera).color[0].clamp(0, 1)
+        views.append(HeldOutView(camera, true_view(truth, photographs, index), background))
+    return tuple(views)
+
+
+def _read_light(panorama: Path, suns: Path) -> Light:
+    try:
+        found = torch.from_numpy(np.load(panorama, allow_pickle=False))
+        return light_from_probe(found, json.loads(suns.read_text()))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{panorama}, {suns.name}: expected a true light, found {error}") from error
+
+
+def _read_normals(path: Path, thing: Gaussians) -> Float[Tensor, "n 3"] | None:
+    if not path.is_file():
+        return None
+    return nearest_normals(thing.means, torch.from_numpy(np.load(path, allow_pickle=False)))

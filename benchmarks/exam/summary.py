@@ -1,0 +1,135 @@
+"""The figures of an exam over all its scenes, and its report in Markdown."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from exam.evaluate_scene import METRICS, SceneResult
+from exam.measure_light import LIGHT_ERRORS
+from exam.rows import ROWS
+
+_METRIC_TITLES = {
+    "object": "PSNR of the object, dB",
+    "whole": "PSNR of the whole image, dB",
+    "shadow": "Error of the shadow (RMSE of the ratio of light with to light without the object)",
+}
+_LIGHT_TITLES = {
+    "rms": "irradiance, RMS over normals, stops",
+    "level": "its level, stops",
+    "tint": "its tint, stops",
+    "direction_deg": "direction of most irradiance, degrees",
+}
+
+
+@dataclass(frozen=True)
+class RowSummary:
+    """One row over all scenes on which it and pasting were measured; None where there is no such scene."""
+
+    scenes: int
+    object_gain: float | None
+    """Mean of the object's PSNR minus that of pasting, dB."""
+    shadow_removed: float | None
+    """Mean share of pasting's shadow error that is gone."""
+    worse: int
+    """Scenes whose whole image has a lower PSNR than pasted."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and worst of the absolute values of an error."""
+
+    mean: float
+    worst: float
+
+
+def summarize_row(row: str, results: Sequence[SceneResult]) -> RowSummary:
+    """One row against pasting."""
+    objects, wholes, shadows = (_beside_paste(row, results, metric) for metric in ("object", "whole", "shadow"))
+    return RowSummary(
+        scenes=len(wholes),
+        object_gain=_mean([value - paste for value, paste in objects]),
+        shadow_removed=_mean([1 - value / paste for value, paste in shadows]),
+        worse=sum(value < paste for value, paste in wholes),
+    )
+
+
+def summarize_light(results: Sequence[SceneResult]) -> dict[str, Spread | None]:
+    """Errors of the light over all places, new and old; of the ratio's level and of normals over all scenes."""
+    places = [errors for r in results for errors in r.light.values() if errors is not None]
+    out = {_LIGHT_TITLES[name]: _spread([errors[name] for errors in places]) for name in LIGHT_ERRORS}
+    out["level of the ratio of new to old light, stops"] = _spread([r.ratio_level for r in results])
+    out["normals, median of an object, degrees"] = _spread([r.normals_deg for r in results])
+    return out
+
+
+def summary_markdown(results: Sequence[SceneResult]) -> str:
+    """Tables of a line per scene, then the summary."""
+    rows = [row for row in ROWS if any(row in r.rows for r in results)]
+    parts = []
+    for metric in METRICS:
+        lines = [[r.name, *(_text(r.rows.get(row, {}).get(metric), metric) for row in rows)] for r in results]
+        parts.append(f"## {_METRIC_TITLES[metric]}\n\n{_table(['scene', *rows], lines)}")
+    parts.append(f"## Errors of the light\n\n{_light_table(results)}")
+    parts.append(f"## Summary\n\n{_rows_table(rows, results)}\n\n{_spread_table(results)}")
+    parts.append("## Notes\n\n" + "\n".join(f"- {r.name}: {note}" for r in results for note in r.notes))
+    return "\n\n".join(parts) + "\n"
+
+
+def _light_table(results: Sequence[SceneResult]) -> str:
+    head = [
+        "scene",
+        *(f"{place} {name}" for place in ("new", "old") for name in LIGHT_ERRORS),
+        "ratio level",
+        "normals",
+    ]
+    lines = []
+    for r in results:
+        places = [r.light.get(place) or {} for place in ("new", "old")]
+        values = [_text(place.get(name), name) for place in places for name in LIGHT_ERRORS]
+        lines.append([r.name, *values, _text(r.ratio_level, "level"), _text(r.normals_deg, "direction_deg")])
+    return _table(head, lines)
+
+
+def _rows_table(rows: Sequence[str], results: Sequence[SceneResult]) -> str:
+    lines = []
+    for row in rows:
+        found = summarize_row(row, results)
+        share = "-" if found.shadow_removed is None else f"{found.shadow_removed:.0%}"
+        gain = "-" if found.object_gain is None else f"{found.object_gain:+.2f}"
+        lines.append([row, ROWS[row], gain, share, f"{found.worse} of {found.scenes}"])
+    return _table(["row", "what it is", "object gain, dB", "shadow error removed", "scenes made worse"], lines)
+
+
+def _spread_table(results: Sequence[SceneResult]) -> str:
+    lines = []
+    for title, found in summarize_light(results).items():
+        lines.append([title, *(["-", "-"] if found is None else [f"{found.mean:.2f}", f"{found.worst:.2f}"])])
+    return _table(["error of the estimate (absolute)", "mean", "worst"], lines)
+
+
+def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *lines))
+
+
+def _text(value: float | None, name: str) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if name == "shadow" else f"{value:.1f}" if name == "direction_deg" else f"{value:.2f}"
+
+
+def _beside_paste(row: str, results: Sequence[SceneResult], metric: str) -> list[tuple[float, float]]:
+    """A row's value and that of pasting, of the scenes that have both."""
+    out = []
+    for one in results:
+        value, paste = (one.rows.get(name, {}).get(metric) for name in (row, "paste"))
+        if value is not None and paste is not None:
+            out.append((value, paste))
+    return out
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _spread(values: Sequence[float | None]) -> Spread | None:
+    known = [abs(value) for value in values if value is not None]
+    return Spread(sum(known) / len(known), max(known)) if known else None

@@ -1,0 +1,170 @@
+"""Fits the numbers of the light estimate over rendered scenes with known light, and checks them across scenes.
+
+`python benchmarks/fit_light.py SCENES [SCENES ...] --work FOLDER [--minutes M] [--folds F] [--out FILE]`, where SCENES
+are folders of scenes as `python benchmarks/exam` renders them. The objective, in stops: the mean over places of the RMS
+over 200 normals of log2(estimated / true irradiance), plus half of the same RMS of the ratio of both places. Numbers
+are changed a few at a time by random factors, and a change is kept where the objective falls. With folds, the numbers
+are fitted as often without one part of the scenes, and the objective of the part left out is printed.
+"""
+
+import argparse
+import json
+import math
+import random
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from exam.scene_files import ExamScene, read_scene
+
+from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.directions import even_directions
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
+from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem
+from splatgraft.relighting.light.radiance_search import SearchSettings, irradiance_of, search_radiance
+from splatgraft.runtime.console import Console
+
+NORMALS = even_directions(200)
+FACTORS = {
+    "albedo": 1.3,
+    "albedo_sd": 1.4,
+    "materials": 1.7,
+    "residual": 1.3,
+    "effective": 1.6,
+    "near": 1.4,
+    "highlights": 1.6,
+    "sky_sd": 1.4,
+    "unseen_sd": 1.4,
+    "unseen_nu": 1.3,
+    "source": 1.6,
+    "source_sd": 1.4,
+    "surface": 1.8,
+    "surface_sd": 1.4,
+    "within_patch_sd": 1.6,
+    "source_odds": 1.5,
+    "temperature": 1.6,
+}
+"""Standard deviation of each number's random factor."""
+SHIFTS = {"sky_bias": 0.3}
+"""The same of a number that may be negative, added."""
+
+
+@dataclass(frozen=True)
+class TrainingPlace:
+    """One of a scene's two places: its evidence and its true irradiance."""
+
+    evidence: LightEvidence
+    truth: Float[Tensor, "200"]
+    """Gray irradiance on `NORMALS`."""
+
+
+def places_of(scene: ExamScene) -> tuple[TrainingPlace, TrainingPlace]:
+    """The new and the old place."""
+    placed, source = scene.composite.objects[0], scene.source
+    new = fit_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
+    old = fit_light(
+        source.gaussians, bounding_sphere(placed.gaussians), source.cameras, object_gaussians=placed.gaussians
+    )
+    return _place(new, scene.new_light), _place(old, scene.old_light)
+
+
+def _place(found: EstimatedLight | NoLight, truth: Light) -> TrainingPlace:
+    if isinstance(found, NoLight):
+        raise ValueError(f"expected light at both places, found none: {found.reason}")
+    return TrainingPlace(found.evidence, truth.irradiance(NORMALS).mean(1))
+
+
+def log_irradiance(place: TrainingPlace, numbers: dict[str, float]) -> Float[Tensor, "200"]:
+    """Estimated, base 2, gray."""
+    rest = dict(numbers)
+    search = SearchSettings(temperature=rest.pop("temperature"))
+    problem = radiance_problem(place.evidence, settings=RadianceSettings(**rest))
+    hidden = search_radiance(problem, settings=search)
+    around, far = place.evidence.around, place.evidence.far
+    gray = around.radiance.mean(1) + (1 - around.seen).clamp_min(0) * hidden.unseen
+    gray = gray + torch.minimum(around.clipped, far.clipped) * hidden.clipped
+    return irradiance_of(gray, NORMALS).clamp_min(1e-6).log2()
+
+
+def errors(scenes: Sequence[tuple[TrainingPlace, TrainingPlace]], numbers: dict[str, float]) -> Float[Tensor, "s 3"]:
+    """Per scene the RMS in stops at the new place, at the old one, and of the ratio."""
+    rows = []
+    for pair in scenes:
+        away = [log_irradiance(place, numbers) - place.truth.log2() for place in pair]
+        rows.append([float(e.pow(2).mean().sqrt()) for e in (*away, away[0] - away[1])])
+    return torch.tensor(rows)
+
+
+def objective(found: Float[Tensor, "s 3"]) -> float:
+    """Of some scenes, in stops."""
+    return float(0.5 * found[:, :2].sum(1).mean() + 0.5 * found[:, 2].mean())
+
+
+def fit(
+    scenes: Sequence[tuple[TrainingPlace, TrainingPlace]], numbers: dict[str, float], *, minutes: float, seed: int
+) -> dict[str, float]:
+    """The best numbers that a random search finds in the time."""
+    rng, end = random.Random(seed), time.monotonic() + 60 * minutes
+    best = objective(errors(scenes, numbers))
+    print(f"start {best:.3f}", flush=True)
+    while time.monotonic() < end:
+        changed = dict(numbers)
+        for name in rng.sample([*FACTORS, *SHIFTS], rng.choice([1, 1, 2, 3])):
+            if name in SHIFTS:
+                changed[name] = round(numbers[name] + rng.gauss(0, SHIFTS[name]), 3)
+            else:
+                changed[name] = float(f"{numbers[name] * math.exp(rng.gauss(0, math.log(FACTORS[name]))):.3g}")
+        value = objective(errors(scenes, changed))
+        if value < best:
+            moved = {name: v for name, v in changed.items() if v != numbers[name]}
+            best, numbers = value, changed
+            print(f"{best:.4f} {moved}", flush=True)
+    return numbers
+
+
+def main() -> None:
+    """Fit and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
+    parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
+    parser.add_argument("--minutes", type=float, default=10.0, help="of every fit; 0 measures today's numbers")
+    parser.add_argument("--folds", type=int, default=0, help="parts of the cross-validation; 0: none")
+    parser.add_argument("--out", type=Path, help="receives the numbers as JSON")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--start", type=Path, help="numbers to start from, as --out writes them")
+    options = parser.parse_args()
+    sizes = ReconstructOptions(iterations=1000, budget=20_000)
+    scenes = {}
+    for folder, work in zip(options.scenes, options.work, strict=True):
+        for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file()):
+            scenes[path.name] = places_of(read_scene(path, work / path.name, sizes, Console()))
+    numbers = {**asdict(RadianceSettings()), "temperature": SearchSettings().temperature}
+    numbers = {name: numbers[name] for name in (*FACTORS, *SHIFTS)}
+    if options.start is not None:
+        numbers |= json.loads(options.start.read_text())
+    for fold in range(options.folds):
+        inside = [pair for i, pair in enumerate(scenes.values()) if i % options.folds != fold]
+        outside = [pair for i, pair in enumerate(scenes.values()) if i % options.folds == fold]
+        found = fit(inside, numbers, minutes=options.minutes, seed=options.seed + fold)
+        print(f"fold {fold}: fitted {objective(errors(inside, found)):.3f}", end=" ")
+        print(f"left out {objective(errors(outside, found)):.3f} (before {objective(errors(outside, numbers)):.3f})")
+    found = fit(list(scenes.values()), numbers, minutes=options.minutes, seed=options.seed)
+    for name, row in zip(scenes, errors(list(scenes.values()), found), strict=True):
+        print(f"{name:20s} new {row[0]:.2f} old {row[1]:.2f} ratio {row[2]:.2f}")
+    print(json.dumps(found))
+    if options.out is not None:
+        options.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""Fits the numbers of the object's shading over rendered scenes, and checks them across scenes.
+
+`python benchmarks/fit_shading.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `python
+benchmarks/exam` renders them. The objective is the mean gain of the object's PSNR over pasting on the held-out views.
+Every combination of a grid is tried; the numbers are chosen with each scene left out in turn, too, and the gain of the
+scene left out is reported.
+"""
+
+import argparse
+import itertools
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from exam.evaluate_scene import measure_row
+from exam.rows import make_row
+from exam.scene_files import ExamScene, read_scene
+
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.relighting import relight
+from splatgraft.relighting.shading.irradiance import ShadeSettings, shade_ratio
+from splatgraft.runtime.console import Console
+
+FLOORS = (0.02, 0.08, 0.2)
+LEVEL_SHARES = (0.0, 0.4, 0.6, 0.8, 1.0)
+TINT_SHARES = (0.5, 0.75, 1.0)
+SPANS = (3.0, 5.0, 12.0)
+
+
+def gains(scene: ExamScene, choices: list[ShadeSettings]) -> list[float]:
+    """Of the object's PSNR over pasting, dB, for each choice."""
+    pasted = measure_row(make_row("paste", scene)[0], scene.views)["object"]
+    relit = relight(scene.composite, scene.cameras, sources=[scene.source])
+    source = relit.prepared[0].source_lighting if relit.prepared else None
+    assert pasted is not None
+    if source is None:
+        return [0.0] * len(choices)
+    found = []
+    for choice in choices:
+        shade = relit.shade.clone()
+        opacities = relit.gaussians.opacities[relit.is_object]
+        shade[relit.is_object] = shade_ratio(relit.received[0], source.irradiance, opacities, settings=choice)
+        value = measure_row(replace(relit, shade=shade).bake()[0], scene.views)["object"]
+        assert value is not None
+        found.append(value - pasted)
+    return found
+
+
+def main() -> None:
+    """Fit and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
+    parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
+    options = parser.parse_args()
+    sizes = ReconstructOptions(iterations=1000, budget=20_000)
+    grid = itertools.product(SPANS, FLOORS, LEVEL_SHARES, TINT_SHARES)
+    choices = [ShadeSettings(span, floor, level, tint) for span, floor, level, tint in grid]
+    names, rows = [], []
+    for folder, work in zip(options.scenes, options.work, strict=True):
+        for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file()):
+            names.append(path.name)
+            rows.append(gains(read_scene(path, work / path.name, sizes, Console()), choices))
+            print(f"{path.name}: best {max(rows[-1]):+.2f} dB", flush=True)
+    table = torch.tensor(rows)
+    best = int(table.mean(0).argmax())
+    print(f"fitted: {table.mean(0)[best]:+.2f} dB, {choices[best]}")
+    left_out = []
+    for i in range(len(names)):
+        rest = torch.cat([table[:i], table[i + 1 :]]).mean(0)
+        left_out.append(float(table[i, rest.argmax()]))
+    print(
+        f"each scene by the numbers of the others: {sum(left_out) / len(left_out):+.2f} dB, worst {min(left_out):+.2f}"
+    )
+    today = ShadeSettings()
+    for name in ("span", "floor", "level_share", "tint_share"):
+        for value in sorted({getattr(choice, name) for choice in choices}):
+            alike = [j for j, c in enumerate(choices) if c == replace(choices[best], **{name: value})]
+            print(f"{name} {value}: {table.mean(0)[alike[0]]:+.2f} dB (today {getattr(today, name)})")
+
+
+if __name__ == "__main__":
+    main()

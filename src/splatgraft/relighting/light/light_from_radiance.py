@@ -1,0 +1,104 @@
+"""A `Light` from radiance sorted into directions: peaks become sources, the rest ambient light of degree 2."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.core.directions import fit_sh
+from splatgraft.relighting.light.light import LightSource
+from splatgraft.relighting.light.surroundings import DIRECTIONS, SOLID_ANGLE, Surroundings
+
+_LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
+"""Rec. 709."""
+
+
+@dataclass(frozen=True)
+class PeakSettings:
+    """What is a source; none of these numbers is sensitive."""
+
+    over_median: float = 4.0
+    """Luminance over the median of all directions."""
+    least_share: float = 0.02
+    """Of all light, from one direction."""
+    most: int = 4
+    """Sources."""
+    radius: float = math.radians(14)
+    """Radians around the brightest direction that belong to one source: its neighbours."""
+    sun: float = 0.03
+    """Steradians; a smaller clipped patch is called sun, a larger one window."""
+    unseen_radius_deg: float = 1.0
+    """Degrees: angular radius of a source that no camera saw, beside the uncertainty of its direction."""
+    half_bin_deg: float = 4.0
+    """Degrees: error of a direction that is known to one of `DIRECTIONS` alone."""
+    clipped_error_deg: float = 2.0
+    """Degrees: error of the middle of a clipped patch."""
+
+
+def split_peaks(
+    radiance: Float[Tensor, "k 3"],
+    clipped: Float[Tensor, "k"],
+    around: Surroundings,
+    *,
+    within: float,
+    settings: PeakSettings = PeakSettings(),
+) -> tuple[tuple[LightSource, ...], Float[Tensor, "k 3"]]:
+    """Cut the brightest directions out of the light as sources.
+
+    Args:
+        radiance: Linear rgb from all `DIRECTIONS`.
+        clipped: Share of each direction that is a visible source's, in [0, 1].
+        around: The surroundings, for the directions of visible sources.
+        within: World units; occluders farther away do not block sources that no camera saw.
+        settings: What is a source.
+
+    Returns:
+        The sources, brightest first, and the radiance without them.
+    """
+    luminance = radiance @ _LUMINANCE
+    is_peak = luminance > settings.over_median * luminance.median()
+    is_peak &= luminance > settings.least_share * luminance.sum()
+    near = math.cos(settings.radius) < DIRECTIONS @ DIRECTIONS.T
+    left, rest, sources = is_peak.clone(), radiance.clone(), []
+    while bool(left.any()) and len(sources) < settings.most:
+        i = int((luminance * left).argmax())
+        group, ring = near[i] & left, near[i] & ~is_peak
+        left &= ~near[i]
+        background = radiance[ring].mean(0) if bool(ring.any()) else radiance.median(0).values
+        extra = (radiance[group] - background).clamp_min(0)
+        sources.append(_source(group, extra, clipped, around, within=within, settings=settings))
+        rest[group] = torch.minimum(rest[group], background)
+    return tuple(sorted(sources, key=lambda source: -source.luminance)), rest
+
+
+def ambient_of(rest: Float[Tensor, "k 3"]) -> Float[Tensor, "9 3"]:
+    """Harmonics of degree 2 of radiance from all `DIRECTIONS`."""
+    return fit_sh(DIRECTIONS, rest, torch.ones(len(DIRECTIONS)))
+
+
+def _source(
+    group: Bool[Tensor, "k"],
+    extra: Float[Tensor, "p 3"],
+    clipped: Float[Tensor, "k"],
+    around: Surroundings,
+    *,
+    within: float,
+    settings: PeakSettings,
+) -> LightSource:
+    weight = extra @ _LUMINANCE
+    visible = float(clipped[group].sum())
+    towards = around.clipped_direction[group] if visible > 0 else DIRECTIONS[group]
+    direction = torch.nn.functional.normalize((weight[:, None] * towards).sum(0), dim=0)
+    x, y, z = direction.tolist()
+    r, g, b = (extra.sum(0) * SOLID_ANGLE).tolist()
+    if visible > 0:
+        size = max(visible, 0.1) * SOLID_ANGLE
+        radius = math.degrees(math.acos(max(-1.0, 1 - size / (2 * math.pi))))
+        name = "sun" if size < settings.sun else "window"
+        return LightSource((x, y, z), (r, g, b), radius, settings.clipped_error_deg, 1.0, name)
+    away = torch.rad2deg(torch.acos((towards @ direction).clamp(-1, 1)))
+    spread = float((weight * away**2).sum() / weight.sum().clamp_min(1e-9)) ** 0.5
+    error = math.hypot(spread, settings.half_bin_deg)
+    return LightSource((x, y, z), (r, g, b), settings.unseen_radius_deg, error, 1.0, "sun", blockers_within=within)

@@ -1,0 +1,374 @@
+"""The posterior density of the light around a place, and its local maximum by Gauss-Newton steps.
+
+Unknown are, in logarithms: the radiance of every direction that no camera saw, what every clipped direction gives
+beyond what the camera recorded, and one albedo per material. For receiver i of material m and transport t_i
+
+    log colour_i = log albedo_m + log(t_i . radiance + blocked_i * mean colour) + error.
+
+Errors have a Student-t density, weighted so that all receivers together count as few independent ones. Priors: albedo
+log-normal; unseen directions share the level of the seen sky, single ones may be far brighter (Student-t); a clipped
+patch is either a source or a bright surface, and each is log-normal. Highlights add the share of view-dependent change
+that the light explains. All gray; as MAP estimation in precomputed radiance transfer (Sloan 2002).
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splatgraft.relighting.light.highlight_evidence import HighlightEvidence
+from splatgraft.relighting.light.shading_evidence import ShadingEvidence
+from splatgraft.relighting.light.surroundings import DIRECTIONS, Surroundings
+
+_MOST_ALBEDO = math.log(0.9)
+_ABOVE_MOST = 100.0
+"""Precision of the prior that keeps albedo below 0.9."""
+_LARGEST_STEP = 1.5
+"""Of any logarithm in one step."""
+_PRESENT = 0.02
+"""Share of a direction that is clipped, from which it has an unknown."""
+_UNSEEN = 0.05
+"""The same for unseen ones."""
+_TOUCHING = math.cos(math.radians(15))
+"""Clipped directions nearer than this are one patch."""
+
+
+@dataclass(frozen=True)
+class RadianceSettings:
+    """The numbers of the density, fitted together over training scenes by benchmarks/fit_light.py."""
+
+    albedo: float = 0.296
+    """Median linear albedo of a material."""
+    albedo_sd: float = 0.3
+    """Standard deviation of its logarithm."""
+    materials: float = 4.5
+    """Most independent albedos that the materials of a scene are worth."""
+    residual: float = 0.8
+    """Scale of the error of log colour."""
+    nu: float = 4.0
+    """Degrees of freedom of that error."""
+    effective: float = 50.0
+    """Independent receivers that all are worth: neighbours share their errors."""
+    near: float = 0.66
+    """Radii of the surroundings: standard deviation of the weight of surfaces by their distance; the light is that at
+    the object."""
+    highlights: float = 105.0
+    """Independent view-dependent colours that all are worth."""
+    sky_bias: float = -0.07
+    """Mean log radiance of unseen directions over that of the seen ones above the horizon: zeniths are brighter."""
+    sky_sd: float = 0.415
+    """Standard deviation of that difference between scenes."""
+    unseen_sd: float = 1.13
+    """Scale of the logarithm of one unseen direction around their common level."""
+    unseen_nu: float = 1.64
+    """Degrees of freedom: the lower, the likelier is a lamp among them."""
+    source: float = 77.4
+    """Median radiance of a clipped source, where the camera's white is 1."""
+    source_sd: float = 0.6
+    """Standard deviation of its logarithm."""
+    surface: float = 0.07
+    """Median radiance of a clipped bright surface beyond white."""
+    surface_sd: float = 0.77
+    """Standard deviation of its logarithm."""
+    within_patch_sd: float = 0.212
+    """Standard deviation of log radiance within a patch."""
+    source_odds: float = 4.61
+    """Log odds that a clipped patch above the horizon is a source."""
+
+
+@dataclass(frozen=True)
+class LightEvidence:
+    """What is known of the light at a place."""
+
+    surfaces: ShadingEvidence
+    """Of a region around the place."""
+    highlights: HighlightEvidence | None
+    """On the same surfaces; None without view-dependent colours."""
+    far: Surroundings
+    """What surrounds the region."""
+    around: Surroundings
+    """What surrounds the object, near things included."""
+    up: Float[Tensor, "3"]
+    """Unit, world frame."""
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A connected clipped part of the surroundings that may be a source."""
+
+    members: Int[Tensor, "p"]
+    """Positions in `RadianceProblem.clipped`."""
+    size: float
+    """Directions that it covers."""
+
+
+@dataclass(frozen=True)
+class ClippedPrior:
+    """The normal density of the logarithms of the x clipped unknowns, given which patches are sources."""
+
+    mean: Float[Tensor, "x"]
+    precision: Float[Tensor, "x x"]
+    cost: float
+    """Minus the log odds of that choice."""
+
+
+@dataclass(frozen=True)
+class RadianceProblem:
+    """One place: m receivers, u unseen and x clipped directions, g materials; double precision."""
+
+    evidence: ShadingEvidence
+    highlights: HighlightEvidence | None
+    around: Surroundings
+    """What surrounds the object, near things included."""
+    settings: RadianceSettings
+    unseen: Int[Tensor, "u"]
+    """Positions in `DIRECTIONS`."""
+    clipped: Int[Tensor, "x"]
+    """The same."""
+    transport: Float[Tensor, "m n"]
+    """n = u + x columns: transport of the unknowns' own shares of their directions."""
+    shares: Float[Tensor, "n"]
+    """Those shares, as seen from the surfaces around."""
+    shares_at_object: Float[Tensor, "n"]
+    """The same as seen from the object."""
+    known: Float[Tensor, "m"]
+    """Radiance of white surfaces under what was captured."""
+    log_color: Float[Tensor, "m"]
+    weights: Float[Tensor, "m"]
+    """Of the receivers; they sum to `effective`."""
+    is_white: Bool[Tensor, "m"]
+    """Receivers that the camera clipped: they may be brighter than recorded."""
+    material_weights: Float[Tensor, "g"]
+    """How many independent albedos each material is worth."""
+    sky: float
+    """Log radiance expected of unseen directions."""
+    patches: tuple[Patch, ...]
+    """Clipped ones above the horizon, largest first."""
+
+    def split(self, x: Float[Tensor, "s"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Of a state: level of the unseen sky, the n log radiances, the g log albedos."""
+        n = self.transport.shape[1]
+        return x[0], x[1 : 1 + n], x[1 + n :]
+
+    def received(self, radiances: Float[Tensor, "n"]) -> Float[Tensor, "m"]:
+        """Radiance of white surfaces for log radiances of the unknowns."""
+        return (self.known + self.transport @ radiances.exp()).clamp_min(1e-5)
+
+    def radiance_at_object(self, x: Float[Tensor, "s"]) -> Float[Tensor, "k"]:
+        """Gray radiance from all `DIRECTIONS` at the object."""
+        total = self.around.radiance.mean(1).double()
+        index = torch.cat([self.unseen, self.clipped])
+        return total.index_add(0, index, self.shares_at_object * self.split(x)[1].exp())
+
+    def highlight_cost(self, x: Float[Tensor, "s"]) -> float:
+        """Minus the log likelihood of the highlights, up to a constant."""
+        if self.highlights is None:
+            return 0.0
+        return self.settings.highlights * math.log1p(-self.highlights.explained(self.radiance_at_object(x)))
+
+    def with_prior(self, sources: tuple[bool, ...]) -> ClippedPrior:
+        """The prior where the first patches are sources or not."""
+        s, count = self.settings, len(self.clipped)
+        mean = torch.full((count,), math.log(s.surface), dtype=torch.float64)
+        deviation = torch.full((count,), s.surface_sd, dtype=torch.float64)
+        for patch, is_source in zip(self.patches, sources, strict=True):
+            if is_source:
+                mean[patch.members], deviation[patch.members] = math.log(s.source), s.source_sd
+        if not count:
+            return ClippedPrior(mean, torch.zeros(0, 0, dtype=torch.float64), 0.0)
+        label = _patch_labels(self.clipped)
+        same = (label[:, None] == label[None]).double()
+        covariance = same * deviation[:, None] * deviation + s.within_patch_sd**2 * torch.eye(count).double()
+        return ClippedPrior(mean, torch.linalg.inv(covariance), -s.source_odds * sum(sources))
+
+
+def radiance_problem(
+    found: LightEvidence, *, most_patches: int = 5, settings: RadianceSettings = RadianceSettings()
+) -> RadianceProblem:
+    """Set up the density at one place.
+
+    Args:
+        found: What is known.
+        most_patches: Clipped patches that may be sources; the search tries all their combinations.
+        settings: The numbers.
+    """
+    evidence, far, around, up = found.surfaces, found.far, found.around, found.up
+    s = settings
+    unseen = (torch.maximum(1 - far.seen, 1 - around.seen) > _UNSEEN).nonzero()[:, 0]
+    clipped = (far.clipped > _PRESENT).nonzero()[:, 0]
+    shares = torch.cat([1 - far.seen[unseen], far.clipped[clipped]]).clamp_min(0).double()
+    # a source is beyond the surroundings: what is clipped nearby is a reconstruction's fault or a bright surface
+    at_object = torch.minimum(around.clipped, far.clipped)
+    transport = evidence.transport.double()
+    mean_color = (evidence.weights[:, None] * evidence.colors).sum(0).mean()
+    weights = (evidence.weights * torch.exp(-0.5 * (evidence.distance / s.near) ** 2)).double()
+    weights *= s.effective / weights.sum().clamp_min(1e-12)
+    groups = int(evidence.material.max()) + 1 if len(weights) else 0
+    by_material = torch.zeros(groups, dtype=torch.float64).index_add_(0, evidence.material, weights)
+    material_weights = by_material / (by_material + 1)
+    material_weights *= min(1.0, s.materials / max(float(material_weights.sum()), 1e-9))
+    return RadianceProblem(
+        evidence=evidence,
+        highlights=found.highlights,
+        around=around,
+        settings=s,
+        unseen=unseen,
+        clipped=clipped,
+        transport=transport[:, torch.cat([unseen, clipped])] * shares,
+        shares=shares,
+        shares_at_object=torch.cat([1 - around.seen[unseen], at_object[clipped]]).clamp_min(0).double(),
+        known=transport @ far.radiance.mean(1).double() + evidence.blocked.double() * float(mean_color),
+        log_color=evidence.colors.mean(1).double().log(),
+        weights=weights,
+        is_white=evidence.colors.max(1).values > 0.9,
+        material_weights=material_weights,
+        sky=math.log(float(seen_sky(far, up, mean_color.expand(3)).mean())) + s.sky_bias,
+        patches=_patches(far, clipped, up)[:most_patches],
+    )
+
+
+def seen_sky(far: Surroundings, up: Float[Tensor, "3"], otherwise: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Geometric mean radiance of what was seen above the horizon, or of all that was seen, or `otherwise`."""
+    weights = far.seen * (DIRECTIONS @ up > 0)
+    if float(weights.sum()) < 2:
+        weights = far.seen
+    if float(weights.sum()) < 1:
+        return otherwise
+    radiance = far.radiance / far.seen.clamp_min(1e-3)[:, None]
+    return ((weights / weights.sum())[:, None] * radiance.clamp_min(1e-3).log()).sum(0).exp()
+
+
+def _patch_labels(clipped: Int[Tensor, "x"]) -> Int[Tensor, "x"]:
+    """One label per connected set of directions."""
+    towards = DIRECTIONS[clipped]
+    touching = towards @ towards.T > _TOUCHING
+    label = torch.arange(len(clipped))
+    for _ in range(len(clipped)):
+        spread = torch.where(touching, label[None], len(clipped)).min(1).values
+        if torch.equal(spread, label):
+            break
+        label = spread
+    return label
+
+
+_LOWEST = math.sin(math.radians(-8))
+"""A window beside a table reaches below the horizon; reflections lie lower."""
+_SMALLEST = 0.05
+"""Of a direction."""
+
+
+def _patches(far: Surroundings, clipped: Int[Tensor, "x"], up: Float[Tensor, "3"]) -> tuple[Patch, ...]:
+    label = _patch_labels(clipped)
+    found = []
+    for value in label.unique():
+        members = (label == value).nonzero()[:, 0]
+        share = far.clipped[clipped[members]]
+        height = float((share * (DIRECTIONS[clipped[members]] @ up)).sum() / share.sum())
+        if height > _LOWEST and float(share.sum()) > _SMALLEST:
+            found.append(Patch(members, float(share.sum())))
+    return tuple(sorted(found, key=lambda patch: -patch.size))
+
+
+def start(problem: RadianceProblem, prior: ClippedPrior) -> Float[Tensor, "s"]:
+    """The state of an even sky, with albedos between the prior's and those that explain the colours."""
+    p, s = problem, problem.settings
+    radiances = torch.cat([torch.full((len(p.unseen),), p.sky, dtype=torch.float64), prior.mean])
+    residual = p.log_color - p.received(radiances).log()
+    total = _by_material(p, p.weights)
+    mean = _by_material(p, p.weights * residual) / total.clamp_min(1e-9)
+    precision = total * 0.5 / s.residual**2
+    share = precision / (precision + p.material_weights * s.albedo_sd**-2 + 1e-3)
+    albedo = share * mean + (1 - share) * math.log(s.albedo)
+    return torch.cat([torch.tensor([p.sky], dtype=torch.float64), radiances, albedo])
+
+
+def cost(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"]) -> float:
+    """Minus the log density of shading and priors, up to a constant."""
+    p, s = problem, problem.settings
+    level, radiances, albedo = p.split(x)
+    unseen, clipped = radiances[: len(p.unseen)], radiances[len(p.unseen) :]
+    residual = _residual(p, x)
+    total = shading_cost(p, residual)
+    total += 0.5 * float((p.material_weights * ((albedo - math.log(s.albedo)) / s.albedo_sd) ** 2).sum())
+    total += 0.5 * _ABOVE_MOST * float(((albedo - _MOST_ALBEDO).clamp_min(0) ** 2).sum())
+    total += 0.5 * ((float(level) - p.sky) / s.sky_sd) ** 2 + float(unseen_cost(s, unseen - level).sum())
+    away = clipped - prior.mean
+    return total + 0.5 * float(away @ prior.precision @ away) + prior.cost
+
+
+def shading_cost(problem: RadianceProblem, residual: Float[Tensor, "m"]) -> float:
+    """Minus the log likelihood of the receivers' colours."""
+    s = problem.settings
+    return 0.75 * (s.nu + 1) * float((problem.weights * torch.log1p(residual**2 / (s.nu * s.residual**2))).sum())
+
+
+def unseen_cost(settings: RadianceSettings, away: Tensor) -> Tensor:
+    """Minus the log density of unseen directions' log radiances around their level."""
+    s = settings
+    return 0.5 * (s.unseen_nu + 1) * torch.log1p(away**2 / (s.unseen_nu * s.unseen_sd**2))
+
+
+def polish(
+    problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], *, steps: int = 8
+) -> Float[Tensor, "s"]:
+    """The nearest local maximum of the density of shading and priors (Levenberg-Marquardt, reweighted)."""
+    best, damping = cost(problem, prior, x), 1e-3
+    for _ in range(steps):
+        moved = x + _step(problem, prior, x, damping).clamp(-_LARGEST_STEP, _LARGEST_STEP)
+        value = cost(problem, prior, moved)
+        if value < best:
+            gained, x, best, damping = best - value, moved, value, max(0.3 * damping, 1e-4)
+            if gained < 0.01:
+                break
+        else:
+            damping *= 10
+    return x
+
+
+def _residual(problem: RadianceProblem, x: Float[Tensor, "s"]) -> Float[Tensor, "m"]:
+    _, radiances, albedo = problem.split(x)
+    residual = problem.log_color - albedo[problem.evidence.material] - problem.received(radiances).log()
+    return torch.where(problem.is_white, residual.clamp_min(0), residual)
+
+
+def _by_material(problem: RadianceProblem, values: Float[Tensor, "m ..."]) -> Float[Tensor, "g ..."]:
+    out = torch.zeros(len(problem.material_weights), *values.shape[1:], dtype=values.dtype)
+    return out.index_add_(0, problem.evidence.material, values)
+
+
+def _step(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], damping: float) -> Float[Tensor, "s"]:
+    """One damped Gauss-Newton step."""
+    p, s = problem, problem.settings
+    level, radiances, albedo = p.split(x)
+    u, n = len(p.unseen), len(radiances)
+    residual = _residual(p, x)
+    weights = 1.5 * p.weights * (s.nu + 1) / (s.nu * s.residual**2 + residual**2)
+    weights = torch.where(p.is_white & (residual <= 0), 0.0, weights)
+    slope = (p.transport * radiances.exp()) / p.received(radiances)[:, None]  # of log received by log radiance
+    hessian = torch.zeros(len(x), len(x), dtype=torch.float64)
+    gradient = torch.zeros(len(x), dtype=torch.float64)
+    light, material = slice(1, 1 + n), slice(1 + n, len(x))
+    single = slope.float()
+    hessian[light, light] = (single.T @ (weights.float()[:, None] * single)).double()
+    mixed = _by_material(p, weights[:, None] * slope)
+    hessian[material, light], hessian[light, material] = mixed, mixed.T
+    gradient[light] = -(slope.T @ (weights * residual))
+    gradient[material] = -_by_material(p, weights * residual)
+    diagonal = hessian.diagonal()
+    above = (albedo > _MOST_ALBEDO) * _ABOVE_MOST
+    diagonal[material] += _by_material(p, weights) + p.material_weights * s.albedo_sd**-2 + above + 1e-6
+    gradient[material] += p.material_weights * (albedo - math.log(s.albedo)) * s.albedo_sd**-2
+    gradient[material] += above * (albedo - _MOST_ALBEDO)
+    away = radiances[:u] - level
+    tied = (s.unseen_nu + 1) / (s.unseen_nu * s.unseen_sd**2 + away**2)
+    diagonal[1 : 1 + u] += tied
+    hessian[0, 1 : 1 + u], hessian[1 : 1 + u, 0] = -tied, -tied
+    diagonal[0] += tied.sum() + s.sky_sd**-2
+    gradient[1 : 1 + u] += tied * away
+    gradient[0] = -(tied * away).sum() + (level - p.sky) * s.sky_sd**-2
+    hessian[1 + u : 1 + n, 1 + u : 1 + n] += prior.precision
+    gradient[1 + u : 1 + n] += prior.precision @ (radiances[u:] - prior.mean)
+    diagonal += damping * diagonal
+    return -torch.cholesky_solve(gradient[:, None], torch.linalg.cholesky(hessian))[:, 0]

@@ -1,0 +1,241 @@
+"""The light around a place as an average over the local maxima of its posterior density.
+
+First the clipped patches are tried as sources in every combination, then single unseen or clipped directions as
+lamps; the best of each are polished. What several maxima of about the same height say is averaged, and a lamp is
+spread over the directions that explain the scene about as well.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.relighting.light.radiance_model import (
+    ClippedPrior,
+    RadianceProblem,
+    cost,
+    polish,
+    start,
+    unseen_cost,
+)
+from splatgraft.relighting.light.surroundings import DIRECTIONS
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How many local maxima are looked for, and how they are averaged."""
+
+    combinations: int = 3
+    """Combinations of clipped patches that are polished."""
+    lamps: int = 5
+    """Single directions that are tried as lamps."""
+    more_lamps: int = 2
+    """Directions that are tried as one more lamp beside the best maximum."""
+    strengths: tuple[float, ...] = (4.0, 12.0, 40.0, 120.0)
+    """Radiance of a lamp over what is there without it."""
+    apart: float = math.radians(18)
+    """Radians between directions that are tried."""
+    temperature: float = 5.2
+    """By which differences of the log density are divided before maxima are averaged; fitted with the density."""
+    same: float = 0.04
+    """Root mean square of log irradiance between maxima, below which they are one."""
+    spread: float = math.radians(35)
+    """Radians around a lamp over which its direction is uncertain at most."""
+
+
+@dataclass(frozen=True)
+class Maximum:
+    """A local maximum of the density."""
+
+    cost: float
+    """Minus the log density, highlights included."""
+    state: Float[Tensor, "s"]
+    sources: tuple[bool, ...]
+    """Which patches are sources."""
+
+
+@dataclass(frozen=True)
+class RadianceEstimate:
+    """What no camera recorded of the light around a place: means over the posterior, gray, per direction."""
+
+    unseen: Float[Tensor, "k"]
+    """Radiance of the parts of each direction that no camera saw."""
+    clipped: Float[Tensor, "k"]
+    """Radiance of the clipped parts beyond the camera's white."""
+    weights: tuple[float, ...]
+    """Probabilities of the local maxima, highest first."""
+    residual: Float[Tensor, "m"]
+    """Observed over explained brightness of the receivers, logarithm, at the best maximum."""
+
+
+def search_radiance(problem: RadianceProblem, *, settings: SearchSettings = SearchSettings()) -> RadianceEstimate:
+    """Find and average the local maxima of the density of `problem`.
+
+    Args:
+        problem: The density.
+        settings: Extent of the search.
+    """
+    nothing = problem.with_prior((False,) * len(problem.patches))
+    dark = polish(problem, nothing, start(problem, nothing), steps=2)
+    combined = _combinations(problem, dark)[: settings.combinations]
+    found = [_polished(problem, one) for one in combined]
+    best = combined[0]
+    # not polished to the end: a state that has learned to do without a lamp hides it
+    early = polish(problem, problem.with_prior(best.sources), best.state, steps=2)
+    found += _with_lamps(problem, replace(best, state=early), settings.lamps, settings)
+    found.sort(key=lambda maximum: maximum.cost)
+    found += _with_lamps(problem, found[0], settings.more_lamps, settings)
+    maxima = _distinct(problem, sorted(found, key=lambda maximum: maximum.cost), settings)
+    weights = torch.tensor([(maxima[0].cost - m.cost) / settings.temperature for m in maxima]).double().exp()
+    weights /= weights.sum()
+    hidden = torch.zeros(2, len(DIRECTIONS), dtype=torch.float64)
+    for weight, maximum in zip(weights, maxima, strict=True):
+        hidden += weight * _hidden_radiance(problem, maximum, settings)
+    _, at_best, albedo = problem.split(maxima[0].state)
+    explained = albedo[problem.evidence.material] + problem.received(at_best).log()
+    return RadianceEstimate(
+        unseen=hidden[0].float(),
+        clipped=hidden[1].float(),
+        weights=tuple(weights.tolist()),
+        residual=(problem.log_color - explained).float(),
+    )
+
+
+def _polished(problem: RadianceProblem, at: Maximum) -> Maximum:
+    prior = problem.with_prior(at.sources)
+    return _at(problem, prior, polish(problem, prior, at.state), at.sources)
+
+
+def _at(problem: RadianceProblem, prior: ClippedPrior, state: Float[Tensor, "s"], sources: tuple[bool, ...]) -> Maximum:
+    return Maximum(cost(problem, prior, state) + problem.highlight_cost(state), state, sources)
+
+
+def _combinations(problem: RadianceProblem, dark: Float[Tensor, "s"]) -> list[Maximum]:
+    """All combinations of patches as sources, by cost, albedos shifted together to suit."""
+    n, found = problem.transport.shape[1], []
+    for sources in itertools.product((True, False), repeat=len(problem.patches)):
+        prior, state = problem.with_prior(sources), dark.clone()
+        state[1 + len(problem.unseen) : 1 + n] = prior.mean
+        _, radiances, albedo = problem.split(state)
+        residual = problem.log_color - albedo[problem.evidence.material] - problem.received(radiances).log()
+        state[1 + n :] += _RELEVELED * float((problem.weights * residual).sum() / problem.weights.sum().clamp_min(1e-9))
+        found.append(_at(problem, prior, state, sources))
+    return sorted(found, key=lambda maximum: maximum.cost)
+
+
+_RELEVELED = 0.7
+"""Share of the mean residual that albedos take up before a state is polished."""
+
+
+@dataclass(frozen=True)
+class _LampCosts:
+    """Every unknown made a lamp of every strength: n x f."""
+
+    cost: Float[Tensor, "n f"]
+    """Change of the cost, up to a constant."""
+    radiance: Float[Tensor, "n f"]
+    """Logarithm."""
+    shift: Float[Tensor, "n f"]
+    """Of all log albedos."""
+
+
+def _lamp_costs(
+    problem: RadianceProblem, prior: ClippedPrior, state: Float[Tensor, "s"], strengths: tuple[float, ...]
+) -> _LampCosts:
+    p, s = problem, problem.settings
+    level, radiances, albedo = p.split(state)
+    u, now = len(p.unseen), radiances.exp()
+    at_least = torch.where(torch.arange(len(now)) < u, level.exp(), _WHITE)
+    received = p.received(radiances)
+    residual = (p.log_color - albedo[p.evidence.material] - received.log()).float()
+    relative = (p.transport / received[:, None]).float()
+    index = torch.cat([p.unseen, p.clipped])
+    light = p.radiance_at_object(state)
+    columns = []
+    for strength in strengths:
+        lamp = torch.maximum(now, at_least) * strength
+        changed = residual[:, None] - torch.log1p(relative * (lamp - now).float())
+        weight = p.weights.float()[:, None]
+        shift = _RELEVELED * (weight * changed).sum(0) / weight.sum().clamp_min(1e-9)
+        changed = changed - shift
+        changed = torch.where(p.is_white[:, None], changed.clamp_min(0), changed)
+        value = 0.75 * (s.nu + 1) * (weight * torch.log1p(changed**2 / (s.nu * s.residual**2))).sum(0).double()
+        away = (albedo - math.log(s.albedo))[:, None]
+        value += 0.5 * (p.material_weights[:, None] * ((away + shift) ** 2 - away**2)).sum(0) / s.albedo_sd**2
+        value[:u] += unseen_cost(s, lamp[:u].log() - level) - unseen_cost(s, radiances[:u] - level)
+        moved, pull = lamp[u:].log() - radiances[u:], prior.precision @ (radiances[u:] - prior.mean)
+        value[u:] += moved * pull + 0.5 * moved**2 * prior.precision.diag()
+        if p.highlights is not None:
+            explained = p.highlights.explained_with_more(light, index, p.shares_at_object * (lamp - now))
+            value += s.highlights * torch.log1p(-explained).double()
+        value[p.shares < _LEAST_SHARE] = math.inf
+        columns.append(torch.stack([value, lamp.log(), shift.double()]))
+    found = torch.stack(columns, 2)
+    return _LampCosts(found[0], found[1], found[2])
+
+
+_WHITE = 0.3
+"""Radiance beyond white that a clipped lamp starts from, at least."""
+_LEAST_SHARE = 0.1
+"""Share of a direction that must be unknown for a lamp in it."""
+
+
+def _with_lamps(problem: RadianceProblem, base: Maximum, count: int, settings: SearchSettings) -> list[Maximum]:
+    """The polished states with one more lamp, at the `count` best directions."""
+    prior = problem.with_prior(base.sources)
+    costs = _lamp_costs(problem, prior, base.state, settings.strengths)
+    left, strength = costs.cost.min(1)
+    towards = DIRECTIONS[torch.cat([problem.unseen, problem.clipped])]
+    found = []
+    for _ in range(min(count, len(left))):
+        i = int(left.argmin())
+        if not math.isfinite(float(left[i])):
+            break
+        left = torch.where(towards @ towards[i] > math.cos(settings.apart), math.inf, left)
+        state = base.state.clone()
+        state[1 + i] = costs.radiance[i, strength[i]]
+        state[1 + len(towards) :] += costs.shift[i, strength[i]]
+        found.append(_polished(problem, replace(base, state=state)))
+    return found
+
+
+def _distinct(problem: RadianceProblem, maxima: list[Maximum], settings: SearchSettings) -> list[Maximum]:
+    """The maxima of which no better one gives the same irradiance."""
+    kept: list[Maximum] = []
+    seen: list[Tensor] = []
+    for maximum in maxima:
+        log_irradiance = irradiance_of(problem.radiance_at_object(maximum.state)).clamp_min(1e-6).log()
+        if all(float((log_irradiance - other).pow(2).mean().sqrt()) > settings.same for other in seen):
+            kept.append(maximum)
+            seen.append(log_irradiance)
+    return kept
+
+
+def irradiance_of(radiance: Float[Tensor, "k ..."], normals: Float[Tensor, "n 3"] = DIRECTIONS) -> Tensor:
+    """Irradiance on unshadowed planes with unit `normals` from the radiance of all `DIRECTIONS`."""
+    cosine = (normals @ DIRECTIONS.T).clamp_min(0).to(radiance)
+    return cosine @ radiance * (4 * math.pi / len(DIRECTIONS))
+
+
+def _hidden_radiance(problem: RadianceProblem, maximum: Maximum, settings: SearchSettings) -> Float[Tensor, "2 k"]:
+    """Radiance of unseen and clipped parts; unseen lamps are spread over directions that explain the scene as well."""
+    level, radiances, _ = problem.split(maximum.state)
+    count = len(problem.unseen)
+    out = torch.zeros(2, len(DIRECTIONS), dtype=torch.float64)
+    out[0, problem.unseen], out[1, problem.clipped] = radiances[:count].exp(), radiances[count:].exp()
+    towards, shares = DIRECTIONS[problem.unseen], problem.shares[:count].clamp_min(_LEAST_SHARE)
+    prior = problem.with_prior(maximum.sources)
+    for i in (radiances[:count] - level > math.log(settings.strengths[0])).nonzero()[:, 0].tolist():
+        without = maximum.state.clone()
+        without[1 + i] = level
+        strengths = tuple((float(radiances[i] - level) + torch.linspace(-1, 1, 5)).exp().tolist())
+        value = _lamp_costs(problem, prior, without, strengths).cost[:count].min(1).values
+        value = torch.where(towards @ towards[i] > math.cos(settings.spread), value, math.inf)
+        likely = (-(value - value.min()) / settings.temperature).exp()
+        energy = shares[i] * (radiances[i].exp() - level.exp())
+        out[0, problem.unseen[i]] = level.exp()
+        out[0] = out[0].index_add(0, problem.unseen, energy * likely / likely.sum() / shares)
+    return out

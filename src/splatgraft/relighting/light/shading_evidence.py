@@ -1,0 +1,184 @@
+"""Evidence for the light from the shading and the shadows of the surfaces around a place.
+
+The scene is shadow-mapped from every direction: visibility times cosine, the transport, says how much of the light
+from each direction arrives at each surface. Surfaces are grouped by colour and position, one material per group.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatgraft.core.bounds import BoundingSphere
+from splatgraft.core.directions import frames_along
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.spherical_harmonics import rgb_from_dc
+from splatgraft.relighting.light.surroundings import DIRECTIONS
+from splatgraft.relighting.shading.normals import Normals
+from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occluders_of, splat_depth_maps, visibility
+
+
+@dataclass(frozen=True)
+class ShadingEvidenceSettings:
+    """Which Gaussians count, and how they are grouped; none of these numbers is sensitive."""
+
+    receivers: int = 1000
+    """Most Gaussians whose brightness is explained, chosen at random with a fixed seed."""
+    fewest: int = 200
+    """Receivers; with fewer there is no evidence."""
+    receiver_opacity: float = 0.3
+    """Opacity below which a Gaussian is no receiver."""
+    least_confidence: float = 0.1
+    """Of its normal; below it a Gaussian is no receiver."""
+    darkest: float = 0.01
+    """sRGB; darker channels count as this."""
+    half_weight: float = 0.02
+    """Linear brightness at which a receiver has half its weight: almost black ones say little about light."""
+    enclosed: float = 0.15
+    """Share of the directions above a surface that are open; with less it is inside something, and is left out."""
+    occluders: int = 16000
+    """Most Gaussians that block light, chosen at random with a fixed seed and grown to cover the same area."""
+    occluder_opacity: float = 0.1
+    """Opacity below which a Gaussian blocks no light."""
+    occluders_within: float = 1.3
+    """Radii of the region within which Gaussians block light."""
+    map_size: int = 128
+    """Pixels, a multiple of 16: width of a shadow map."""
+    bias: float = 1.5
+    """Pixels of a map; a nearer occluder is the receiver's own surface."""
+    materials: int = 24
+    """Groups."""
+    rounds: int = 12
+    """Iterations of k-means."""
+    green_magenta: float = 0.25
+    """Unit of log(green / sqrt(red blue)) among the features, where that of log(red / blue) is 1."""
+    extent: float = 0.4
+    """Radii of the region; the unit of position among the features."""
+
+
+@dataclass(frozen=True)
+class ShadingEvidence:
+    """m receivers around a place and the transport of light from the k `DIRECTIONS` to them."""
+
+    points: Float[Tensor, "m 3"]
+    """Centres, world units."""
+    distance: Float[Tensor, "m"]
+    """From the middle of the region, in its radii."""
+    transport: Float[Tensor, "m k"]
+    """Visibility times cosine, scaled so that an open surface's row sums to 1: transport @ radiance is the radiance of
+    a white surface."""
+    colors: Float[Tensor, "m 3"]
+    """Linear rgb."""
+    weights: Float[Tensor, "m"]
+    """By visible area and certainty; they sum to 1."""
+    material: Int[Tensor, "m"]
+    """Group of each receiver, from 0."""
+
+    @property
+    def blocked(self) -> Float[Tensor, "m"]:
+        """Share of the light of an even sky that other surfaces block, in [0, 1]."""
+        return (1 - self.transport.sum(1)).clamp_min(0)
+
+
+def find_shading_evidence(
+    scene: Gaussians,
+    normals: Normals,
+    *,
+    region: BoundingSphere,
+    settings: ShadingEvidenceSettings = ShadingEvidenceSettings(),
+) -> ShadingEvidence:
+    """Receivers around a place and the transport of light to them; none where there are too few.
+
+    Args:
+        scene: All Gaussians.
+        normals: Of all Gaussians.
+        region: Receivers lie within it.
+        settings: Which Gaussians count.
+    """
+    chosen = _receivers(scene, normals, region, settings)
+    if len(chosen) < settings.fewest:
+        return _nothing()
+    points, facing = scene.means[chosen], normals.vectors[chosen]
+    colors = linear_from_srgb(rgb_from_dc(scene.sh[chosen, 0]).clamp(settings.darkest, 1))
+    lit = _lit(_occluders(scene, region, settings), points, facing, region=region, settings=settings)
+    transport = lit / (facing @ DIRECTIONS.T).clamp_min(0).sum(1, keepdim=True)
+    area = scene.scales[chosen].sort(1).values[:, 1:].prod(1)
+    certain = scene.opacities[chosen] * normals.confidence[chosen].clamp_min(0.05)
+    weights = certain * area.clamp_max(4 * float(area.median()))
+    gray = colors.mean(1)
+    weights = weights * (gray / (gray + settings.half_weight)) * (transport.sum(1) > settings.enclosed)
+    if float(weights.sum()) <= 0:
+        return _nothing()
+    return ShadingEvidence(
+        points=points,
+        distance=(points - region.center).norm(dim=1) / region.radius,
+        transport=transport,
+        colors=colors,
+        weights=weights / weights.sum(),
+        material=_materials(colors, points, region, settings),
+    )
+
+
+def _nothing() -> ShadingEvidence:
+    none, index = torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64)
+    return ShadingEvidence(none, torch.zeros(0), torch.zeros(0, len(DIRECTIONS)), none, torch.zeros(0), index)
+
+
+def _receivers(
+    scene: Gaussians, normals: Normals, region: BoundingSphere, settings: ShadingEvidenceSettings
+) -> Int[Tensor, "m"]:
+    inside = (scene.means - region.center).norm(dim=1) < region.radius
+    good = inside & normals.seen & (scene.opacities > settings.receiver_opacity)
+    chosen = (good & (normals.confidence > settings.least_confidence)).nonzero()[:, 0]
+    generator = torch.Generator().manual_seed(0)
+    return chosen[torch.randperm(len(chosen), generator=generator)[: settings.receivers]]
+
+
+def _occluders(scene: Gaussians, region: BoundingSphere, settings: ShadingEvidenceSettings) -> Occluders:
+    near = (scene.means - region.center).norm(dim=1) < settings.occluders_within * region.radius
+    chosen = (near & (scene.opacities > settings.occluder_opacity)).nonzero()[:, 0]
+    if len(chosen) <= settings.occluders:
+        return occluders_of(scene.select(chosen))
+    generator = torch.Generator().manual_seed(0)
+    part = scene.select(chosen[torch.randperm(len(chosen), generator=generator)[: settings.occluders]])
+    # fewer, wider: together they cover the same area
+    grown = part.log_scales + 0.5 * math.log(len(chosen) / settings.occluders)
+    return occluders_of(replace(part, log_scales=grown))
+
+
+def _lit(
+    occluders: Occluders,
+    points: Float[Tensor, "m 3"],
+    normals: Float[Tensor, "m 3"],
+    *,
+    region: BoundingSphere,
+    settings: ShadingEvidenceSettings,
+) -> Float[Tensor, "m k"]:
+    """Visibility times cosine."""
+    window = Window(center=region.center, radius=region.radius, frames=frames_along(DIRECTIONS))
+    nearest = torch.full((len(DIRECTIONS),), -region.radius)
+    maps = splat_depth_maps(occluders, window, size=settings.map_size, with_color=False, nearest=nearest)
+    cosine = (normals @ DIRECTIONS.T).clamp_min(0)
+    return visibility(maps, points, normals, bias=settings.bias * maps.texel) * cosine
+
+
+def _materials(
+    colors: Float[Tensor, "m 3"],
+    points: Float[Tensor, "m 3"],
+    region: BoundingSphere,
+    settings: ShadingEvidenceSettings,
+) -> Int[Tensor, "m"]:
+    """Groups of similar colour and position, not of similar normals: those would hide the light."""
+    red, green, blue = colors.clamp_min(1e-3).log().unbind(1)
+    chroma = torch.stack([red - blue, (green - 0.5 * (red + blue)) / settings.green_magenta], 1)
+    features = torch.cat([chroma, (points - region.center) / (settings.extent * region.radius)], 1)
+    generator = torch.Generator().manual_seed(0)
+    means = features[torch.randperm(len(features), generator=generator)[: settings.materials]]
+    for _ in range(settings.rounds):
+        label = torch.cdist(features, means).argmin(1)
+        sums = torch.zeros_like(means).index_add_(0, label, features)
+        means = sums / torch.bincount(label, minlength=len(means)).clamp_min(1)[:, None]
+    return torch.cdist(features, means).argmin(1)

@@ -1,0 +1,124 @@
+"""The exam draws its scenes from its number alone, away from all known seeds, and its figures are what they say."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from exam.draw import SIZE, draw_scenes
+from exam.evaluate_scene import SceneResult
+from exam.measure_light import light_errors, median_angle_deg, nearest_normals
+from exam.summary import summarize_light, summarize_row, summary_markdown
+
+from splatgraft.core.directions import even_directions
+from splatgraft.relighting import Light, LightSource
+from splatgraft.relighting.light.light import fit_ambient
+from splatgraft.synthesis import benchmark, pairs
+
+SUN = LightSource(direction=(0.0, 0.0, 1.0), irradiance=(3.0, 3.0, 3.0))
+LIGHT = Light(sources=(SUN,), ambient=fit_ambient(torch.tensor([0.5, 0.5, 0.5])))
+
+
+def test_a_number_is_an_exam():
+    first = draw_scenes(7, 8)
+    assert draw_scenes(7, 8) == first
+    assert draw_scenes(7, 3) == first[:3]
+    other = draw_scenes(8, 8)
+    assert not {scene.seed for scene in first} & {scene.seed for scene in other}
+    assert not {scene.object_seed for scene in first} & {scene.object_seed for scene in other}
+    # all kinds, in another order
+    assert sorted(scene.kind for scene in first) == sorted(pairs.KINDS) == sorted(scene.kind for scene in other)
+    assert len({scene.name for scene in first}) == 8
+
+
+def test_no_seed_of_an_exam_is_known():
+    known = [*benchmark.SCENES, *benchmark.ROTATIONS]
+    taken = {scene.seed for scene in known} | {scene.object_seed for scene in known} | set(range(10_000))
+    drawn = [scene for number in range(3) for scene in draw_scenes(number, 4)]
+    for scene in drawn:
+        # pairs draw their objects below 2**31, and scenes from set * 100003 + number: over 20000 sets until there
+        assert scene.seed >= 2**31
+        assert scene.object_seed >= 2**31
+        assert not {scene.seed, scene.object_seed} & taken
+        assert len(benchmark.plan(scene, SIZE)[0].cameras) == SIZE.views
+
+
+def scaled(light: Light, factor: float) -> Light:
+    r, g, b = light.sources[0].irradiance
+    sun = replace(light.sources[0], irradiance=(factor * r, factor * g, factor * b))
+    return replace(light, sources=(sun,), ambient=factor * light.ambient)
+
+
+def test_errors_of_a_light_of_double_strength_are_one_stop_of_level():
+    assert light_errors(LIGHT, LIGHT) == {"rms": 0, "level": 0, "tint": 0, "direction_deg": pytest.approx(0, abs=0.05)}
+    double = light_errors(scaled(LIGHT, 2.0), LIGHT)
+    # float32
+    assert double["level"] == pytest.approx(1, abs=1e-5)
+    assert double["rms"] == pytest.approx(1, abs=1e-5)
+    assert double["tint"] == pytest.approx(0, abs=1e-5)
+
+
+def test_a_turned_light_is_off_by_its_angle():
+    angle = math.radians(30)
+    turned = replace(LIGHT, sources=(replace(SUN, direction=(math.sin(angle), 0.0, math.cos(angle))),))
+    # 10,000 directions are 2 degrees apart, so that each of both is off by at most 1.5
+    assert light_errors(turned, LIGHT)["direction_deg"] == pytest.approx(30, abs=3)
+
+
+def test_a_red_light_has_a_tint_and_no_level():
+    gray, red = fit_ambient(torch.tensor([0.5, 0.5, 0.5])), fit_ambient(torch.tensor([0.75, 0.5, 0.25]))
+    errors = light_errors(Light((), red), Light((), gray))
+    assert errors["level"] == pytest.approx(0, abs=1e-5)
+    wanted = math.sqrt((math.log2(1.5) ** 2 + math.log2(0.5) ** 2) / 3)
+    assert errors["tint"] == pytest.approx(wanted, abs=1e-5)
+
+
+def test_true_normals_are_those_of_the_nearest_surface():
+    around = even_directions(5000)
+    points = 0.9 * even_directions(100)
+    found = nearest_normals(points, torch.cat([around, around], 1))
+    chosen = torch.ones(100, dtype=torch.bool)
+    # 5000 directions are about 3 degrees apart
+    angle = median_angle_deg(found, torch.nn.functional.normalize(points, dim=1), chosen)
+    assert angle is not None
+    assert angle < 3
+    assert median_angle_deg(found, found, ~chosen) is None
+
+
+def result(name, *rows, light=None) -> SceneResult:
+    keys = ("object", "whole", "shadow")
+    named = zip(("paste", "transfer"), rows, strict=True)
+    return SceneResult(name, {row: dict(zip(keys, values, strict=True)) for row, values in named}, light or {})
+
+
+def errors(level, rms):
+    return {"rms": rms, "level": level, "tint": 0.1, "direction_deg": 10.0}
+
+
+def test_the_summary_is_the_mean_over_scenes_against_pasting():
+    results = [
+        result("a", (14.0, 24.0, 0.4), (17.0, 25.0, 0.1), light={"new": errors(-0.5, 0.6), "old": errors(0.25, 0.2)}),
+        result("b", (10.0, 20.0, 0.2), (11.0, 19.0, 0.15), light={"new": errors(1.0, 1.0), "old": None}),
+        result("c", (12.0, 22.0, None), (12.5, 22.5, None)),
+    ]
+    found = summarize_row("transfer", results)
+    assert found.scenes == 3
+    assert found.object_gain == pytest.approx((3 + 1 + 0.5) / 3)
+    # shares of 75% and 25%; the third scene has no shadow
+    assert found.shadow_removed == pytest.approx(0.5)
+    assert found.worse == 1
+    light = summarize_light(results)
+    rms = light["irradiance, RMS over normals, stops"]
+    assert rms is not None
+    assert (rms.mean, rms.worst) == pytest.approx((0.6, 1.0))
+    ratio = light["level of the ratio of new to old light, stops"]
+    assert ratio is not None
+    assert ratio.mean == pytest.approx(0.75)
+    assert summarize_row("gain", results).object_gain is None
+    text = summary_markdown(results)
+    assert "| transfer | the transfer, everything estimated | +1.50 | 50% | 1 of 3 |" in text
+
+
+def test_a_result_survives_its_file():
+    one = result("a", (14.0, 24.0, None), (17.0, 25.0, 0.1), light={"new": errors(-0.5, 0.6), "old": None})
+    assert SceneResult.from_json(one.as_json()) == one

@@ -1,0 +1,96 @@
+"""What is known of an object's capture (its light, its normals) is used as it is, instead of an estimate."""
+
+import math
+
+import pytest
+import torch
+
+from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.composite import Composite, PlacedObject
+from splatgraft.core.directions import even_directions, frames_along
+from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.core.rotations import quaternion_from_rotation
+from splatgraft.core.similarity import Similarity
+from splatgraft.core.spherical_harmonics import dc_from_rgb
+from splatgraft.relighting import Light, LightSource, SourceScene, relight
+from splatgraft.relighting.light.light import fit_ambient
+from splatgraft.relighting.prepared_object import prepare_object
+from splatgraft.runtime.memo import Memo
+
+COUNT = 2000
+QUARTER = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+LIGHT = Light(
+    sources=(LightSource(direction=(0.6, 0.0, 0.8), irradiance=(3.0, 2.5, 2.0), name="sun"),),
+    ambient=fit_ambient(torch.tensor([0.4, 0.5, 0.6])),
+)
+
+
+def surfels(points, normals, width) -> Gaussians:
+    n = len(points)
+    return Gaussians(
+        means=points,
+        log_scales=torch.tensor([width, width, 0.1 * width]).log().repeat(n, 1),
+        quaternions=quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
+        opacity_logits=torch.full((n,), 3.0),
+        sh=dc_from_rgb(torch.full((n, 1, 3), 0.5)),
+    )
+
+
+def ball() -> Gaussians:
+    around = even_directions(COUNT)
+    return surfels(0.3 * around, around, 0.012)
+
+
+def cameras():
+    turn = torch.arange(8) / 8 * 2 * math.pi
+    eyes = torch.stack([2.5 * turn.cos(), 2.5 * turn.sin(), torch.full((8,), 1.5)], 1)
+    return pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 100.0, width=64, height=48)
+
+
+def prepared(source: SourceScene, rotation=QUARTER):
+    placed = PlacedObject(ball(), Similarity(1.0, rotation, torch.tensor([0.0, 0.0, 1.0])))
+    return prepare_object(placed, source, cameras(), light=LIGHT, index=0, cache=Memo())
+
+
+def test_a_told_light_is_turned_with_the_object_and_needs_no_scene():
+    lighting = prepared(SourceScene(empty(), cameras(), light=LIGHT)).source_lighting
+    assert lighting is not None
+    # a quarter turn about z takes (0.6, 0, 0.8) to (0, 0.6, 0.8); float32
+    assert lighting.light.sources[0].direction == pytest.approx((0.0, 0.6, 0.8), abs=1e-6)
+    assert lighting.light.sources[0].irradiance == LIGHT.sources[0].irradiance
+
+
+def test_an_object_told_to_have_stood_in_the_same_light_keeps_its_colours():
+    sky = surfels(20 * even_directions(500), -even_directions(500), 0.1)
+    at = Similarity(1.0, torch.eye(3), torch.zeros(3))
+    composite = Composite(sky, (PlacedObject(ball(), at),), torch.zeros(sky.count, dtype=torch.bool))
+    relit = relight(composite, cameras(), sources=(SourceScene(empty(), cameras(), light=LIGHT),), light=LIGHT)
+    shade = relit.shade[relit.is_object]
+    # both irradiances come from the same samples; float32
+    assert torch.allclose(shade, torch.ones_like(shade), atol=1e-4)
+    assert any("as given" in sentence for sentence in relit.report[1:])
+
+
+def test_told_normals_are_turned_with_the_object_and_believed():
+    told = even_directions(COUNT).flip(1)
+    normals = prepared(SourceScene(empty(), cameras(), light=LIGHT, normals=told)).normals
+    # float32
+    assert torch.allclose(normals.vectors, told @ QUARTER.T, atol=1e-6)
+    assert bool((normals.confidence == 1).all())
+    assert bool(normals.seen.all())
+
+
+def test_told_normals_must_be_those_of_the_object():
+    with pytest.raises(ValueError, match="expected 2000 normals, found 7"):
+        prepared(SourceScene(empty(), cameras(), normals=even_directions(7)))
+
+
+def test_a_transfer_tells_what_it_found_of_each_object():
+    sky = surfels(20 * even_directions(500), -even_directions(500), 0.1)
+    at = Similarity(1.0, QUARTER, torch.zeros(3))
+    composite = Composite(sky, (PlacedObject(ball(), at),), torch.zeros(sky.count, dtype=torch.bool))
+    relit = relight(composite, cameras(), sources=(SourceScene(empty(), cameras(), light=LIGHT),), light=LIGHT)
+    (found,) = relit.prepared
+    assert found.normals.vectors.shape == (COUNT, 3)
+    assert found.source_lighting is not None
+    assert found.source_lighting.light.sources[0].direction == pytest.approx((0.0, 0.6, 0.8), abs=1e-6)
