@@ -297,7 +297,9 @@ def test_one_source_per_object_is_required():
 
 
 def test_light_json_round_trip_and_its_messages():
-    light = replace(sun_from(1, 2, 3, uncertainty_deg=9.0, name="sun", blockers_within=2.5), coverage=0.7)
+    light = replace(sun_from(1, 2, 3, uncertainty_deg=9.0, name="sun", blockers_within=2.5, distance=3.5), coverage=0.7)
+    assert light_from_json(light_to_json(light)).sources[0].distance == 3.5
+    assert light_from_json(light_to_json(sun_from(1, 2, 3))).sources[0].distance == math.inf
     text = light_to_json(light)
     assert light_to_json(light_from_json(text)) == text
     for broken, message in (
@@ -306,6 +308,9 @@ def test_light_json_round_trip_and_its_messages():
         (text.replace("splatgraft light 1", "other"), 'expected "format"'),
         (text.replace('"coverage": 0.7', '"coverage": 7'), "coverage: expected 1 number from 0 to 1"),
         (text.replace('"confidence"', '"confidense"'), "confidense"),
+        (text.replace('"distance": 3.5', '"distance": 0'), "distance: expected 1 number from 0.0001 to inf, found 0"),
+        (text.replace('"distance": 3.5', '"distance": -1'), "distance: expected 1 number"),
+        (text.replace('"distance": 3.5', '"distance": "far"'), "distance: expected 1 number"),
     ):
         with pytest.raises(ValueError, match=r"my\.json") as caught:
             light_from_json(broken, name="my.json")
