@@ -88,7 +88,11 @@ class Relit:
         """The m Gaussians under the layers, in the order of `gaussians`; those that no layer changes keep every bit."""
         ratio = self.ratio(weights)
         sloped = (weights.shadow * self.slope != 0).any(1).nonzero()[:, 0]
-        sh = spherical_harmonics.with_degree(self.gaussians.sh, max(self.gaussians.sh_degree, int(len(sloped) > 0)))
+        glossy = (
+            (self.gloss != 0).flatten(1).any(1).nonzero()[:, 0] if weights.gloss else torch.zeros(0, dtype=torch.int64)
+        )
+        degree = spherical_harmonics.degree_of(self.gloss.shape[1]) if len(glossy) else int(len(sloped) > 0)
+        sh = spherical_harmonics.with_degree(self.gaussians.sh, max(self.gaussians.sh_degree, degree))
         sh = sh.clone()
         lit = (ratio != 1).any(1).nonzero()[:, 0]
         if len(lit):
@@ -98,7 +102,6 @@ class Relit:
             slope = _srgb_slope(color, ratio[sloped], weights.shadow * self.slope[sloped])
             sh[sloped, 1:4] += spherical_harmonics.band_from_slope(slope)
         sh[self.bands_replaced, 1:] *= 1 - weights.gloss
-        glossy = (self.gloss != 0).flatten(1).any(1).nonzero()[:, 0]
         sh[glossy, : self.gloss.shape[1]] += weights.gloss * self.gloss[glossy]
         return replace(self.gaussians, sh=sh)
 

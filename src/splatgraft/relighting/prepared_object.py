@@ -18,11 +18,18 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
 from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.shading.depth_normals import fuse_normals
 from splatgraft.relighting.shading.irradiance import irradiance
+from splatgraft.relighting.shading.materials import Materials, estimate_materials
 from splatgraft.relighting.shading.normals import Normals, estimate_normals
+from splatgraft.relighting.shading.object_views import ObjectView, object_views
+from splatgraft.relighting.shading.reflected_light import reflected_light
 from splatgraft.relighting.shadows.light_sampling import LightSamples, ambient_pairs, sample_light, source_pairs
 from splatgraft.relighting.shadows.scene_ratio import ObjectShadowMaps, object_shadow_maps, self_visibility
 from splatgraft.runtime.memo import Memo
+
+_LEAST_TOLD = 0.03
+"""Share of the object; less gloss is not reported."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,8 @@ class SourceLighting:
     """Target's frame."""
     irradiance: Float[Tensor, "n 3"]
     """Linear rgb on each Gaussian under that light."""
+    materials: Materials
+    """What of the object's colours is matt and what is gloss, in units of that light."""
     estimate: EstimatedLight | None
     """What the light rests on, source's frame; None where it was told."""
 
@@ -96,7 +105,10 @@ def prepare_object(
         return _moved(cached, placed, samples)
     gaussians = placed.in_target()
     sphere = bounding_sphere(gaussians)
-    normals = _normals(placed, source, gaussians, cameras)
+    # the object is seen best from where it was captured
+    seen_from = cameras if source is None else placed.target_from_object.cameras(source.cameras)
+    views = object_views(gaussians, sphere, seen_from)
+    normals = _normals(placed, source, gaussians, seen_from, views)
     maps = object_shadow_maps(gaussians, sphere, samples)
     source_lighting, notes = None, None
     if source is not None:
@@ -112,7 +124,10 @@ def prepare_object(
             source_samples = sample_light(source_light)
             shares = self_visibility(maps, gaussians, normals.vectors, source_samples)
             received = irradiance(source_samples, normals.vectors, sample_visibility=shares)
-            source_lighting = SourceLighting(source_light, received, estimate)
+            reflected = reflected_light(source_light, source_samples, shares)
+            materials = estimate_materials(gaussians, normals.vectors, views, reflected)
+            notes += _gloss_note(materials, gaussians)
+            source_lighting = SourceLighting(source_light, received, materials, estimate)
     prepared = PreparedObject(
         gaussians=gaussians,
         target_from_object=placed.target_from_object,
@@ -127,10 +142,28 @@ def prepare_object(
     return prepared
 
 
-def _normals(placed: PlacedObject, source: SourceScene | None, in_target: Gaussians, cameras: Cameras) -> Normals:
+def _gloss_note(materials: Materials, gaussians: Gaussians) -> str:
+    """A sentence on what was found glossy; empty where nothing was."""
+    size = gaussians.opacities * gaussians.scales.sort(1).values[:, 1:].prod(1)
+    share = float((size * materials.share).sum() / size.sum())
+    mirrors = float((size * materials.mirrors).sum() / size.sum())
+    note = f" {100 * share:.0f}% of what the object showed was gloss." if share > _LEAST_TOLD else ""
+    if mirrors > _LEAST_TOLD:
+        note += f" {100 * mirrors:.0f}% of it is a mirror, whose reflections are only blurred."
+    return note
+
+
+def _normals(
+    placed: PlacedObject,
+    source: SourceScene | None,
+    in_target: Gaussians,
+    cameras: Cameras,
+    views: tuple[ObjectView, ...],
+) -> Normals:
     """The object's normals in the target's frame: those that the source tells, or an estimate."""
     if source is None or source.normals is None:
-        return estimate_normals(in_target, cameras)
+        neighbours = estimate_normals(in_target, cameras)
+        return fuse_normals(in_target, views, neighbours, radius=bounding_sphere(in_target).radius)
     if len(source.normals) != in_target.count:
         raise ValueError(f"relight: expected {in_target.count} normals, found {len(source.normals)}")
     turned = source.normals @ placed.target_from_object.rotation.to(source.normals).T

@@ -17,13 +17,16 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.spherical_harmonics import MAX_DEGREE, coefficient_count
 from splatgraft.relighting.layers import Relit, unchanged
 from splatgraft.relighting.light.estimate import NoLight
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.prepared_object import PreparedObject, SourceScene, prepare_object
 from splatgraft.relighting.prepared_scene import PreparedScene, prepare_scene
-from splatgraft.relighting.shading.irradiance import irradiance, shade_ratio, unknown_origin_ratio
+from splatgraft.relighting.shading.gloss import gloss_bands
+from splatgraft.relighting.shading.irradiance import irradiance, light_scale, shade_ratio, unknown_origin_ratio
 from splatgraft.relighting.shading.normals import raised
+from splatgraft.relighting.shading.reflected_light import reflected_light
 from splatgraft.relighting.shadows.receivers import RIM, Receivers, shade_receivers
 from splatgraft.relighting.shadows.scene_ratio import (
     SceneRatio,
@@ -64,6 +67,8 @@ class _LitObject:
     """Linear rgb irradiance at the new place."""
     shade: Float[Tensor, "n 3"]
     """Factor on linear rgb by its own shading."""
+    gloss: Float[Tensor, "n 16 3"] | None
+    """Coefficients of what it reflects at its new place; None where it is matt."""
 
 
 def relight(
@@ -134,10 +139,14 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
     received = irradiance(scene.samples, normals.vectors, sample_visibility=shares)
     source = prepared.source_lighting
     if source is None:
-        shade = unknown_origin_ratio(received, opacities)
-    else:
-        shade = shade_ratio(received, source.irradiance, opacities)
-    return _LitObject(prepared, visibility, received, shade)
+        return _LitObject(prepared, visibility, received, unknown_origin_ratio(received, opacities), None)
+    shade = shade_ratio(received, source.irradiance, opacities)
+    if not bool(source.materials.glossy.any()):
+        return _LitObject(prepared, visibility, received, shade, None)
+    scale = light_scale(received, source.irradiance, opacities)
+    reflected = reflected_light(scene.light, scene.samples, shares).scaled(scale)
+    gloss = gloss_bands(prepared.gaussians, normals.vectors, source.materials, reflected, shade=shade)
+    return _LitObject(prepared, visibility, received, shade, gloss)
 
 
 def _assembled(
@@ -172,7 +181,7 @@ def _assembled(
         shadow=torch.cat([ones, ratio.shadow, *[r.shadow for r in on_objects]])[order],
         bounce=torch.cat([zeros, ratio.bounce, *[r.bounce for r in on_objects]])[order],
         slope=torch.cat([zeros, ratio.slope, *[r.slope for r in on_objects]])[order],
-        gloss=torch.zeros_like(gaussians.sh),
+        gloss=_glosses(objects, gaussians)[order],
         bands_replaced=torch.cat([torch.zeros(count, dtype=torch.bool), *replaced])[order],
         objects=tuple(one.prepared.gaussians for one in objects),
         light=scene.light,
@@ -231,6 +240,19 @@ def _on_scene(
     rest = torch.ones(scene.scene.count, dtype=torch.bool)
     rest[receivers.origin] = False
     return receivers, fit_to_views(receivers, total, scene.scene.select(rest), cameras, ratio_at=ratio_at)
+
+
+def _glosses(objects: list[_LitObject], gaussians: Gaussians) -> Float[Tensor, "m k 3"]:
+    """The gloss layer of all m Gaussians, the objects' last; of degree 3 where something is glossy."""
+    if all(one.gloss is None for one in objects):
+        return torch.zeros_like(gaussians.sh)
+    out = torch.zeros(gaussians.count, coefficient_count(MAX_DEGREE), 3)
+    start = gaussians.count - sum(one.prepared.gaussians.count for one in objects)
+    for one in objects:
+        if one.gloss is not None:
+            out[start : start + len(one.gloss)] = one.gloss
+        start += one.prepared.gaussians.count
+    return out
 
 
 def _on_object(index: int, objects: list[_LitObject]) -> SceneRatio:

@@ -69,11 +69,30 @@ def shade_ratio(
         opacities: Weights of the means, in [0, 1].
         settings: Limits and shares.
     """
+    scaled = target * light_scale(target, source, opacities, settings=settings)
+    log_ratio = (_floored(scaled, opacities, settings) / _floored(source, opacities, settings)).log()
+    return _limited(log_ratio, opacities, settings)
+
+
+def light_scale(
+    target: Float[Tensor, "n 3"],
+    source: Float[Tensor, "n 3"],
+    opacities: Float[Tensor, "n"],
+    *,
+    settings: ShadeSettings = ShadeSettings(),
+) -> Float[Tensor, "3"]:
+    """Factor on the new light after which the mean ratio to the old light has changed by the settings' shares alone.
+
+    Args:
+        target: Linear irradiance at the new place.
+        source: Linear irradiance at the old place.
+        opacities: Weights of the means, in [0, 1].
+        settings: Shares.
+    """
     log_ratio = (_floored(target, opacities, settings) / _floored(source, opacities, settings)).log()
-    mean = _mean(log_ratio, opacities)
+    mean = _mean(log_ratio, opacities)[0]
     gray = mean.mean()
-    kept = settings.level_share * gray + settings.tint_share * (mean - gray)
-    return _limited(log_ratio - mean + kept, opacities, settings)
+    return ((settings.level_share - 1) * gray + (settings.tint_share - 1) * (mean - gray)).exp()
 
 
 def unknown_origin_ratio(

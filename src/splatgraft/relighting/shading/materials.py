@@ -1,0 +1,271 @@
+"""Gloss of an object's materials, from how its colours change with the view under a known light.
+
+Per cluster of like colour and place one lobe is fitted by least squares: the part of the seen colours that changes
+with the view is a reflectance times the light in mirrored directions. What a Gaussian shows beside it is matt.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import linear_from_srgb
+from splatgraft.relighting.shading.object_views import ObjectView
+from splatgraft.relighting.shading.reflected_light import ReflectedLight
+
+_CHUNK = 8192
+"""Gaussians at a time; bounds memory."""
+
+
+@dataclass(frozen=True)
+class MaterialSettings:
+    """The model's few numbers. On twelve rendered scenes (true light told) the result is flat around all of them."""
+
+    clusters: int = 6
+    """Clusters of colour and place; 2 to 16 give the same PSNR within 0.02 dB."""
+    concentrations: tuple[float, ...] = (1.5, 3.0, 6.0, 12.0, 25.0)
+    """Of the lobes that are tried, from a satin to a polished surface; finer ones no bands of degree 3 can hold."""
+    evidence: float = 0.05
+    """Explained share of the change with the view at which a lobe is believed by half: shares of pure noise."""
+    lowest_cosine: float = 0.1
+    """Between normal and view; flatter views are left out."""
+    least_matt: float = 0.2
+    """Share of a Gaussian's colour that stays, whatever the lobe explains."""
+    facing: float = 0.04
+    """Reflectance at normal incidence relative to grazing, of a dielectric (Schlick 1994)."""
+    mirror: float = 0.3
+    """Reflectance from which the sharpest lobe is called a mirror."""
+
+
+@dataclass(frozen=True)
+class Materials:
+    """One lobe for each of n Gaussians, and what is matt."""
+
+    reflectance: Float[Tensor, "n 3"]
+    """Linear rgb share of the light in the lobe that is reflected, at least 0; 0 where nothing tells of gloss."""
+    concentration: Float[Tensor, "n"]
+    """Of the lobe."""
+    dielectric: Bool[Tensor, "n"]
+    """Whether reflectance grows towards grazing views (Schlick 1994); otherwise it is even, as that of a metal."""
+    matt: Float[Tensor, "n 3"]
+    """Linear rgb under the old light, without the lobe."""
+    share: Float[Tensor, "n"]
+    """Of the light seen under the old light, what the lobe gave, in [0, 1]."""
+    settings: MaterialSettings
+    """That it was fitted with."""
+
+    @property
+    def glossy(self) -> Bool[Tensor, "n"]:
+        """Which Gaussians have a lobe."""
+        return (self.reflectance > 0).any(1)
+
+    @property
+    def mirrors(self) -> Bool[Tensor, "n"]:
+        """Which Gaussians are mirrors, whose reflections bands can only blur."""
+        sharpest = self.concentration >= max(self.settings.concentrations)
+        return sharpest & ~self.dielectric & (self.reflectance.mean(1) > self.settings.mirror)
+
+
+def estimate_materials(
+    gaussians: Gaussians,
+    normals: Float[Tensor, "n 3"],
+    views: tuple[ObjectView, ...],
+    light: ReflectedLight,
+    *,
+    settings: MaterialSettings = MaterialSettings(),
+) -> Materials:
+    """Fit the lobes of an object's materials.
+
+    Args:
+        gaussians: The n Gaussians of the object, with the bands that its capture gave them.
+        normals: Unit, outward.
+        views: Of the object alone, from its capture's cameras.
+        light: That it was captured in.
+        settings: The model's numbers.
+
+    Returns:
+        Lobes in the light's units, all 0 where the Gaussians have no bands or no camera sees them.
+    """
+    base = linear_from_srgb(spherical_harmonics.rgb_from_dc(gaussians.sh[:, 0]).clamp_min(0))
+    n = gaussians.count
+    matt = Materials(
+        reflectance=torch.zeros(n, 3),
+        concentration=torch.ones(n),
+        dielectric=torch.zeros(n, dtype=torch.bool),
+        matt=base,
+        share=torch.zeros(n),
+        settings=settings,
+    )
+    if gaussians.sh_degree == 0 or not views:
+        return matt
+    record = _Record.of(gaussians, normals, views, settings)
+    cluster = _clusters(record.mean, gaussians.means, settings.clusters)
+    reflectance, concentration, dielectric = _fitted(record, cluster, light, settings)
+    lobes = replace(
+        matt,
+        reflectance=reflectance[cluster],
+        concentration=concentration[cluster],
+        dielectric=dielectric[cluster],
+    )
+    old = torch.zeros(n, 3)
+    for start in range(0, n, _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        part = lobe_radiance(lobes, rows, light, record.mirrored(rows), record.cosine[rows])
+        old[rows] = (record.weight[rows, :, None] * part).sum(1)
+    left = torch.maximum(base - old, settings.least_matt * base)
+    return replace(
+        lobes,
+        reflectance=lobes.reflectance * _taken(base, old, settings),
+        matt=left,
+        share=1 - left.sum(1) / base.sum(1).clamp_min(1e-6),
+    )
+
+
+def lobe_radiance(
+    materials: Materials,
+    rows: slice,
+    light: ReflectedLight,
+    mirrored: Float[Tensor, "m v 3"],
+    cosine: Float[Tensor, "m v"],
+) -> Float[Tensor, "m v 3"]:
+    """Linear rgb that the lobes of some Gaussians add in v views.
+
+    Args:
+        materials: Of all Gaussians.
+        rows: The m Gaussians.
+        light: At all Gaussians.
+        mirrored: Unit, the views' directions mirrored by the surface.
+        cosine: Between the normals and the directions to the cameras.
+    """
+    reflectance, concentration = materials.reflectance[rows], materials.concentration[rows]
+    out = torch.zeros(mirrored.shape)
+    here = light.select(rows)
+    for value in concentration.unique().tolist():
+        which = ((concentration == value) & (reflectance > 0).any(1)).nonzero()[:, 0]
+        if len(which):
+            part = here.select(which).radiance(mirrored[which], value)
+            factor = torch.where(
+                materials.dielectric[rows][which][:, None],
+                _schlick(cosine[which], materials.settings.facing),
+                torch.ones(()),
+            )
+            out[which] = part * factor[..., None] * reflectance[which][:, None]
+    return out
+
+
+def _schlick(cosine: Float[Tensor, "m v"], facing: float) -> Float[Tensor, "m v"]:
+    return facing + (1 - facing) * (1 - cosine.clamp(0, 1)) ** 5
+
+
+def _taken(base: Float[Tensor, "n 3"], old: Float[Tensor, "n 3"], settings: MaterialSettings) -> Float[Tensor, "n 3"]:
+    """Share of the lobe that is taken out of the colours, so that no more is put in."""
+    most = (1 - settings.least_matt) * base
+    return torch.where(old > 1e-6, most / old.clamp_min(1e-6), torch.zeros(())).clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What v views show of n Gaussians."""
+
+    colors: Float[Tensor, "n v 3"]
+    """Linear rgb, the mean of each picture over the pixels that the Gaussian covers."""
+    weight: Float[Tensor, "n v"]
+    """Of each view, sums to 1 or 0."""
+    pixels: Float[Tensor, "n"]
+    """That the Gaussian covers in all views."""
+    directions: Float[Tensor, "n v 3"]
+    cosine: Float[Tensor, "n v"]
+    normals: Float[Tensor, "n 3"]
+
+    @property
+    def mean(self) -> Float[Tensor, "n 3"]:
+        """Mean colour over the views, linear rgb."""
+        return (self.weight[..., None] * self.colors).sum(1)
+
+    def mirrored(self, rows: slice) -> Float[Tensor, "m v 3"]:
+        """View directions mirrored by the surface."""
+        return self.directions[rows] + 2 * self.cosine[rows][..., None] * self.normals[rows][:, None]
+
+    def centred(self, values: Float[Tensor, "m v 3"], rows: slice) -> Float[Tensor, "m v 3"]:
+        """Values without each Gaussian's mean over the views."""
+        return values - (self.weight[rows][..., None] * values).sum(1, keepdim=True)
+
+    @staticmethod
+    def of(
+        gaussians: Gaussians, normals: Float[Tensor, "n 3"], views: tuple[ObjectView, ...], settings: MaterialSettings
+    ) -> "_Record":
+        colors, pixels = [], []
+        for view in views:
+            alpha = view.operator.alpha[..., None]
+            picture = view.operator.blend(spherical_harmonics.colors(gaussians.sh, view.directions))
+            shown = (alpha > 0.5).float()  # thinner pixels show what is behind the object
+            linear = linear_from_srgb((picture / alpha.clamp_min(1e-6)).clamp(0, 1)) * shown
+            sums = view.operator.blend_transpose(torch.cat([linear, shown], 2).contiguous())
+            colors.append(sums[:, :3] / sums[:, 3:].clamp_min(1e-6))
+            pixels.append(sums[:, 3])
+        directions = torch.stack([view.directions for view in views], 1)
+        cosine = -(directions * normals[:, None]).sum(-1)
+        seen = torch.stack(pixels, 1) * (cosine > settings.lowest_cosine)
+        total = seen.sum(1)
+        return _Record(
+            colors=torch.stack(colors, 1),
+            weight=seen / total[:, None].clamp_min(1e-6),
+            pixels=total,
+            directions=directions,
+            cosine=cosine,
+            normals=normals,
+        )
+
+
+def _clusters(mean: Float[Tensor, "n 3"], points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "n"]:
+    """Clusters of chromaticity, brightness and place by k-means, first centres farthest from one another."""
+    srgb = mean.clamp_min(0) ** (1 / 2.2)
+    gray = srgb.mean(1, keepdim=True)
+    place = (points - points.mean(0)) / (points - points.mean(0)).norm(dim=1).quantile(0.9).clamp_min(1e-9)
+    # chromaticity tells materials apart best, shading changes brightness, and parts lie apart: weights by hand
+    features = torch.cat([2 * (srgb - gray) / (gray + 0.1), 0.5 * gray, 0.5 * place], 1)
+    first = [int(((features - features.mean(0)) ** 2).sum(1).argmin())]
+    nearest = torch.full((len(features),), torch.inf)
+    for _ in range(min(count, len(features)) - 1):
+        nearest = torch.minimum(nearest, ((features - features[first[-1]]) ** 2).sum(1))
+        first.append(int(nearest.argmax()))
+    centres = features[first]
+    label = torch.zeros(len(features), dtype=torch.int64)
+    for _ in range(15):
+        label = torch.cdist(features, centres).argmin(1)
+        sums = torch.zeros_like(centres).index_add_(0, label, features)
+        sizes = torch.bincount(label, minlength=len(centres))[:, None]
+        centres = torch.where(sizes > 0, sums / sizes.clamp_min(1), centres)
+    return label
+
+
+def _fitted(
+    record: _Record, cluster: Int[Tensor, "n"], light: ReflectedLight, settings: MaterialSettings
+) -> tuple[Float[Tensor, "c 3"], Float[Tensor, "c"], Bool[Tensor, "c"]]:
+    """Per cluster the reflectance, concentration and kind of the lobe that explains most."""
+    shapes = [(value, kind) for value in settings.concentrations for kind in (False, True)]
+    count = int(cluster.max()) + 1
+    own, cross, square = (torch.zeros(len(shapes), count, 3) for _ in range(3))
+    for start in range(0, len(cluster), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        weight = (record.pixels[rows, None] * record.weight[rows])[..., None]
+        seen, mirrored, here = record.centred(record.colors[rows], rows), record.mirrored(rows), light.select(rows)
+        fresnel = _schlick(record.cosine[rows], settings.facing)[..., None]
+        for i, (value, kind) in enumerate(shapes):
+            if not kind:
+                radiance = here.radiance(mirrored, value)
+            lobe = record.centred(radiance * fresnel if kind else radiance, rows)
+            for sums, term in ((own, lobe * lobe), (cross, lobe * seen), (square, seen * seen)):
+                sums[i].index_add_(0, cluster[rows], (weight * term).sum(1))
+    reflectance = (cross / own.clamp_min(1e-9)).clamp_min(0)
+    explained = ((2 * reflectance * cross - reflectance**2 * own).sum(2) / square.sum(2).clamp_min(1e-9)).clamp(0, 1)
+    best = explained.argmax(0)
+    each = torch.arange(count)
+    share = explained[best, each]
+    believed = share / (share + settings.evidence)
+    values = torch.tensor([value for value, _ in shapes])
+    kinds = torch.tensor([kind for _, kind in shapes])
+    return believed[:, None] * reflectance[best, each], values[best], kinds[best]
