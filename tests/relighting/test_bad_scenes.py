@@ -1,4 +1,4 @@
-"""Light where captures are poor: a single view, no bands, values that are not finite or huge; the estimate stays finite."""
+"""Light where captures are poor: one view, no bands, values that are not finite or huge. It stays finite."""
 
 import math
 from dataclasses import replace
