@@ -54,10 +54,10 @@ class SourceLighting:
     """Target's frame."""
     irradiance: Float[Tensor, "n 3"]
     """Linear rgb on each Gaussian under that light."""
-    estimate: EstimatedLight | None
-    """What the light rests on, source's frame; None where it was told."""
     materials: Materials
     """What of the object's colours is matt and what is gloss, in units of that light."""
+    estimate: EstimatedLight | None
+    """What the light rests on, source's frame; None where it was told."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def prepare_object(
             reflected = reflected_light(source_light, source_samples, shares)
             materials = estimate_materials(gaussians, normals.vectors, views, reflected)
             notes += _gloss_note(materials, gaussians)
-            source_lighting = SourceLighting(source_light, received, estimate, materials)
+            source_lighting = SourceLighting(source_light, received, materials, estimate)
     prepared = PreparedObject(
         gaussians=gaussians,
         target_from_object=placed.target_from_object,

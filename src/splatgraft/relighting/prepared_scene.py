@@ -29,7 +29,7 @@ from splatgraft.relighting.shadows.scene_ratio import (
     scene_visibility,
 )
 from splatgraft.relighting.shadows.shadow_maps import thinned
-from splatgraft.relighting.shadows.surface_layer import above_layer
+from splatgraft.relighting.shadows.surface_layer import above_layer, layer_middle
 from splatgraft.runtime.memo import Memo
 
 # set by hand
@@ -61,6 +61,8 @@ class PreparedScene:
     """k samples of `light`."""
     maps: SceneShadowMaps
     """The scene's own shadow maps for the samples."""
+    surface: Float[Tensor, "m 3"]
+    """For each receiver the nearest point of the surface that it is part of."""
     sample_visibility: Float[Tensor, "m k"]
     """Share of every sample that reaches the receivers past the scene, in [0, 1]."""
 
@@ -118,6 +120,7 @@ def prepare_scene(
         estimate=estimate,
         samples=samples,
         maps=maps,
+        surface=cache.get("surface", (normals,), lambda: layer_middle(receivers, normals.vectors)),
         sample_visibility=sample_visibility,
     )
 

@@ -38,7 +38,7 @@ def remove_object_shadow(
     """Divide the colours around an object's old place by the ratio of its shadow and bounce.
 
     Args:
-        source: The capture without the object.
+        source: The capture without the object; its light is estimated where it is not told.
         object_gaussians: The object, in the same frame.
         settings: Extent and strength.
 
@@ -47,7 +47,7 @@ def remove_object_shadow(
         estimated.
     """
     scene, sphere = source.gaussians, bounding_sphere(object_gaussians)
-    light = estimate_light(scene, sphere, source.cameras, object_gaussians=object_gaussians)
+    light = source.light or estimate_light(scene, sphere, source.cameras, object_gaussians=object_gaussians)
     if isinstance(light, NoLight):
         return scene, (f"{light.reason} The old place stays as it is.",)
     samples = sample_light(light)

@@ -28,7 +28,15 @@ from splatgraft.relighting.shading.irradiance import irradiance, light_scale, sh
 from splatgraft.relighting.shading.normals import raised
 from splatgraft.relighting.shading.reflected_light import reflected_light
 from splatgraft.relighting.shadows.receivers import RIM, Receivers, shade_receivers
-from splatgraft.relighting.shadows.scene_ratio import SceneRatio, reachable, scene_ratio, scene_visibility
+from splatgraft.relighting.shadows.scene_ratio import (
+    SceneRatio,
+    light_sums,
+    ratio_from_sums,
+    reachable,
+    scene_ratio,
+    scene_visibility,
+)
+from splatgraft.relighting.shadows.view_fit import fit_to_views
 from splatgraft.runtime.memo import Memo
 
 _LEAST_BUDGET = 40_000
@@ -44,6 +52,8 @@ class RelightOptions:
     """Shadows are computed up to this many object radii from the object."""
     most_added: float = 0.3
     """At most this share of the composite's Gaussians is added by splitting, or 40,000 where that is more; 0: none."""
+    fitted_views: int = 8
+    """Views of the target in which shadows are fitted to the surface that is seen; 0: none, for a quick draft."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +126,7 @@ def relight(
         if prepared.source_lighting is None:
             report.append(f"The light that object {i + 1} had is not known: it keeps its mean brightness.")
         objects.append(_lit_object(prepared, scene))
-    return _assembled(scene, objects, options=options, baked=baked, report=report)
+    return _assembled(scene, objects, cameras.spread(options.fitted_views), options=options, baked=baked, report=report)
 
 
 def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
@@ -140,11 +150,17 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
 
 
 def _assembled(
-    scene: PreparedScene, objects: list[_LitObject], *, options: RelightOptions, baked: Gaussians, report: list[str]
+    scene: PreparedScene,
+    objects: list[_LitObject],
+    cameras: Cameras,
+    *,
+    options: RelightOptions,
+    baked: Gaussians,
+    report: list[str],
 ) -> Relit:
     """The layers of all Gaussians, in the order of the baked composite; pieces where their whole was."""
     budget = max(int(options.most_added * baked.count), _LEAST_BUDGET) if options.most_added > 0 else 0
-    receivers, ratio = _on_scene(scene, objects, budget=budget, degree=baked.sh_degree)
+    receivers, ratio = _on_scene(scene, objects, cameras, budget=budget, degree=baked.sh_degree)
     scene_count = scene.scene.count
     rest = torch.ones(scene_count, dtype=torch.bool)
     rest[receivers.origin] = False
@@ -177,9 +193,12 @@ def _assembled(
 
 
 def _on_scene(
-    scene: PreparedScene, objects: list[_LitObject], *, budget: int, degree: int
+    scene: PreparedScene, objects: list[_LitObject], cameras: Cameras, *, budget: int, degree: int
 ) -> tuple[Receivers, SceneRatio]:
-    """The receivers that some object reaches, split where needed, and the product of all objects' ratios on them."""
+    """The receivers that some object reaches, split where needed, and the product of all objects' ratios on them.
+
+    The ratios are fitted to what `cameras` see.
+    """
     points, rims = scene.receivers.means, RIM * scene.receivers.scales.max(1).values
     reached = torch.zeros(len(points), dtype=torch.bool)
     for one in objects:
@@ -189,11 +208,16 @@ def _on_scene(
         gaussians=scene.receivers.select(reached).with_sh_degree(degree),
         normals=scene.normals.vectors[reached],
         sample_visibility=scene.sample_visibility[reached],
+        surface=scene.surface[reached],
         origin=scene.receiver_indices[reached],
     )
     total: SceneRatio | None = None
+    ambient_sums: list[Float[Tensor, "3 m 3"]] = []
     for one in objects:
-        receivers, parents, ratio = shade_receivers(receivers, one.prepared.maps, budget=budget // len(objects))
+        receivers, parents, ratio, ambient = shade_receivers(
+            receivers, one.prepared.maps, budget=budget // len(objects)
+        )
+        ambient_sums = [*(sums[:, parents] for sums in ambient_sums), ambient]
         if total is None:
             total = ratio
             continue
@@ -204,7 +228,18 @@ def _on_scene(
             + total.shadow[parents].mean(1, keepdim=True) * ratio.slope,
         )
     assert total is not None
-    return receivers, total
+
+    def ratio_at(points: Tensor, normals: Tensor, receiver: Tensor) -> Tensor:
+        through, grey = receivers.sample_visibility[receiver], torch.ones(len(points))
+        for one, ambient in zip(objects, ambient_sums, strict=True):
+            sums = light_sums(one.prepared.maps, points, normals, sample_visibility=through, sources=True)
+            found = ratio_from_sums(sums + ambient[:, receiver])
+            grey = grey * (found.shadow + found.bounce).mean(1)
+        return grey
+
+    rest = torch.ones(scene.scene.count, dtype=torch.bool)
+    rest[receivers.origin] = False
+    return receivers, fit_to_views(receivers, total, scene.scene.select(rest), cameras, ratio_at=ratio_at)
 
 
 def _glosses(objects: list[_LitObject], gaussians: Gaussians) -> Float[Tensor, "m k 3"]:

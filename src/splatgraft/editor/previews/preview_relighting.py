@@ -150,7 +150,7 @@ class PreviewRelighting:
         is_draft: bool = False,
     ) -> Relit:
         cameras, options = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.files.relight_options
-        options = replace(options, most_added=0.0) if is_draft else options
+        options = replace(options, most_added=0.0, fitted_views=0) if is_draft else options
         full_target = self._scenes.gaussians(self._scenes.files.target_scene)
         memo = self._relight_memo if composite.target is full_target else self._draft_memo
         return relight(composite, cameras, sources=sources, light=light, options=options, cache=memo)

@@ -158,6 +158,7 @@ def fit_light(
             part of the surroundings.
         settings: Of all parts.
     """
+    scene = _usable(scene)
     panorama = panorama_at(scene, place, settings=settings.place)
     if isinstance(panorama, NoLight):
         return panorama
@@ -191,6 +192,17 @@ def fit_light(
     )
     light = Light(sources, ambient_of(rest), **_seen_shares(around, up))
     return replace(found, light=with_source_distances(light, scene, place))
+
+
+def _usable(scene: Gaussians) -> Gaussians:
+    """The Gaussians whose values are finite and no larger than any camera or scene makes them."""
+    values = torch.cat([scene.means, scene.log_scales, scene.quaternions, scene.sh.flatten(1)], 1)
+    good = (values.abs() < _HUGE).all(1)  # false for nan too
+    return scene if bool(good.all()) else scene.select(good)
+
+
+_HUGE = 1e6
+"""World units, and units of colour; such Gaussians are a format's or an optimiser's fault."""
 
 
 def _seen_shares(around: Surroundings, up: Float[Tensor, "3"]) -> dict[str, float]:

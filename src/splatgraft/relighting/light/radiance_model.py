@@ -371,4 +371,6 @@ def _step(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], 
     hessian[1 + u : 1 + n, 1 + u : 1 + n] += prior.precision
     gradient[1 + u : 1 + n] += prior.precision @ (radiances[u:] - prior.mean)
     diagonal += damping * diagonal
-    return -torch.cholesky_solve(gradient[:, None], torch.linalg.cholesky(hessian))[:, 0]
+    factor, failed = torch.linalg.cholesky_ex(hessian)
+    # without a step the caller damps more
+    return torch.zeros_like(x) if int(failed) else -torch.cholesky_solve(gradient[:, None], factor)[:, 0]

@@ -66,6 +66,8 @@ class Receivers:
     """Unit, world frame."""
     sample_visibility: Float[Tensor, "m k"]
     """Share of every light sample that the scene lets through, in [0, 1]."""
+    surface: Float[Tensor, "m 3"]
+    """A point of the surface that each one shows, world units; pieces keep that of their whole."""
     origin: Int[Tensor, "m"]
     """Position in the list that they were taken from."""
 
@@ -75,6 +77,7 @@ class Receivers:
             gaussians=self.gaussians.select(which),
             normals=self.normals[which],
             sample_visibility=self.sample_visibility[which],
+            surface=self.surface[which],
             origin=self.origin[which],
         )
 
@@ -85,7 +88,7 @@ def shade_receivers(
     *,
     budget: int,
     settings: ReceiverSettings = ReceiverSettings(),
-) -> tuple[Receivers, Int[Tensor, "j"], SceneRatio]:
+) -> tuple[Receivers, Int[Tensor, "j"], SceneRatio, Float[Tensor, "3 j 3"]]:
     """Split receivers at shadow edges and average the ratio over each.
 
     Args:
@@ -95,9 +98,10 @@ def shade_receivers(
         settings: Which are split.
 
     Returns:
-        j receivers, some of them pieces; the position in `receivers` that each was or is a piece of; their ratios.
+        j receivers, some of them pieces; the position in `receivers` that each was or is a piece of; their ratios; and
+        the ambient part of their light sums, as `light_sums` gives it.
     """
-    done: list[tuple[Receivers, Tensor, SceneRatio]] = []
+    done: list[tuple[Receivers, Tensor, SceneRatio, Tensor]] = []
     pending, which = receivers, torch.arange(len(receivers.origin))
     ambient = _sums(pending, maps, sources=False)
     for round_ in range(settings.rounds + 1):
@@ -109,13 +113,13 @@ def shade_receivers(
         )
         room = budget // (PIECES - 1)
         if round_ == settings.rounds or room == 0 or not bool((wanted > 0).any()):
-            done.append((pending, which, ratio))
+            done.append((pending, which, ratio, ambient))
             break
         order = wanted.argsort(descending=True)[: min(room, int((wanted > 0).sum()))]
         keep = torch.ones(len(wanted), dtype=torch.bool)
         keep[order] = False
         kept = SceneRatio(shadow=ratio.shadow[keep], bounce=ratio.bounce[keep], slope=ratio.slope[keep])
-        done.append((pending.select(keep), which[keep], kept))
+        done.append((pending.select(keep), which[keep], kept, ambient[:, keep]))
         parents = pending.select(order)
         pieces, parent = split_along(parents.gaussians, axis[order])
         pending = replace(parents.select(parent), gaussians=pieces)
@@ -125,18 +129,19 @@ def shade_receivers(
         ambient[:, anew] = _sums(pending.select(anew), maps, sources=False)
         budget -= (PIECES - 1) * len(order)
     joined = Receivers(
-        gaussians=concatenate([r.gaussians for r, _, _ in done]),
-        normals=torch.cat([r.normals for r, _, _ in done]),
-        sample_visibility=torch.cat([r.sample_visibility for r, _, _ in done]),
-        origin=torch.cat([r.origin for r, _, _ in done]),
+        gaussians=concatenate([r.gaussians for r, _, _, _ in done]),
+        normals=torch.cat([r.normals for r, _, _, _ in done]),
+        sample_visibility=torch.cat([r.sample_visibility for r, _, _, _ in done]),
+        surface=torch.cat([r.surface for r, _, _, _ in done]),
+        origin=torch.cat([r.origin for r, _, _, _ in done]),
     )
     ratios = SceneRatio(
         # not shadow itself: this rounds it to the precision near 1, as all results so far have it
-        shadow=1 - (1 - torch.cat([ratio.shadow for _, _, ratio in done])),
-        bounce=torch.cat([ratio.bounce for _, _, ratio in done]),
-        slope=torch.cat([ratio.slope for _, _, ratio in done]),
+        shadow=1 - (1 - torch.cat([ratio.shadow for _, _, ratio, _ in done])),
+        bounce=torch.cat([ratio.bounce for _, _, ratio, _ in done]),
+        slope=torch.cat([ratio.slope for _, _, ratio, _ in done]),
     )
-    return joined, torch.cat([w for _, w, _ in done]), ratios
+    return joined, torch.cat([w for _, w, _, _ in done]), ratios, torch.cat([a for *_, a in done], 1)
 
 
 def _broad(gaussians: Gaussians, maps: ObjectShadowMaps, settings: ReceiverSettings) -> Bool[Tensor, "m"]:

@@ -20,6 +20,8 @@ class SurfaceLayerSettings:
 
     neighbours: int = 16
     """Gaussians that form the layer around one, as for its normal."""
+    level: int = 48
+    """Gaussians over whose heights the middle is taken."""
     deviations: float = 3.0
     """Standard deviations of the layer's height between its middle and its top."""
 
@@ -36,11 +38,30 @@ def above_layer(
         normals: Unit, of their surfaces.
         settings: How the layer is measured.
     """
-    near = nearest_neighbours(gaussians.means, count=settings.neighbours).long()
+    middle, deviation = _layer(gaussians, normals, settings.neighbours)
+    return gaussians.means + (middle + settings.deviations * deviation)[:, None] * normals
+
+
+def layer_middle(
+    gaussians: Gaussians, normals: Float[Tensor, "n 3"], *, settings: SurfaceLayerSettings = SurfaceLayerSettings()
+) -> Float[Tensor, "n 3"]:
+    """For each Gaussian the point on its normal's line in the middle of the layer of its neighbours.
+
+    Args:
+        gaussians: n Gaussians.
+        normals: Unit, of their surfaces.
+        settings: How the layer is measured.
+    """
+    return gaussians.means + _layer(gaussians, normals, settings.level)[0][:, None] * normals
+
+
+def _layer(
+    gaussians: Gaussians, normals: Float[Tensor, "n 3"], count: int
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Mean and standard deviation of the layer's height over each Gaussian's centre."""
+    if not gaussians.count:
+        return torch.zeros(0), torch.zeros(0)
+    near = nearest_neighbours(gaussians.means, count=count).long()
     heights = ((gaussians.means[near] - gaussians.means[:, None]) * normals[:, None]).sum(-1)
-    along = torch.einsum("nij,ni->nj", gaussians.rotations, normals) * gaussians.scales
-    own = (along**2).sum(1)
-    variance = (heights - heights.mean(1, keepdim=True)).square().mean(1)
-    deviation = (variance + own[near].mean(1)).sqrt()
-    top = heights.mean(1) + settings.deviations * deviation
-    return gaussians.means + top[:, None] * normals
+    own = ((torch.einsum("nij,ni->nj", gaussians.rotations, normals) * gaussians.scales) ** 2).sum(1)
+    return heights.mean(1), (heights.var(1, correction=0) + own[near].mean(1)).sqrt()

@@ -1,0 +1,247 @@
+"""Shadows fitted in the target's own views: ratios of receivers that draw the ratio of the surface seen in each pixel.
+
+A surface is drawn by Gaussians in a layer, blended in the order of their centres. From low above it, one that is a
+little too high hides the surface well behind it, so a shadow that is evaluated at the centres is displaced from every
+side, and blurred. Rendering is linear in the Gaussians' values: simultaneous iterative reconstruction (SIRT, Gilbert
+1972) finds a value and a slope over view directions for each Gaussian whose blend is nearest to the true ratio.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.relighting.shadows.receivers import Receivers
+from splatgraft.relighting.shadows.scene_ratio import SceneRatio
+from splatgraft.rendering import ViewOperator, view_operator
+
+RatioAt = Callable[[Float[Tensor, "p 3"], Float[Tensor, "p 3"], Int[Tensor, "p"]], Float[Tensor, "p"]]
+"""Grey ratio of light at points with unit normals, each on the surface of the receiver whose index is given."""
+
+
+@dataclass(frozen=True)
+class ViewFitSettings:
+    """The views and the solver, set by hand."""
+
+    rounds: int = 5
+    """Iterations of the solver."""
+    longest_px: int = 512
+    """Longest side of a view, cut to the shadow; wider ones are reduced."""
+    narrowest_px: float = 0.5
+    """Widest standard deviation in pixels below which a Gaussian keeps what it has: a reduced view draws it wider than
+    it is, and so in the wrong place. Measured on planes: at 0.3 the fit makes shadows worse, at 0.6 better."""
+    margin: float = 0.25
+    """Share of its size that a view reaches beyond the shadow on each side."""
+    changed: float = 0.01
+    """Change of light from which a receiver counts as shadowed."""
+    beside_px: int = 4
+    """Pixels around a shadowed pixel that are fitted too."""
+    receiving: float = 0.5
+    """Share of a pixel that receivers must make up."""
+    gamma: float = 2.2
+    """Exponent of sRGB, in which Gaussians are blended, as a power law."""
+    darkest: float = 0.04
+    """Least ratio of light that is fitted, as `SceneRatioSettings.darkest`."""
+    most_slope: float = 0.9
+    """Most share of a value that a view direction takes away."""
+    least_weight: float = 0.05
+    """Pixels; receivers with less weight in all views together keep what they have."""
+
+
+@dataclass(frozen=True)
+class _FittedView:
+    """One view of the m Gaussians in front of a camera."""
+
+    which: Int[Tensor, "m"]
+    """Their positions among receivers and others together."""
+    weights: ViewOperator
+    """From values of the m Gaussians to pixels."""
+    target: Float[Tensor, "h w"]
+    """What the values must blend to: where no shadow is near, what they blend to at first."""
+    directions: Float[Tensor, "m 3"]
+    """Unit, from the camera to each Gaussian."""
+    wide: Bool[Tensor, "m"]
+    """Which Gaussians the view draws as wide as they are."""
+
+
+@dataclass(frozen=True)
+class _Surfaces:
+    """The surfaces that m receivers form."""
+
+    points: Float[Tensor, "m 3"]
+    """Of each one the point in the middle of the layer."""
+    normals: Float[Tensor, "m 3"]
+    """Unit."""
+    extents: Float[Tensor, "m"]
+    """World units; how far from its point a receiver shows the surface."""
+    tree: KDTree
+    """Of the points."""
+
+    @staticmethod
+    def of(receivers: Receivers) -> "_Surfaces":
+        off = ((receivers.gaussians.means - receivers.surface) * receivers.normals).sum(1, keepdim=True)
+        points = receivers.gaussians.means - off * receivers.normals
+        extents = 3 * receivers.gaussians.scales.max(1).values
+        return _Surfaces(points, receivers.normals, extents, KDTree(points.numpy()))
+
+    def hit(
+        self, origin: Float[Tensor, "3"], rays: Float[Tensor, "p 3"], near: Float[Tensor, "p 3"]
+    ) -> tuple[Float[Tensor, "p 3"], Int[Tensor, "p"], Bool[Tensor, "p"]]:
+        """Where rays meet the plane of the receiver nearest to a guess, that receiver, and whether it is there."""
+        points, nearest = near, torch.zeros(len(near), dtype=torch.int64)
+        facing = torch.zeros(len(near))
+        for _ in range(2):
+            nearest = torch.from_numpy(self.tree.query(points.numpy())[1].astype(np.int64))
+            normal = self.normals[nearest]
+            facing = (normal * rays).sum(1)
+            along = ((self.points[nearest] - origin) * normal).sum(1) / torch.where(facing < -1e-3, facing, -1)
+            points = origin + along[:, None] * rays
+        apart = (points - self.points[nearest]).norm(dim=1)
+        return points, nearest, (facing < -1e-3) & (apart < self.extents[nearest])
+
+
+def fit_to_views(
+    receivers: Receivers,
+    ratio: SceneRatio,
+    others: Gaussians,
+    cameras: Cameras,
+    *,
+    ratio_at: RatioAt,
+    settings: ViewFitSettings = ViewFitSettings(),
+) -> SceneRatio:
+    """Fit the ratios of receivers to what some views show of them.
+
+    Args:
+        receivers: m Gaussians that an object's shadow may fall on.
+        ratio: Their ratios so far, at their centres; receivers that no view shows keep them.
+        others: The rest of the scene, which hides receivers.
+        cameras: The views; none to change nothing.
+        ratio_at: The ratio anywhere on the receivers' surfaces.
+        settings: Of the views and the solver.
+    """
+    grey = (ratio.shadow + ratio.bounce).mean(1)
+    shadowed = (1 - grey).abs() > settings.changed
+    if not bool(shadowed.any()) or not len(cameras):
+        return ratio
+    count = len(grey)
+    scene = concatenate([receivers.gaussians, others.with_sh_degree(receivers.gaussians.sh_degree)])
+    values = torch.cat([grey.clamp_min(settings.darkest) ** (1 / settings.gamma), torch.ones(others.count)])
+    surfaces = _Surfaces.of(receivers)
+    views = []
+    for camera in cameras:
+        cut = _cut_to(camera, receivers.gaussians.means[shadowed], settings)
+        if cut is not None:
+            found = _view(scene, cut, values, surfaces, ratio_at=ratio_at, settings=settings)
+            views += [found] if found is not None else []
+    value, slope, known = _solved(values, views, count, settings)
+    wanted, before = value[:count] ** settings.gamma, ratio.shadow.mean(1).clamp_min(1e-6)
+    factor = ((wanted - ratio.bounce.mean(1)) / before).clamp_min(0)
+    shadow = (ratio.shadow * factor[:, None]).clamp(settings.darkest, 1)
+    slope = settings.gamma * (value[:count] ** (settings.gamma - 1))[:, None] * slope[:count]
+    return SceneRatio(
+        shadow=torch.where(known[:, None], shadow, ratio.shadow),
+        bounce=ratio.bounce,
+        slope=torch.where(known[:, None], slope, ratio.slope),
+    )
+
+
+def _solved(
+    values: Float[Tensor, "n"], views: Sequence[_FittedView], count: int, settings: ViewFitSettings
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Bool[Tensor, "r"]]:
+    """Values and slopes of all Gaussians, of which the first `count` may change, and which of these were fitted."""
+    values, slope, weight = values.clone(), torch.zeros(len(values), 3), torch.zeros(len(values))
+    for view in views:
+        weight.index_add_(0, view.which, view.weights.blend_transpose(torch.ones_like(view.target)[..., None])[:, 0])
+    wide = torch.zeros(len(values), dtype=torch.bool)
+    for view in views:
+        wide[view.which] |= view.wide
+    step = torch.where(wide & (weight > settings.least_weight), 1 / weight.clamp_min(settings.least_weight), 0)
+    step[count:] = 0
+    least = settings.darkest ** (1 / settings.gamma)
+    for _ in range(settings.rounds):
+        change, turn = torch.zeros_like(values), torch.zeros_like(slope)
+        for view in views:
+            seen = values[view.which] + (slope[view.which] * view.directions).sum(1)
+            error = view.target - view.weights.blend(seen[:, None])[..., 0]
+            back = view.weights.blend_transpose(error[..., None])
+            change.index_add_(0, view.which, back[:, 0])
+            turn.index_add_(0, view.which, back * view.directions)
+        values = (values + step * change).clamp(least, 1)
+        slope = slope + step[:, None] * turn
+        most = torch.minimum(settings.most_slope * values, 1 - values)[:, None]
+        slope = slope * (most / slope.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1)
+    return values, slope, (step > 0)[:count]
+
+
+def _cut_to(camera: Cameras, points: Float[Tensor, "s 3"], settings: ViewFitSettings) -> Cameras | None:
+    """The camera cut to what it shows of `points`, and reduced; None where it shows nothing of them."""
+    pixels, depth = _projected(camera, points)
+    size = camera.sizes[0].float()
+    seen = (depth > 0) & (pixels > 0).all(1) & (pixels < size).all(1)
+    if not bool(seen.any()):
+        return None
+    low, high = pixels[seen].amin(0), pixels[seen].amax(0)
+    margin = settings.margin * (high - low) + settings.beside_px
+    low, high = (low - margin).clamp_min(0).floor(), torch.minimum(high + margin, size).ceil()
+    window = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    return camera.cropped([window]).resized(min(1.0, settings.longest_px / float((high - low).max())))
+
+
+def _projected(camera: Cameras, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n"]]:
+    """Pixels and depths of points."""
+    pose = camera.camera_from_world[0]
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    seen = local @ camera.intrinsics[0].T
+    return seen[:, :2] / seen[:, 2:].clamp_min(1e-6), local[:, 2]
+
+
+def _view(
+    scene: Gaussians,
+    camera: Cameras,
+    values: Float[Tensor, "n"],
+    surfaces: _Surfaces,
+    *,
+    ratio_at: RatioAt,
+    settings: ViewFitSettings,
+) -> _FittedView | None:
+    """What one camera shows: per pixel, the ratio where its ray meets the receivers' surface."""
+    pixels, depth = _projected(camera, scene.means)
+    width = scene.scales.max(1).values * camera.intrinsics[0, 0, 0] / depth.clamp_min(1e-6)
+    inside = (pixels > -3 * width[:, None]).all(1) & (pixels < camera.sizes[0] + 3 * width[:, None]).all(1)
+    which = ((depth > 0) & inside).nonzero()[:, 0]
+    weights = view_operator(scene.select(which), camera)
+    receiving = which < len(surfaces.points)
+    features = torch.zeros(len(which), 5)
+    features[:, 0] = values[which]
+    features[receiving, 1:4], features[receiving, 4] = surfaces.points[which[receiving]], 1
+    blended = weights.blend(features)
+    value, mass = blended[..., 0], blended[..., 4]
+    changed = (value / weights.alpha.clamp_min(1e-6) - 1).abs() > settings.changed
+    beside = F.max_pool2d(changed[None].float(), 2 * settings.beside_px + 1, 1, settings.beside_px)[0].bool()
+    fitted = beside & (mass > settings.receiving)
+    if not bool(fitted.any()):
+        return None
+    origin = camera.centers[0]
+    seen = blended[..., 1:4][fitted] / mass[fitted][:, None]
+    points, nearest, valid = surfaces.hit(origin, _rays(camera)[fitted], seen)
+    fitted[fitted.clone()] = valid
+    points, nearest = points[valid], nearest[valid]
+    target = value.clone()
+    ratio = ratio_at(points, surfaces.normals[nearest], nearest).clamp(settings.darkest, 1) ** (1 / settings.gamma)
+    target[fitted] = weights.alpha[fitted] * ratio
+    directions = F.normalize(scene.means[which] - origin, dim=1)
+    return _FittedView(which, weights, target, directions, width[which] > settings.narrowest_px)
+
+
+def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
+    """Unit directions of the pixels' rays."""
+    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    rays = torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(camera.intrinsics[0]).T
+    return F.normalize(rays @ camera.world_from_camera[0, :3, :3].T, dim=-1)
