@@ -3,7 +3,7 @@
 `python benchmarks/fit_shading.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `python
 benchmarks/exam` renders them. The objective is the mean gain of the object's PSNR over pasting on the held-out views.
 Every combination of a grid is tried; the numbers are chosen with each scene left out in turn, too, and the gain of the
-scene left out is reported.
+scene left out is reported. Gloss stays as today's numbers give it.
 """
 
 import argparse
