@@ -51,7 +51,6 @@ FACTORS = {
     "surface": 1.8,
     "surface_sd": 1.4,
     "within_patch_sd": 1.6,
-    "source_odds": 1.5,
     "temperature": 1.6,
 }
 """Standard deviation of each number's random factor."""

@@ -74,8 +74,6 @@ class RadianceSettings:
     """Standard deviation of its logarithm."""
     within_patch_sd: float = 0.212
     """Standard deviation of log radiance within a patch."""
-    source_odds: float = 4.61
-    """Log odds that a clipped patch above the horizon is a source."""
 
 
 @dataclass(frozen=True)
@@ -106,12 +104,13 @@ class Patch:
 
 @dataclass(frozen=True)
 class ClippedPrior:
-    """The normal density of the logarithms of the x clipped unknowns, given which patches are sources."""
+    """The normal density of the logarithms of the x clipped unknowns, given which patches are sources.
+
+    Either is as likely: odds that were fitted to rooms made four white walls of a square its lights.
+    """
 
     mean: Float[Tensor, "x"]
     precision: Float[Tensor, "x x"]
-    cost: float
-    """Minus the log odds of that choice."""
 
 
 @dataclass(frozen=True)
@@ -177,11 +176,11 @@ class RadianceProblem:
             if is_source:
                 mean[patch.members], deviation[patch.members] = math.log(s.source), s.source_sd
         if not count:
-            return ClippedPrior(mean, torch.zeros(0, 0, dtype=torch.float64), 0.0)
+            return ClippedPrior(mean, torch.zeros(0, 0, dtype=torch.float64))
         label = _patch_labels(self.clipped)
         same = (label[:, None] == label[None]).double()
         covariance = same * deviation[:, None] * deviation + s.within_patch_sd**2 * torch.eye(count).double()
-        return ClippedPrior(mean, torch.linalg.inv(covariance), -s.source_odds * sum(sources))
+        return ClippedPrior(mean, torch.linalg.inv(covariance))
 
 
 def radiance_problem(
@@ -295,7 +294,7 @@ def cost(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"]) -
     total += 0.5 * _ABOVE_MOST * float(((albedo - _MOST_ALBEDO).clamp_min(0) ** 2).sum())
     total += 0.5 * ((float(level) - p.sky) / s.sky_sd) ** 2 + float(unseen_cost(s, unseen - level).sum())
     away = clipped - prior.mean
-    return total + 0.5 * float(away @ prior.precision @ away) + prior.cost
+    return total + 0.5 * float(away @ prior.precision @ away)
 
 
 def shading_cost(problem: RadianceProblem, residual: Float[Tensor, "m"]) -> float:
