@@ -39,8 +39,8 @@ class ViewFitSettings:
     it is, and so in the wrong place. Measured on planes: at 0.3 the fit makes shadows worse, at 0.6 better."""
     margin: float = 0.25
     """Share of its size that a view reaches beyond the shadow on each side."""
-    changed: float = 0.01
-    """Change of light from which a receiver counts as shadowed."""
+    changed: float = 0.05
+    """Change of light from which a receiver or a pixel counts as shadowed; fainter changes are smooth."""
     beside_px: int = 4
     """Pixels around a shadowed pixel that are fitted too."""
     receiving: float = 0.5
