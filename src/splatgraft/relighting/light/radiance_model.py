@@ -27,6 +27,8 @@ _ABOVE_MOST = 100.0
 """Precision of the prior that keeps albedo below 0.9."""
 _LARGEST_STEP = 1.5
 """Of any logarithm in one step."""
+_DARKEST = 1e-3
+"""Radiance that the sky is taken to have where nothing at all was seen."""
 _PRESENT = 0.02
 """Share of a direction that is clipped, from which it has an unknown."""
 _UNSEEN = 0.05
@@ -223,7 +225,7 @@ def radiance_problem(
         weights=weights,
         is_white=evidence.colors.max(1).values > 0.9,
         material_weights=material_weights,
-        sky=math.log(float(seen_sky(far, up, mean_color.expand(3)).mean())) + s.sky_bias,
+        sky=math.log(max(float(seen_sky(far, up, mean_color.expand(3)).mean()), _DARKEST)) + s.sky_bias,
         patches=_patches(far, clipped, up)[:most_patches],
     )
 
