@@ -88,11 +88,8 @@ def log_irradiance(place: TrainingPlace, numbers: dict[str, float]) -> Float[Ten
     rest = dict(numbers)
     search = SearchSettings(temperature=rest.pop("temperature"))
     problem = radiance_problem(place.evidence, settings=RadianceSettings(**rest))
-    hidden = search_radiance(problem, settings=search)
-    around, far = place.evidence.around, place.evidence.far
-    gray = around.radiance.mean(1) + (1 - around.seen).clamp_min(0) * hidden.unseen
-    gray = gray + torch.minimum(around.clipped, far.clipped) * hidden.clipped
-    return irradiance_of(gray, NORMALS).clamp_min(1e-6).log2()
+    radiance = search_radiance(problem, settings=search).radiance(place.evidence, torch.ones(3))
+    return irradiance_of(radiance.mean(1), NORMALS).clamp_min(1e-6).log2()
 
 
 def errors(scenes: Sequence[tuple[TrainingPlace, TrainingPlace]], numbers: dict[str, float]) -> Float[Tensor, "s 3"]:

@@ -13,7 +13,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.light.highlight_evidence import HighlightSettings, find_highlights
 from splatgraft.relighting.light.light import Light
-from splatgraft.relighting.light.light_from_radiance import PeakSettings, ambient_of, split_peaks
+from splatgraft.relighting.light.light_from_radiance import RadianceSourceSettings, ambient_of, split_peaks
 from splatgraft.relighting.light.panorama import Panorama, cube_cameras, render_panorama
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem, seen_sky
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, SearchSettings, search_radiance
@@ -22,12 +22,16 @@ from splatgraft.relighting.light.shading_evidence import (
     find_shading_evidence,
 )
 from splatgraft.relighting.light.source_distance import with_source_distances
-from splatgraft.relighting.light.surroundings import DIRECTIONS, Surroundings, surroundings_at
+from splatgraft.relighting.light.surroundings import DIRECTIONS, surroundings_at
 from splatgraft.relighting.shading.normals import estimate_normals
 from splatgraft.rendering import render
 
 _SURFACE_ALPHA = 0.5
 """A pixel of a depth image above this alpha shows a surface."""
+_HUGE = 1e6
+"""World units, and units of colour; such Gaussians are a format's or an optimiser's fault."""
+_OVERHEAD = 0.5
+"""Cosine to the up direction of what counts as ceiling, 60 degrees."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,7 @@ class LightEstimateSettings:
     """Of the surfaces around."""
     highlights: HighlightSettings = field(default_factory=HighlightSettings)
     """Of highlights on them."""
-    peaks: PeakSettings = field(default_factory=PeakSettings)
+    peaks: RadianceSourceSettings = field(default_factory=RadianceSourceSettings)
     """Of sources."""
     radius: tuple[float, float] = (3.0, 8.0)
     """Object radii: limits of the radius of the surroundings that are evidence; between them it is the cameras' median
@@ -94,19 +98,8 @@ class EstimatedLight:
     """What no camera recorded."""
     evidence: LightEvidence
     """What the estimate rests on."""
-    sky: Float[Tensor, "3"]
-    """Mean linear rgb radiance of what was seen above the horizon."""
-
-    def radiance(self, around: Surroundings) -> Float[Tensor, "k 3"]:
-        """Linear rgb radiance from all `DIRECTIONS` at a place with other near surroundings."""
-        tint = self.sky / self.sky.mean().clamp_min(1e-6)
-        unseen = ((1 - around.seen).clamp_min(0) * self.hidden.unseen)[:, None] * tint
-        # clipped parts are white: their own tint was lost
-        return around.radiance + unseen + (self.visible_sources(around) * self.hidden.clipped)[:, None]
-
-    def visible_sources(self, around: Surroundings) -> Float[Tensor, "k"]:
-        """Share of each direction that is clipped and lies outside of the region, in [0, 1]."""
-        return torch.minimum(around.clipped, self.evidence.far.clipped)
+    tint: Float[Tensor, "3"]
+    """Linear rgb of mean 1, of what was seen above the horizon; what no camera saw is taken to have it too."""
 
     def at(
         self,
@@ -117,14 +110,16 @@ class EstimatedLight:
         settings: PlaceSettings = PlaceSettings(),
     ) -> "EstimatedLight | NoLight":
         """At a place in the same region: the same sources, and ambient light with what is near there."""
+        scene = _usable(scene)
         panorama = panorama_at(scene, place, settings=settings)
         if isinstance(panorama, NoLight):
             return panorama
         around = surroundings_at(scene, cameras, place.center, nearest=settings.nearest * place.radius)
-        clipped = self.visible_sources(around)
-        _, rest = split_peaks(self.radiance(around), clipped, around, within=math.inf)
-        light = replace(self.light, ambient=ambient_of(rest), **_seen_shares(around, self.evidence.up))
-        return replace(self, light=light, evidence=replace(self.evidence, around=around))
+        evidence = replace(self.evidence, around=around)
+        radiance = self.hidden.radiance(evidence, self.tint)
+        _, rest = split_peaks(radiance, evidence.visible_sources, around, within=math.inf)
+        light = replace(self.light, ambient=ambient_of(rest), **_seen_shares(evidence))
+        return replace(self, light=light, evidence=evidence)
 
 
 def estimate_light(
@@ -185,33 +180,30 @@ def fit_light(
     hidden = search_radiance(radiance_problem(evidence, settings=settings.radiance), settings=settings.search)
     mean = (surfaces.weights[:, None] * surfaces.colors).sum(0)
     sky = seen_sky(evidence.far, up, mean.clamp_min(1e-3))
-    found = EstimatedLight(Light((), torch.zeros(9, 3)), hidden, evidence, sky)
-    around = evidence.around
+    tint = sky / sky.mean().clamp_min(1e-6)
     sources, rest = split_peaks(
-        found.radiance(around), found.visible_sources(around), around, within=region.radius, settings=settings.peaks
+        hidden.radiance(evidence, tint),
+        evidence.visible_sources,
+        evidence.around,
+        within=region.radius,
+        settings=settings.peaks,
     )
-    light = Light(sources, ambient_of(rest), **_seen_shares(around, up))
-    return replace(found, light=with_source_distances(light, scene, place))
+    light = Light(sources, ambient_of(rest), **_seen_shares(evidence))
+    return EstimatedLight(with_source_distances(light, scene, place), hidden, evidence, tint)
 
 
 def _usable(scene: Gaussians) -> Gaussians:
     """The Gaussians whose values are finite and no larger than any camera or scene makes them."""
-    values = torch.cat([scene.means, scene.log_scales, scene.quaternions, scene.sh.flatten(1)], 1)
-    good = (values.abs() < _HUGE).all(1)  # false for nan too
+    good = torch.ones(scene.count, dtype=torch.bool)
+    for values in (scene.means, scene.log_scales, scene.quaternions, scene.sh.flatten(1)):
+        good &= (values.abs() < _HUGE).all(1)  # false for nan too
     return scene if bool(good.all()) else scene.select(good)
 
 
-_HUGE = 1e6
-"""World units, and units of colour; such Gaussians are a format's or an optimiser's fault."""
-
-
-def _seen_shares(around: Surroundings, up: Float[Tensor, "3"]) -> dict[str, float]:
-    overhead = DIRECTIONS @ up > _OVERHEAD
-    return {"coverage": float(around.seen.mean()), "unseen_up": float(1 - around.seen[overhead].mean())}
-
-
-_OVERHEAD = 0.5
-"""Cosine to the up direction of what counts as ceiling, 60 degrees."""
+def _seen_shares(evidence: LightEvidence) -> dict[str, float]:
+    seen = evidence.around.seen
+    overhead = DIRECTIONS @ evidence.up > _OVERHEAD
+    return {"coverage": float(seen.mean()), "unseen_up": float(1 - seen[overhead].mean())}
 
 
 def panorama_at(

@@ -109,6 +109,11 @@ class Light:
         return "; ".join([*parts, f"{100 * self.coverage:.0f}% of the surroundings seen"])
 
 
+def angular_radius_deg(solid_angle: float) -> float:
+    """Half the angle, in degrees, that a round light of `solid_angle` (steradians) subtends."""
+    return math.degrees(math.acos(max(-1.0, 1 - solid_angle / (2 * math.pi))))
+
+
 def fit_ambient(radiance: Float[Tensor, "3"]) -> Float[Tensor, "9 3"]:
     """Coefficients of uniform ambient light of linear rgb `radiance`."""
     out = torch.zeros(_AMBIENT_COUNT, 3)

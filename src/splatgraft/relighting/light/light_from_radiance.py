@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.directions import fit_sh
-from splatgraft.relighting.light.light import LightSource
+from splatgraft.relighting.light.light import LightSource, angular_radius_deg
 from splatgraft.relighting.light.surroundings import DIRECTIONS, SOLID_ANGLE, Surroundings
 
 _LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
@@ -16,7 +16,7 @@ _LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 
 
 @dataclass(frozen=True)
-class PeakSettings:
+class RadianceSourceSettings:
     """What is a source; none of these numbers is sensitive."""
 
     over_median: float = 4.0
@@ -43,7 +43,7 @@ def split_peaks(
     around: Surroundings,
     *,
     within: float,
-    settings: PeakSettings = PeakSettings(),
+    settings: RadianceSourceSettings = RadianceSourceSettings(),
 ) -> tuple[tuple[LightSource, ...], Float[Tensor, "k 3"]]:
     """Cut the brightest directions out of the light as sources.
 
@@ -85,7 +85,7 @@ def _source(
     around: Surroundings,
     *,
     within: float,
-    settings: PeakSettings,
+    settings: RadianceSourceSettings,
 ) -> LightSource:
     weight = extra @ _LUMINANCE
     visible = float(clipped[group].sum())
@@ -95,7 +95,7 @@ def _source(
     r, g, b = (extra.sum(0) * SOLID_ANGLE).tolist()
     if visible > 0:
         size = max(visible, 0.1) * SOLID_ANGLE
-        radius = math.degrees(math.acos(max(-1.0, 1 - size / (2 * math.pi))))
+        radius = angular_radius_deg(size)
         name = "sun" if size < settings.sun else "window"
         return LightSource((x, y, z), (r, g, b), radius, settings.clipped_error_deg, 1.0, name)
     away = torch.rad2deg(torch.acos((towards @ direction).clamp(-1, 1)))

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from splatgraft.core.k_means import k_means
+
 
 @dataclass(frozen=True)
 class MaterialGroupSettings:
@@ -42,15 +44,18 @@ def group_materials(
         normals: Unit.
         settings: Features and number of groups.
     """
-    red, green, blue = brightness.clamp_min(settings.darkest).log().unbind(1)
-    chroma = torch.stack([(red - blue) / settings.red_blue, (green - 0.5 * (red + blue)) / settings.green_magenta], 1)
-    features = torch.cat([chroma, normals / settings.normal], 1)
+    chroma = log_chromaticity(brightness.clamp_min(settings.darkest))
+    features = torch.cat(
+        [chroma / torch.tensor([settings.red_blue, settings.green_magenta]), normals / settings.normal], 1
+    )
     generator = torch.Generator().manual_seed(0)
     sample = features[torch.randperm(len(features), generator=generator)[: settings.sample]]
     count = min(settings.groups, max(2, len(sample) // settings.members))
-    means = sample[:count]
-    for _ in range(settings.rounds):
-        label = torch.cdist(sample, means).argmin(1)
-        sums = torch.zeros_like(means).index_add_(0, label, sample)
-        means = sums / torch.bincount(label, minlength=count).clamp_min(1)[:, None]
+    means = k_means(sample, sample[:count], rounds=settings.rounds)
     return torch.cdist(features, means).argmin(1)
+
+
+def log_chromaticity(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2"]:
+    """log(red / blue) and log(green / sqrt(red blue)) of linear rgb above 0."""
+    red, green, blue = colors.log().unbind(1)
+    return torch.stack([red - blue, green - 0.5 * (red + blue)], 1)

@@ -42,6 +42,8 @@ class Panorama:
     """Unit, from the point outwards, in the scene's frame."""
     solid_angles: Float[Tensor, "6 s s"]
     """Steradians; they sum to 4 pi."""
+    distance: Float[Tensor, "6 s s"] | None = None
+    """World units from the point to the surfaces; None where it was not asked for."""
 
     @property
     def coverage(self) -> float:
@@ -81,13 +83,15 @@ def cube_pixels(directions: Float[Tensor, "n 3"], size: int) -> Int[Tensor, "n"]
     return (face * size + v) * size + u
 
 
-def far_enough(scene: Gaussians, center: Float[Tensor, "3"], nearest: float) -> Gaussians:
+def _far_enough(scene: Gaussians, center: Float[Tensor, "3"], nearest: float) -> Gaussians:
     """The Gaussians at least `nearest` world units from `center` that are not too wide for their distance."""
     distance = (scene.means - center.to(scene.means)).norm(dim=-1)
     return scene.select((distance >= nearest) & (scene.scales.max(1).values < _WIDEST * distance))
 
 
-def render_panorama(scene: Gaussians, center: Float[Tensor, "3"], *, size: int = 64, nearest: float = 0.0) -> Panorama:
+def render_panorama(
+    scene: Gaussians, center: Float[Tensor, "3"], *, size: int = 64, nearest: float = 0.0, with_distance: bool = False
+) -> Panorama:
     """Render the panorama of `scene` from `center`.
 
     Args:
@@ -95,18 +99,29 @@ def render_panorama(scene: Gaussians, center: Float[Tensor, "3"], *, size: int =
         center: World units.
         size: Width of a face, pixels.
         nearest: World units; Gaussians whose centre is nearer are left out.
+        with_distance: Whether the panorama has the distance of the surfaces, too.
     """
     # the near plane of each face only removes what is behind it: near Gaussians are already left out
     near = max(nearest / math.sqrt(3), 1e-6)
-    rendered = render(far_enough(scene, center, nearest), cube_cameras(center, size), options=RenderOptions(near=near))
+    rendered = render(
+        _far_enough(scene, center, nearest),
+        cube_cameras(center, size),
+        options=RenderOptions(near=near),
+        outputs=frozenset({"color", "depth"} if with_distance else {"color"}),
+    )
     alpha = rendered.alpha.detach().clamp(0, 1)
     # Gaussians are blended in sRGB, so alpha is divided out before the conversion to linear light
     color = rendered.color.detach().clamp_min(0) / alpha.clamp_min(_FAINTEST)[..., None]
     visible = alpha > _FAINTEST
     directions, solid_angles = cube_directions(size)
+    distance = None
+    if with_distance:
+        # depth runs along each face's axis, which is a direction's largest component
+        distance = rendered.depth.detach() / directions.abs().max(-1).values.to(alpha)
     return Panorama(
         radiance=linear_from_srgb(color) * visible[..., None],
         alpha=alpha * visible,
         directions=directions.to(alpha),
         solid_angles=solid_angles.to(alpha),
+        distance=distance,
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from splatgraft.core.directions import fit_sh
 from splatgraft.core.images import srgb_from_linear
-from splatgraft.relighting.light.light import Light, LightSource
+from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
 from splatgraft.relighting.light.panorama import Panorama
 
 
@@ -77,7 +77,7 @@ def light_from_panorama(
         LightSource(
             direction=_tuple(patch.direction),
             irradiance=_tuple(patch.radiance * patch.solid_angle),
-            angular_radius_deg=math.degrees(math.acos(1 - patch.solid_angle / (2 * math.pi))),
+            angular_radius_deg=angular_radius_deg(patch.solid_angle),
             uncertainty_deg=settings.uncertainty_deg,
             confidence=1.0,
             name="bright patch",

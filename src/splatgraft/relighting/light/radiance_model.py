@@ -35,6 +35,11 @@ _UNSEEN = 0.05
 """The same for unseen ones."""
 _TOUCHING = math.cos(math.radians(15))
 """Clipped directions nearer than this are one patch."""
+_LOWEST = math.sin(math.radians(-8))
+"""Least height of a patch that may be a source: a window beside a table reaches below the horizon, reflections lie
+lower."""
+_SMALLEST = 0.05
+"""Directions that such a patch covers at least."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,7 @@ class RadianceSettings:
     residual: float = 0.8
     """Scale of the error of log colour."""
     nu: float = 4.0
-    """Degrees of freedom of that error."""
+    """Degrees of freedom of that error; set by hand, as the fit does not tell it from the scale."""
     effective: float = 50.0
     """Independent receivers that all are worth: neighbours share their errors."""
     near: float = 0.66
@@ -92,6 +97,14 @@ class LightEvidence:
     """What surrounds the object, near things included."""
     up: Float[Tensor, "3"]
     """Unit, world frame."""
+
+    @property
+    def visible_sources(self) -> Float[Tensor, "k"]:
+        """Share of each direction that is clipped and lies outside of the region, in [0, 1].
+
+        What is clipped nearby alone is a fault of the reconstruction or a bright surface.
+        """
+        return torch.minimum(self.around.clipped, self.far.clipped)
 
 
 @dataclass(frozen=True)
@@ -145,6 +158,8 @@ class RadianceProblem:
     """How many independent albedos each material is worth."""
     sky: float
     """Log radiance expected of unseen directions."""
+    connected: Bool[Tensor, "x x"]
+    """Which clipped directions are of one patch."""
     patches: tuple[Patch, ...]
     """Clipped ones above the horizon, largest first."""
 
@@ -156,6 +171,21 @@ class RadianceProblem:
     def received(self, radiances: Float[Tensor, "n"]) -> Float[Tensor, "m"]:
         """Radiance of white surfaces for log radiances of the unknowns."""
         return (self.known + self.transport @ radiances.exp()).clamp_min(1e-5)
+
+    def residual(self, radiances: Float[Tensor, "n"], albedos: Float[Tensor, "g"]) -> Float[Tensor, "m"]:
+        """Logarithm of observed over explained brightness of the receivers, for logarithms of the unknowns."""
+        return self.log_color - albedos[self.evidence.material] - self.received(radiances).log()
+
+    def counted(self, residual: Float[Tensor, "m ..."]) -> Float[Tensor, "m ..."]:
+        """The residual without that of receivers which may be brighter than the camera recorded."""
+        is_white = self.is_white.reshape(-1, *[1] * (residual.ndim - 1))
+        return torch.where(is_white, residual.clamp_min(0), residual)
+
+    def shading_cost(self, residual: Float[Tensor, "m ..."]) -> Float[Tensor, "..."]:
+        """Minus the log likelihood of the receivers' colours."""
+        s, weights = self.settings, self.weights.to(residual).reshape(-1, *[1] * (residual.ndim - 1))
+        away = self.counted(residual) ** 2 / (s.nu * s.residual**2)
+        return 0.75 * (s.nu + 1) * (weights * torch.log1p(away)).sum(0)
 
     def radiance_at_object(self, x: Float[Tensor, "s"]) -> Float[Tensor, "k"]:
         """Gray radiance from all `DIRECTIONS` at the object."""
@@ -179,9 +209,9 @@ class RadianceProblem:
                 mean[patch.members], deviation[patch.members] = math.log(s.source), s.source_sd
         if not count:
             return ClippedPrior(mean, torch.zeros(0, 0, dtype=torch.float64))
-        label = _patch_labels(self.clipped)
-        same = (label[:, None] == label[None]).double()
-        covariance = same * deviation[:, None] * deviation + s.within_patch_sd**2 * torch.eye(count).double()
+        covariance = (
+            self.connected.double() * deviation[:, None] * deviation + s.within_patch_sd**2 * torch.eye(count).double()
+        )
         return ClippedPrior(mean, torch.linalg.inv(covariance))
 
 
@@ -200,9 +230,8 @@ def radiance_problem(
     unseen = (torch.maximum(1 - far.seen, 1 - around.seen) > _UNSEEN).nonzero()[:, 0]
     clipped = (far.clipped > _PRESENT).nonzero()[:, 0]
     shares = torch.cat([1 - far.seen[unseen], far.clipped[clipped]]).clamp_min(0).double()
-    # a source is beyond the surroundings: what is clipped nearby is a reconstruction's fault or a bright surface
-    at_object = torch.minimum(around.clipped, far.clipped)
     transport = evidence.transport.double()
+    label = _patch_labels(clipped)
     mean_color = (evidence.weights[:, None] * evidence.colors).sum(0).mean()
     weights = (evidence.weights * torch.exp(-0.5 * (evidence.distance / s.near) ** 2)).double()
     weights *= s.effective / weights.sum().clamp_min(1e-12)
@@ -219,14 +248,15 @@ def radiance_problem(
         clipped=clipped,
         transport=transport[:, torch.cat([unseen, clipped])] * shares,
         shares=shares,
-        shares_at_object=torch.cat([1 - around.seen[unseen], at_object[clipped]]).clamp_min(0).double(),
+        shares_at_object=torch.cat([1 - around.seen[unseen], found.visible_sources[clipped]]).clamp_min(0).double(),
         known=transport @ far.radiance.mean(1).double() + evidence.blocked.double() * float(mean_color),
         log_color=evidence.colors.mean(1).double().log(),
         weights=weights,
         is_white=evidence.colors.max(1).values > 0.9,
         material_weights=material_weights,
         sky=math.log(max(float(seen_sky(far, up, mean_color.expand(3)).mean()), _DARKEST)) + s.sky_bias,
-        patches=_patches(far, clipped, up)[:most_patches],
+        connected=label[:, None] == label[None],
+        patches=_patches(far, clipped, label, up)[:most_patches],
     )
 
 
@@ -254,14 +284,9 @@ def _patch_labels(clipped: Int[Tensor, "x"]) -> Int[Tensor, "x"]:
     return label
 
 
-_LOWEST = math.sin(math.radians(-8))
-"""A window beside a table reaches below the horizon; reflections lie lower."""
-_SMALLEST = 0.05
-"""Of a direction."""
-
-
-def _patches(far: Surroundings, clipped: Int[Tensor, "x"], up: Float[Tensor, "3"]) -> tuple[Patch, ...]:
-    label = _patch_labels(clipped)
+def _patches(
+    far: Surroundings, clipped: Int[Tensor, "x"], label: Int[Tensor, "x"], up: Float[Tensor, "3"]
+) -> tuple[Patch, ...]:
     found = []
     for value in label.unique():
         members = (label == value).nonzero()[:, 0]
@@ -290,19 +315,12 @@ def cost(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"]) -
     p, s = problem, problem.settings
     level, radiances, albedo = p.split(x)
     unseen, clipped = radiances[: len(p.unseen)], radiances[len(p.unseen) :]
-    residual = _residual(p, x)
-    total = shading_cost(p, residual)
+    total = float(p.shading_cost(p.residual(radiances, albedo)))
     total += 0.5 * float((p.material_weights * ((albedo - math.log(s.albedo)) / s.albedo_sd) ** 2).sum())
     total += 0.5 * _ABOVE_MOST * float(((albedo - _MOST_ALBEDO).clamp_min(0) ** 2).sum())
     total += 0.5 * ((float(level) - p.sky) / s.sky_sd) ** 2 + float(unseen_cost(s, unseen - level).sum())
     away = clipped - prior.mean
     return total + 0.5 * float(away @ prior.precision @ away)
-
-
-def shading_cost(problem: RadianceProblem, residual: Float[Tensor, "m"]) -> float:
-    """Minus the log likelihood of the receivers' colours."""
-    s = problem.settings
-    return 0.75 * (s.nu + 1) * float((problem.weights * torch.log1p(residual**2 / (s.nu * s.residual**2))).sum())
 
 
 def unseen_cost(settings: RadianceSettings, away: Tensor) -> Tensor:
@@ -328,12 +346,6 @@ def polish(
     return x
 
 
-def _residual(problem: RadianceProblem, x: Float[Tensor, "s"]) -> Float[Tensor, "m"]:
-    _, radiances, albedo = problem.split(x)
-    residual = problem.log_color - albedo[problem.evidence.material] - problem.received(radiances).log()
-    return torch.where(problem.is_white, residual.clamp_min(0), residual)
-
-
 def _by_material(problem: RadianceProblem, values: Float[Tensor, "m ..."]) -> Float[Tensor, "g ..."]:
     out = torch.zeros(len(problem.material_weights), *values.shape[1:], dtype=values.dtype)
     return out.index_add_(0, problem.evidence.material, values)
@@ -344,7 +356,7 @@ def _step(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], 
     p, s = problem, problem.settings
     level, radiances, albedo = p.split(x)
     u, n = len(p.unseen), len(radiances)
-    residual = _residual(p, x)
+    residual = p.counted(p.residual(radiances, albedo))
     weights = 1.5 * p.weights * (s.nu + 1) / (s.nu * s.residual**2 + residual**2)
     weights = torch.where(p.is_white & (residual <= 0), 0.0, weights)
     slope = (p.transport * radiances.exp()) / p.received(radiances)[:, None]  # of log received by log radiance

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splatgraft.relighting.light.radiance_model import (
     ClippedPrior,
+    LightEvidence,
     RadianceProblem,
     cost,
     polish,
@@ -22,6 +23,13 @@ from splatgraft.relighting.light.radiance_model import (
     unseen_cost,
 )
 from splatgraft.relighting.light.surroundings import DIRECTIONS
+
+_RELEVELED = 0.7
+"""Share of the mean residual that albedos take up before a state is polished."""
+_WHITE = 0.3
+"""Radiance beyond white that a clipped lamp starts from, at least."""
+_LEAST_SHARE = 0.1
+"""Share of a direction that must be unknown for a lamp in it."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,18 @@ class RadianceEstimate:
     residual: Float[Tensor, "m"]
     """Observed over explained brightness of the receivers, logarithm, at the best maximum."""
 
+    def radiance(self, evidence: LightEvidence, tint: Float[Tensor, "3"]) -> Float[Tensor, "k 3"]:
+        """Linear rgb radiance from all `DIRECTIONS` at the object.
+
+        Args:
+            evidence: At the object; its near surroundings may be others than those of the estimate.
+            tint: Linear rgb of mean 1, of what no camera saw.
+        """
+        around = evidence.around
+        unseen = ((1 - around.seen).clamp_min(0) * self.unseen)[:, None] * tint
+        # clipped parts are white: their own tint was lost
+        return around.radiance + unseen + (evidence.visible_sources * self.clipped)[:, None]
+
 
 def search_radiance(problem: RadianceProblem, *, settings: SearchSettings = SearchSettings()) -> RadianceEstimate:
     """Find and average the local maxima of the density of `problem`.
@@ -95,12 +115,11 @@ def search_radiance(problem: RadianceProblem, *, settings: SearchSettings = Sear
     for weight, maximum in zip(weights, maxima, strict=True):
         hidden += weight * _hidden_radiance(problem, maximum, settings)
     _, at_best, albedo = problem.split(maxima[0].state)
-    explained = albedo[problem.evidence.material] + problem.received(at_best).log()
     return RadianceEstimate(
         unseen=hidden[0].float(),
         clipped=hidden[1].float(),
         weights=tuple(weights.tolist()),
-        residual=(problem.log_color - explained).float(),
+        residual=problem.residual(at_best, albedo).float(),
     )
 
 
@@ -120,14 +139,10 @@ def _combinations(problem: RadianceProblem, dark: Float[Tensor, "s"]) -> list[Ma
         prior, state = problem.with_prior(sources), dark.clone()
         state[1 + len(problem.unseen) : 1 + n] = prior.mean
         _, radiances, albedo = problem.split(state)
-        residual = problem.log_color - albedo[problem.evidence.material] - problem.received(radiances).log()
+        residual = problem.residual(radiances, albedo)
         state[1 + n :] += _RELEVELED * float((problem.weights * residual).sum() / problem.weights.sum().clamp_min(1e-9))
         found.append(_at(problem, prior, state, sources))
     return sorted(found, key=lambda maximum: maximum.cost)
-
-
-_RELEVELED = 0.7
-"""Share of the mean residual that albedos take up before a state is polished."""
 
 
 @dataclass(frozen=True)
@@ -149,9 +164,8 @@ def _lamp_costs(
     level, radiances, albedo = p.split(state)
     u, now = len(p.unseen), radiances.exp()
     at_least = torch.where(torch.arange(len(now)) < u, level.exp(), _WHITE)
-    received = p.received(radiances)
-    residual = (p.log_color - albedo[p.evidence.material] - received.log()).float()
-    relative = (p.transport / received[:, None]).float()
+    residual = p.residual(radiances, albedo).float()
+    relative = (p.transport / p.received(radiances)[:, None]).float()
     index = torch.cat([p.unseen, p.clipped])
     light = p.radiance_at_object(state)
     columns = []
@@ -160,9 +174,7 @@ def _lamp_costs(
         changed = residual[:, None] - torch.log1p(relative * (lamp - now).float())
         weight = p.weights.float()[:, None]
         shift = _RELEVELED * (weight * changed).sum(0) / weight.sum().clamp_min(1e-9)
-        changed = changed - shift
-        changed = torch.where(p.is_white[:, None], changed.clamp_min(0), changed)
-        value = 0.75 * (s.nu + 1) * (weight * torch.log1p(changed**2 / (s.nu * s.residual**2))).sum(0).double()
+        value = p.shading_cost(changed - shift).double()
         away = (albedo - math.log(s.albedo))[:, None]
         value += 0.5 * (p.material_weights[:, None] * ((away + shift) ** 2 - away**2)).sum(0) / s.albedo_sd**2
         value[:u] += unseen_cost(s, lamp[:u].log() - level) - unseen_cost(s, radiances[:u] - level)
@@ -175,12 +187,6 @@ def _lamp_costs(
         columns.append(torch.stack([value, lamp.log(), shift.double()]))
     found = torch.stack(columns, 2)
     return _LampCosts(found[0], found[1], found[2])
-
-
-_WHITE = 0.3
-"""Radiance beyond white that a clipped lamp starts from, at least."""
-_LEAST_SHARE = 0.1
-"""Share of a direction that must be unknown for a lamp in it."""
 
 
 def _with_lamps(problem: RadianceProblem, base: Maximum, count: int, settings: SearchSettings) -> list[Maximum]:

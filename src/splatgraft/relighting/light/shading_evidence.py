@@ -15,7 +15,9 @@ from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.directions import frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.k_means import k_means
 from splatgraft.core.spherical_harmonics import rgb_from_dc
+from splatgraft.relighting.light.material_groups import log_chromaticity
 from splatgraft.relighting.light.surroundings import DIRECTIONS
 from splatgraft.relighting.shading.normals import Normals
 from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occluders_of, splat_depth_maps, visibility
@@ -172,13 +174,8 @@ def _materials(
     settings: ShadingEvidenceSettings,
 ) -> Int[Tensor, "m"]:
     """Groups of similar colour and position, not of similar normals: those would hide the light."""
-    red, green, blue = colors.clamp_min(1e-3).log().unbind(1)
-    chroma = torch.stack([red - blue, (green - 0.5 * (red + blue)) / settings.green_magenta], 1)
+    chroma = log_chromaticity(colors.clamp_min(1e-3)) / torch.tensor([1.0, settings.green_magenta])
     features = torch.cat([chroma, (points - region.center) / (settings.extent * region.radius)], 1)
     generator = torch.Generator().manual_seed(0)
-    means = features[torch.randperm(len(features), generator=generator)[: settings.materials]]
-    for _ in range(settings.rounds):
-        label = torch.cdist(features, means).argmin(1)
-        sums = torch.zeros_like(means).index_add_(0, label, features)
-        means = sums / torch.bincount(label, minlength=len(means)).clamp_min(1)[:, None]
-    return torch.cdist(features, means).argmin(1)
+    start = features[torch.randperm(len(features), generator=generator)[: settings.materials]]
+    return torch.cdist(features, k_means(features, start, rounds=settings.rounds)).argmin(1)

@@ -11,13 +11,14 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
-from splatgraft.relighting.light.panorama import Panorama, cube_cameras, far_enough, render_panorama
-from splatgraft.rendering import RenderOptions, render
+from splatgraft.relighting.light.panorama import Panorama, render_panorama
 
 DIRECTIONS = even_directions(320)
 """Unit directions into which all light is sorted: 11 degrees apart, as fine as the surfaces around tell it."""
 SOLID_ANGLE = 4 * math.pi / len(DIRECTIONS)
 """Steradians of each direction."""
+_FARTHEST = 1e4
+"""World units; what is farther away counts as so far."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,8 @@ def surroundings_at(
         nearest: World units; Gaussians whose centre is nearer are left out.
         settings: Thresholds.
     """
-    panorama = render_panorama(scene, center, size=settings.size, nearest=nearest)
-    known = _photographed(_points(panorama, scene, center, nearest, settings.size), cameras)
+    panorama = render_panorama(scene, center, size=settings.size, nearest=nearest, with_distance=True)
+    known = _photographed(_points(panorama, center), cameras)
     known &= panorama.alpha.flatten() > settings.least_alpha
     directions, angles = panorama.directions.reshape(-1, 3), panorama.solid_angles.flatten()
     radiance = panorama.radiance.reshape(-1, 3)
@@ -88,17 +89,10 @@ def _sum(values: Float[Tensor, "p ..."], index: Int[Tensor, "p"]) -> Float[Tenso
     return torch.zeros(len(DIRECTIONS), *values.shape[1:]).index_add_(0, index, values)
 
 
-def _points(
-    panorama: Panorama, scene: Gaussians, center: Float[Tensor, "3"], nearest: float, size: int
-) -> Float[Tensor, "p 3"]:
+def _points(panorama: Panorama, center: Float[Tensor, "3"]) -> Float[Tensor, "p 3"]:
     """Where the surfaces of a panorama are."""
-    part = far_enough(scene, center, nearest)
-    options = RenderOptions(near=max(nearest / math.sqrt(3), 1e-6))
-    depth = render(part, cube_cameras(center, size), options=options, outputs=frozenset({"depth"})).depth
-    assert depth is not None
-    directions = panorama.directions.reshape(-1, 3)
-    along = directions / directions.abs().max(1, keepdim=True).values
-    return center + along * depth.reshape(-1, 1).clamp(0, 1e4)
+    assert panorama.distance is not None
+    return center + panorama.directions.reshape(-1, 3) * panorama.distance.reshape(-1, 1).clamp(0, _FARTHEST)
 
 
 def _photographed(points: Float[Tensor, "p 3"], cameras: Cameras) -> Bool[Tensor, "p"]:

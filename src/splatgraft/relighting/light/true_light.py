@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.relighting.light.light import Light, LightSource
+from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
 from splatgraft.relighting.light.panorama import Panorama, cube_directions
 from splatgraft.relighting.light.panorama_sources import light_from_panorama
 
@@ -97,7 +97,7 @@ def _source(
     return LightSource(
         direction=_triple(torch.nn.functional.normalize((gray[:, None] * directions).sum(0), dim=0).tolist()),
         irradiance=_triple(power.sum(0).tolist()),
-        angular_radius_deg=math.degrees(math.acos(1 - extent / (2 * math.pi))),
+        angular_radius_deg=angular_radius_deg(extent),
         name="bright peak",
     )
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.k_means import k_means
 from splatgraft.relighting.shading.object_views import ObjectView
 from splatgraft.relighting.shading.reflected_light import ReflectedLight
 
@@ -20,6 +21,8 @@ _CHUNK = 8192
 """Gaussians at a time; bounds memory."""
 _MOST_FITTED = 8192
 """Gaussians that lobes are fitted to, spread over the object; more add time and change nothing."""
+_ROUNDS = 15
+"""Of k-means."""
 
 
 @dataclass(frozen=True)
@@ -234,14 +237,7 @@ def _clusters(mean: Float[Tensor, "n 3"], points: Float[Tensor, "n 3"], count: i
     for _ in range(min(count, len(features)) - 1):
         nearest = torch.minimum(nearest, ((features - features[first[-1]]) ** 2).sum(1))
         first.append(int(nearest.argmax()))
-    centres = features[first]
-    label = torch.zeros(len(features), dtype=torch.int64)
-    for _ in range(15):
-        label = torch.cdist(features, centres).argmin(1)
-        sums = torch.zeros_like(centres).index_add_(0, label, features)
-        sizes = torch.bincount(label, minlength=len(centres))[:, None]
-        centres = torch.where(sizes > 0, sums / sizes.clamp_min(1), centres)
-    return label
+    return torch.cdist(features, k_means(features, features[first], rounds=_ROUNDS)).argmin(1)
 
 
 def _fitted(
