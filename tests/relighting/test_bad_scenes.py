@@ -5,28 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shapes import UP, ring, surfels
 
 from splatgraft.core.bounds import BoundingSphere
-from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.directions import even_directions, frames_along
+from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.core.rotations import quaternion_from_rotation
-from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.relighting.light.estimate import NoLight, estimate_light
 
-UP = torch.tensor([0.0, 0.0, 1.0])
 PLACE = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
-
-
-def surfels(points, normals, width, gray) -> Gaussians:
-    n = len(points)
-    return Gaussians(
-        means=points,
-        log_scales=torch.tensor([width, width, 0.1 * width]).log().repeat(n, 1),
-        quaternions=quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
-        opacity_logits=torch.full((n,), 3.0),
-        sh=dc_from_rgb(torch.full((n, 1, 3), gray)),
-    )
 
 
 def room() -> Gaussians:
@@ -34,19 +20,15 @@ def room() -> Gaussians:
     generator = torch.Generator().manual_seed(0)
     floor = torch.cat([(torch.rand(4000, 2, generator=generator) - 0.5) * 5, torch.zeros(4000, 1)], 1)
     shell = even_directions(4000)
-    return concatenate([surfels(floor, UP.repeat(4000, 1), 0.05, 0.4), surfels(20 * shell, -shell, 0.7, 0.7)])
-
-
-def views(count=12):
-    turn = torch.arange(count) / count * 2 * math.pi
-    eyes = torch.stack([2.5 * turn.cos(), 2.5 * turn.sin(), torch.full((count,), 1.5)], 1)
-    return pinhole(look_at(eyes, torch.zeros(3), UP), 100.0, width=128, height=96)
+    return concatenate(
+        [surfels(floor, UP.repeat(4000, 1), width=0.05, srgb=0.4), surfels(20 * shell, -shell, width=0.7, srgb=0.7)]
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("count", [1, 12])
 def test_few_views_and_no_bands_give_a_finite_light(count, degree):
-    light = estimate_light(room().with_sh_degree(degree), PLACE, views(count))
+    light = estimate_light(room().with_sh_degree(degree), PLACE, ring(count))
     assert not isinstance(light, NoLight)
     found = light.irradiance(even_directions(50))
     assert bool(torch.isfinite(found).all())
@@ -59,7 +41,7 @@ def test_colours_that_are_not_finite_or_huge_leave_the_light_finite(value):
     scene = room()
     sh = scene.sh.clone()
     sh[::97] = value
-    light = estimate_light(replace(scene, sh=sh), PLACE, views())
+    light = estimate_light(replace(scene, sh=sh), PLACE, ring())
     assert not isinstance(light, NoLight)
     found = light.irradiance(even_directions(50))
     assert bool(torch.isfinite(found).all())
@@ -71,6 +53,6 @@ def test_places_that_are_not_finite_or_huge_leave_the_light_finite(value):
     scene = room()
     means = scene.means.clone()
     means[::97, 0] = value
-    light = estimate_light(replace(scene, means=means), PLACE, views())
+    light = estimate_light(replace(scene, means=means), PLACE, ring())
     assert not isinstance(light, NoLight)
     assert bool(torch.isfinite(light.irradiance(even_directions(50))).all())

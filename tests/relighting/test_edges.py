@@ -6,31 +6,18 @@ from functools import cache
 
 import pytest
 import torch
+from shapes import surfels
 
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
-from splatgraft.core.directions import even_directions, frames_along
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.directions import even_directions
 from splatgraft.core.images import linear_from_srgb
-from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
-from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.relighting import Light, LightSource, RelightOptions, relight
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.rendering import render
 
 RADIUS, SUN = 0.3, (0.5, -0.3, 0.8)
-
-
-def surfels(points, normals, width, gray) -> Gaussians:
-    n = len(points)
-    return Gaussians(
-        points,
-        torch.tensor([width, width, min(0.1 * width, 0.002)]).log().repeat(n, 1),
-        quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
-        torch.full((n,), 3.0),
-        dc_from_rgb(torch.full((n, 1, 3), gray)),
-    )
 
 
 @cache
@@ -43,12 +30,13 @@ def cameras():
 
 def error(width, options) -> float:
     """RMSE of the ratio of light after to before, over the shadow beside the ball."""
+    thin = min(0.1 * width, 0.002)
     x = torch.arange(-1.5, 1.5, 1.5 * width)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
     up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(grid), 1)
-    plane = surfels(torch.cat([grid, torch.zeros(len(grid), 1)], 1), up, width, 0.5)
+    plane = surfels(torch.cat([grid, torch.zeros(len(grid), 1)], 1), up, width=width, thickness=thin)
     around, center = even_directions(10000), torch.tensor([0.0, 0.0, RADIUS])
-    ball = surfels(RADIUS * around + center, around, RADIUS / 55, 0.0)
+    ball = surfels(RADIUS * around + center, around, width=RADIUS / 55, srgb=0.0, thickness=RADIUS / 550)
     sun = torch.nn.functional.normalize(torch.tensor(SUN), dim=0)
     source = LightSource(tuple(sun.tolist()), (3.0, 3.0, 3.0), angular_radius_deg=0.25)
     # hardly any sky: its part of the ratio is left out of the truth
@@ -100,13 +88,20 @@ def seen_from(view, relit, plane, ground) -> torch.Tensor:
 
 def test_an_edge_stands_in_one_place_from_all_sides():
     width = 0.03
+    thin = min(0.1 * width, 0.002)
     x = torch.arange(-1.5, 1.5, 1.5 * width)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
     up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(grid), 1)
-    plane = surfels(torch.cat([grid, torch.zeros(len(grid), 1)], 1), up, width, 0.5)
+    plane = surfels(torch.cat([grid, torch.zeros(len(grid), 1)], 1), up, width=width, thickness=thin)
     around = even_directions(10000)
     # high enough that no view of its shadow is hidden; its own Gaussians are left out of the pictures
-    ball = surfels(RADIUS * around + torch.tensor([0.0, 0.0, 2 * RADIUS]), around, RADIUS / 55, 0.0)
+    ball = surfels(
+        RADIUS * around + torch.tensor([0.0, 0.0, 2 * RADIUS]),
+        around,
+        width=RADIUS / 55,
+        srgb=0.0,
+        thickness=RADIUS / 550,
+    )
     sun = torch.nn.functional.normalize(torch.tensor(SUN), dim=0)
     source = LightSource(tuple(sun.tolist()), (3.0, 3.0, 3.0), angular_radius_deg=5.0)
     composite = Composite(

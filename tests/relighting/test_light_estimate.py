@@ -5,40 +5,25 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shapes import UP, ring, surfels
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.composite import PlacedObject
-from splatgraft.core.directions import even_directions, fit_sh, frames_along
+from splatgraft.core.directions import even_directions, fit_sh
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import srgb_from_linear
-from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
-from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.core.splitting import split_along
 from splatgraft.relighting.light.estimate import estimate_light
 from splatgraft.relighting.light.light import Light, fit_ambient
 from splatgraft.relighting.shading.normals import estimate_normals
 from splatgraft.rendering import render
 
-UP = torch.tensor([0.0, 0.0, 1.0])
-
-
-def colored(points, normals, width, rgb) -> Gaussians:
-    n = len(points)
-    return Gaussians(
-        means=points,
-        log_scales=torch.tensor([width, width, 0.1 * width]).log().repeat(n, 1),
-        quaternions=quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
-        opacity_logits=torch.full((n,), 3.0),
-        sh=dc_from_rgb(rgb)[:, None],
-    )
-
 
 def views(levels=(0.0,)):
-    """Twelve cameras around the middle, for each level that they look at."""
-    turn = torch.arange(12) / 12 * 2 * math.pi
-    eyes = torch.stack([2.5 * turn.cos(), 2.5 * turn.sin(), torch.full((12,), 1.5)], 1)
+    """Twelve cameras on one circle, for each level that they look at."""
+    eyes = ring().centers
     poses = torch.cat([look_at(eyes, torch.tensor([0.0, 0.0, level]), UP) for level in levels])
     return pinhole(poses, 100.0, width=128, height=96)
 
@@ -64,7 +49,7 @@ def sunlit_scene(sun, strength):
     gray = 0.15 * (1 + strength * lit)
     keep = (point[:, None, :2] - centers[:, :2]).norm(dim=-1).min(1).values > 0.05
     keep |= point[:, 2] > 0.01
-    return colored(point[keep], normal[keep], 0.03, srgb_from_linear(gray)[keep, None].repeat(1, 3))
+    return surfels(point[keep], normal[keep], width=0.03, srgb=srgb_from_linear(gray)[keep, None].repeat(1, 3))
 
 
 def estimated(scene, cameras=None) -> Light:
@@ -105,7 +90,7 @@ def test_a_clipped_window_is_a_source_where_it_was_photographed(white):
     window = torch.nn.functional.normalize(torch.tensor([0.8, 0.3, 0.15]), dim=0)
     bright = shell @ window > math.cos(math.radians(10))
     rgb = torch.where(bright[:, None], white, 0.4).repeat(1, 3)
-    room = colored(20 * shell, -shell, 0.6, rgb)
+    room = surfels(20 * shell, -shell, width=0.6, srgb=rgb)
     floor = sunlit_scene(window, strength=3.0)
     light = estimated(concatenate([room, floor]), views((0.0, 1.5)))
     main = light.sources[0]
@@ -117,7 +102,7 @@ def test_a_clipped_window_is_a_source_where_it_was_photographed(white):
 
 def test_without_surfaces_to_compare_the_light_is_what_was_photographed():
     shell = even_directions(6000)
-    light = estimated(colored(20 * shell, -shell, 0.6, torch.full((6000, 3), 0.5)), views((0.0, 1.5)))
+    light = estimated(surfels(20 * shell, -shell, width=0.6, srgb=torch.full((6000, 3), 0.5)), views((0.0, 1.5)))
     normals = even_directions(50)
     # sRGB 0.5 is 0.214
     assert torch.allclose(light.irradiance(normals), torch.full((50, 3), 0.214 * math.pi), rtol=0.25)
@@ -149,7 +134,7 @@ def test_a_harmonic_fit_of_half_the_sphere_recovers_an_even_light():
 
 def test_normals_of_a_ball_point_outwards():
     around = even_directions(3000)
-    ball = colored(0.3 * around, around, 0.01, torch.full((3000, 3), 0.5))
+    ball = surfels(0.3 * around, around, width=0.01, srgb=torch.full((3000, 3), 0.5))
     found = estimate_normals(ball, views())
     above = around[:, 2] > -0.2  # the cameras do not see the underside
     # neighbours lie within 3 degrees on the ball
@@ -158,7 +143,7 @@ def test_normals_of_a_ball_point_outwards():
 
 
 def test_split_pieces_look_like_the_whole():
-    one = colored(torch.tensor([[0.0, 0.0, 0.0]]), UP[None], 0.3, torch.tensor([[0.8, 0.4, 0.2]]))
+    one = surfels(torch.tensor([[0.0, 0.0, 0.0]]), UP[None], width=0.3, srgb=(0.8, 0.4, 0.2))
     camera = pinhole(look_at(torch.tensor([[0.0, 0.3, 4.0]]), torch.zeros(3), UP), 160.0, width=96, height=96)
     for opacity in (0.1, 0.5, 0.9):
         whole = Gaussians(one.means, one.log_scales, one.quaternions, torch.logit(torch.tensor([opacity])), one.sh)

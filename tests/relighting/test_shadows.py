@@ -4,15 +4,13 @@ import math
 
 import pytest
 import torch
+from shapes import ring, surfels
 
-from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb
-from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
-from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.relighting import Light, LightSource, RelightOptions, relight
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.rendering import render
@@ -21,17 +19,6 @@ DARK = fit_ambient(torch.full((3,), 1e-6))
 WHOLE = RelightOptions(most_added=0.0, fitted_views=0)
 CENTER = torch.tensor([0.0, 0.0, 0.5])
 RADIUS = 0.3
-
-
-def surfels(points, normals, *, width, gray=0.5) -> Gaussians:
-    n = len(points)
-    return Gaussians(
-        means=points,
-        log_scales=torch.tensor([width, width, 0.1 * width]).log().repeat(n, 1),
-        quaternions=quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
-        opacity_logits=torch.full((n,), 3.0),
-        sh=dc_from_rgb(torch.full((n, 1, 3), gray)),
-    )
 
 
 def floor(half=1.5, count=200, height=0.0) -> Gaussians:
@@ -45,13 +32,11 @@ def floor(half=1.5, count=200, height=0.0) -> Gaussians:
 
 def ball(gray=0.0) -> Gaussians:
     around = even_directions(8000)
-    return surfels(RADIUS * around + CENTER, around, width=0.007, gray=gray)
+    return surfels(RADIUS * around + CENTER, around, width=0.007, srgb=gray)
 
 
 def cameras(height=1.5):
-    turn = torch.arange(12) / 12 * 2 * math.pi
-    eyes = torch.stack([2.5 * turn.cos(), 2.5 * turn.sin(), torch.full((12,), height)], 1)
-    return pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 220.0, width=256, height=192)
+    return ring(height=height, focal=220.0, size=(256, 192))
 
 
 def from_above(*, x=0.0, irradiance=3.0, ambient=DARK, **more) -> Light:
@@ -94,7 +79,7 @@ def test_a_source_is_not_blocked_by_what_the_scene_shows_in_its_place():
     grid = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
     frame = frames_along(-towards[None])[0]
     pane = CENTER + 2.0 * towards + grid @ frame[:2]
-    behind_pane = concatenate([floor(), surfels(pane, -towards.repeat(len(pane), 1), width=0.02, gray=1.0)])
+    behind_pane = concatenate([floor(), surfels(pane, -towards.repeat(len(pane), 1), width=0.02, srgb=1.0)])
     lost, _ = lost_light(relit_ball(light, target=behind_pane))
     expected, _ = lost_light(relit_ball(light))
     assert float(expected.max()) > 0.9

@@ -1,17 +1,13 @@
 """What is known of an object's capture (its light, its normals) is used as it is, instead of an estimate."""
 
-import math
-
 import pytest
 import torch
+from shapes import ring, surfels
 
-from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
-from splatgraft.core.directions import even_directions, frames_along
+from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, empty
-from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
-from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.relighting import Light, LightSource, SourceScene, relight
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.prepared_object import prepare_object
@@ -25,26 +21,13 @@ LIGHT = Light(
 )
 
 
-def surfels(points, normals, width) -> Gaussians:
-    n = len(points)
-    return Gaussians(
-        means=points,
-        log_scales=torch.tensor([width, width, 0.1 * width]).log().repeat(n, 1),
-        quaternions=quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
-        opacity_logits=torch.full((n,), 3.0),
-        sh=dc_from_rgb(torch.full((n, 1, 3), 0.5)),
-    )
-
-
 def ball() -> Gaussians:
     around = even_directions(COUNT)
-    return surfels(0.3 * around, around, 0.012)
+    return surfels(0.3 * around, around, width=0.012)
 
 
 def cameras():
-    turn = torch.arange(8) / 8 * 2 * math.pi
-    eyes = torch.stack([2.5 * turn.cos(), 2.5 * turn.sin(), torch.full((8,), 1.5)], 1)
-    return pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 100.0, width=64, height=48)
+    return ring(8, size=(64, 48))
 
 
 def prepared(source: SourceScene, rotation=QUARTER):
@@ -61,7 +44,7 @@ def test_a_told_light_is_turned_with_the_object_and_needs_no_scene():
 
 
 def test_an_object_told_to_have_stood_in_the_same_light_keeps_its_colours():
-    sky = surfels(20 * even_directions(500), -even_directions(500), 0.1)
+    sky = surfels(20 * even_directions(500), -even_directions(500), width=0.1)
     at = Similarity(1.0, torch.eye(3), torch.zeros(3))
     composite = Composite(sky, (PlacedObject(ball(), at),), torch.zeros(sky.count, dtype=torch.bool))
     relit = relight(composite, cameras(), sources=(SourceScene(empty(), cameras(), light=LIGHT),), light=LIGHT)
@@ -86,7 +69,7 @@ def test_told_normals_must_be_those_of_the_object():
 
 
 def test_a_transfer_tells_what_it_found_of_each_object():
-    sky = surfels(20 * even_directions(500), -even_directions(500), 0.1)
+    sky = surfels(20 * even_directions(500), -even_directions(500), width=0.1)
     at = Similarity(1.0, QUARTER, torch.zeros(3))
     composite = Composite(sky, (PlacedObject(ball(), at),), torch.zeros(sky.count, dtype=torch.bool))
     relit = relight(composite, cameras(), sources=(SourceScene(empty(), cameras(), light=LIGHT),), light=LIGHT)

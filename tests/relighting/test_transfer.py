@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shapes import ring, surfels
 
-from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
 from splatgraft.core.images import linear_from_srgb
-from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
-from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
+from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting import (
     LayerWeights,
     Light,
@@ -34,17 +33,6 @@ SKY = fit_ambient(torch.tensor([0.4, 0.5, 0.6]))
 WHOLE = RelightOptions(most_added=0.0)  # nothing is split: Gaussians can be compared one by one
 
 
-def surfels(points, normals, *, width, rgb=(0.5, 0.5, 0.5)) -> Gaussians:
-    n = len(points)
-    return Gaussians(
-        means=points,
-        log_scales=torch.tensor([width, width, 0.1 * width]).log().repeat(n, 1),
-        quaternions=quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
-        opacity_logits=torch.full((n,), 3.0),
-        sh=dc_from_rgb(torch.tensor(rgb)).repeat(n, 1)[:, None],
-    )
-
-
 def floor(half=2.0, count=90) -> Gaussians:
     x = torch.linspace(-half, half, count)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
@@ -54,14 +42,11 @@ def floor(half=2.0, count=90) -> Gaussians:
 
 def ball(radius=0.3, count=3000, rgb=(0.5, 0.5, 0.5)) -> Gaussians:
     around = even_directions(count)
-    return surfels(radius * around, around, width=1.2 * radius * math.sqrt(4 * math.pi / count) / 2, rgb=rgb)
+    return surfels(radius * around, around, width=1.2 * radius * math.sqrt(4 * math.pi / count) / 2, srgb=rgb)
 
 
 def cameras(center=(0.0, 0.0, 0.0)):
-    turn = torch.arange(12) / 12 * 2 * math.pi
-    eyes = torch.stack([2.5 * turn.cos(), 2.5 * turn.sin(), torch.full((12,), 1.5)], 1) + torch.tensor(center)
-    poses = look_at(eyes, torch.tensor(center), torch.tensor([0.0, 0.0, 1.0]))
-    return pinhole(poses, 100.0, width=128, height=96)
+    return ring(center=center)
 
 
 def sun_from(x, y, z, **more) -> Light:
@@ -234,8 +219,8 @@ def test_a_cached_transfer_equals_a_fresh_one():
 def test_even_lights_change_the_tint_and_a_share_of_the_level():
     # the ball is as bright as one of the expected albedo, 0.3, in the dim light
     shell = even_directions(4000)
-    bright = surfels(20 * shell, -shell, width=0.7, rgb=(0.8, 0.7, 0.6))
-    dim = surfels(20 * shell, -shell, width=0.7, rgb=(0.6, 0.6, 0.6))
+    bright = surfels(20 * shell, -shell, width=0.7, srgb=(0.8, 0.7, 0.6))
+    dim = surfels(20 * shell, -shell, width=0.7, srgb=(0.6, 0.6, 0.6))
     composite = placed((ball(rgb=(0.35, 0.35, 0.35)), at(0.0, 0.0, 0.6)), target=bright)
     relit = relight(composite, cameras(), sources=(SourceScene(dim, cameras()),), options=WHOLE)
     shade = relit.shade[relit.is_object].log()
@@ -255,7 +240,7 @@ def test_shade_takes_the_stated_share_of_the_level():
 
 def test_shading_is_full_where_no_surface_is_sure():
     cloud = replace(ball(), log_scales=torch.full((3000, 3), -3.0))  # round Gaussians: no flatness tells a normal
-    dark = surfels(20 * even_directions(4000), -even_directions(4000), width=0.7, rgb=(0.5, 0.5, 0.5))
+    dark = surfels(20 * even_directions(4000), -even_directions(4000), width=0.7, srgb=(0.5, 0.5, 0.5))
     sources = (SourceScene(dark, cameras()),)
     shades = []
     for body in (cloud, ball()):
@@ -284,7 +269,7 @@ def test_highlights_of_the_old_light_go_where_it_is_known():
 def test_places_without_light_give_the_plain_composite_and_a_reason():
     nothing = placed((ball(), at(0.0, 0.0, 0.35)), target=empty())
     inside = placed((ball(), at(0.0, 0.0, 0.0)), target=ball(radius=0.09, count=2000))
-    night = surfels(20 * even_directions(4000), -even_directions(4000), width=0.7, rgb=(0.0, 0.0, 0.0))
+    night = surfels(20 * even_directions(4000), -even_directions(4000), width=0.7, srgb=(0.0, 0.0, 0.0))
     black = placed((ball(), at(0.0, 0.0, 0.5)), target=night)
     for composite, word in ((nothing, "empty"), (inside, "inside"), (black, "no light")):
         relit = relight(composite, cameras())
@@ -326,7 +311,7 @@ def test_shadow_removal_clears_the_old_place():
     body = apply_gain(ball(), side)  # a ball that was photographed in that light
     shaded = relight(placed((body, at(0.0, 0.0, 0.35)), target=scene), cameras(), light=light, options=WHOLE).shaded()
     around = even_directions(4000)
-    sky = surfels(20 * around, -around, width=0.7, rgb=(0.7, 0.7, 0.7))
+    sky = surfels(20 * around, -around, width=0.7, srgb=(0.7, 0.7, 0.7))
     capture = concatenate([shaded.select(torch.arange(scene.count)), sky])
     before = (rgb_from_dc(capture.sh[: scene.count, 0]) - 0.5).abs().mean()
     # one shadow is weak evidence for a light: an estimate from it alone may remove nothing, and makes nothing worse

@@ -109,7 +109,10 @@ def _draw_lights(folder: Path, relit: Relit, composite: Composite, sources: Sequ
     if relit.estimate is not None and relit.objects:
         center = torch.stack([bounding_sphere(one).center for one in relit.objects]).mean(0)
         write_image(folder / LIGHT_PICTURE, draw_light(relit.estimate, composite.target, center))
-    for i, (one, placed, source) in enumerate(zip(relit.prepared, composite.objects, sources, strict=False), start=1):
+    if not relit.prepared:
+        return  # there was no transfer
+    lit = [(i, p, s) for i, (p, s) in enumerate(zip(composite.objects, sources, strict=True), 1) if p.gaussians.count]
+    for one, (i, placed, source) in zip(relit.prepared, lit, strict=True):
         lighting = one.source_lighting
         if source is not None and lighting is not None and lighting.estimate is not None:
             center = bounding_sphere(placed.gaussians).center

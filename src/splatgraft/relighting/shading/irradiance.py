@@ -23,8 +23,8 @@ class ShadeSettings:
     floor: float = 0.08
     """Share of the mean irradiance that is added to all: interreflections that no sample follows; set by hand."""
     level_share: float = 0.75
-    """Share, in [0, 1], of the mean's gray part (in logarithms) that is applied. 0: both captures were exposed for
-    their own light, and the level of an estimated ratio is wrong by more than it is worth (0.9 stops)."""
+    """Share, in [0, 1], of the mean's gray part (in logarithms) that is applied, as each capture may have been exposed
+    for its own light and the estimated level is uncertain; set by hand on the training scenes."""
     tint_share: float = 1.0
     """Share, in [0, 1], of the mean's tint that is applied."""
     unknown_share: float = 0.5
