@@ -2,7 +2,8 @@
 
 `make exam NUMBER=...` or `python benchmarks/exam NUMBER --out FOLDER`. The scenes follow from the number alone. A
 number is used for one exam: whoever has looked at its scenes may tune to them. Number 0 is for training and never a
-proof. `--scenes-from FOLDER` measures rendered scenes instead.
+proof. `--benchmark` renders and measures the nine scenes of `splatgraft synth benchmark` in the exam's size instead, as
+a regression table, and `--scenes-from FOLDER` scenes that are rendered already.
 
 OUT gets scenes/ (captures and the truth), work/ (reconstructions), results/ (a .json per scene), pictures/ (views one
 above the other: pasted, transfer, told everything, truth), exam.md and exam.json. A run that was stopped goes on where
@@ -31,6 +32,7 @@ from exam.summary import summarize_light, summarize_row, summary_markdown
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
+from splatgraft.synthesis.benchmark import SCENES
 
 _ROOT = Path(__file__).resolve().parents[2]
 
@@ -96,7 +98,8 @@ def main() -> int:
 def _scene_folders(asked: argparse.Namespace) -> Iterator[tuple[str, partial[Path]]]:
     """Name of each scene, and the function that renders what is missing of it and gives its folder."""
     if asked.scenes_from is None:
-        for which in draw_scenes(asked.number, asked.scenes or 12):
+        scenes = SCENES[: asked.scenes] if asked.benchmark else draw_scenes(asked.number, asked.scenes or 12)
+        for which in scenes:
             yield which.name, partial(render_scene, which, asked.out, asked.blender_python, jobs=asked.jobs)
         return
     folders = sorted(path.parent for path in asked.scenes_from.glob("*/placement.json"))
@@ -127,6 +130,8 @@ def _write_report(asked: argparse.Namespace, exam: Exam, results: list[SceneResu
 def _title(asked: argparse.Namespace) -> str:
     if asked.scenes_from is not None:
         return "Scenes that were given: no proof"
+    if asked.benchmark:
+        return "The benchmark's nine scenes: no proof"
     if asked.number == TRAINING_NUMBER:
         return f"Number {asked.number}, for training: no proof"
     return f"Exam {asked.number}"
@@ -152,8 +157,9 @@ def _parse() -> argparse.Namespace:
         prog="python benchmarks/exam", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("number", type=int, nargs="?", help="seeds follow from it; 0 is for training, never a proof")
-    parser.add_argument("--scenes", type=int, help="number of scenes (12, or all that are given)")
+    parser.add_argument("--scenes", type=int, help="number of scenes (12; all of --benchmark and --scenes-from)")
     parser.add_argument("--scenes-from", type=Path, help="folder of rendered scenes, instead of a number")
+    parser.add_argument("--benchmark", action="store_true", help="the nine benchmark scenes, instead of a number")
     parser.add_argument("--out", type=Path, help="folder of everything that is made (build/exam/NUMBER)")
     parser.add_argument("--work", type=Path, help="folder of the reconstructions, to be shared by runs (OUT/work)")
     parser.add_argument("--iterations", type=int, default=1000, help="of each reconstruction (1000)")
@@ -164,8 +170,9 @@ def _parse() -> argparse.Namespace:
         "--blender-python", type=Path, default=_ROOT / ".venv-blender/bin/python", help="made by `make blender`"
     )
     asked = parser.parse_args()
-    if (asked.number is None) == (asked.scenes_from is None):
-        parser.error("expected a NUMBER or --scenes-from FOLDER, found " + ("none" if asked.number is None else "both"))
+    given = [asked.number is not None, asked.benchmark, asked.scenes_from is not None]
+    if sum(given) != 1:
+        parser.error(f"expected a NUMBER, --benchmark or --scenes-from FOLDER, found {sum(given)} of them")
     if asked.out is None:
-        asked.out = _ROOT / "build" / "exam" / ("given" if asked.number is None else str(asked.number))
+        asked.out = _ROOT / "build" / "exam" / (str(asked.number) if given[0] else "benchmark" if given[1] else "given")
     return asked
