@@ -5,14 +5,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shapes import surfels
 
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, empty
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.rotations import quaternion_from_rotation
+from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import basis, colors, dc_from_rgb
+from splatgraft.relighting import SourceScene, relight
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
 from splatgraft.relighting.shading.gloss import gloss_bands
 from splatgraft.relighting.shading.materials import estimate_materials
@@ -116,3 +120,21 @@ def test_a_highlight_moves_to_the_new_light():
 
         # the lobe is known up to belief and blur: a quarter of its amplitude, a sixteenth of the squared error
         assert error(moved) < 0.15 * error(body.sh)
+
+
+@pytest.mark.parametrize("reflectance", [0.5, 0.0])
+def test_the_report_names_a_mirror(reflectance):
+    # bands of degree 3 hold the mirror image of such a sky exactly, so that the sharpest lobe fits best
+    sky = fit_ambient(torch.full((3,), 0.6))
+    sky[2] += 0.8
+    sky[6] += 0.4
+    light = Light(sources=(), ambient=sky)
+    body = ball(light, (reflectance,) * 3, concentration=1000.0)
+    eyes = 2.0 * even_directions(16)
+    cameras = pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.3, 0.1, 1.0])), 100.0, width=64, height=64)
+    far = surfels(20 * even_directions(500), -even_directions(500), width=0.1)
+    placed = PlacedObject(body, Similarity(1.0, torch.eye(3), torch.zeros(3)))
+    composite = Composite(far, (placed,), torch.zeros(far.count, dtype=torch.bool))
+    source = SourceScene(empty(), cameras, light=light, normals=AROUND)
+    report = relight(composite, cameras, sources=(source,), light=lamp(1, 0, 1)).report
+    assert any("is a mirror, whose reflections are only blurred" in line for line in report) == (reflectance > 0)

@@ -9,6 +9,7 @@ from PIL.ExifTags import IFD, Base
 
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import read_rgb
+from splatgraft.formats.captures.exif import exif_of, read_exposure
 from splatgraft.runtime.atomic_file import atomic_write
 
 _EXIF_ORIENTATION = 0x0112
@@ -62,11 +63,11 @@ def _camera_traits(copy: Path) -> tuple[object, ...]:
 
 
 def write_undistorted(copy: Path, path: Path, distortion: Distortion) -> torch.Tensor:
-    """Write the pinhole image of `copy` as JPEG, and give the matrix (3, 3) of that pinhole."""
+    """Write the pinhole image of `copy` as JPEG with its exposure metadata, and give that pinhole's matrix (3, 3)."""
     width, height = distortion.size
     intrinsics = torch.from_numpy(distortion.pinhole())
     pixels = distortion.undistort(read_rgb(copy), intrinsics, width=width, height=height)
     array = (pixels.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     with atomic_write(path) as stream:
-        Image.fromarray(array).save(stream, "JPEG", quality=95, subsampling=0)
+        Image.fromarray(array).save(stream, "JPEG", quality=95, subsampling=0, exif=exif_of(read_exposure(copy)))
     return intrinsics.float()

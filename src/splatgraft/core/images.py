@@ -4,12 +4,14 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image, ImageOps
+from PIL.ExifTags import IFD
 from torch import Tensor
 
 from splatgraft.runtime.atomic_file import atomic_write
@@ -19,6 +21,8 @@ _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 _ALWAYS_ALLOWED_PIXELS = 1 << 24
 _PIXELS_PER_BYTE = 1 << 14
 """Above every real image: a black 1-bit PNG has 8256. Above 179 million pixels Pillow itself refuses."""
+_MEAN_PX = 256
+"""Longest side from which a mean is taken of a file that can be read smaller than it is."""
 _GREY_SCALES = {"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I;16N": 65535, "I": 65535, "F": 1}
 """White in Pillow's modes of more than 8 bits; some versions read a 16-bit PNG as mode I."""
 
@@ -72,6 +76,30 @@ def stored_size(path: Path) -> tuple[int, int]:
     """
     with _opened(path) as image:
         return image.size
+
+
+def mean_luminance(path: Path) -> float:
+    """Mean linear luminance (Rec. 709) of a picture in [0, 1]; a JPEG is read at a small size.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    with _opened(path) as image:
+        image.draft(None, (_MEAN_PX, _MEAN_PX))
+        image.load()
+        linear = linear_from_srgb(_rgb(image)).mean((0, 1))
+    return float(linear @ torch.tensor([0.2126, 0.7152, 0.0722]))
+
+
+def read_exif(path: Path) -> dict[int, Any]:
+    """The camera's EXIF tags of an image file, with Pillow's values; empty where there are none or they are damaged.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    with _opened(path) as image:
+        try:
+            return dict(image.getexif().get_ifd(IFD.Exif))
+        except Exception:  # Pillow's parsers raise more kinds than it documents; damaged metadata tells nothing
+            return {}
 
 
 def has_transparency(path: Path) -> bool:

@@ -15,6 +15,7 @@ from splatgraft.formats.scenes.spz import read_spz, write_spz
 
 __all__ = [
     "is_scene",
+    "list_capture_images",
     "read_cameras",
     "read_capture",
     "read_gaussians",
@@ -128,6 +129,22 @@ def read_cameras(path: Path | str) -> Cameras:
             return cameras_json.read_cameras(path)
         transforms = _transforms_path(path)
         return transforms_json.read_cameras(transforms) if transforms else colmap.read_cameras(path)
+
+
+def list_capture_images(path: Path) -> list[Path]:
+    """The image files of a capture that exist; none for a cameras.json.
+
+    Args:
+        path: As for `read_cameras`.
+
+    Raises:
+        ValueError: There is no capture at `path`, or a file is broken.
+    """
+    with _readable(path):
+        if cameras_json.is_cameras_json(path):
+            return []
+        transforms = _transforms_path(path)
+        return transforms_json.image_files(transforms) if transforms else colmap.image_files(path)
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:

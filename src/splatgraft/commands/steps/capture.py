@@ -1,5 +1,6 @@
 """The command `capture`: photos, a video, a posed capture or a trained scene become a folder with transforms.json."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from splatgraft.capture import (
 from splatgraft.core.images import list_images, write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs, has_poses
+from splatgraft.folders.photo_exposures import exposure_warnings
 from splatgraft.formats import is_scene, read_capture, read_gaussians, write_capture
 from splatgraft.project.step import Context, Inputs, Positional
 
@@ -49,9 +51,12 @@ class Capture:
         elif has_poses(self.capture):
             posed = read_capture(self.capture)
             context.console.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points")
+            self._warn_of_exposures(posed.image_paths, context)
         else:
+            photos = self._photos(folder, context)
+            self._warn_of_exposures(photos, context)
             posed, report = pose_photos(
-                self._photos(folder, context),
+                photos,
                 folder,
                 options=self.options,
                 progress=context.progress,
@@ -80,6 +85,10 @@ class Capture:
             points=found.points,
             point_colors=found.point_colors,
         )
+
+    def _warn_of_exposures(self, photos: Sequence[Path], context: Context) -> None:
+        for warning in exposure_warnings(self.capture, photos):
+            context.console.say(warning)
 
     def _photos(self, folder: Path, context: Context) -> list[Path]:
         if self.capture.is_dir():

@@ -11,6 +11,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import psnr, ssim
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.folders.capture_files import capture_inputs
+from splatgraft.folders.photo_exposures import exposure_warnings
 from splatgraft.formats import read_capture, write_gaussians
 from splatgraft.project.layout import METRICS_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Inputs, Positional, choose_device
@@ -55,6 +56,8 @@ class Reconstruct:
         if self.eval and not options.eval_every:
             options = replace(options, eval_every=EVAL_EVERY)
         context.console.say(f"memory: at most about {predict_memory(capture, options) / 2**30:.1f} GiB")
+        for warning in exposure_warnings(self.capture, capture.image_paths):
+            context.console.say(warning)
         scene = reconstruct(capture, options, progress=context.progress, checkpoint=context.checkpoint)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
         if options.eval_every:

@@ -11,6 +11,7 @@ from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.composite import Composite
 from splatgraft.core.images import write_image
 from splatgraft.folders.composite_folder import placement_files, read_composite
+from splatgraft.folders.photo_exposures import read_luminance_scale
 from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
@@ -18,6 +19,7 @@ from splatgraft.project.layout import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_PICTURE,
 from splatgraft.project.step import Context, Inputs
 from splatgraft.relighting.gain_transfer import relight_by_gain
 from splatgraft.relighting.layers import LayerWeights, Relit
+from splatgraft.relighting.level_check import describe_level
 from splatgraft.relighting.light.light import Light, light_from_json, light_to_json
 from splatgraft.relighting.light.light_picture import draw_light
 from splatgraft.relighting.transfer import RelightOptions, SourceScene, relight
@@ -73,7 +75,8 @@ class Relight:
             cameras, sources = read_cameras(self.cameras), self._sources()
             relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
             found = relit.light
-            (gaussians, is_object), sentences = relit.bake(self.weights), relit.report
+            gaussians, is_object = relit.bake(self.weights)
+            sentences = (*relit.report, *self._level(relit))
             _draw_lights(folder, relit, composite, sources)
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_selection(folder / IS_OBJECT_FILE, is_object)
@@ -82,6 +85,14 @@ class Relight:
             (folder / LIGHT_FILE).write_text(light_to_json(found))
         for sentence in sentences:
             context.console.say(sentence)
+
+    def _level(self, relit: Relit) -> tuple[str, ...]:
+        """What the exposure metadata of both captures says of the level; their photos are no inputs, as only this
+        depends on them."""
+        if self.object_cameras is None:
+            return ()
+        target, source = read_luminance_scale(self.cameras), read_luminance_scale(self.object_cameras)
+        return () if target is None or source is None else describe_level(relit, target=target, source=source)
 
     def _given(self) -> Light | None:
         if self.given_light is None:

@@ -75,6 +75,14 @@ def read_cameras(folder: Path) -> Cameras:
     return cameras_of([fitted_to_file(view, source) for view in _views(model, images, folder)], source)[0]
 
 
+def image_files(folder: Path) -> list[Path]:
+    """The image files of the largest model that exist.
+
+    Raises: ValueError where no whole model is there.
+    """
+    return [view.image_path for view in _views(*_largest_model(folder), folder) if view.image_path]
+
+
 def _model_folders(folder: Path) -> list[Path]:
     found = [
         path

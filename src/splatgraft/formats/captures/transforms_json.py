@@ -54,6 +54,14 @@ def read_cameras(path: Path) -> Cameras:
     return cameras_of([fitted_to_file(view, path) for view in _views(path, _load(path))], path)[0]
 
 
+def image_files(path: Path) -> list[Path]:
+    """The image files that a transforms.json names and that exist.
+
+    Raises: ValueError where the file is missing or broken.
+    """
+    return [view.image_path for view in _views(path, _load(path)) if view.image_path]
+
+
 def _load(path: Path) -> dict[str, Any]:
     meta = load(path)
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list):
