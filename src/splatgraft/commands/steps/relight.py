@@ -91,7 +91,10 @@ class Relight:
         depends on them."""
         if self.object_cameras is None:
             return ()
-        target, source = read_luminance_scale(self.cameras), read_luminance_scale(self.object_cameras)
+        try:
+            target, source = read_luminance_scale(self.cameras), read_luminance_scale(self.object_cameras)
+        except ValueError as error:  # the transfer itself needs no photo
+            return (f"The photos' exposure was not compared with the light: {error}.",)
         return () if target is None or source is None else describe_level(relit, target=target, source=source)
 
     def _given(self) -> Light | None:
