@@ -6,6 +6,7 @@ import pytest
 import torch
 from shapes import ring, surfels
 
+from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate
@@ -13,6 +14,8 @@ from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting import Light, LightSource, RelightOptions, relight
 from splatgraft.relighting.light.light import fit_ambient
+from splatgraft.relighting.shadows.light_sampling import sample_light
+from splatgraft.relighting.shadows.scene_ratio import object_shadow_maps, scene_ratio
 from splatgraft.rendering import render
 
 DARK = fit_ambient(torch.full((3,), 1e-6))
@@ -146,3 +149,21 @@ def test_the_shadow_is_darkest_at_the_foot():
     assert found == sorted(found, reverse=True)
     # 0.05: 32 samples of the sky, and a bias of a texel or two under the ball
     assert found == pytest.approx([float(truth[ring].mean()) for ring in rings], abs=0.05)
+
+
+def test_an_even_sky_leaves_no_light_where_a_ball_touches_the_floor():
+    """Closed form: a sphere on a plane takes R^3 / d^3 of the irradiance, d from its centre to the point."""
+    light = Light(sources=(), ambient=fit_ambient(torch.full((3,), 1.0)))
+    samples = sample_light(light)
+    maps = object_shadow_maps(ball(), bounding_sphere(ball()), samples)
+    away = RADIUS * torch.tensor([0.1, 0.2, 0.3, 0.5, 1.0])
+    turn = torch.arange(24) / 24 * 2 * math.pi
+    touching = float(CENTER[2]) - RADIUS
+    x, y = away[:, None] * turn.cos(), away[:, None] * turn.sin()
+    points = torch.stack([x, y, torch.full_like(x, touching)], -1).reshape(-1, 3)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(points), 1)
+    ratio = scene_ratio(maps, points, up, sample_visibility=torch.ones(len(points), len(samples)))
+    found = ratio.shadow.mean(1).reshape(len(away), -1).mean(1)
+    truth = 1 - (1 + (away / RADIUS) ** 2) ** -1.5
+    # 32 directions stand for the whole sky, so a cone of 0.35 rad leaves a part of its rim; and `darkest` is left
+    torch.testing.assert_close(found, truth, rtol=0, atol=0.05)

@@ -160,8 +160,9 @@ def _assembled(
 ) -> Relit:
     """The layers of all Gaussians, in the order of the baked composite; pieces where their whole was."""
     budget = max(int(options.most_added * baked.count), _LEAST_BUDGET) if options.most_added > 0 else 0
-    receivers, ratio = _on_scene(scene, objects, cameras, budget=budget, degree=baked.sh_degree)
     scene_count = scene.scene.count
+    pressed = baked.select(torch.arange(scene_count))
+    receivers, ratio = _on_scene(scene, pressed, objects, cameras, budget=budget)
     rest = torch.ones(scene_count, dtype=torch.bool)
     rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
@@ -193,11 +194,11 @@ def _assembled(
 
 
 def _on_scene(
-    scene: PreparedScene, objects: list[_LitObject], cameras: Cameras, *, budget: int, degree: int
+    scene: PreparedScene, pressed: Gaussians, objects: list[_LitObject], cameras: Cameras, *, budget: int
 ) -> tuple[Receivers, SceneRatio]:
     """The receivers that some object reaches, split where needed, and the product of all objects' ratios on them.
 
-    The ratios are fitted to what `cameras` see.
+    `pressed` is the scene as it is drawn, flat around the objects' feet; the ratios are fitted to what `cameras` see.
     """
     points, rims = scene.receivers.means, RIM * scene.receivers.scales.max(1).values
     reached = torch.zeros(len(points), dtype=torch.bool)
@@ -205,7 +206,7 @@ def _on_scene(
         sphere, farthest = one.prepared.sphere, scene.maps.region.radius
         reached |= reachable(points, sphere, scene.samples, farthest=farthest, rims=rims)
     receivers = Receivers(
-        gaussians=scene.receivers.select(reached).with_sh_degree(degree),
+        gaussians=pressed.select(scene.receiver_indices[reached]),
         normals=scene.normals.vectors[reached],
         sample_visibility=scene.sample_visibility[reached],
         surface=scene.surface[reached],
@@ -237,9 +238,9 @@ def _on_scene(
             grey = grey * (found.shadow + found.bounce).mean(1)
         return grey
 
-    rest = torch.ones(scene.scene.count, dtype=torch.bool)
+    rest = torch.ones(pressed.count, dtype=torch.bool)
     rest[receivers.origin] = False
-    return receivers, fit_to_views(receivers, total, scene.scene.select(rest), cameras, ratio_at=ratio_at)
+    return receivers, fit_to_views(receivers, total, pressed.select(rest), cameras, ratio_at=ratio_at)
 
 
 def _glosses(objects: list[_LitObject], gaussians: Gaussians) -> Float[Tensor, "m k 3"]:

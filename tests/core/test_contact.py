@@ -1,0 +1,194 @@
+"""Contact: a thick floor does not cover the foot of what stands on it, and everything else keeps every bit."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from shapes import surfels
+
+from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.composite import Composite, PlacedObject
+from splatgraft.core.contact import press_supports
+from splatgraft.core.directions import even_directions
+from splatgraft.core.gaussians import Gaussians, concatenate, empty
+from splatgraft.core.rotations import rotation_about
+from splatgraft.core.similarity import Similarity
+from splatgraft.rendering import view_operator
+
+RADIUS = 0.3
+NOISE = 0.03
+"""Standard deviation of the heights of the floor's centres."""
+THICKNESS = 0.02
+"""Standard deviation of each along the normal."""
+
+
+def ball(height=0.0, center=(0.0, 0.0)) -> Gaussians:
+    """A ball whose lowest point is `height` over the floor."""
+    around = even_directions(4000)
+    return surfels(RADIUS * around + torch.tensor([*center, RADIUS + height]), around, width=0.01)
+
+
+def box() -> Gaussians:
+    """The four walls of a box of half width 0.2 and height 0.4 on the floor, seen by all cameras as a capture shows it:
+    without the bottom."""
+    along, up = torch.meshgrid(torch.linspace(-0.2, 0.2, 41), torch.linspace(0.005, 0.4, 40), indexing="ij")
+    walls = []
+    for turn in range(4):
+        rotation = rotation_about(torch.tensor([0.0, 0.0, 1.0]), turn * torch.pi / 2)
+        points = torch.stack([torch.full_like(along, 0.2), along, up], -1).reshape(-1, 3) @ rotation.T
+        walls.append(surfels(points, rotation[:, 0].repeat(len(points), 1), width=0.01))
+    return concatenate(walls)
+
+
+def floor(half=2.0, count=160) -> Gaussians:
+    """A thick, noisy floor in the plane z = 0."""
+    x = torch.linspace(-half, half, count)
+    grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    z = NOISE * torch.randn(len(grid), 1, generator=torch.Generator().manual_seed(0))
+    up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(grid), 1)
+    return surfels(torch.cat([grid, z], 1), up, width=0.03, thickness=THICKNESS)
+
+
+def wall() -> Gaussians:
+    """A wall of the same kind in the plane x = -0.4, 0.1 away from the ball."""
+    turn = rotation_about(torch.tensor([0.0, 1.0, 0.0]), torch.pi / 2)
+    return Similarity(1.0, turn, torch.tensor([-0.4, 0.0, 0.0])).gaussians(floor())
+
+
+def same_bits(one, other):
+    return all(torch.equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(Gaussians))
+
+
+def low_view():
+    """A camera 15 degrees above the floor."""
+    eye, middle = torch.tensor([[2.9, 0.0, 0.8]]), torch.tensor([0.0, 0.0, 0.1])
+    return pinhole(look_at(eye, middle, torch.tensor([0.0, 0.0, 1.0])), 300.0, width=128, height=96)
+
+
+def shown(thing, target) -> tuple[torch.Tensor, torch.Tensor]:
+    """Share of each pixel that an object makes up, with the target as a composite draws it and without."""
+    placed = (PlacedObject(thing, Similarity.identity()),)
+    scene, is_object = Composite(target, placed, torch.zeros(target.count, dtype=torch.bool)).bake()
+    camera = low_view()
+    inside = view_operator(scene, camera).blend(is_object.float()[:, None])[..., 0]
+    return inside, view_operator(thing, camera).alpha
+
+
+@pytest.mark.parametrize("thing", [box, ball], ids=["box", "ball"])
+def test_the_foot_on_a_thick_floor_is_seen_from_the_side_as_without_a_floor(thing):
+    inside, alone = shown(thing(), floor())
+    middle = slice(56, 72)
+    hidden = (alone - inside).sum(0)[middle]
+    # of 100 px per unit, three deviations of heights are 0.11, pressed to a fifth 2 px; two widths of the Gaussians in
+    # the plane are 0.06, at 15 degrees 1.6 px. Not pressed, the floor hides 9 px of the box.
+    assert float(hidden.max()) < 3.6
+    # above that nothing is hidden
+    assert float((alone - inside)[:56, middle].max()) < 0.01
+
+
+def test_far_gaussians_keep_every_bit_and_near_ones_their_colour_and_opacity():
+    target = floor()
+    pressed = press_supports(target, [ball()])
+    changed = (pressed.means != target.means).any(1)
+    away = target.means[:, :2].norm(dim=1)
+    assert int(changed.sum()) > 50
+    # twice the radius of the bounding sphere and twice the width of the Gaussians
+    assert float(away[changed].max()) < 2.2 * (RADIUS + 0.05)
+    assert same_bits(pressed.select(~changed), target.select(~changed))
+    assert torch.equal(pressed.sh, target.sh)
+    assert torch.equal(pressed.opacity_logits, target.opacity_logits)
+
+
+def test_centres_move_along_the_normal_and_heights_shrink_by_one_factor():
+    target = floor()
+    pressed = press_supports(target, [box()])
+    aside = target.means[:, :2].abs().amax(1)
+    inside = (aside > 0.15) & (aside < 0.19) & (target.means[:, 2].abs() < 0.06)
+    before, after = target.means[inside], pressed.means[inside]
+    # the fitted plane is tilted by less than noise / (reach x sqrt(n)) = 0.03 / (0.3 x 30): 0.003 of the 0.1 moved
+    torch.testing.assert_close(after[:, :2], before[:, :2], rtol=0, atol=0.001)
+    factor = after[:, 2].std() / before[:, 2].std()
+    assert float(factor) < 0.25
+    widths = pressed.scales[inside].min(1).values
+    torch.testing.assert_close(widths, torch.full_like(widths, 0.2 * THICKNESS), rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize("height", [0.2, 1.0])
+def test_nothing_changes_below_a_floating_ball(height):
+    target = floor()
+    assert press_supports(target, [ball(height)]) is target
+
+
+def test_nothing_changes_without_a_surface_an_object_or_anything_opaque():
+    target = floor()
+    cloud = replace(target, means=torch.rand(target.count, 3, generator=torch.Generator().manual_seed(1)) - 0.5)
+    faint = replace(ball(), opacity_logits=torch.full((4000,), -5.0))
+    assert press_supports(cloud, [ball(-RADIUS)]) is cloud
+    assert press_supports(target, [empty(), faint]) is target
+    assert press_supports(target, []) is target
+    assert press_supports(empty(), [ball()]).count == 0
+
+
+def test_no_hole_is_dug_for_a_buried_ball():
+    target = floor()
+    pressed = press_supports(target, [ball(-RADIUS)])
+    deviation = (NOISE**2 + THICKNESS**2) ** 0.5
+    moved = pressed.means[:, 2] - target.means[:, 2]
+    # the upper Gaussians come down to one deviation below the middle: from three above at most
+    assert float(moved.min()) > -4.1 * deviation
+    assert float(pressed.means[:, 2].min()) >= float(target.means[:, 2].min())
+
+
+def test_a_wall_beside_the_object_is_not_pressed():
+    both = concatenate([floor(), wall()])
+    higher = (torch.arange(both.count) >= floor().count) & (both.means[:, 2] > 0.2)
+    pressed = press_supports(both, [ball()])
+    assert same_bits(pressed.select(higher), both.select(higher))
+    assert not same_bits(pressed, both)
+
+
+def test_a_leaf_that_lies_on_the_floor_and_two_objects_are_safe():
+    leaf = surfels(
+        ball().means * torch.tensor([1.0, 1.0, 0.001]), torch.tensor([[0.0, 0.0, 1.0]]).repeat(4000, 1), width=0.01
+    )
+    far = ball(center=(1.2, 0.0))
+    target = floor()
+    pressed = press_supports(target, [leaf, far])
+    assert bool(pressed.means.isfinite().all())
+    assert bool(pressed.log_scales.isfinite().all())
+    for one in (leaf, far):
+        alone = press_supports(target, [one])
+        changed = (alone.means != target.means).any(1)
+        assert bool((pressed.means != target.means).any(1)[changed].all())
+
+
+def test_a_book_on_the_table_beside_the_foot_keeps_its_shape():
+    x, y = torch.meshgrid(torch.linspace(0.35, 0.6, 40), torch.linspace(-0.2, 0.2, 60), indexing="ij")
+    top = torch.stack([x, y, torch.full_like(x, 0.09)], -1).reshape(-1, 3)
+    book = surfels(top, torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(top), 1), width=0.01)
+    both = concatenate([floor(), book])
+    pressed = press_supports(both, [ball()])
+    moved = (pressed.means - both.means).norm(dim=1)[-book.count :]
+    inner = (top[:, 0] > 0.4) & (top[:, 0] < 0.55) & (top[:, 1].abs() < 0.15)
+    # its edge counts in part, as the floor is next to it
+    assert float(moved[inner].max()) == 0.0
+
+
+def test_a_cup_on_the_table_beside_the_foot_keeps_its_shape():
+    turn, up = torch.meshgrid(torch.arange(40) / 40 * 2 * torch.pi, torch.linspace(0, 0.3, 30), indexing="ij")
+    outward = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1).reshape(-1, 3)
+    wall_ = 0.08 * outward + torch.stack([torch.full_like(up, 0.4), torch.zeros_like(up), up], -1).reshape(-1, 3)
+    cup = surfels(wall_, outward, width=0.01)
+    both = concatenate([floor(), cup])
+    pressed = press_supports(both, [ball()])
+    assert same_bits(pressed.select(torch.arange(both.count) >= floor().count), cup)
+
+
+def test_the_result_does_not_depend_on_frame_and_scale():
+    target, thing = floor(), box()
+    move = Similarity(3.0, rotation_about(torch.tensor([0.6, 0.0, 0.8]), 0.7), torch.tensor([5.0, -2.0, 1.0]))
+    expected = move.gaussians(press_supports(target, [thing]))
+    found = press_supports(move.gaussians(target), [move.gaussians(thing)])
+    # float32 at coordinates up to 10: 1e-6 each
+    torch.testing.assert_close(found.means, expected.means, rtol=0, atol=2e-4)
+    torch.testing.assert_close(found.covariances, expected.covariances, rtol=1e-2, atol=1e-5)
