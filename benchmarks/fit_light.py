@@ -1,21 +1,25 @@
 """Fits the numbers of the light estimate over rendered scenes with known light, and checks them across scenes.
 
-`python benchmarks/fit_light.py SCENES [SCENES ...] --work FOLDER [--minutes M] [--folds F] [--out FILE]`, where SCENES
-are folders of scenes as `python benchmarks/exam` renders them. The objective, in stops: the mean over places of the RMS
-over 200 normals of log2(estimated / true irradiance), plus half of the same RMS of the ratio of both places. Numbers
-are changed a few at a time by random factors, and a change is kept where the objective falls. With folds, the numbers
-are fitted as often without one part of the scenes, and the objective of the part left out is printed.
+    python benchmarks/fit_light.py SCENES [SCENES ...] --work FOLDER [FOLDER ...] --evidence FOLDER
+
+SCENES are folders of scenes as `python benchmarks/exam` renders them. The objective, in stops: the mean over places of
+the RMS over 200 normals of log2(estimated / true irradiance), plus half of the same RMS of the ratio of both places.
+Numbers are changed a few at a time by random factors, and a change is kept where the objective falls. With `--folds`,
+the numbers are fitted as often without one part of the scenes, and the objective of the part left out is printed. What
+the fit needs of the scenes is kept in files (`--evidence`), and read from there by later runs.
 """
 
 import argparse
 import json
 import math
+import multiprocessing
 import random
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -56,6 +60,8 @@ FACTORS = {
 """Standard deviation of each number's random factor."""
 SHIFTS = {"sky_bias": 0.3}
 """The same of a number that may be negative, added."""
+_WORSE = 0.01
+"""Stops by which a change may be worse on half of the scenes before it is dropped."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,11 @@ class TrainingPlace:
     """Gray irradiance on `NORMALS`."""
 
 
-def places_of(scene: ExamScene) -> tuple[TrainingPlace, TrainingPlace]:
+Pair: TypeAlias = tuple[TrainingPlace, TrainingPlace]
+"""The new and the old place of a scene."""
+
+
+def places_of(scene: ExamScene) -> Pair:
     """The new and the old place."""
     placed, source = scene.composite.objects[0], scene.source
     new = fit_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
@@ -92,13 +102,37 @@ def log_irradiance(place: TrainingPlace, numbers: dict[str, float]) -> Float[Ten
     return irradiance_of(radiance.mean(1), NORMALS).clamp_min(1e-6).log2()
 
 
-def errors(scenes: Sequence[tuple[TrainingPlace, TrainingPlace]], numbers: dict[str, float]) -> Float[Tensor, "s 3"]:
-    """Per scene the RMS in stops at the new place, at the old one, and of the ratio."""
-    rows = []
-    for pair in scenes:
-        away = [log_irradiance(place, numbers) - place.truth.log2() for place in pair]
-        rows.append([float(e.pow(2).mean().sqrt()) for e in (*away, away[0] - away[1])])
-    return torch.tensor(rows)
+def scene_errors(pair: Pair, numbers: dict[str, float]) -> list[float]:
+    """The RMS in stops at the new place, at the old one, and of the ratio."""
+    away = [log_irradiance(place, numbers) - place.truth.log2() for place in pair]
+    return [float(e.pow(2).mean().sqrt()) for e in (*away, away[0] - away[1])]
+
+
+class Scenes:
+    """Scenes whose errors are computed by several processes, which inherit the evidence."""
+
+    def __init__(self, pairs: dict[str, Pair], jobs: int) -> None:
+        """Start `jobs` processes."""
+        self.names = list(pairs)
+        self._pairs = list(pairs.values())
+        self._pool = multiprocessing.get_context("fork").Pool(jobs, _start, (self._pairs,))
+
+    def errors(self, numbers: dict[str, float], which: Sequence[int] | None = None) -> Float[Tensor, "s 3"]:
+        """Of some scenes, or of all."""
+        which = range(len(self.names)) if which is None else which
+        return torch.tensor(self._pool.starmap(_errors_of, [(i, numbers) for i in which], chunksize=1))
+
+
+_INHERITED: list[Pair] = []
+
+
+def _start(pairs: list[Pair]) -> None:
+    torch.set_num_threads(1)
+    _INHERITED[:] = pairs
+
+
+def _errors_of(index: int, numbers: dict[str, float]) -> list[float]:
+    return scene_errors(_INHERITED[index], numbers)
 
 
 def objective(found: Float[Tensor, "s 3"]) -> float:
@@ -107,11 +141,16 @@ def objective(found: Float[Tensor, "s 3"]) -> float:
 
 
 def fit(
-    scenes: Sequence[tuple[TrainingPlace, TrainingPlace]], numbers: dict[str, float], *, minutes: float, seed: int
+    scenes: Scenes, which: Sequence[int], numbers: dict[str, float], *, minutes: float, seed: int
 ) -> dict[str, float]:
-    """The best numbers that a random search finds in the time."""
+    """The best numbers for some scenes that a random search finds in the time.
+
+    A change that is worse on every second scene is not tried on the others.
+    """
     rng, end = random.Random(seed), time.monotonic() + 60 * minutes
-    best = objective(errors(scenes, numbers))
+    first, rest = list(which[::2]), list(which[1::2])
+    known = [scenes.errors(numbers, part) for part in (first, rest)]
+    best = objective(torch.cat(known))
     print(f"start {best:.3f}", flush=True)
     while time.monotonic() < end:
         changed = dict(numbers)
@@ -120,10 +159,14 @@ def fit(
                 changed[name] = round(numbers[name] + rng.gauss(0, SHIFTS[name]), 3)
             else:
                 changed[name] = float(f"{numbers[name] * math.exp(rng.gauss(0, math.log(FACTORS[name]))):.3g}")
-        value = objective(errors(scenes, changed))
+        found = [scenes.errors(changed, first)]
+        if objective(found[0]) > objective(known[0]) + _WORSE:
+            continue
+        found.append(scenes.errors(changed, rest))
+        value = objective(torch.cat(found))
         if value < best:
             moved = {name: v for name, v in changed.items() if v != numbers[name]}
-            best, numbers = value, changed
+            best, numbers, known = value, changed, found
             print(f"{best:.4f} {moved}", flush=True)
     return numbers
 
@@ -133,6 +176,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
     parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
+    parser.add_argument("--evidence", type=Path, required=True, help="folder of what the fit needs of each scene")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--minutes", type=float, default=10.0, help="of every fit; 0 measures today's numbers")
     parser.add_argument("--folds", type=int, default=0, help="parts of the cross-validation; 0: none")
     parser.add_argument("--out", type=Path, help="receives the numbers as JSON")
@@ -140,23 +185,32 @@ def main() -> None:
     parser.add_argument("--start", type=Path, help="numbers to start from, as --out writes them")
     options = parser.parse_args()
     sizes = ReconstructOptions(iterations=1000, budget=20_000)
-    scenes = {}
+    pairs = {}
     for folder, work in zip(options.scenes, options.work, strict=True):
         for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file()):
-            scenes[path.name] = places_of(read_scene(path, work / path.name, sizes, Console()))
+            kept = options.evidence / f"{path.name}.pt"
+            if not kept.is_file():
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                torch.save(places_of(read_scene(path, work / path.name, sizes, Console())), kept)
+            pairs[path.name] = torch.load(kept, weights_only=False)
+    scenes = Scenes(pairs, options.jobs)
+    everything = range(len(pairs))
     numbers = {**asdict(RadianceSettings()), "temperature": SearchSettings().temperature}
     numbers = {name: numbers[name] for name in (*FACTORS, *SHIFTS)}
     if options.start is not None:
         numbers |= json.loads(options.start.read_text())
     for fold in range(options.folds):
-        inside = [pair for i, pair in enumerate(scenes.values()) if i % options.folds != fold]
-        outside = [pair for i, pair in enumerate(scenes.values()) if i % options.folds == fold]
-        found = fit(inside, numbers, minutes=options.minutes, seed=options.seed + fold)
-        print(f"fold {fold}: fitted {objective(errors(inside, found)):.3f}", end=" ")
-        print(f"left out {objective(errors(outside, found)):.3f} (before {objective(errors(outside, numbers)):.3f})")
-    found = fit(list(scenes.values()), numbers, minutes=options.minutes, seed=options.seed)
-    for name, row in zip(scenes, errors(list(scenes.values()), found), strict=True):
+        inside = [i for i in everything if i % options.folds != fold]
+        outside = [i for i in everything if i % options.folds == fold]
+        found = fit(scenes, inside, numbers, minutes=options.minutes, seed=options.seed + fold)
+        print(f"fold {fold}: fitted {objective(scenes.errors(found, inside)):.3f}", end=" ")
+        left = [objective(scenes.errors(one, outside)) for one in (found, numbers)]
+        print(f"left out {left[0]:.3f} (before {left[1]:.3f}) {json.dumps(found)}", flush=True)
+    found = fit(scenes, everything, numbers, minutes=options.minutes, seed=options.seed)
+    rows = scenes.errors(found)
+    for name, row in zip(scenes.names, rows, strict=True):
         print(f"{name:20s} new {row[0]:.2f} old {row[1]:.2f} ratio {row[2]:.2f}")
+    print(f"objective {objective(rows):.3f}, means {[round(v, 3) for v in rows.mean(0).tolist()]}")
     print(json.dumps(found))
     if options.out is not None:
         options.out.write_text(json.dumps(found, indent=1) + "\n")

@@ -58,7 +58,7 @@ class RadianceSettings:
     """Degrees of freedom of that error; set by hand, as the fit does not tell it from the scale."""
     effective: float = 50.0
     """Independent receivers that all are worth: neighbours share their errors."""
-    near: float = 0.66
+    near: float = 1.0
     """Radii of the surroundings: standard deviation of the weight of surfaces by their distance; the light is that at
     the object."""
     highlights: float = 105.0
@@ -230,8 +230,9 @@ def radiance_problem(
     unseen = (torch.maximum(1 - far.seen, 1 - around.seen) > _UNSEEN).nonzero()[:, 0]
     clipped = (far.clipped > _PRESENT).nonzero()[:, 0]
     shares = torch.cat([1 - far.seen[unseen], far.clipped[clipped]]).clamp_min(0).double()
-    transport = evidence.transport.double()
-    label = _patch_labels(clipped)
+    transport = evidence.transport(_distances(far)).double()
+    blocked = (1 - transport.sum(1)).clamp_min(0)
+    label = _patch_labels(clipped, up)
     mean_color = (evidence.weights[:, None] * evidence.colors).sum(0).mean()
     weights = (evidence.weights * torch.exp(-0.5 * (evidence.distance / s.near) ** 2)).double()
     weights *= s.effective / weights.sum().clamp_min(1e-12)
@@ -249,7 +250,7 @@ def radiance_problem(
         transport=transport[:, torch.cat([unseen, clipped])] * shares,
         shares=shares,
         shares_at_object=torch.cat([1 - around.seen[unseen], found.visible_sources[clipped]]).clamp_min(0).double(),
-        known=transport @ far.radiance.mean(1).double() + evidence.blocked.double() * float(mean_color),
+        known=transport @ far.radiance.mean(1).double() + blocked * float(mean_color),
         log_color=evidence.colors.mean(1).double().log(),
         weights=weights,
         is_white=evidence.colors.max(1).values > 0.9,
@@ -258,6 +259,11 @@ def radiance_problem(
         connected=label[:, None] == label[None],
         patches=_patches(far, clipped, label, up)[:most_patches],
     )
+
+
+def _distances(far: Surroundings) -> Float[Tensor, "k"]:
+    """World units to what shines from each direction; infinite where nothing was seen."""
+    return torch.where(far.seen > 0, far.distance, math.inf)
 
 
 def seen_sky(far: Surroundings, up: Float[Tensor, "3"], otherwise: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
@@ -271,10 +277,11 @@ def seen_sky(far: Surroundings, up: Float[Tensor, "3"], otherwise: Float[Tensor,
     return ((weights / weights.sum())[:, None] * radiance.clamp_min(1e-3).log()).sum(0).exp()
 
 
-def _patch_labels(clipped: Int[Tensor, "x"]) -> Int[Tensor, "x"]:
-    """One label per connected set of directions."""
+def _patch_labels(clipped: Int[Tensor, "x"], up: Float[Tensor, "3"]) -> Int[Tensor, "x"]:
+    """One label per connected set of directions; a window is not connected with its reflection on a table below it."""
     towards = DIRECTIONS[clipped]
-    touching = towards @ towards.T > _TOUCHING
+    above = towards @ up > _LOWEST
+    touching = (towards @ towards.T > _TOUCHING) & (above[:, None] == above)
     label = torch.arange(len(clipped))
     for _ in range(len(clipped)):
         spread = torch.where(touching, label[None], len(clipped)).min(1).values

@@ -18,9 +18,14 @@ from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.k_means import k_means
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting.light.material_groups import log_chromaticity
-from splatgraft.relighting.light.surroundings import DIRECTIONS
+from splatgraft.relighting.light.surroundings import DIRECTIONS, nearest_directions
 from splatgraft.relighting.shading.normals import Normals
 from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occluders_of, splat_depth_maps, visibility
+
+_CHUNK = 100
+"""Receivers at a time; bounds memory."""
+_FARTHEST = 1e4
+"""World units; what shines from farther away is as if it were infinitely far."""
 
 
 @dataclass(frozen=True)
@@ -63,15 +68,16 @@ class ShadingEvidenceSettings:
 
 @dataclass(frozen=True)
 class ShadingEvidence:
-    """m receivers around a place and the transport of light from the k `DIRECTIONS` to them."""
+    """m receivers around a place, and what blocks the light from the k `DIRECTIONS` to them."""
 
+    region: BoundingSphere
+    """They lie within it; its middle is the place."""
     points: Float[Tensor, "m 3"]
     """Centres, world units."""
-    distance: Float[Tensor, "m"]
-    """From the middle of the region, in its radii."""
-    transport: Float[Tensor, "m k"]
-    """Visibility times cosine, scaled so that an open surface's row sums to 1: transport @ radiance is the radiance of
-    a white surface."""
+    normals: Float[Tensor, "m 3"]
+    """Unit."""
+    visibility: Float[Tensor, "m k"]
+    """In [0, 1]."""
     colors: Float[Tensor, "m 3"]
     """Linear rgb."""
     weights: Float[Tensor, "m"]
@@ -80,9 +86,34 @@ class ShadingEvidence:
     """Group of each receiver, from 0."""
 
     @property
-    def blocked(self) -> Float[Tensor, "m"]:
-        """Share of the light of an even sky that other surfaces block, in [0, 1]."""
-        return (1 - self.transport.sum(1)).clamp_min(0)
+    def distance(self) -> Float[Tensor, "m"]:
+        """From the middle of the region, in its radii."""
+        return (self.points - self.region.center).norm(dim=1) / self.region.radius
+
+    def transport(self, distances: Float[Tensor, "k"] | None = None) -> Float[Tensor, "m k"]:
+        """Visibility times cosine, scaled so that an open surface's row sums to 1.
+
+        transport @ radiance is the radiance of a white surface.
+
+        Args:
+            distances: World units, from the middle of the region to what shines from each of the `DIRECTIONS`: other
+                places see it in other directions, and larger where it is nearer. Infinitely far where not given.
+        """
+        if distances is None:
+            return _transported(self.visibility, (self.normals @ DIRECTIONS.T).clamp_min(0))
+        lights = self.region.center + DIRECTIONS * distances.clamp(self.region.radius, _FARTHEST)[:, None]
+        rows = [self._near_transport(part, lights) for part in torch.arange(len(self.points)).split(_CHUNK)]
+        return torch.cat(rows) if rows else self.visibility
+
+    def _near_transport(self, part: Int[Tensor, "p"], lights: Float[Tensor, "k 3"]) -> Float[Tensor, "p k"]:
+        """Of some receivers, for lights at places in world units."""
+        away = lights - self.points[part, None]
+        apart = away.norm(dim=2, keepdim=True).clamp_min(1e-6)
+        towards = away / apart
+        cosine = (towards * self.normals[part, None]).sum(2).clamp_min(0)
+        size = ((lights - self.region.center).norm(dim=1) / apart[..., 0]) ** 2
+        seen = self.visibility[part].gather(1, nearest_directions(towards.reshape(-1, 3)).reshape(cosine.shape))
+        return _transported(seen, cosine * size)
 
 
 def find_shading_evidence(
@@ -102,31 +133,36 @@ def find_shading_evidence(
     """
     chosen = _receivers(scene, normals, region, settings)
     if len(chosen) < settings.fewest:
-        return _nothing()
+        return _nothing(region)
     points, facing = scene.means[chosen], normals.vectors[chosen]
     colors = linear_from_srgb(rgb_from_dc(scene.sh[chosen, 0]).clamp(settings.darkest, 1))
-    lit = _lit(_occluders(scene, region, settings), points, facing, region=region, settings=settings)
-    transport = lit / (facing @ DIRECTIONS.T).clamp_min(0).sum(1, keepdim=True)
+    visible = _visibility(_occluders(scene, region, settings), points, facing, region=region, settings=settings)
+    open_ = _transported(visible, (facing @ DIRECTIONS.T).clamp_min(0)).sum(1)
     area = scene.scales[chosen].sort(1).values[:, 1:].prod(1)
     certain = scene.opacities[chosen] * normals.confidence[chosen].clamp_min(0.05)
     weights = certain * area.clamp_max(4 * float(area.median()))
     gray = colors.mean(1)
-    weights = weights * (gray / (gray + settings.half_weight)) * (transport.sum(1) > settings.enclosed)
+    weights = weights * (gray / (gray + settings.half_weight)) * (open_ > settings.enclosed)
     if float(weights.sum()) <= 0:
-        return _nothing()
+        return _nothing(region)
     return ShadingEvidence(
+        region=region,
         points=points,
-        distance=(points - region.center).norm(dim=1) / region.radius,
-        transport=transport,
+        normals=facing,
+        visibility=visible,
         colors=colors,
         weights=weights / weights.sum(),
         material=_materials(colors, points, region, settings),
     )
 
 
-def _nothing() -> ShadingEvidence:
+def _transported(visibility: Float[Tensor, "m k"], weight: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:
+    return visibility * weight / weight.sum(1, keepdim=True).clamp_min(1e-6)
+
+
+def _nothing(region: BoundingSphere) -> ShadingEvidence:
     none, index = torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64)
-    return ShadingEvidence(none, torch.zeros(0), torch.zeros(0, len(DIRECTIONS)), none, torch.zeros(0), index)
+    return ShadingEvidence(region, none, none, torch.zeros(0, len(DIRECTIONS)), none, torch.zeros(0), index)
 
 
 def _receivers(
@@ -151,7 +187,7 @@ def _occluders(scene: Gaussians, region: BoundingSphere, settings: ShadingEviden
     return occluders_of(replace(part, log_scales=grown))
 
 
-def _lit(
+def _visibility(
     occluders: Occluders,
     points: Float[Tensor, "m 3"],
     normals: Float[Tensor, "m 3"],
@@ -159,12 +195,10 @@ def _lit(
     region: BoundingSphere,
     settings: ShadingEvidenceSettings,
 ) -> Float[Tensor, "m k"]:
-    """Visibility times cosine."""
     window = Window(center=region.center, radius=region.radius, frames=frames_along(DIRECTIONS))
     nearest = torch.full((len(DIRECTIONS),), -region.radius)
     maps = splat_depth_maps(occluders, window, size=settings.map_size, with_color=False, nearest=nearest)
-    cosine = (normals @ DIRECTIONS.T).clamp_min(0)
-    return visibility(maps, points, normals, bias=settings.bias * maps.texel) * cosine
+    return visibility(maps, points, normals, bias=settings.bias * maps.texel)
 
 
 def _materials(

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,12 +12,14 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
-from splatgraft.relighting.light.panorama import Panorama, render_panorama
+from splatgraft.relighting.light.panorama import Panorama, cube_directions, cube_pixels, render_panorama
 
 DIRECTIONS = even_directions(320)
 """Unit directions into which all light is sorted: 11 degrees apart, as fine as the surfaces around tell it."""
 SOLID_ANGLE = 4 * math.pi / len(DIRECTIONS)
 """Steradians of each direction."""
+_TABLE = 64
+"""Pixels; width of a face of the cube map that tells which of the directions is nearest."""
 _FARTHEST = 1e4
 """World units; what is farther away counts as so far."""
 
@@ -45,6 +48,8 @@ class Surroundings:
     """Share that is as bright as a camera records, in [0, 1]; the light there may be brighter."""
     clipped_direction: Float[Tensor, "k 3"]
     """Unit, the middle of that part."""
+    distance: Float[Tensor, "k"]
+    """World units to what was captured there, the harmonic mean; infinite where nothing was."""
 
 
 def surroundings_at(
@@ -73,16 +78,31 @@ def surroundings_at(
     radiance = panorama.radiance.reshape(-1, 3)
     clipped = known & (radiance.max(1).values > float(linear_from_srgb(torch.tensor(settings.clipped))))
     seen = known * panorama.alpha.flatten().clamp(0, 1)
-    nearest_direction = (directions @ DIRECTIONS.T).argmax(1)
+    nearest_direction = nearest_directions(directions)
     total = _sum(angles, nearest_direction).clamp_min(1e-9)
+    assert panorama.distance is not None
+    away = panorama.distance.flatten().clamp(1e-6, _FARTHEST)
     towards = _sum((angles * clipped)[:, None] * directions, nearest_direction)
     some = towards.norm(dim=1, keepdim=True) > 1e-6
     return Surroundings(
         radiance=_sum((angles * seen)[:, None] * radiance, nearest_direction) / total[:, None],
         seen=_sum(angles * seen, nearest_direction) / total,
         clipped=_sum(angles * clipped, nearest_direction) / total,
+        distance=_sum(angles * seen, nearest_direction).clamp_min(1e-12)
+        / _sum(angles * seen / away, nearest_direction),
         clipped_direction=torch.where(some, torch.nn.functional.normalize(towards, dim=1), DIRECTIONS),
     )
+
+
+def nearest_directions(towards: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    """Position in `DIRECTIONS` of the one nearest to each unit direction, up to the width of a table's cell, 1.4
+    degrees."""
+    return _nearest_table()[cube_pixels(towards, _TABLE)]
+
+
+@cache
+def _nearest_table() -> Int[Tensor, "c"]:
+    return (cube_directions(_TABLE)[0].reshape(-1, 3) @ DIRECTIONS.T).argmax(1)
 
 
 def _sum(values: Float[Tensor, "p ..."], index: Int[Tensor, "p"]) -> Float[Tensor, "k ..."]:
