@@ -111,7 +111,9 @@ class ShadingEvidence:
         apart = away.norm(dim=2, keepdim=True).clamp_min(1e-6)
         towards = away / apart
         cosine = (towards * self.normals[part, None]).sum(2).clamp_min(0)
-        size = ((lights - self.region.center).norm(dim=1) / apart[..., 0]) ** 2
+        # solid angle of what shines, over that from the middle; it faces the middle
+        facing = (towards * DIRECTIONS).sum(2).clamp_min(0)
+        size = facing * ((lights - self.region.center).norm(dim=1) / apart[..., 0]) ** 2
         seen = self.visibility[part].gather(1, nearest_directions(towards.reshape(-1, 3)).reshape(cosine.shape))
         return _transported(seen, cosine * size)
 
