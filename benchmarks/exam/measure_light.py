@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.directions import even_directions
 from splatgraft.relighting import Light
 
@@ -16,6 +17,11 @@ _FINE_NORMALS = 10_000
 """Even directions among which the one of most irradiance is looked for; 2 degrees apart."""
 _DARKEST = 1e-6
 """Linear irradiance; less counts as this."""
+
+_CELLS = 80
+"""Width of the image in whose cells surface points are compared; the object takes up half of it or less."""
+_BEHIND = 0.05
+"""Of the object's size: how far behind the nearest point a point is still seen."""
 
 LIGHT_ERRORS = ("rms", "level", "tint", "direction_deg")
 
@@ -44,6 +50,34 @@ def light_errors(estimated: Light, truth: Light) -> dict[str, float]:
         "tint": _rms(tint),
         "direction_deg": math.degrees(math.acos(max(-1.0, min(1.0, float(brightest[0] @ brightest[1]))))),
     }
+
+
+def seen_surface(surface: Float[Tensor, "m 6"], cameras: Cameras) -> Float[Tensor, "s 6"]:
+    """The surface points that some camera sees: not what lies inside of the object or under it.
+
+    A point is seen where it faces the camera and no point in its cell of an image is nearer by more than a share
+    of the object's size.
+
+    Args:
+        surface: Positions and unit normals of m points, ten or more per cell.
+        cameras: That the object was captured with.
+    """
+    points, normals = surface[:, :3], surface[:, 3:]
+    middle, size = points.mean(0), float((points - points.mean(0)).norm(dim=1).max())
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for i in range(len(cameras)):
+        pose = cameras.camera_from_world[i]
+        depth = points @ pose[2, :3] + pose[2, 3]
+        if float(depth.min()) <= 0:
+            continue
+        plane = (points @ pose[:2, :3].T + pose[:2, 3]) / depth[:, None]
+        half = size / float(middle @ pose[2, :3] + pose[2, 3])
+        cells = ((plane - plane.mean(0)) / half * _CELLS / 4 + _CELLS / 2).long().clamp(0, _CELLS - 1)
+        index = cells[:, 1] * _CELLS + cells[:, 0]
+        nearest = torch.full((_CELLS**2,), torch.inf).scatter_reduce(0, index, depth, "amin")
+        facing = ((cameras.centers[i] - points) * normals).sum(1) > 0
+        seen |= facing & (depth < nearest[index] + _BEHIND * size)
+    return surface[seen]
 
 
 def nearest_normals(points: Float[Tensor, "n 3"], surface: Float[Tensor, "m 6"]) -> Float[Tensor, "n 3"]:

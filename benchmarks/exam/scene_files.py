@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from exam.measure_light import nearest_normals
+from exam.measure_light import nearest_normals, seen_surface
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
@@ -75,15 +75,16 @@ def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: C
     files = GroundTruthScene.from_folder(folder)
     composed = compose_scene(files, work, options, device="cpu", console=console)
     composite = read_composite(composed.target, composed.composite / PLACEMENT_FILE)
+    source = SourceScene(read_gaussians(composed.surroundings), read_cameras(composed.source_cameras))
     return ExamScene(
         name=folder.name,
         composite=composite,
         cameras=read_cameras(composed.cameras),
-        source=SourceScene(read_gaussians(composed.surroundings), read_cameras(composed.source_cameras)),
+        source=source,
         views=_held_out_views(files, composite.target),
         new_light=_read_light(folder / "probe.npy", folder / "suns.json"),
         old_light=_read_light(folder / "old_light" / "0000.npy", folder / "old_light" / "suns.json"),
-        normals=_read_normals(folder / "surface.npy", composite.objects[0].gaussians),
+        normals=_read_normals(folder / "surface.npy", composite.objects[0].gaussians, source.cameras),
     )
 
 
@@ -105,7 +106,8 @@ def _read_light(panorama: Path, suns: Path) -> Light:
         raise ValueError(f"{panorama}, {suns.name}: expected a true light, found {error}") from error
 
 
-def _read_normals(path: Path, thing: Gaussians) -> Float[Tensor, "n 3"] | None:
+def _read_normals(path: Path, thing: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3"] | None:
     if not path.is_file():
         return None
-    return nearest_normals(thing.means, torch.from_numpy(np.load(path, allow_pickle=False)))
+    surface = torch.from_numpy(np.load(path, allow_pickle=False)).float()
+    return nearest_normals(thing.means, seen_surface(surface, cameras))

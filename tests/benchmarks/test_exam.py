@@ -7,8 +7,9 @@ import pytest
 import torch
 from exam.draw import SIZE, draw_scenes
 from exam.evaluate_scene import SceneResult
-from exam.measure_light import light_errors, median_angle_deg, nearest_normals
+from exam.measure_light import light_errors, median_angle_deg, nearest_normals, seen_surface
 from exam.summary import summarize_light, summarize_row, summary_markdown
+from shapes import ring
 
 from splatgraft.core.directions import even_directions
 from splatgraft.relighting import Light, LightSource
@@ -71,6 +72,16 @@ def test_a_red_light_has_a_tint_and_no_level():
     assert errors["level"] == pytest.approx(0, abs=1e-5)
     wanted = math.sqrt((math.log2(1.5) ** 2 + math.log2(0.5) ** 2) / 3)
     assert errors["tint"] == pytest.approx(wanted, abs=1e-5)
+
+
+def test_what_lies_inside_of_an_object_is_not_its_surface():
+    around = even_directions(20_000)
+    ball, core = torch.cat([0.2 * around, around], 1), torch.cat([0.17 * around[::2], around[::2]], 1)
+    inner = torch.cat([0.19 * around, -around], 1)  # the inner wall of a hollow ball
+    seen = seen_surface(torch.cat([ball, core, inner]), ring(12))
+    # the cameras stand above the middle: of the ball a cap around the lower pole is unseen
+    assert 0.7 * len(ball) < len(seen) < len(ball)
+    assert float(seen[:, :3].norm(dim=1).min()) > 0.199
 
 
 def test_true_normals_are_those_of_the_nearest_surface():
