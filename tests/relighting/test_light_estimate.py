@@ -84,20 +84,30 @@ def test_an_even_sky_gives_an_even_light():
     assert float(up / side) < 3
 
 
+def windowed_room(window, radius_deg, white=1.0):
+    """A shell of radius 20 with a bright disc towards `window`, and a floor that it lights."""
+    shell = even_directions(6000)
+    bright = shell @ window > math.cos(math.radians(radius_deg))
+    rgb = torch.where(bright[:, None], white, 0.4).repeat(1, 3)
+    return concatenate([surfels(20 * shell, -shell, width=0.6, srgb=rgb), sunlit_scene(window, strength=3.0)])
+
+
 @pytest.mark.parametrize("white", [1.0, 0.99])
 def test_a_clipped_window_is_a_source_where_it_was_photographed(white):
-    shell = even_directions(6000)
     window = torch.nn.functional.normalize(torch.tensor([0.8, 0.3, 0.15]), dim=0)
-    bright = shell @ window > math.cos(math.radians(10))
-    rgb = torch.where(bright[:, None], white, 0.4).repeat(1, 3)
-    room = surfels(20 * shell, -shell, width=0.6, srgb=rgb)
-    floor = sunlit_scene(window, strength=3.0)
-    light = estimated(concatenate([room, floor]), views((0.0, 1.5)))
+    light = estimated(windowed_room(window, 10, white), views((0.0, 1.5)))
     main = light.sources[0]
     # half the patch's radius: its edge is ragged by the splats' width, 3 degrees
     assert math.degrees(math.acos(min(1.0, float(torch.tensor(main.direction) @ window)))) < 5
     # brighter than the camera recorded: white over its solid angle is 0.095
     assert main.luminance > 0.2
+
+
+def test_a_wide_window_stands_where_it_was_photographed():
+    window = torch.nn.functional.normalize(torch.tensor([0.8, 0.3, 0.15]), dim=0)
+    main = estimated(windowed_room(window, 14), views((0.0, 1.5))).sources[0]
+    assert main.name == "window"
+    assert main.distance == pytest.approx(20, rel=0.05)
 
 
 def test_without_surfaces_to_compare_the_light_is_what_was_photographed():

@@ -117,7 +117,7 @@ class EstimatedLight:
         around = surroundings_at(scene, cameras, place.center, nearest=settings.nearest * place.radius)
         evidence = replace(self.evidence, around=around)
         radiance = self.hidden.radiance(evidence, self.tint)
-        _, rest = split_peaks(radiance, evidence.visible_sources, around, within=math.inf)
+        _, rest = split_peaks(radiance, evidence, within=math.inf)
         light = replace(self.light, ambient=ambient_of(rest), **_seen_shares(evidence))
         return replace(self, light=light, evidence=evidence)
 
@@ -182,11 +182,7 @@ def fit_light(
     sky = seen_sky(evidence.far, up, mean.clamp_min(1e-3))
     tint = sky / sky.mean().clamp_min(1e-6)
     sources, rest = split_peaks(
-        hidden.radiance(evidence, tint),
-        evidence.visible_sources,
-        evidence.around,
-        within=region.radius,
-        settings=settings.peaks,
+        hidden.radiance(evidence, tint), evidence, within=region.radius, settings=settings.peaks
     )
     light = Light(sources, ambient_of(rest), **_seen_shares(evidence))
     return EstimatedLight(with_source_distances(light, scene, place), hidden, evidence, tint)

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from splatgraft.core.directions import fit_sh
 from splatgraft.relighting.light.light import LightSource, angular_radius_deg
-from splatgraft.relighting.light.surroundings import DIRECTIONS, SOLID_ANGLE, Surroundings
+from splatgraft.relighting.light.radiance_model import LightEvidence
+from splatgraft.relighting.light.surroundings import DIRECTIONS, SOLID_ANGLE
 
 _LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 """Rec. 709."""
@@ -39,8 +40,7 @@ class RadianceSourceSettings:
 
 def split_peaks(
     radiance: Float[Tensor, "k 3"],
-    clipped: Float[Tensor, "k"],
-    around: Surroundings,
+    evidence: LightEvidence,
     *,
     within: float,
     settings: RadianceSourceSettings = RadianceSourceSettings(),
@@ -49,8 +49,7 @@ def split_peaks(
 
     Args:
         radiance: Linear rgb from all `DIRECTIONS`.
-        clipped: Share of each direction that is a visible source's, in [0, 1].
-        around: The surroundings, for the directions of visible sources.
+        evidence: At the place; it tells the directions and distances of visible sources.
         within: World units; occluders farther away do not block sources that no camera saw.
         settings: What is a source.
 
@@ -68,7 +67,7 @@ def split_peaks(
         left &= ~near[i]
         background = radiance[ring].mean(0) if bool(ring.any()) else radiance.median(0).values
         extra = (radiance[group] - background).clamp_min(0)
-        sources.append(_source(group, extra, clipped, around, within=within, settings=settings))
+        sources.append(_source(group, extra, evidence, within=within, settings=settings))
         rest[group] = torch.minimum(rest[group], background)
     return tuple(sorted(sources, key=lambda source: -source.luminance)), rest
 
@@ -81,15 +80,15 @@ def ambient_of(rest: Float[Tensor, "k 3"]) -> Float[Tensor, "9 3"]:
 def _source(
     group: Bool[Tensor, "k"],
     extra: Float[Tensor, "p 3"],
-    clipped: Float[Tensor, "k"],
-    around: Surroundings,
+    evidence: LightEvidence,
     *,
     within: float,
     settings: RadianceSourceSettings,
 ) -> LightSource:
     weight = extra @ _LUMINANCE
-    visible = float(clipped[group].sum())
-    towards = around.clipped_direction[group] if visible > 0 else DIRECTIONS[group]
+    shares = evidence.visible_sources[group]
+    visible = float(shares.sum())
+    towards = evidence.around.clipped_direction[group] if visible > 0 else DIRECTIONS[group]
     direction = torch.nn.functional.normalize((weight[:, None] * towards).sum(0), dim=0)
     x, y, z = direction.tolist()
     r, g, b = (extra.sum(0) * SOLID_ANGLE).tolist()
@@ -97,8 +96,23 @@ def _source(
         size = max(visible, 0.1) * SOLID_ANGLE
         radius = angular_radius_deg(size)
         name = "sun" if size < settings.sun else "window"
-        return LightSource((x, y, z), (r, g, b), radius, settings.clipped_error_deg, 1.0, name)
+        # a small patch may show the sun through a window; a large one stands where the panorama shows it
+        distance = _distance(evidence.far.distance[group], weight * shares) if name == "window" else math.inf
+        return LightSource(
+            (x, y, z),
+            (r, g, b),
+            radius,
+            settings.clipped_error_deg,
+            name=name,
+            distance=distance,
+        )
     away = torch.rad2deg(torch.acos((towards @ direction).clamp(-1, 1)))
     spread = float((weight * away**2).sum() / weight.sum().clamp_min(1e-9)) ** 0.5
     error = math.hypot(spread, settings.half_bin_deg)
     return LightSource((x, y, z), (r, g, b), settings.unseen_radius_deg, error, 1.0, "sun", blockers_within=within)
+
+
+def _distance(distances: Float[Tensor, "p"], weight: Float[Tensor, "p"]) -> float:
+    """Their weighted harmonic mean."""
+    nearness = float((weight / distances).sum() / weight.sum().clamp_min(1e-9))
+    return 1 / nearness if nearness > 0 else math.inf
