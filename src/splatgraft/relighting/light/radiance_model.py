@@ -46,40 +46,40 @@ _SMALLEST = 0.05
 class RadianceSettings:
     """The numbers of the density, fitted together over training scenes by benchmarks/fit_light.py."""
 
-    albedo: float = 0.296
+    albedo: float = 0.29
     """Median linear albedo of a material."""
-    albedo_sd: float = 0.3
+    albedo_sd: float = 0.332
     """Standard deviation of its logarithm."""
-    materials: float = 4.5
+    materials: float = 9.04
     """Most independent albedos that the materials of a scene are worth."""
-    residual: float = 0.8
+    residual: float = 0.816
     """Scale of the error of log colour."""
     nu: float = 4.0
     """Degrees of freedom of that error; set by hand, as the fit does not tell it from the scale."""
-    effective: float = 50.0
+    effective: float = 52.3
     """Independent receivers that all are worth: neighbours share their errors."""
-    near: float = 1.0
+    near: float = 1.28
     """Radii of the surroundings: standard deviation of the weight of surfaces by their distance; the light is that at
     the object."""
     highlights: float = 105.0
     """Independent view-dependent colours that all are worth."""
     sky_bias: float = -0.07
     """Mean log radiance of unseen directions over that of the seen ones above the horizon: zeniths are brighter."""
-    sky_sd: float = 0.415
+    sky_sd: float = 0.431
     """Standard deviation of that difference between scenes."""
     unseen_sd: float = 1.13
     """Scale of the logarithm of one unseen direction around their common level."""
-    unseen_nu: float = 1.64
+    unseen_nu: float = 1.28
     """Degrees of freedom: the lower, the likelier is a lamp among them."""
     source: float = 77.4
     """Median radiance of a clipped source, where the camera's white is 1."""
-    source_sd: float = 0.6
+    source_sd: float = 0.444
     """Standard deviation of its logarithm."""
-    surface: float = 0.07
+    surface: float = 0.121
     """Median radiance of a clipped bright surface beyond white."""
-    surface_sd: float = 0.77
+    surface_sd: float = 0.897
     """Standard deviation of its logarithm."""
-    within_patch_sd: float = 0.212
+    within_patch_sd: float = 0.272
     """Standard deviation of log radiance within a patch."""
 
 

@@ -46,7 +46,7 @@ class SearchSettings:
     """Radiance of a lamp over what is there without it."""
     apart: float = math.radians(18)
     """Radians between directions that are tried."""
-    temperature: float = 5.2
+    temperature: float = 4.6
     """By which differences of the log density are divided before maxima are averaged; fitted with the density."""
     same: float = 0.04
     """Root mean square of log irradiance between maxima, below which they are one."""
