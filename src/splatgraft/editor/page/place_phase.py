@@ -44,6 +44,8 @@ class PlacePhase:
         self._page, gui = page, page.gui
         self._chosen = 0
         self._dragging = False
+        self._shown: Gizmo | None = None
+        """What the fields of numbers show; as `SelectPhase._shown_box`."""
         self._saved = 0.0
         self._is_active = False
         self._note = gui.add_html("", visible=False)
@@ -155,7 +157,9 @@ class PlacePhase:
     def _numbers_changed(self) -> None:
         session = self._page.require_session()
         gizmo = Gizmo(self._position.value, quaternion_from_degrees(self._degrees.value), float(self._scale.value))
+        self._shown = None  # so that the fields go back to the state where these numbers are refused
         self._set_placement(similarity_from_gizmo(gizmo, session.placeable_object(self._chosen).base.point))
+        self._shown = self._current()
 
     def _apply_operation(self, name: str) -> None:
         session = self._page.require_session()
@@ -253,6 +257,9 @@ class PlacePhase:
     # the gizmo
 
     def _show_numbers(self, gizmo: Gizmo) -> None:
+        if gizmo == self._shown:
+            return
+        self._shown = gizmo
         self._position.value = gizmo.position
         # rounded for display, without -0; typed numbers are used exactly
         x, y, z = (round(angle, 2) + 0.0 for angle in degrees_from_quaternion(gizmo.wxyz))

@@ -11,6 +11,7 @@ import viser
 from splatgraft.editor.page.box_handles import BoxHandles
 from splatgraft.editor.page.brush import Brush
 from splatgraft.editor.page.scene_view import TINT, Color, camera_from_viser
+from splatgraft.editor.session.edit_state import BoxNumbers
 from splatgraft.editor.session.picking import Rectangle, in_rectangle
 from splatgraft.formats import read_capture
 from splatgraft.segmentation import Box, Keep, default_box
@@ -60,6 +61,9 @@ class SelectPhase:
         self._correction_handles = BoxHandles(page.server, page.view, "/source/correction_box", color=(60, 160, 255))
         self._brush = Brush(page, on_stroke=self._apply_stroke, color=lambda: _ADDS if self._adds() else _REMOVES)
         self._is_active = False
+        self._shown_box: BoxNumbers | None = None
+        """What the fields of the box show. They are written only where the state has something else: the value of a
+        refresh would arrive while the next number is typed, and replace it."""
         self._connect()
 
     def enter(self) -> None:
@@ -92,8 +96,9 @@ class SelectPhase:
         box = session.box()
         self._show_box.value = box is not None
         self._lower.visible = self._upper.visible = self._show_box.value
-        if box is not None:
-            self._lower.value, self._upper.value = tuple(box.lower.tolist()), tuple(box.upper.tolist())
+        if state.box is not None and state.box != self._shown_box:
+            self._lower.value, self._upper.value = state.box[:3], state.box[3:]
+            self._shown_box = state.box
         if self._show_box.value and box is not None:
             self._handles.show(box)
         else:
@@ -172,7 +177,11 @@ class SelectPhase:
         self._set(box=(a, b, c, d, e, f))
 
     def _box_typed(self) -> None:
-        self._set_box(Box(torch.tensor(self._lower.value), torch.tensor(self._upper.value)))
+        typed = (*self._lower.value, *self._upper.value)
+        self._shown_box = None  # so that the fields go back to the state where these numbers are refused
+        Box(torch.tensor(typed[:3]), torch.tensor(typed[3:]))
+        self._shown_box = typed
+        self._set(box=typed)
 
     def _box_dragged(self, box: Box, ended: bool) -> None:
         if ended:
