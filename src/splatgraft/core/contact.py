@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.planes import least_squares_normal
 from splatgraft.core.rotations import quaternion_from_rotation
 
 _OPAQUE = 0.1
@@ -223,8 +224,7 @@ def _fitted_layer(
             return None
         middle = on_plane @ means / on_plane.sum()
         offsets = means - middle
-        scatter = torch.einsum("n,ni,nj->ij", on_plane, offsets, offsets)
-        normal = torch.linalg.eigh(scatter).eigenvectors[:, 0].float()
+        normal = least_squares_normal(on_plane.sqrt()[:, None] * offsets).float()
     if float(on_plane.sum()) < settings.least_share * float(weights.sum()):
         return None
     layer = _Layer(normal, float(middle.float() @ normal), 0.0)

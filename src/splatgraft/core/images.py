@@ -21,6 +21,8 @@ _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 _ALWAYS_ALLOWED_PIXELS = 1 << 24
 _PIXELS_PER_BYTE = 1 << 14
 """Above every real image: a black 1-bit PNG has 8256. Above 179 million pixels Pillow itself refuses."""
+LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
+"""Weights of linear rgb in luminance (Rec. 709)."""
 _MEAN_PX = 256
 """Longest side from which a mean is taken of a file that can be read smaller than it is."""
 _GREY_SCALES = {"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I;16N": 65535, "I": 65535, "F": 1}
@@ -87,7 +89,7 @@ def mean_luminance(path: Path) -> float:
         image.draft(None, (_MEAN_PX, _MEAN_PX))
         image.load()
         linear = linear_from_srgb(_rgb(image)).mean((0, 1))
-    return float(linear @ torch.tensor([0.2126, 0.7152, 0.0722]))
+    return float(linear @ LUMINANCE)
 
 
 def read_exif(path: Path) -> dict[int, Any]:

@@ -8,12 +8,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.images import LUMINANCE, linear_from_srgb
 
 SHADOW_RATIO = 0.95
 """Linear light with the object over linear light without it, below which a pixel counts as shadowed."""
-_LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
-"""Rec. 709."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ def find_regions(truth: Truth) -> Regions:
 
 def luminance_ratio(image: Float[Tensor, "h w 3"], background: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
     """Ratio of linear Rec. 709 luminance, `image` over `background`, each averaged over 3x3 pixels against noise."""
-    numerator, denominator = (_mean_3x3(linear_from_srgb(x) @ _LUMINANCE.to(x)) for x in (image, background))
+    numerator, denominator = (_mean_3x3(linear_from_srgb(x) @ LUMINANCE.to(x)) for x in (image, background))
     return (numerator + SETTINGS.ratio_offset) / (denominator + SETTINGS.ratio_offset)
 
 

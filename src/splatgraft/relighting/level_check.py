@@ -7,11 +7,11 @@ units and does not depend on it.
 import math
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.exposure import LuminanceScale
+from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.layers import Relit
 
 
@@ -77,7 +77,7 @@ def _line(number: int, by_photos: float, lux: tuple[float, float], settings: Lev
 
 def _mean_luminance(irradiance: Float[Tensor, "n 3"], weights: Float[Tensor, "n"]) -> float:
     mean = (weights[:, None] * irradiance).sum(0) / weights.sum().clamp_min(1e-9)
-    return float(mean @ torch.tensor([0.2126, 0.7152, 0.0722]))
+    return float(mean @ LUMINANCE)
 
 
 def _brighter(stops: float) -> str:

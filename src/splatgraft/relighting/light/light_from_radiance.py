@@ -8,12 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.directions import fit_sh
+from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.light.light import LightSource, angular_radius_deg
 from splatgraft.relighting.light.radiance_model import LightEvidence
 from splatgraft.relighting.light.surroundings import DIRECTIONS, SOLID_ANGLE
-
-_LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
-"""Rec. 709."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def split_peaks(
     Returns:
         The sources, brightest first, and the radiance without them.
     """
-    luminance = radiance @ _LUMINANCE
+    luminance = radiance @ LUMINANCE
     is_peak = luminance > settings.over_median * luminance.median()
     is_peak &= luminance > settings.least_share * luminance.sum()
     near = math.cos(settings.radius) < DIRECTIONS @ DIRECTIONS.T
@@ -85,7 +83,7 @@ def _source(
     within: float,
     settings: RadianceSourceSettings,
 ) -> LightSource:
-    weight = extra @ _LUMINANCE
+    weight = extra @ LUMINANCE
     shares = evidence.visible_sources[group]
     visible = float(shares.sum())
     towards = evidence.around.clipped_direction[group] if visible > 0 else DIRECTIONS[group]

@@ -14,7 +14,7 @@ from splatgraft.core.images import srgb_from_linear
 from splatgraft.relighting.light.estimate import EstimatedLight
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import cube_pixels, render_panorama
-from splatgraft.relighting.light.surroundings import DIRECTIONS
+from splatgraft.relighting.light.surroundings import nearest_directions
 
 _HEIGHT = 256
 """Pixels of the panorama, which is twice as wide."""
@@ -52,7 +52,7 @@ def _panorama(
     nearest = 0.25 * float((found.evidence.surfaces.points - center).norm(dim=1).median()) if _has(found) else 0.0
     cube = render_panorama(scene, center, size=_FACE, nearest=nearest)
     shown = srgb_from_linear(cube.radiance.reshape(-1, 3)[cube_pixels(directions, _FACE)].clamp(0, 1))
-    seen = found.evidence.around.seen[(directions @ DIRECTIONS.T).argmax(1)][:, None]
+    seen = found.evidence.around.seen[nearest_directions(directions)][:, None]
     image = (seen * shown + (1 - seen) * _UNSEEN).reshape(_HEIGHT, 2 * _HEIGHT, 3)
     canvas = np.ascontiguousarray((image * 255).byte().numpy())
     for source in found.light.sources:

@@ -36,7 +36,7 @@ _UNSEEN = 0.05
 _TOUCHING = math.cos(math.radians(15))
 """Clipped directions nearer than this are one patch."""
 _LOWEST = math.sin(math.radians(-8))
-"""Least height of a patch that may be a source: a window beside a table reaches below the horizon, reflections lie
+"""Least sine of the height of what may be a source: a window beside a table reaches below the horizon, reflections lie
 lower."""
 _SMALLEST = 0.05
 """Directions that such a patch covers at least."""
@@ -230,7 +230,7 @@ def radiance_problem(
     unseen = (torch.maximum(1 - far.seen, 1 - around.seen) > _UNSEEN).nonzero()[:, 0]
     clipped = (far.clipped > _PRESENT).nonzero()[:, 0]
     shares = torch.cat([1 - far.seen[unseen], far.clipped[clipped]]).clamp_min(0).double()
-    transport = evidence.transport(_distances(far)).double()
+    transport = evidence.transport(far.distance).double()
     blocked = (1 - transport.sum(1)).clamp_min(0)
     label = _patch_labels(clipped, up)
     mean_color = (evidence.weights[:, None] * evidence.colors).sum(0).mean()
@@ -259,11 +259,6 @@ def radiance_problem(
         connected=label[:, None] == label[None],
         patches=_patches(far, clipped, label, up)[:most_patches],
     )
-
-
-def _distances(far: Surroundings) -> Float[Tensor, "k"]:
-    """World units to what shines from each direction; infinite where nothing was seen."""
-    return torch.where(far.seen > 0, far.distance, math.inf)
 
 
 def seen_sky(far: Surroundings, up: Float[Tensor, "3"], otherwise: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
@@ -297,10 +292,10 @@ def _patches(
     found = []
     for value in label.unique():
         members = (label == value).nonzero()[:, 0]
-        share = far.clipped[clipped[members]]
-        height = float((share * (DIRECTIONS[clipped[members]] @ up)).sum() / share.sum())
-        if height > _LOWEST and float(share.sum()) > _SMALLEST:
-            found.append(Patch(members, float(share.sum())))
+        size = float(far.clipped[clipped[members]].sum())
+        # members lie all above or all below
+        if float(DIRECTIONS[clipped[members[0]]] @ up) > _LOWEST and size > _SMALLEST:
+            found.append(Patch(members, size))
     return tuple(sorted(found, key=lambda patch: -patch.size))
 
 

@@ -18,14 +18,12 @@ from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.k_means import k_means
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting.light.material_groups import log_chromaticity
-from splatgraft.relighting.light.surroundings import DIRECTIONS, nearest_directions
+from splatgraft.relighting.light.surroundings import DIRECTIONS, FARTHEST, nearest_directions
 from splatgraft.relighting.shading.normals import Normals
 from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occluders_of, splat_depth_maps, visibility
 
 _CHUNK = 100
 """Receivers at a time; bounds memory."""
-_FARTHEST = 1e4
-"""World units; what shines from farther away is as if it were infinitely far."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ class ShadingEvidence:
         """
         if distances is None:
             return _transported(self.visibility, (self.normals @ DIRECTIONS.T).clamp_min(0))
-        lights = self.region.center + DIRECTIONS * distances.clamp(self.region.radius, _FARTHEST)[:, None]
+        lights = self.region.center + DIRECTIONS * distances.clamp(self.region.radius, FARTHEST)[:, None]
         rows = [self._near_transport(part, lights) for part in torch.arange(len(self.points)).split(_CHUNK)]
         return torch.cat(rows) if rows else self.visibility
 

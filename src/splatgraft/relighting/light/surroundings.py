@@ -20,7 +20,7 @@ SOLID_ANGLE = 4 * math.pi / len(DIRECTIONS)
 """Steradians of each direction."""
 _TABLE = 64
 """Pixels; width of a face of the cube map that tells which of the directions is nearest."""
-_FARTHEST = 1e4
+FARTHEST = 1e4
 """World units; what is farther away counts as so far."""
 
 
@@ -81,7 +81,7 @@ def surroundings_at(
     nearest_direction = nearest_directions(directions)
     total = _sum(angles, nearest_direction).clamp_min(1e-9)
     assert panorama.distance is not None
-    away = panorama.distance.flatten().clamp(1e-6, _FARTHEST)
+    away = panorama.distance.flatten().clamp(1e-6, FARTHEST)
     towards = _sum((angles * clipped)[:, None] * directions, nearest_direction)
     some = towards.norm(dim=1, keepdim=True) > 1e-6
     return Surroundings(
@@ -112,7 +112,7 @@ def _sum(values: Float[Tensor, "p ..."], index: Int[Tensor, "p"]) -> Float[Tenso
 def _points(panorama: Panorama, center: Float[Tensor, "3"]) -> Float[Tensor, "p 3"]:
     """Where the surfaces of a panorama are."""
     assert panorama.distance is not None
-    return center + panorama.directions.reshape(-1, 3) * panorama.distance.reshape(-1, 1).clamp(0, _FARTHEST)
+    return center + panorama.directions.reshape(-1, 3) * panorama.distance.reshape(-1, 1).clamp(0, FARTHEST)
 
 
 def _photographed(points: Float[Tensor, "p 3"], cameras: Cameras) -> Bool[Tensor, "p"]:
