@@ -121,7 +121,7 @@ def _sharpness(inspection: Inspection, names: Sequence[str], rule: FindingRule) 
     middle = float(np.median(blur))
     deviation = 1.4826 * float(np.median(np.abs(blur - middle)))
     limit = middle + max(rule.blur_above, rule.blur_deviations * deviation)
-    blurred = tuple(names[i] for i in np.argsort(-blur) if blur[i] > limit)
+    blurred = tuple(names[i] for i in np.argsort(-blur).tolist() if blur[i] > limit)
     if middle > rule.blur_of_all:
         text = f"most photos are blurred (median blur {middle:.2f}, sharp captures have 0.23 to 0.37)"
         return Finding("sharpness", "doubtful", text, "photograph again with shorter exposure and in focus", blurred)
@@ -158,7 +158,7 @@ def _copies(inspection: Inspection, names: Sequence[str]) -> Finding:
 
 def _jumps(inspection: Inspection, names: Sequence[str], rule: FindingRule) -> Finding:
     jumps = np.abs(inspection.jumps)
-    odd = tuple(names[i] for i in np.argsort(-jumps) if jumps[i] > rule.jump_stops)
+    odd = tuple(names[i] for i in np.argsort(-jumps).tolist() if jumps[i] > rule.jump_stops)
     if odd:
         text = f"{len(odd)} photos are up to {jumps.max():.1f} stops off their neighbours in brightness: {named(odd)}"
         return Finding("exposure", "doubtful", text, "lock exposure and white balance, or leave them out", odd)

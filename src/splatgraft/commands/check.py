@@ -67,7 +67,7 @@ class Check:
         posed = read_capture(self.capture) if has_poses(self.capture) else None
         files = list(posed.image_paths) if posed is not None else list_images(self.capture)
         if not files:
-            raise ValueError(f"{self.capture}: expected photos, found none in this folder")
+            raise ValueError(f"{self.capture}: expected photos in this folder, found none")
         readable, broken = _readable(files)
         if broken:
             names = tuple(path.name for path in broken)

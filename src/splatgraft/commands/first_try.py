@@ -86,8 +86,9 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
         record = read_record(step.out)
         if record is None or not record.warnings:
             continue
-        more = f" (and {len(record.warnings) - 1} more in the report)" if len(record.warnings) > 1 else ""
-        lines.append(f"unsure: {name}: {record.warnings[0].text}{more}")
+        first, *others = record.warnings
+        more = f" (and {len(others)} more in the report)" if others else ""
+        lines.append(f"unsure: {name}: {first.text}{more}")
         helps = helps or remedy(record.step, shown) or ""
     # later steps build on earlier ones: the first that was unsure is the one to mend
     lines.append(f"helps most: {helps}" if helps else "no step was unsure of its result")

@@ -62,6 +62,7 @@ _SECTIONS = {
     "harmonization": "render-and-harmonize",
     "rendering": "render-and-harmonize",
     "harmonization.flux": "flux",
+    "harmonization.flux.sampling": "render-and-harmonize",
     "harmonization.peers": "other-image-models",
     "commands.steps.consolidate": "consolidate-and-evaluate",
     "commands.steps.evaluate": "consolidate-and-evaluate",
@@ -80,6 +81,7 @@ _SECTIONS = {
     "commands.synth.orida": "training",
     "commands.train": "training",
     "training": "training",
+    "training.removal_objective": "flux",
     "workflow.flux_training": "training",
 }
 """Section of the page by package or module; the longest name that fits counts."""
