@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatgraft.commands.init import Init
+from splatgraft.commands.steps.segment import Segment
 from splatgraft.core.images import list_images
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.folders.capture_files import has_poses
@@ -13,7 +14,7 @@ from splatgraft.formats import is_scene, read_capture
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
 from splatgraft.project.record import read_record
 from splatgraft.project.remedies import remedy
-from splatgraft.project.step import Positional
+from splatgraft.project.step import Positional, Step
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.desktop import open_page
@@ -84,16 +85,22 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
     helps = ""
     for name, step in flow:
         record = read_record(step.out)
-        if record is None or not record.warnings:
+        if record is None or not (doubts := [*_guesses(step), *(warning.text for warning in record.warnings)]):
             continue
-        first, *others = record.warnings
-        more = f" (and {len(others)} more in the report)" if others else ""
-        lines.append(f"unsure: {name}: {first.text}{more}")
+        more = f" (and {len(doubts) - 1} more)" if len(doubts) > 1 else ""
+        lines.append(f"unsure: {name}: {doubts[0]}{more}")
         helps = helps or remedy(record.step, shown) or ""
     # later steps build on earlier ones: the first that was unsure is the one to mend
     lines.append(f"helps most: {helps}" if helps else "no step was unsure of its result")
     finer = f'quality = "standard" under [reconstruct] in {shown / PROJECT_FILE}'
     return [*lines, f"finer: {finer}, then splatgraft run {shown}"]
+
+
+def _guesses(step: Step) -> list[str]:
+    """What a step had to guess because nothing was asked."""
+    if isinstance(step, Segment) and step.mask_source == "grabcut" and step.box is None:
+        return ["no masks and no box were given: the object is what GrabCut found in a box that was guessed."]
+    return []
 
 
 def _name(capture: Path) -> str:
