@@ -54,9 +54,18 @@ def test_a_first_transfer_needs_nothing_but_two_captures(
     assert "begins" not in again
     assert "opened" not in again
     assert toml.read_text().endswith("# mine\n")
-    # and other captures do not replace it
-    assert main(["try", *reversed(captures), "--out", "images__into_room"]) == 2
+
+
+def test_a_project_of_other_captures_is_not_replaced(
+    captures: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, target = captures
+    folder = str(tmp_path / "project")
+    assert main(["init", folder, "--source", source, "--target", target]) == 0
+    text = (tmp_path / "project" / "project.toml").read_text()
+    assert main(["try", target, source, "--out", folder]) == 2
     assert "project.toml: expected a project of these captures" in capsys.readouterr().err
+    assert (tmp_path / "project" / "project.toml").read_text() == text
 
 
 def test_what_does_not_exist_leaves_nothing_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from splatgraft.project.step import Positional, Step
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.desktop import open_page
+from splatgraft.runtime.settings import read_toml
 from splatgraft.workflow.flow import Flow, read_flow
 from splatgraft.workflow.run_steps import run_steps
 
@@ -91,16 +93,21 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
         lines.append(f"unsure: {name}: {doubts[0]}{more}")
         helps = helps or remedy(record.step, shown) or ""
     # later steps build on earlier ones: the first that was unsure is the one to mend
-    lines.append(f"helps most: {helps}" if helps else "no step was unsure of its result")
+    if not lines:
+        lines.append("no step warned of its result: look at the pictures; a cut that is off is what people mend most")
+        helps = remedy("segment", shown) or ""
+    lines.append(f"helps most: {helps}")
     finer = f'quality = "standard" under [reconstruct] in {shown / PROJECT_FILE}'
     return [*lines, f"finer: {finer}, then splatgraft run {shown}"]
 
 
 def _guesses(step: Step) -> list[str]:
     """What a step had to guess because nothing was asked."""
-    if isinstance(step, Segment) and step.mask_source == "grabcut" and step.box is None:
+    if not isinstance(step, Segment):
+        return []
+    if step.mask_source == "grabcut" and step.box is None:
         return ["no masks and no box were given: the object is what GrabCut found in a box that was guessed."]
-    return []
+    return ["the object is all that lies in a box; masks cut it finer."] if step.mask_source == "box" else []
 
 
 def _name(capture: Path) -> str:
@@ -111,7 +118,10 @@ def _name(capture: Path) -> str:
 
 
 def _same_captures(project: Path, sides: tuple[str, str]) -> bool:
-    return all(line in project.read_text(encoding="utf-8").splitlines() for line in sides)
+    """Whether a project has the captures that two lines of project.toml name."""
+    content = read_toml(project)
+    wanted = zip(("source", "target"), map(tomllib.loads, sides), strict=True)
+    return all(content.get(side, {}).items() >= line.items() for side, line in wanted)
 
 
 def _has_masks(capture: Path) -> bool:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 _OPENERS = {"darwin": "open", "linux": "xdg-open"}
@@ -22,7 +23,9 @@ def open_page(page: Path) -> bool:
         return False
     quiet = subprocess.DEVNULL
     try:
-        subprocess.Popen([opener, str(page)], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+        opened = subprocess.Popen([opener, str(page)], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
     except OSError:
         return False
+    # some openers last as long as the browser's window
+    threading.Thread(target=opened.wait, daemon=True).start()
     return True
