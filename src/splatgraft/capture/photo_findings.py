@@ -116,12 +116,18 @@ def named(photos: Sequence[str]) -> str:
     return ", ".join(photos[:_NAMED]) + more
 
 
+def _above(names: Sequence[str], values: Sequence[float], limit: float) -> tuple[str, ...]:
+    """The names whose values are above a limit, the largest first."""
+    pairs = sorted(zip(values, names, strict=True), key=lambda pair: -pair[0])
+    return tuple(name for value, name in pairs if value > limit)
+
+
 def _sharpness(inspection: Inspection, names: Sequence[str], rule: FindingRule) -> Finding:
     blur = np.array(inspection.blur)
     middle = float(np.median(blur))
     deviation = 1.4826 * float(np.median(np.abs(blur - middle)))
     limit = middle + max(rule.blur_above, rule.blur_deviations * deviation)
-    blurred = tuple(names[i] for i in np.argsort(-blur).tolist() if blur[i] > limit)
+    blurred = _above(names, inspection.blur, limit)
     if middle > rule.blur_of_all:
         text = f"most photos are blurred (median blur {middle:.2f}, sharp captures have 0.23 to 0.37)"
         return Finding("sharpness", "doubtful", text, "photograph again with shorter exposure and in focus", blurred)
@@ -157,9 +163,9 @@ def _copies(inspection: Inspection, names: Sequence[str]) -> Finding:
 
 
 def _jumps(inspection: Inspection, names: Sequence[str], rule: FindingRule) -> Finding:
-    jumps = np.abs(inspection.jumps)
-    odd = tuple(names[i] for i in np.argsort(-jumps).tolist() if jumps[i] > rule.jump_stops)
+    jumps = [abs(jump) for jump in inspection.jumps]
+    odd = _above(names, jumps, rule.jump_stops)
     if odd:
-        text = f"{len(odd)} photos are up to {jumps.max():.1f} stops off their neighbours in brightness: {named(odd)}"
+        text = f"{len(odd)} photos are up to {max(jumps):.1f} stops off their neighbours in brightness: {named(odd)}"
         return Finding("exposure", "doubtful", text, "lock exposure and white balance, or leave them out", odd)
-    return Finding("exposure", "good", f"neighbours agree in brightness within {jumps.max():.2f} stops")
+    return Finding("exposure", "good", f"neighbours agree in brightness within {max(jumps):.2f} stops")
