@@ -64,7 +64,7 @@ class Capture:
             )
             context.console.say(f"{self.capture}: {report}")
             for doubt in report.doubts:
-                context.console.say(f"{self.capture}: doubtful: {doubt}")
+                context.console.warn(f"{self.capture}: doubtful: {doubt}")
             write_pose_report(folder, report)
         write_capture(folder, _limited(posed, self.max_side))
 
@@ -88,7 +88,7 @@ class Capture:
 
     def _warn_of_exposures(self, photos: Sequence[Path], context: Context) -> None:
         for warning in exposure_warnings(self.capture, photos):
-            context.console.say(warning)
+            context.console.warn(warning)
 
     def _photos(self, folder: Path, context: Context) -> list[Path]:
         if self.capture.is_dir():
