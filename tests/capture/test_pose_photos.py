@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from splatgraft.capture import PoseOptions, pose_photos, structure_from_motion
+from splatgraft.capture import PoseOptions, Unposed, pose_photos, structure_from_motion
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.images import write_image
+from splatgraft.formats.captures.masks import PhotoFiles
 
 UP = torch.tensor([0.0, 0, 1])
 
@@ -21,7 +22,7 @@ def photo_paths(folder, count):
     paths = [folder / f"{i:02d}.png" for i in range(count)]
     for path in paths:
         write_image(path, torch.rand(30, 40, 3, generator=generator))
-    return paths
+    return PhotoFiles(tuple(paths))
 
 
 def model_of(poses, focal=50.0, points=()):
@@ -30,7 +31,9 @@ def model_of(poses, focal=50.0, points=()):
         "models": 1,
         "method": "global",
         "explained": 0.8,
+        "seconds": {"features": 1.0, "matching": 2.0, "mapping": 0.5},
         "cpu_seconds": {"features": 1.0, "matching": 2.0, "mapping": 0.5},
+        "unposed": [{"name": f"{i:02d}.jpg", "features": 900, "matches": 12} for i in range(len(poses), 8)],
         "mean_reprojection_px": 0.4,
         "images": [
             {
@@ -59,7 +62,7 @@ def answer(monkeypatch):
 
     def give(*models):
         queue = list(models)
-        monkeypatch.setattr(structure_from_motion, "_run", lambda job, advance: queue.pop(0))
+        monkeypatch.setattr(structure_from_motion, "_run", lambda job, advance, say: queue.pop(0))
         return queue
 
     return give
@@ -79,15 +82,15 @@ def test_two_photos_are_too_few(tmp_path, answer):
 
 def test_photos_of_one_name_are_refused(tmp_path, answer):
     answer()
-    paths = photo_paths(tmp_path / "a", 3) + photo_paths(tmp_path / "b", 1)
+    paths = photo_paths(tmp_path / "a", 3).paths + photo_paths(tmp_path / "b", 1).paths
     with pytest.raises(ValueError, match="one photo per name"):
-        pose_photos(paths, tmp_path)
+        pose_photos(PhotoFiles(paths), tmp_path)
 
 
 def test_an_unreadable_photo_is_named(tmp_path, answer):
     answer()
     paths = photo_paths(tmp_path / "photos", 3)
-    paths[1].write_bytes(b"no image")
+    paths.paths[1].write_bytes(b"no image")
     with pytest.raises(ValueError, match=r"01\.png"):
         pose_photos(paths, tmp_path)
 
@@ -101,7 +104,7 @@ def test_under_half_registered_says_what_to_do(tmp_path, answer):
 def test_the_larger_of_both_efforts_is_taken_and_reported(tmp_path, answer):
     answer(model_of(circle(4)), model_of(circle(7)))
     posed, report = pose_photos(photo_paths(tmp_path / "photos", 8), tmp_path)
-    assert (report.registered, report.photos, report.missing) == (7, 8, ("07",))
+    assert (report.registered, report.photos, report.missing) == (7, 8, (Unposed("07", 900, 12),))
     assert "7 of 8 photos registered" in str(report)
     assert len(posed) == 7
     assert posed.image(0).shape == (30, 40, 3)
@@ -115,7 +118,8 @@ def test_a_full_quick_model_needs_no_second_effort(tmp_path, answer):
 
 
 def test_a_dying_process_is_reported_in_one_line(tmp_path, monkeypatch):
-    program = tmp_path / "colmap_process.py"
+    (tmp_path / "colmap_process").mkdir()
+    program = tmp_path / "colmap_process" / "__main__.py"
     program.write_text("import sys; print('nothing to match', file=sys.stderr); sys.exit(3)")
     monkeypatch.setattr(structure_from_motion, "__file__", str(tmp_path / "structure_from_motion.py"))
     monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: object())
@@ -159,7 +163,7 @@ def test_true_poses_come_back_up_to_a_similarity(tmp_path):
     paths = [tmp_path / "photos" / f"{name}.png" for name in truth.names]
     for camera, path in zip(truth, paths, strict=True):
         write_image(path, corner_photo(camera))
-    posed, report = pose_photos(paths, tmp_path, options=PoseOptions(effort="quick"))
+    posed, report = pose_photos(PhotoFiles(tuple(paths)), tmp_path, options=PoseOptions(effort="quick"))
     assert report.registered == 8
     # SIFT places features to about a third of a pixel
     assert report.mean_reprojection_px < 1

@@ -14,11 +14,12 @@ from splatgraft.capture import (
     render_pictures,
     write_pose_report,
 )
-from splatgraft.core.images import list_images, write_image
+from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs, has_poses
 from splatgraft.folders.photo_exposures import exposure_warnings
 from splatgraft.formats import is_scene, read_capture, read_gaussians, write_capture
+from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.project.step import Context, Inputs, Positional
 
 
@@ -42,7 +43,10 @@ class Capture:
         """The photos, or the video, or the scene, or the files of the posed capture."""
         if has_poses(self.capture):
             return capture_inputs(self.capture, read_capture(self.capture), masks=True)
-        return {"photos": tuple(list_images(self.capture)) if self.capture.is_dir() else (self.capture,)}
+        if not self.capture.is_dir():
+            return {"photos": (self.capture,)}
+        photos = find_photos(self.capture)
+        return {"photos": photos.paths, "masks": tuple(mask for mask in photos.masks if mask is not None)}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the posed capture."""
@@ -50,14 +54,16 @@ class Capture:
             posed = self._pictures(folder, context)
         elif has_poses(self.capture):
             posed = read_capture(self.capture)
-            context.console.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points")
+            masks = describe_masks(posed.image_paths, posed.mask_paths)
+            context.console.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points; {masks}")
             self._warn_of_exposures(posed.image_paths, context)
         else:
             photos = self._photos(folder, context)
-            self._warn_of_exposures(photos, context)
+            self._warn_of_exposures(photos.paths, context)
             posed, report = pose_photos(
                 photos,
                 folder,
+                scratch=context.checkpoint.folder / "colmap",
                 options=self.options,
                 progress=context.progress,
                 say=lambda sentence: context.console.say(f"{self.capture}: {sentence}"),
@@ -90,10 +96,13 @@ class Capture:
         for warning in exposure_warnings(self.capture, photos):
             context.console.say(warning)
 
-    def _photos(self, folder: Path, context: Context) -> list[Path]:
-        if self.capture.is_dir():
-            return list_images(self.capture)
-        return extract_frames(self.capture, folder / "frames", progress=context.progress)
+    def _photos(self, folder: Path, context: Context) -> PhotoFiles:
+        if not self.capture.is_dir():
+            return PhotoFiles(tuple(extract_frames(self.capture, folder / "frames", progress=context.progress)))
+        photos = find_photos(self.capture)
+        masks = describe_masks(photos.paths, photos.masks)
+        context.console.say(f"{self.capture}: {len(photos.paths)} photos without poses; {masks}")
+        return photos
 
 
 def doubt_about(step: Capture) -> str | None:
