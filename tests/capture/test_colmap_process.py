@@ -15,7 +15,7 @@ import pytest
 from made_up_photos import FOCAL, turntable
 
 from splatgraft.capture import colmap_process
-from splatgraft.capture.colmap_process.job import Job
+from splatgraft.capture.colmap_process.job import SEARCH, Job
 
 pytestmark = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is an optional extra")
 
@@ -64,17 +64,16 @@ def error_after_alignment(found: np.ndarray, truth: np.ndarray) -> float:
 
 def test_an_object_on_a_turntable_is_posed_by_its_masks(tmp_path: Path) -> None:
     truth = turntable(tmp_path, 12, 15)
-    whole = finish(job_of(tmp_path, "whole"))
-    masked = finish(job_of(tmp_path, "masked", masks=True))
+    job = job_of(tmp_path, "masked", masks=True)
+    masked = finish(job)
+    whole = json.loads((job.folder / "answers" / "global, all pairs.json").read_text())
+    assert whole["explained"] < SEARCH.clear_explained  # what the still wall says is another motion
     assert masked["database"] == "masked"
     assert len(masked["images"]) == 12
     assert masked["images"][0]["camera"][0] == pytest.approx(FOCAL, rel=0.03)
     # a third of a pixel (SIFT) at a focal length of 500 px and a distance of 4.5 is 3 mm; hundreds of points share it,
     # while focal length and distance trade against each other: one percent of 4.5
     assert error_after_alignment(camera_centers(masked), truth[:, :3, 3]) < 0.045
-    # what the still wall says: the camera never moved
-    posed = [int(image["name"][:2]) for image in whole["images"]]
-    assert len(posed) < 12 or error_after_alignment(camera_centers(whole), truth[posed, :3, 3]) > 0.45
 
 
 def test_a_still_scene_is_posed_by_all_its_features(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Capture, structure from motion: errors that help, and poses of made-up photos whose true poses are known."""
 
 import math
+from dataclasses import replace
 from importlib.util import find_spec
 
 import cv2
@@ -115,6 +116,45 @@ def test_a_full_quick_model_needs_no_second_effort(tmp_path, answer):
     left = answer(model_of(circle(5)), model_of(circle(5)))
     pose_photos(photo_paths(tmp_path / "photos", 5), tmp_path)
     assert len(left) == 1
+
+
+def test_masks_are_carried_along_undistorted_like_their_photos(tmp_path, answer):
+    answer(model_of(circle(3)))
+    photos = photo_paths(tmp_path / "photos", 3)
+    mask = torch.zeros(30, 40, 3)
+    mask[:, :20] = 1
+    write_image(tmp_path / "mask.png", mask)
+    posed, _ = pose_photos(replace(photos, masks=(None, tmp_path / "mask.png", None)), tmp_path)
+    assert [path and path.relative_to(tmp_path).as_posix() for path in posed.mask_paths] == [None, "masks/01.png", None]
+    carried = posed.mask(1)
+    assert carried.shape == posed.image(1).shape[:2]
+    # the middle column stays where it is, since the principal point is in the middle
+    assert carried[:, :19].min() == 1
+    assert carried[:, 21:].max() == 0
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path, answer):
+    answer()
+    photos = photo_paths(tmp_path / "photos", 3)
+    write_image(tmp_path / "mask.png", torch.zeros(40, 40, 3))
+    with pytest.raises(ValueError, match=r"mask\.png: expected 40x30 px.*found 40x40"):
+        pose_photos(replace(photos, masks=(None, tmp_path / "mask.png", None)), tmp_path)
+
+
+def test_before_a_second_attempt_it_is_said_why_and_for_how_long(tmp_path, answer):
+    said = []
+    first = model_of(circle(7)) | {"mean_reprojection_px": 2.0, "seconds": {"features": 20.0, "mapping": 10.0}}
+    answer(first, model_of(circle(8)))
+    pose_photos(photo_paths(tmp_path / "photos", 8), tmp_path, say=said.append)
+    assert "took 30 s (features 20, mapping 10)" in said[0]
+    for expected in ("mean reprojection error", "once more with more features", "about 10 min", "effort = quick"):
+        assert expected in said[1]
+
+
+def test_photos_without_a_pose_are_named_with_the_usual_reason(tmp_path, answer):
+    answer(model_of(circle(7)), model_of(circle(7)))
+    _, report = pose_photos(photo_paths(tmp_path / "photos", 8), tmp_path)
+    assert "without a pose: 07 (900 features, at most 12 matches: of another place" in str(report)
 
 
 def test_a_dying_process_is_reported_in_one_line(tmp_path, monkeypatch):
