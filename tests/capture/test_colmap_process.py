@@ -105,3 +105,10 @@ def test_the_process_ends_with_its_parent(tmp_path: Path) -> None:
         assert process.stdin is not None
         process.stdin.close()
         assert process.wait() == 1
+
+
+def test_models_that_share_photos_are_joined_and_missing_photos_are_posed(tmp_path: Path) -> None:
+    program = Path(__file__).with_name("join_synthetic_models.py")
+    command = [sys.executable, str(program), str(Path(colmap_process.__file__).parents[1]), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -12,17 +12,23 @@ import numpy as np
 
 from .job import SEARCH, Job
 from .joining import joined
-from .scores import explained_shares, posed_and_explained, read_matches
+from .scores import Matches, explained_shares, posed_and_explained, read_matches
 
 
 def refined(job: Job, database: Path, models: list[Any]) -> Any:
     """The best of `models`, of which there is at least one, with what others of them add to it, refined."""
-    import pycolmap
-
     matches, refiner = read_matches(database), _Refiner(job, database)
     start = joined(models) or max(models, key=lambda model: posed_and_explained(matches, model))
-    best = refiner.adjusted(pycolmap.Reconstruction(start))
-    tried_before: set[int] = set()
+    best = _reposed(refiner, matches, refiner.adjusted(refiner.with_all_photos(start)))
+    best.extract_colors_for_all_images(job.photos)
+    return best
+
+
+def _reposed(refiner: "_Refiner", matches: Matches, model: Any) -> Any:
+    """The model with badly explained photos, and those without a pose, posed anew as long as the score grows."""
+    import pycolmap
+
+    best, tried_before = model, set()
     while True:
         shares = explained_shares(matches, best)
         usual = float(np.median(list(shares.values()))) if shares else 0.0
@@ -53,13 +59,29 @@ class _Refiner:
         with pycolmap.Database.open(database) as opened:
             self._cache = pycolmap.DatabaseCache.create(opened, caching)
 
+    def with_all_photos(self, model: Any) -> Any:
+        """A copy of the model that also has the photos without a pose, which mappers drop when they end."""
+        import pycolmap
+
+        whole = pycolmap.Reconstruction()
+        whole.load(self._cache)
+        for i, camera in model.cameras.items():
+            whole.cameras[i].params = camera.params
+        for i in sorted(model.reg_frame_ids()):
+            whole.frame(i).rig_from_world = model.frame(i).rig_from_world
+            whole.register_frame(i)
+        for _, point in sorted(model.points3D.items()):
+            whole.add_point3D(point.xyz, point.track, point.color)
+        return whole
+
     def adjusted(self, model: Any) -> Any:
         """The model with tracks completed and merged, all cameras and points adjusted, and outliers dropped."""
         mapper = self._begin(model)
         for i in sorted(model.reg_image_ids()):
             mapper.triangulate_image(self._triangulation, i)
         self._adjust(mapper)
-        return self._end(mapper, model)
+        model.update_point_3d_errors()
+        return model
 
     def reposed(self, model: Any, poor: list[int]) -> Any:
         """The model with its photos `poor`, and those without a pose, posed from the points of the others."""
@@ -72,7 +94,8 @@ class _Refiner:
             if not posed:
                 break
         self._adjust(mapper)
-        return self._end(mapper, model)
+        model.update_point_3d_errors()
+        return model
 
     def _pose(self, mapper: Any, image: int) -> bool:
         if not mapper.register_next_image(self._mapping, image):
@@ -91,9 +114,3 @@ class _Refiner:
         mapper.iterative_global_refinement(
             SEARCH.adjustments, SEARCH.adjusted_change, self._mapping, self._adjustment, self._triangulation
         )
-
-    @staticmethod
-    def _end(mapper: Any, model: Any) -> Any:
-        mapper.end_reconstruction(False)
-        model.update_point_3d_errors()
-        return model
