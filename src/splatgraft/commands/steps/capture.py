@@ -122,7 +122,7 @@ class Capture:
             return PhotoFiles(tuple(extract_frames(self.capture, folder / "frames", progress=context.progress)))
         photos = find_photos(self.capture)
         masks = describe_masks(photos.paths, photos.masks)
-        context.console.say(f"{self.capture}: {len(photos.paths)} photos without poses; {masks}")
+        context.console.say(f"{self.capture}: {len(photos.paths)} photos; {masks}")
         return photos
 
 
