@@ -87,6 +87,7 @@ def test_killed_runs_go_on_to_the_result_of_one_that_was_not(tmp_path: Path) -> 
     began = time.monotonic()
     expected = finish(whole)
     took = time.monotonic() - began
+    assert all(sum(point[3:6]) > 0 for point in expected["points"])  # those of the refinement have colours, too
     job, chance = replace(whole, scratch=str(tmp_path / "killed")), random.Random(0)
     job.folder.mkdir()
     for _ in range(6):

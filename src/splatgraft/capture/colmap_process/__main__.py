@@ -5,5 +5,6 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-sys.path[0] = str(Path(__file__).resolve().parents[1])
-import_module("colmap_process.program").main(json.loads(sys.argv[1]))
+if __name__ == "__main__":
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
+    import_module("colmap_process.program").main(json.loads(sys.argv[1]))
