@@ -32,10 +32,10 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """COLMAP answers with all photos and an error of 1.05 px; every call is noted."""
     calls: list[str] = []
 
-    def answer(job, advance):
-        calls.append(job["photos"])
+    def answer(job, advance, say):
+        calls.append(job.photos)
         pose = torch.eye(4)[:3]
-        names = [name for group in job["groups"] for name in group]
+        names = [name for group in job.groups for name in group]
         images = [
             {
                 "name": name,
@@ -50,7 +50,9 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             "models": 1,
             "method": "global",
             "explained": 0.7,
+            "seconds": {},
             "cpu_seconds": {},
+            "unposed": [],
             "mean_reprojection_px": 1.05,
             "images": images,
             "points": [[0.0, 0.0, 5.0, 255, 0, 0, 0.3, 4]],
