@@ -26,7 +26,7 @@ def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
     (1035), 40k at 640x426 568 (626).
     """
     pixels = options.served(capture).cameras.sizes.prod(1).double().tolist()
-    pyramid = 3 * sum(pixels) * (1 + 1 / 2 + 1 / 4 + 1 / 16 if options.coarse_to_fine else 1)
+    pyramid = 3 * sum(pixels) * sum(part.factor**2 for part in options.sampling)
     largest = max(pixels, default=0.0)
     numbers = 11 + 3 * coefficient_count(options.sh_degree)
     gaussians = options.most_gaussians * (4 * numbers * _COPIES + _BYTES_PER_GAUSSIAN)
