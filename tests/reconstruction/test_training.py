@@ -167,7 +167,7 @@ def test_more_time_is_predicted_for_more_work(capture):
     assert durations == sorted(durations)
     every_pixel = ReconstructOptions(coarse_to_fine=False)
     assert predict_cpu_seconds(capture, every_pixel) > predict_cpu_seconds(capture, ReconstructOptions())
-    assert describe_duration(312) == "5 minutes"
+    assert describe_duration(312.0) == "5 minutes"
 
 
 def test_many_sparse_points_leave_room_for_the_density_control(capture):
@@ -179,7 +179,7 @@ def test_many_sparse_points_leave_room_for_the_density_control(capture):
 
     reconstruct(capture, ReconstructOptions(iterations=60, budget=150, sh_degree=0), progress=watch)
     # 150 points for a budget of 150
-    assert counts[0] < 100
+    assert counts[0] < 120
     assert counts[-1] > counts[0]
 
 

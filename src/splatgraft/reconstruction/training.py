@@ -30,8 +30,10 @@ class ScheduleOptions:
 
     published_iterations: int = 30_000
     """Steps for which the published values hold (3DGS)."""
-    fewest_points: int = 1000
-    """Sparse points below which more are found by a plane sweep, and with those too few, random ones are taken."""
+    few_points: int = 1000
+    """Sparse points below which more are found by a plane sweep."""
+    fewest_points: int = 100
+    """Points of both kinds below which random ones are taken."""
     sweep: SweepOptions = field(default_factory=SweepOptions)
     """The search for points where the capture has none."""
     start_share: float = 0.4
@@ -136,7 +138,7 @@ def _start(
     seeds = SeedPoints(
         capture.points.float(), capture.point_colors.float(), torch.full((len(capture.points),), torch.inf)
     )
-    if len(seeds) < schedule.fewest_points:
+    if len(seeds) < schedule.few_points:
         cameras, images = views.reduced(schedule.sweep.longest_side_px)
         reach = looked_at(capture.cameras)[1]
         swept = sweep(cameras, images, known=seeds.points, reach=reach, options=schedule.sweep)
