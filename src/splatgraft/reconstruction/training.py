@@ -36,7 +36,7 @@ class ScheduleOptions:
     """Points of both kinds below which random ones are taken."""
     sweep: SweepOptions = field(default_factory=SweepOptions)
     """The search for points where the capture has none."""
-    start_share: float = 0.4
+    start_share: float = 0.6
     """Gaussians at the start at most, over the budget; the others come where the density control wants them."""
     published_opacity: float = 0.1
     """Opacity at the start of a run of the published length or longer (3DGS)."""
