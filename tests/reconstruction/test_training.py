@@ -162,6 +162,14 @@ def test_quality_chooses_what_is_not_given():
     assert ReconstructOptions(quality="full").most_gaussians > ReconstructOptions().most_gaussians
 
 
+def test_pixels_are_left_out_only_where_there_are_more_than_gaussians(capture):
+    options = ReconstructOptions(quality="draft")
+    large = replace(capture, cameras=capture.cameras.resized(12.0))
+    assert max(part.stride for part in options.sampling(large)) == 2
+    assert max(part.stride for part in options.sampling(capture)) == 1
+    assert max(part.stride for part in replace(options, budget=100_000).sampling(large)) == 1
+
+
 def test_more_time_is_predicted_for_more_work(capture):
     durations = [predict_cpu_seconds(capture, ReconstructOptions(quality=q)) for q in ("draft", "standard", "high")]
     assert durations == sorted(durations)

@@ -26,10 +26,11 @@ def predict_cpu_seconds(capture: PosedImages, options: ReconstructOptions, cost:
         options: Likewise.
         cost: Of a step.
     """
-    sizes = options.served(capture).cameras.sizes.prod(1).double()
+    served = options.served(capture)
+    sizes = served.cameras.sizes.prod(1).double()
     size = float(sizes.mean()) if len(sizes) else 0.0
     pixels, begin = 0.0, 0.0
-    for part in options.sampling:
+    for part in options.sampling(served):
         pixels += (part.until - begin) * size * (part.factor / part.stride) ** 2
         begin = part.until
     # about a sixth fewer than the budget on average, as it is reached late

@@ -95,7 +95,7 @@ def reconstruct(
     if len(capture) < 2:
         raise ValueError(f"reconstruct: expected at least 2 views to fit, found {len(capture)}")
     capture = options.served(capture)
-    views = read_pyramid(capture, options.sampling, device=options.device, progress=progress)
+    views = read_pyramid(capture, options.sampling(capture), device=options.device, progress=progress)
     start = _start(capture, views, options, schedule, progress=progress).to(options.device)
     control = _Control(
         options.sh_degree,
