@@ -24,7 +24,7 @@ ROOM = Path(__file__).parents[1] / "data" / "room"
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("capture", nargs="?", type=Path, default=ROOM)
-    parser.add_argument("--quality", choices=["draft", "standard", "full"], default="standard")
+    parser.add_argument("--quality", choices=["draft", "standard", "high", "full"], default="standard")
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--budget", type=int)
     parser.add_argument("--resolution", type=float)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from splatgraft.core.image_metrics import psnr, ssim, ssim_map
+from splatgraft.core.image_metrics import fit_color, psnr, ssim, ssim_map
 
 
 def noisy_pair(seed=0, height=37, width=53):
@@ -68,3 +68,12 @@ def test_ssim_has_a_gradient_that_points_to_the_reference():
 def test_small_images_are_refused():
     with pytest.raises(ValueError, match="at least 11x11 pixels, found 20x10"):
         ssim(torch.zeros(10, 20, 3), torch.zeros(10, 20, 3))
+
+
+def test_a_fit_of_colours_leaves_no_trace_of_exposure_and_white_balance():
+    image = torch.rand(40, 50, 3)
+    reference = 0.1 + image @ torch.tensor([[0.7, 0.05, 0.0], [0.0, 0.6, 0.05], [0.02, 0.0, 0.8]]).T
+    # the ridge of 1e-6 against variances of 1/12 leaves about 1e-5 of the change
+    assert torch.allclose(fit_color(image, reference), reference, atol=1e-4)
+    flat = torch.full((12, 12, 3), 0.5)
+    assert torch.isfinite(fit_color(flat, flat)).all()

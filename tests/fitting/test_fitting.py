@@ -9,6 +9,7 @@ from splatgraft.core import cameras as camera_values
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import ssim
 from splatgraft.fitting import FitOptions, FixedViews, LearningRates, adam, fit, l1_dssim
+from splatgraft.fitting.view_colors import ViewColors
 from splatgraft.rendering import render
 
 
@@ -173,6 +174,31 @@ def test_a_killed_fit_resumes_bit_for_bit(monkeypatch):
     resumed = fit(start, views, options=options, checkpoint=checkpoint)
     for name in rates.active():
         assert torch.equal(getattr(whole, name), getattr(resumed, name)), name
+
+
+def test_colours_that_differ_between_views_do_not_enter_the_scene():
+    truth = blobs(60, seed=3, degree=0)
+    views = pictures(truth)
+    gains = (1.3, 0.7, 1.0, 1.2, 0.8, 1.0)
+    tinted = FixedViews(views.cameras, tuple(g * image for g, image in zip(gains, views.images, strict=True)))
+    grey = replace(truth, sh=torch.zeros_like(truth.sh))
+    errors = []
+    for rate in (0.0, 0.01):
+        options = FitOptions(iterations=240, rates=LearningRates(sh=0.02), view_color_rate=rate)
+        fitted = fit(grey, tinted, options=options)
+        errors.append(float((fitted.sh - truth.sh).abs().median()))
+    # the gains' mean is 1, so the scene's colours are those before the gains
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_the_mean_of_the_views_colours_stays_the_identity():
+    colors = ViewColors.identity(5, torch.device("cpu"))
+    generator = torch.Generator().manual_seed(0)
+    for step in range(40):
+        colors = colors.updated(step % 3, torch.randn(3, 4, generator=generator), 0.01)
+    assert colors.maps.abs().max() > 0.01
+    # float32 rounding of forty sums
+    assert colors.maps.mean(0).abs().max() < 1e-6
 
 
 def test_what_is_not_finite_is_an_error_that_says_so():

@@ -11,7 +11,13 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import psnr
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.reconstruction import ReconstructOptions, predict_memory, reconstruct
+from splatgraft.reconstruction import (
+    ReconstructOptions,
+    describe_duration,
+    predict_cpu_seconds,
+    predict_memory,
+    reconstruct,
+)
 from splatgraft.reconstruction import memory as memory_module
 from splatgraft.rendering import render
 
@@ -154,6 +160,37 @@ def test_quality_chooses_what_is_not_given():
     assert ReconstructOptions(quality="draft").all_iterations == 1000
     assert ReconstructOptions(quality="full", iterations=7).all_iterations == 7
     assert ReconstructOptions(quality="full").most_gaussians > ReconstructOptions().most_gaussians
+
+
+def test_pixels_are_left_out_only_where_there_are_more_than_gaussians(capture):
+    options = ReconstructOptions(quality="draft")
+    large = replace(capture, cameras=capture.cameras.resized(12.0))
+    assert max(part.stride for part in options.sampling(large)) == 2
+    assert max(part.stride for part in options.sampling(capture)) == 1
+    assert max(part.stride for part in replace(options, budget=100_000).sampling(large)) == 1
+
+
+def test_more_time_is_predicted_for_more_work(capture):
+    durations = [predict_cpu_seconds(capture, ReconstructOptions(quality=q)) for q in ("draft", "standard", "high")]
+    assert durations == sorted(durations)
+    every_pixel = ReconstructOptions(coarse_to_fine=False)
+    assert predict_cpu_seconds(capture, every_pixel) > predict_cpu_seconds(capture, ReconstructOptions())
+    assert describe_duration(312.0) == "5 minutes"
+
+
+def test_many_sparse_points_leave_room_for_the_density_control(capture):
+    counts = []
+
+    def watch(done: int, total: int, message: str) -> None:
+        if "k Gaussians" in message:
+            counts.append(float(message.split(", ")[1].split("k", maxsplit=1)[0]) * 1000)
+
+    points = capture.points.repeat(10, 1) + 0.02 * torch.randn(1500, 3, generator=torch.Generator().manual_seed(1))
+    dense = replace(capture, points=points, point_colors=torch.full((1500, 3), 0.5))
+    reconstruct(dense, ReconstructOptions(iterations=60, budget=1500, sh_degree=0), progress=watch)
+    # messages give hundreds; at step 10 of 60 a start of 0.6 of the budget has grown by about a tenth of the budget
+    assert counts[0] < 1300
+    assert counts[-1] > counts[0]
 
 
 def test_large_photographs_are_served_smaller_unless_told(capture):

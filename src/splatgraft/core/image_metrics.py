@@ -1,4 +1,4 @@
-"""PSNR and SSIM (Wang 2004) of images in [0, 1], whole or inside a region; differentiable."""
+"""PSNR and SSIM (Wang 2004) of images in [0, 1], whole or inside a region, differentiable; a fit of colours."""
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +13,20 @@ def psnr(
     squares = (image - reference) ** 2
     mean = squares.mean() if region is None else squares[region].mean()
     return -10 * mean.log10()
+
+
+def fit_color(image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """`image` with its colours mapped to the reference's by one affine map (least squares), clamped to [0, 1].
+
+    What is left of the error has no exposure and white balance in it (as `color_correct` of Mip-NeRF 360's evaluation,
+    without its quadratic terms).
+    """
+    pixels = image.reshape(-1, 3).double()
+    columns = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1)
+    # normal equations with a ridge far below one grey level, for images of one colour
+    matrix = columns.T @ columns + 1e-6 * len(columns) * torch.eye(4, dtype=columns.dtype, device=columns.device)
+    solution = torch.linalg.solve(matrix, columns.T @ reference.reshape(-1, 3).double())
+    return (columns @ solution).to(image).reshape(image.shape).clamp(0, 1)
 
 
 def _window(channels: int, like: Tensor) -> Float[Tensor, "c 1 11 1"]:

@@ -19,6 +19,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import adam
 from splatgraft.fitting.learning_rates import LearningRates
 from splatgraft.fitting.photometric import l1_dssim
+from splatgraft.fitting.view_colors import ViewColors, apply_colors, rate_at
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.interruption import interruption_held
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
@@ -31,6 +32,18 @@ _REPORT_EVERY = 10
 _CHECKPOINT_SECONDS = 30.0
 
 
+@dataclass(frozen=True)
+class View:
+    """One camera and its target image."""
+
+    camera: Cameras
+    """A batch of one."""
+    image: Float[Tensor, "h w 3"]
+    """sRGB."""
+    low_pass_px2: float | None = None
+    """Low pass of the rendering where it is not that of the fit's options, pixels squared."""
+
+
 @runtime_checkable
 class Views(Protocol):
     """The images to fit."""
@@ -39,8 +52,8 @@ class Views(Protocol):
         """Number of views."""
         ...
 
-    def at(self, index: int, done: float) -> tuple[Cameras, Float[Tensor, "h w 3"]]:
-        """One camera and its target image, after the share `done` in [0, 1] of all steps."""
+    def at(self, index: int, *, visit: int, done: float) -> View:
+        """One view, when it is seen for the time `visit` (from 0), after the share `done` in [0, 1] of all steps."""
         ...
 
 
@@ -57,9 +70,9 @@ class FixedViews:
         """Number of views."""
         return len(self.images)
 
-    def at(self, index: int, done: float) -> tuple[Cameras, Float[Tensor, "h w 3"]]:
+    def at(self, index: int, *, visit: int, done: float) -> View:
         """One camera and its image."""
-        return self.cameras[index], self.images[index]
+        return View(self.cameras[index], self.images[index])
 
 
 @dataclass(frozen=True)
@@ -72,6 +85,8 @@ class FitOptions:
     """Learning rates; fields with rate 0 are not fitted."""
     loss: Loss = l1_dssim
     """Loss to minimise."""
+    view_color_rate: float = 0.0
+    """Learning rate of each view's own affine map of colours at the start; 0 fits none."""
     seed: int = 0
     """Of the order of views."""
     rendering: RenderOptions = field(default_factory=RenderOptions)
@@ -88,6 +103,8 @@ class FitState:
     """As fitted so far."""
     moments: adam.Moments
     """Of the fields that are fitted."""
+    view_colors: ViewColors
+    """Of each view over the scene."""
     memory: dict[str, Tensor] = field(default_factory=dict)
     """Tensors that the control stores between steps."""
 
@@ -145,20 +162,32 @@ def fit(
         raise ValueError("fit: expected at least one view, found none")
     names = options.rates.active()
     saved = checkpoint.load()
-    state = _start(gaussians, names) if saved is None else _unpacked(saved, gaussians.device)
+    state = _start(gaussians, names, len(views)) if saved is None else _unpacked(saved, gaussians.device)
     last_save, recent = time.monotonic(), 0.0
     with interruption_held() as interrupted:
         while state.iteration < options.iterations:
             done = state.iteration / options.iterations
-            camera, image = views.at(_view_of(state.iteration, len(views), options.seed), done)
+            index = _view_of(state.iteration, len(views), options.seed)
+            view = views.at(index, visit=state.iteration // len(views), done=done)
+            image, camera = view.image, view.camera
+            rendering = options.rendering
+            if view.low_pass_px2 is not None:
+                rendering = replace(rendering, low_pass_px2=view.low_pass_px2)
             leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
-            drawn = render(replace(state.gaussians, **leaves), camera, options=options.rendering)
-            loss = options.loss(drawn.color[0], image)
+            drawn = render(replace(state.gaussians, **leaves), camera, options=rendering)
+            fits_colors = options.view_color_rate > 0
+            colors = state.view_colors.of(index).requires_grad_(fits_colors)
+            picture = apply_colors(drawn.color[0], colors) if fits_colors else drawn.color[0]
+            loss = options.loss(picture, image)
             value = float(loss.detach())
             if not math.isfinite(value):
                 raise _diverged(state, f"a loss of {value}")
             seen = drawn.visible[0]
-            gradients = dict(zip(names, torch.autograd.grad(loss, list(leaves.values())), strict=True))
+            found = torch.autograd.grad(loss, [*leaves.values(), *([colors] if fits_colors else [])])
+            gradients = dict(zip(names, found[: len(names)], strict=True))
+            if fits_colors:
+                moved = state.view_colors.updated(index, found[-1], rate_at(options.view_color_rate, done))
+                state = replace(state, view_colors=moved)
             values = {name: leaf.detach() for name, leaf in leaves.items()}
             columns = {name: v[0].numel() if len(v) else 1 for name, v in values.items()}
             rates = {name: options.rates.at(name, done, columns[name]) for name in names}
@@ -192,9 +221,10 @@ def _view_of(iteration: int, count: int, seed: int) -> int:
     return int(torch.randperm(count, generator=generator)[iteration % count])
 
 
-def _start(gaussians: Gaussians, names: tuple[str, ...]) -> FitState:
+def _start(gaussians: Gaussians, names: tuple[str, ...], views: int) -> FitState:
     own = gaussians.map(lambda tensor: tensor.detach().clone().contiguous())
-    return FitState(0, own, adam.no_moments({name: getattr(own, name) for name in names}, own.count))
+    moments = adam.no_moments({name: getattr(own, name) for name in names}, own.count)
+    return FitState(0, own, moments, ViewColors.identity(views, own.device))
 
 
 def _packed(state: FitState) -> dict[str, Any]:
@@ -204,6 +234,7 @@ def _packed(state: FitState) -> dict[str, Any]:
         "first": state.moments.first,
         "second": state.moments.second,
         "steps": state.moments.steps,
+        "view_colors": {f.name: getattr(state.view_colors, f.name) for f in fields(ViewColors)},
         "memory": state.memory,
     }
 
@@ -216,5 +247,6 @@ def _unpacked(saved: dict[str, Any], device: torch.device) -> FitState:
         saved["iteration"],
         Gaussians(**placed(saved["gaussians"])),
         adam.Moments(placed(saved["first"]), placed(saved["second"]), saved["steps"].to(device).clone()),
+        ViewColors(**placed(saved["view_colors"])),
         placed(saved["memory"]),
     )

@@ -1,7 +1,12 @@
-"""8-bit image pyramids of a capture's photographs: the first steps of a fit use the coarse levels."""
+"""8-bit image pyramids of a capture's photographs, and the pixels of them that a step sees.
+
+The first steps use a coarse level. Later ones may use every n-th pixel of the photograph, from another first pixel at
+every visit: the low pass stays that of the photograph, so that the gradient is that of all pixels up to chance, at a
+fraction of their cost.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, UInt8
@@ -10,8 +15,14 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import resize
 from splatgraft.core.posed_images import PosedImages
+from splatgraft.fitting import View
+from splatgraft.reconstruction.options import Sampling
 from splatgraft.runtime.progress import Progress
 
+LOW_PASS_PX2 = 0.3
+"""Of the photographs' pixels, as in rendering (3DGS)."""
+_COPRIME = 3
+"""Step through the cells of a stride: visits go through all of them, for strides of 2 and 4."""
 _SMALLEST = 32
 """Least side of a reduced image, pixels: below it the 11-pixel window of SSIM covers most of the image."""
 
@@ -20,8 +31,8 @@ _SMALLEST = 32
 class Level:
     """All photographs at one size."""
 
-    until: float
-    """Share of the steps after which the next level is used."""
+    sampling: Sampling
+    """The size, the pixels that are fitted, and until when."""
     cameras: tuple[Cameras, ...]
     """One batch of 1 per photograph, at the level's size."""
     images: tuple[UInt8[Tensor, "_ _ 3"], ...]
@@ -39,28 +50,54 @@ class Pyramid:
         """Number of views."""
         return len(self.levels[0].images)
 
-    def at(self, index: int, done: float) -> tuple[Cameras, Float[Tensor, "h w 3"]]:
+    def reduced(self, longest_side_px: int) -> tuple[list[Cameras], list[Float[Tensor, "_ _ 3"]]]:
+        """Cameras and images of the coarsest level on the CPU, at most of the given size."""
+        cameras, images = [], []
+        for camera, image in zip(self.levels[0].cameras, self.levels[0].images, strict=True):
+            small = camera.to("cpu").resized(min(1.0, longest_side_px / int(camera.sizes.max())))
+            cameras.append(small)
+            images.append(resize(image.cpu().float() / 255, small.width, small.height))
+        return cameras, images
+
+    def at(self, index: int, *, visit: int, done: float) -> View:
         """Camera and photograph `index` at the level for the share `done` of all steps."""
-        level = next((level for level in self.levels if done < level.until), self.levels[-1])
-        return level.cameras[index], level.images[index].float() / 255
+        level = next((level for level in self.levels if done < level.sampling.until), self.levels[-1])
+        camera, image, stride = level.cameras[index], level.images[index], level.sampling.stride
+        if stride == 1 or min(image.shape[:2]) < stride * _SMALLEST:
+            return View(camera, image.float() / 255)
+        cell = (visit * _COPRIME + index) % stride**2
+        left, top = cell % stride, cell // stride
+        return View(
+            _every_nth(camera, stride, left, top),
+            image[top::stride, left::stride].float() / 255,
+            low_pass_px2=LOW_PASS_PX2 / stride**2,
+        )
 
 
-def read_pyramid(
-    capture: PosedImages, schedule: Sequence[tuple[float, float]], *, device: str, progress: Progress
-) -> Pyramid:
-    """Read every photograph once into all levels; `schedule` has (factor, until) per level, from coarse to fine."""
+def _every_nth(camera: Cameras, stride: int, left: int, top: int) -> Cameras:
+    """The camera of every `stride`-th pixel, from the pixel `left`, `top` on."""
+    first = torch.tensor([left, top])
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[:, :2] /= stride
+    # the centre of the first pixel, left + 0.5, becomes 0.5
+    intrinsics[:, :2, 2] += 0.5 - (first.to(intrinsics) + 0.5) / stride
+    return replace(camera, intrinsics=intrinsics, sizes=(camera.sizes - first + stride - 1) // stride)
+
+
+def read_pyramid(capture: PosedImages, schedule: Sequence[Sampling], *, device: str, progress: Progress) -> Pyramid:
+    """Read every photograph once into all levels; `schedule` goes from coarse to fine."""
     cameras: list[list[Cameras]] = [[] for _ in schedule]
     images: list[list[Tensor]] = [[] for _ in schedule]
     for i in range(len(capture)):
         photograph = capture.image(i)
         camera = capture.cameras[i].to(device)
-        for level, (factor, _) in enumerate(schedule):
+        for level, sampling in enumerate(schedule):
             smallest = min(1.0, _SMALLEST / min(camera.sizes[0].tolist()))
-            reduced = camera.resized(max(factor, smallest))
+            reduced = camera.resized(max(sampling.factor, smallest))
             width, height = reduced.sizes[0].tolist()
             cameras[level].append(reduced)
             images[level].append((resize(photograph, width, height) * 255).round().to(torch.uint8).to(device))
         progress(i + 1, len(capture), "reading photographs")
     return Pyramid(
-        tuple(Level(until, tuple(c), tuple(p)) for (_, until), c, p in zip(schedule, cameras, images, strict=True))
+        tuple(Level(sampling, tuple(c), tuple(p)) for sampling, c, p in zip(schedule, cameras, images, strict=True))
     )

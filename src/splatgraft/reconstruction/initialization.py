@@ -1,4 +1,6 @@
-"""Initial Gaussians of a reconstruction: one per sparse point (3DGS), and random points where the cameras look."""
+"""Initial Gaussians of a reconstruction: one per seed point (3DGS), and random seeds where the cameras look."""
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,6 +16,34 @@ _CANDIDATES = 200_000
 """Random points drawn at a time."""
 
 
+@dataclass(frozen=True)
+class SeedPoints:
+    """m points from which Gaussians start."""
+
+    points: Float[Tensor, "m 3"]
+    """World units."""
+    colors: Float[Tensor, "m 3"]
+    """sRGB in [0, 1]."""
+    widest: Float[Tensor, "m"]
+    """Bound on the Gaussian's standard deviation, world units; may be infinite."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def drawn(self, count: int, seed: int) -> "SeedPoints":
+        """At most `count` of the points, drawn at random, in their order."""
+        order = torch.randperm(len(self), generator=torch.Generator().manual_seed(seed))[:count].sort().values
+        return SeedPoints(self.points[order], self.colors[order], self.widest[order])
+
+    def joined(self, other: "SeedPoints") -> "SeedPoints":
+        """These points, then the others."""
+        return SeedPoints(
+            torch.cat([self.points, other.points]),
+            torch.cat([self.colors, other.colors]),
+            torch.cat([self.widest, other.widest]),
+        )
+
+
 def scene_extent(cameras: Cameras) -> float:
     """1.1 times the largest distance of a camera from the cameras' mean, world units (3DGS); 1 for a single place."""
     centers = cameras.centers.cpu()
@@ -21,18 +51,9 @@ def scene_extent(cameras: Cameras) -> float:
     return radius if radius > 1e-6 else 1.0
 
 
-def from_points(points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"], *, count: int, seed: int) -> Gaussians:
-    """Isotropic Gaussians of opacity one half at the points, as wide as the rms distance to the three nearest points.
-
-    Args:
-        points: World units.
-        colors: sRGB in [0, 1].
-        count: Largest number of Gaussians; of more points, so many are drawn at random.
-        seed: Of the draw.
-    """
-    if len(points) > count:
-        order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))[:count]
-        points, colors = points[order.sort().values], colors[order.sort().values]
+def from_points(seeds: SeedPoints) -> Gaussians:
+    """Isotropic Gaussians of opacity one half, as wide as the rms distance to the three nearest points at most."""
+    points, colors = seeds.points, seeds.colors
     n = len(points)
     array = points.double().numpy()
     neighbours = min(4, n)
@@ -40,6 +61,7 @@ def from_points(points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"], *, c
     spacing = np.sqrt((distances**2).mean(1))
     # an isolated point would start as a Gaussian that covers every image
     spacing = spacing.clip(max(1e-7, 1e-3 * float(np.median(spacing))), 10 * float(np.median(spacing)) + 1e-7)
+    spacing = np.minimum(spacing, seeds.widest.double().numpy())
     log_scales = torch.from_numpy(np.log(spacing)).float()[:, None].repeat(1, 3)
     return Gaussians(
         means=points.float().clone(),
@@ -50,16 +72,14 @@ def from_points(points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"], *, c
     )
 
 
-def random_points(cameras: Cameras, *, count: int, seed: int) -> Float[Tensor, "m 3"]:
-    """`count` points, uniform in the volume that most cameras see; each lies in front of a camera.
+def random_seeds(cameras: Cameras, *, count: int, seed: int) -> SeedPoints:
+    """`count` points of random colours, uniform in the volume that most cameras see; each lies in front of a camera.
 
     They are drawn in a sphere around the point nearest to all optical axes, with the cameras' mean distance as radius;
     a point stays if more than half as many cameras see it as see the best-seen point.
     """
     generator = torch.Generator().manual_seed(seed)
-    centers, forward = cameras.centers.double().cpu(), cameras.world_from_camera[:, :3, 2].double().cpu()
-    focus = _nearest_to_axes(centers, forward)
-    reach = float((centers - focus).norm(dim=1).mean())
+    focus, reach = looked_at(cameras)
     kept: list[Tensor] = []
     missing = count
     while missing > 0:
@@ -70,7 +90,15 @@ def random_points(cameras: Cameras, *, count: int, seed: int) -> Float[Tensor, "
         good = candidates[seen > 0.5 * seen.max()]
         kept.append(good[:missing].float())
         missing -= len(kept[-1])
-    return torch.cat(kept)
+    colors = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+    return SeedPoints(torch.cat(kept), colors, torch.full((count,), torch.inf))
+
+
+def looked_at(cameras: Cameras) -> tuple[Float[Tensor, "3"], float]:
+    """The point nearest to all optical axes, and the cameras' mean distance from it, world units."""
+    centers, forward = cameras.centers.double().cpu(), cameras.world_from_camera[:, :3, 2].double().cpu()
+    focus = _nearest_to_axes(centers, forward)
+    return focus, float((centers - focus).norm(dim=1).mean())
 
 
 def _nearest_to_axes(centers: Float[Tensor, "v 3"], forward: Float[Tensor, "v 3"]) -> Float[Tensor, "3"]:

@@ -25,8 +25,9 @@ def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
     Measured on the CPU with bands up to degree 3: 20k Gaussians at 352x248 took 492 MiB (534 predicted), 200k 974
     (1035), 40k at 640x426 568 (626).
     """
-    pixels = options.served(capture).cameras.sizes.prod(1).double().tolist()
-    pyramid = 3 * sum(pixels) * (1 + 1 / 2 + 1 / 4 + 1 / 16 if options.coarse_to_fine else 1)
+    served = options.served(capture)
+    pixels = served.cameras.sizes.prod(1).double().tolist()
+    pyramid = 3 * sum(pixels) * sum(part.factor**2 for part in options.sampling(served))
     largest = max(pixels, default=0.0)
     numbers = 11 + 3 * coefficient_count(options.sh_degree)
     gaussians = options.most_gaussians * (4 * numbers * _COPIES + _BYTES_PER_GAUSSIAN)

@@ -6,7 +6,7 @@ Gaussians. Measured on a room of 36 views at 352x248, 25k Gaussians, 1000 steps,
 rates other than the centres' eight times 28.1 (a bunch of bananas, 16 photographs: 29.0 and 29.1).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -15,10 +15,11 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.fitting import FitOptions, FitState, LearningRates, Step, fit
 from splatgraft.reconstruction.density import DensityControl
-from splatgraft.reconstruction.image_pyramid import read_pyramid
-from splatgraft.reconstruction.initialization import from_points, random_points, scene_extent
+from splatgraft.reconstruction.image_pyramid import Pyramid, read_pyramid
+from splatgraft.reconstruction.initialization import SeedPoints, from_points, looked_at, random_seeds, scene_extent
 from splatgraft.reconstruction.memory import require_memory
 from splatgraft.reconstruction.options import ReconstructOptions
+from splatgraft.reconstruction.plane_sweep import SweepOptions, sweep
 from splatgraft.rendering import RenderOptions
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
@@ -29,14 +30,18 @@ class ScheduleOptions:
 
     published_iterations: int = 30_000
     """Steps for which the published values hold (3DGS)."""
+    few_points: int = 1000
+    """Sparse points below which more are found by a plane sweep."""
     fewest_points: int = 100
-    """Sparse points below which a run starts from random points."""
+    """Points of both kinds below which random ones are taken."""
+    sweep: SweepOptions = field(default_factory=SweepOptions)
+    """The search for points where the capture has none."""
+    start_share: float = 0.6
+    """Gaussians at the start at most, over the budget; the others come where the density control wants them."""
     published_opacity: float = 0.1
     """Opacity at the start of a run of the published length or longer (3DGS)."""
     short_run_opacity: float = 0.5
     """Opacity at the start of a shorter run."""
-    coarse_to_fine: tuple[tuple[float, float], ...] = ((0.5, 0.3), (0.7071, 0.6), (1.0, 1.0))
-    """Factor on the image size, and share of the steps until which it is used."""
     band_share: int = 30
     """All steps over the steps between two bands of colour."""
     densify_every: int = 100
@@ -55,6 +60,8 @@ class ScheduleOptions:
     """The same exponent for all other rates."""
     most_others: float = 8.0
     """Bound on that factor."""
+    color_rate: float = 0.003
+    """Learning rate of each photograph's own affine map of colours."""
     short_run_final: float = 0.1
     """Last rate over the first, for all but the centres, in a shorter run."""
 
@@ -88,9 +95,8 @@ def reconstruct(
     if len(capture) < 2:
         raise ValueError(f"reconstruct: expected at least 2 views to fit, found {len(capture)}")
     capture = options.served(capture)
-    start = _start(capture, options, schedule, progress).to(options.device)
-    levels = schedule.coarse_to_fine if options.coarse_to_fine else ((1.0, 1.0),)
-    views = read_pyramid(capture, levels, device=options.device, progress=progress)
+    views = read_pyramid(capture, options.sampling(capture), device=options.device, progress=progress)
+    start = _start(capture, views, options, schedule, progress=progress).to(options.device)
     control = _Control(
         options.sh_degree,
         max(1, options.all_iterations // schedule.band_share),
@@ -100,6 +106,7 @@ def reconstruct(
         iterations=options.all_iterations,
         rates=_rates(capture.cameras, options.all_iterations, schedule),
         seed=options.seed,
+        view_color_rate=schedule.color_rate if options.photo_colors else 0.0,
         rendering=RenderOptions(background=options.background),
     )
     fitted = fit(start, views, options=fit_options, control=control, progress=progress, checkpoint=checkpoint)
@@ -124,18 +131,28 @@ class _Control:
 
 
 def _start(
-    capture: PosedImages, options: ReconstructOptions, schedule: ScheduleOptions, progress: Progress
+    capture: PosedImages, views: Pyramid, options: ReconstructOptions, schedule: ScheduleOptions, *, progress: Progress
 ) -> Gaussians:
-    points, colors = capture.points, capture.point_colors
-    if len(points) < schedule.fewest_points:
-        count = max(options.most_gaussians // 4, 1)
-        found = f"{len(points)} sparse points" if len(points) else "no sparse points"
-        progress(0, options.all_iterations, f"{found}: starting from {count} random ones where the cameras look")
-        points = random_points(capture.cameras, count=count, seed=options.seed)
-        colors = torch.rand(count, 3, generator=torch.Generator().manual_seed(options.seed))
+    """Gaussians at sparse points; of few, also at points of a plane sweep; else at random."""
+    most = max(1, int(schedule.start_share * options.most_gaussians))
+    seeds = SeedPoints(
+        capture.points.float(), capture.point_colors.float(), torch.full((len(capture.points),), torch.inf)
+    )
+    if len(seeds) < schedule.few_points:
+        cameras, images = views.reduced(schedule.sweep.longest_side_px)
+        reach = looked_at(capture.cameras)[1]
+        swept = sweep(cameras, images, known=seeds.points, reach=reach, options=schedule.sweep)
+        found = f"{len(seeds) or 'no'} sparse points"
+        seeds = seeds.joined(swept)
+        if len(seeds) < schedule.fewest_points:
+            seeds = random_seeds(capture.cameras, count=max(options.most_gaussians // 4, 1), seed=options.seed)
+            found = f"{found}: starting from {len(seeds)} random ones where the cameras look"
+        else:
+            found = f"{found}: {len(swept)} found by comparing views"
+        progress(0, options.all_iterations, found)
+    start = from_points(seeds.drawn(most, options.seed))
     short = options.all_iterations < schedule.published_iterations
     opacity = schedule.short_run_opacity if short else schedule.published_opacity
-    start = from_points(points, colors, count=options.most_gaussians, seed=options.seed)
     return replace(start, opacity_logits=torch.full_like(start.opacity_logits, opacity).logit())
 
 

@@ -8,8 +8,6 @@ from torch import Tensor
 
 from splatgraft.rendering.interface import Output, Render, RenderOptions
 
-LOW_PASS_PX2 = 0.3
-"""Variance added to projected covariances on every device, pixels squared (3DGS)."""
 CHANNEL_COUNTS: dict[Output, int] = {"color": 3, "depth": 1, "normal": 3}
 """Number of channels of each output, blended in this order; features follow."""
 

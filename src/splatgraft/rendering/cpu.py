@@ -69,7 +69,8 @@ class _View:
         margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
         bounds = [-cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y]
         center = camera.centers[0].detach().double().numpy()
-        parts = [pose[:3, :3].ravel(), pose[:3, 3], center, [fx, fy, cx, cy, *bounds, options.near, width, height]]
+        numbers = [fx, fy, cx, cy, *bounds, options.near, width, height, options.low_pass_px2]
+        parts = [pose[:3, :3].ravel(), pose[:3, 3], center, numbers]
         return _View(np.concatenate(parts), width, height, options.low_pass == "antialiased")
 
 

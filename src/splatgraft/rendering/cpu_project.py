@@ -1,6 +1,6 @@
 """Projection of Gaussians to 2D splats of one camera, their colours, and the gradients of both: numba kernels.
 
-The projection is EWA splatting as in 3DGS (Eq. 5): covariance J W S W^T J^T plus 0.3 px^2, with J taken at a point
+The projection is EWA splatting as in 3DGS (Eq. 5): covariance J W S W^T J^T plus the low pass, with J taken at a point
 clamped to 1.3 times the field of view. All arithmetic on one Gaussian is float64, all storage float32.
 """
 
@@ -10,7 +10,6 @@ from typing import no_type_check
 import numpy as np
 from numba import float32, njit, prange
 
-from splatgraft.rendering.channels import LOW_PASS_PX2
 from splatgraft.rendering.cpu_basis import basis_and_slope, basis_at
 
 MIN_ALPHA = 1.0 / 255.0
@@ -22,7 +21,7 @@ MX, MY, CA, CB, CC, LOG_OPACITY, REACH_X, REACH_Y = range(8)
 COLUMNS = 8
 
 # places in a camera vector: rotation (9) and translation (3) of camera_from_world, centre (3), then
-FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR, WIDTH, HEIGHT = range(15, 26)
+FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR, WIDTH, HEIGHT, LOW_PASS = range(15, 27)
 
 
 @njit(cache=True)
@@ -89,7 +88,7 @@ def _jacobian(x, y, z, camera):
 @no_type_check
 def project(means, log_scales, quaternions, opacity_logits, camera, antialiased, splats, depths):
     """Fill `splats (n, 8)` and `depths (n,)`; a splat outside the image or too transparent has log opacity -inf."""
-    n = means.shape[0]
+    n, low = means.shape[0], camera[LOW_PASS]
     for block in prange((n + BLOCK - 1) // BLOCK):
         rotation, axes, offset = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
@@ -106,7 +105,7 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
                 h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
                 xx, xy, yy = xx + h0 * h0, xy + h0 * h1, yy + h1 * h1
             sharp = max(xx * yy - xy * xy, 0.0)
-            determinant = sharp + LOW_PASS_PX2 * (xx + yy) + LOW_PASS_PX2 * LOW_PASS_PX2
+            determinant = sharp + low * (xx + yy) + low * low
             if antialiased:
                 opacity *= math.sqrt(sharp / determinant)
             # also false where anything is nan or infinite
@@ -114,13 +113,13 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
                 continue
             limit = 2 * math.log(opacity / MIN_ALPHA)
             mx, my = camera[FX] * x / z + camera[CX], camera[FY] * y / z + camera[CY]
-            reach_x, reach_y = math.sqrt(limit * (xx + LOW_PASS_PX2)), math.sqrt(limit * (yy + LOW_PASS_PX2))
+            reach_x, reach_y = math.sqrt(limit * (xx + low)), math.sqrt(limit * (yy + low))
             if not (-reach_x < mx < camera[WIDTH] + reach_x and -reach_y < my < camera[HEIGHT] + reach_y):
                 continue
             splats[g, MX], splats[g, MY] = mx, my
-            splats[g, CA] = (yy + LOW_PASS_PX2) / determinant
+            splats[g, CA] = (yy + low) / determinant
             splats[g, CB] = -xy / determinant
-            splats[g, CC] = (xx + LOW_PASS_PX2) / determinant
+            splats[g, CC] = (xx + low) / determinant
             splats[g, LOG_OPACITY] = math.log(opacity)
             splats[g, REACH_X] = reach_x
             splats[g, REACH_Y] = reach_y
@@ -224,7 +223,7 @@ def project_backward(
     `totals (n, ..)`: first sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2, with d from centre
     to pixel; gradients of depth and of the normal from columns `depth_at` and `normal_at`, unless 0.
     """
-    n = means.shape[0]
+    n, low = means.shape[0], camera[LOW_PASS]
     for block in prange((n + BLOCK - 1) // BLOCK):
         rotation, axes, offset = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
         d_axes, d_rotation = np.empty((3, 3)), np.empty((3, 3))
@@ -240,8 +239,8 @@ def project_backward(
                 h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
                 xx, xy, yy = xx + h0 * h0, xy + h0 * h1, yy + h1 * h1
             sharp = max(xx * yy - xy * xy, 0.0)
-            determinant = sharp + LOW_PASS_PX2 * (xx + yy) + LOW_PASS_PX2 * LOW_PASS_PX2
-            a, b, c = (yy + LOW_PASS_PX2) / determinant, -xy / determinant, (xx + LOW_PASS_PX2) / determinant
+            determinant = sharp + low * (xx + yy) + low * low
+            a, b, c = (yy + low) / determinant, -xy / determinant, (xx + low) / determinant
 
             s0, sx, sy = float(totals[g, 0]), float(totals[g, 1]), float(totals[g, 2])
             sxx, sxy, syy = float(totals[g, 3]), float(totals[g, 4]), float(totals[g, 5])
@@ -255,8 +254,8 @@ def project_backward(
             d_yy = 0.5 * (p10 * b + p11 * c)
             if antialiased:
                 to_sharp, to_blurred = 0.5 * s0 / sharp, -0.5 * s0 / determinant
-                d_xx += to_sharp * yy + to_blurred * (yy + LOW_PASS_PX2)
-                d_yy += to_sharp * xx + to_blurred * (xx + LOW_PASS_PX2)
+                d_xx += to_sharp * yy + to_blurred * (yy + low)
+                d_yy += to_sharp * xx + to_blurred * (xx + low)
                 d_xy -= 2 * xy * (to_sharp + to_blurred)
 
             d00, d02, d11, d12 = 0.0, 0.0, 0.0, 0.0

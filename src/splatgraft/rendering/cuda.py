@@ -10,7 +10,7 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.rendering.channels import LOW_PASS_PX2, assemble_render
+from splatgraft.rendering.channels import assemble_render
 from splatgraft.rendering.interface import Output, Render, RenderOptions
 
 
@@ -83,7 +83,7 @@ def _draw(
         width=camera.width,
         height=camera.height,
         near_plane=options.near,
-        eps2d=LOW_PASS_PX2,
+        eps2d=options.low_pass_px2,
         packed=False,
         render_mode="RGB",
         rasterize_mode=options.low_pass,

@@ -20,7 +20,9 @@ class RenderOptions:
     """How a scene is drawn."""
 
     low_pass: Literal["classic", "antialiased"] = "classic"
-    """Both add 0.3 px^2 to the covariance; `antialiased` also scales opacity by the area ratio (Mip-Splatting)."""
+    """Both widen the covariance; `antialiased` also scales opacity by the area ratio (Mip-Splatting)."""
+    low_pass_px2: float = 0.3
+    """Variance added to projected covariances, pixels squared; 0.3 (3DGS) where a pixel's neighbours are drawn too."""
     near: float = 0.01
     """Gaussians whose centre is nearer than this along the optical axis are not drawn, world units."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)

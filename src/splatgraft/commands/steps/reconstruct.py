@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.image_metrics import psnr, ssim
+from splatgraft.core.image_metrics import fit_color, psnr, ssim
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.folders.capture_files import capture_inputs
 from splatgraft.folders.photo_exposures import exposure_warnings
@@ -16,7 +17,13 @@ from splatgraft.formats import read_capture, write_gaussians
 from splatgraft.project.layout import METRICS_FILE, SCENE_FILE
 from splatgraft.project.record import read_record
 from splatgraft.project.step import Context, Inputs, Positional, choose_device
-from splatgraft.reconstruction import ReconstructOptions, predict_memory, reconstruct
+from splatgraft.reconstruction import (
+    ReconstructOptions,
+    describe_duration,
+    predict_cpu_seconds,
+    predict_memory,
+    reconstruct,
+)
 from splatgraft.rendering import RenderOptions, render
 
 EVAL_EVERY = 8
@@ -57,14 +64,26 @@ class Reconstruct:
         if self.eval and not options.eval_every:
             options = replace(options, eval_every=EVAL_EVERY)
         context.console.say(f"memory: at most about {predict_memory(capture, options) / 2**30:.1f} GiB")
+        if device.type == "cpu":
+            threads = torch.get_num_threads()
+            seconds = predict_cpu_seconds(capture, options) / threads
+            context.console.say(f"time: about {describe_duration(seconds)} on {threads} idle cores, half or twice that")
+        warnings = exposure_warnings(self.capture, capture.image_paths)
         if read_record(self.capture) is None:  # of its own results the command `capture` has said it
-            for warning in exposure_warnings(self.capture, capture.image_paths):
+            for warning in warnings:
                 context.console.warn(warning)
+        if options.photo_colors is None:
+            options = replace(options, photo_colors=bool(warnings))
+            if warnings:
+                context.console.say("exposure and white balance are fitted for each photo (photo_colors)")
         scene = reconstruct(capture, options, progress=context.progress, checkpoint=context.checkpoint)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
         if options.eval_every:
             metrics = _held_out_metrics(scene, options.served(capture), options)
-            context.console.say(f"held out: {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}")
+            context.console.say(
+                f"held out: {metrics['psnr']:.2f} dB as photographed, {metrics['psnr_color_fitted']:.2f} dB with the "
+                f"colours of each view fitted, SSIM {metrics['ssim']:.4f}"
+            )
             photo_of = dict(zip(capture.cameras.names, capture.image_paths, strict=True))
             for name, sentence in far_worse(metrics["psnr_by_view"]).items():
                 context.console.warn(sentence, picture=photo_of[name])
@@ -91,16 +110,27 @@ def far_worse(psnr_by_view: dict[str, float], rule: FarBelow = FarBelow()) -> di
 
 
 def _held_out_metrics(scene: Gaussians, capture: PosedImages, options: ReconstructOptions) -> dict[str, Any]:
-    """Means over the held-out views, and the PSNR of each."""
+    """Means over the held-out views, and the PSNR of each.
+
+    `psnr` and `ssim` are of the views as photographed, `psnr_color_fitted` without exposure and white balance.
+    """
     views = capture.select(held_out(len(capture), options.eval_every))
-    values: list[tuple[float, float]] = []
+    values: list[tuple[float, float, float]] = []
     for index, camera in enumerate(views.cameras.to(scene.device)):
         picture = render(scene, camera, options=RenderOptions(background=options.background)).color
         image, truth = picture[0].cpu().clamp(0, 1), views.image(index)
-        values.append((float(psnr(image, truth)), float(ssim(image, truth))))
+        fitted = fit_color(image, truth)
+        values.append((float(psnr(image, truth)), float(ssim(image, truth)), float(psnr(fitted, truth))))
     means = [sum(column) / len(values) for column in zip(*values, strict=True)]
-    by_view = dict(zip(views.cameras.names, (value for value, _ in values), strict=True))
-    return {"psnr": means[0], "ssim": means[1], "views": len(values), "gaussians": scene.count, "psnr_by_view": by_view}
+    by_view = dict(zip(views.cameras.names, (value for value, *_ in values), strict=True))
+    return {
+        "psnr": means[0],
+        "psnr_color_fitted": means[2],
+        "ssim": means[1],
+        "views": len(values),
+        "gaussians": scene.count,
+        "psnr_by_view": by_view,
+    }
 
 
 COMMAND = Reconstruct

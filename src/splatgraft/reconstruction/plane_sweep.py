@@ -1,0 +1,183 @@
+"""Rough surface points by a plane sweep over small images: seeds where structure from motion found no points.
+
+Along the rays of a grid of pixels of every view, the depth is taken at which patches agree best with the nearest views
+(Collins 1996; the mean over the better half of the views allows for occlusion, as Kang et al. 2001). A patch is a few
+pixels of a photograph reduced to a hundred or two, parallel to the image; costs are sums of absolute differences.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.reconstruction.initialization import SeedPoints
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Grid, depths and views of the sweep."""
+
+    longest_side_px: int = 160
+    """To which photographs are reduced."""
+    cell_px: int = 6
+    """Distance of two rays in the reduced image."""
+    depths: int = 32
+    """Hypotheses per ray, evenly spaced in inverse depth."""
+    neighbours: int = 4
+    """Views that each is compared with."""
+    spacing_px: float = 1.5
+    """Between the 3x3 pixels of a patch."""
+    least_angle_deg: float = 2.0
+    """Between the directions of two views to what they look at; less tells nothing about depth."""
+    least_cosine: float = 0.5
+    """Of the angle between the optical axes of two views that are compared."""
+    near: float = 0.4
+    """Least distance from every camera, over the cameras' mean distance from what they look at."""
+    fewest_known: int = 100
+    """Known points from which the nearest depth is taken instead, where it is larger."""
+    known_nearest: float = 0.02
+    """Share of the known points that are nearer to a camera; structure from motion has some outliers."""
+    far: float = 8.0
+    """Farthest depth, over the same."""
+    tie: float = 0.015
+    """Difference in cost that tells nothing, four grey levels."""
+    most_cost: float = 0.12
+    """Mean absolute difference in sRGB above which a ray gives no point."""
+
+
+def sweep(
+    cameras: Sequence[Cameras],
+    images: Sequence[Float[Tensor, "_ _ 3"]],
+    *,
+    known: Float[Tensor, "p 3"],
+    reach: float,
+    options: SweepOptions,
+) -> SeedPoints:
+    """Points on the rays through grid cells in which no known point lies.
+
+    Args:
+        cameras: One batch of 1 per view, at the size of its image.
+        images: sRGB, small.
+        known: World points that are there already.
+        reach: The cameras' mean distance from what they look at, world units.
+        options: Grid, depths and views.
+
+    Returns:
+        Points of all views, as wide as the distance of neighbouring rays at most.
+    """
+    nearest = options.near * reach
+    if len(known) >= options.fewest_known:
+        nearest = max(nearest, float(_nearest(known, cameras).quantile(options.known_nearest)))
+    depths = 1 / torch.linspace(1 / (options.far * reach), 1 / nearest, options.depths)
+    search = _Search(tuple(cameras), tuple(images), known, depths, reach, options)
+    none = SeedPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+    return reduce(SeedPoints.joined, (search.view(i) for i in range(len(cameras))), none)
+
+
+@dataclass(frozen=True)
+class _Search:
+    cameras: tuple[Cameras, ...]
+    images: tuple[Tensor, ...]
+    known: Float[Tensor, "p 3"]
+    depths: Float[Tensor, "d"]
+    """From the farthest to the nearest."""
+    reach: float
+    options: SweepOptions
+
+    def view(self, view: int) -> SeedPoints:
+        """Points on the rays of one view."""
+        camera, image, cell = self.cameras[view], self.images[view], self.options.cell_px
+        rows, columns = torch.arange(cell // 2, camera.height, cell), torch.arange(cell // 2, camera.width, cell)
+        y, x = (grid.flatten() for grid in torch.meshgrid(rows, columns, indexing="ij"))
+        free = ~_occupied(self.known, camera, cell, (len(columns), len(rows)))
+        x, y = x[free].float() + 0.5, y[free].float() + 0.5
+        others = self._neighbours(view)
+        if len(x) == 0 or not others:
+            return SeedPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+        step = self.options.spacing_px * torch.tensor([-1.0, 0.0, 1.0])
+        dy, dx = (grid.flatten() for grid in torch.meshgrid(step, step, indexing="ij"))
+        pixels = torch.stack([x[:, None] + dx, y[:, None] + dy], -1)
+        own = _sampled(image, pixels)
+        patches = camera.centers[0].float() + self.depths[:, None, None, None] * _rays(camera, pixels)
+        costs = torch.stack([_cost(patches, own, self.cameras[j], self.images[j]) for j in others])
+        costs = costs.sort(0).values[: (len(others) + 1) // 2].mean(0)
+        best = costs.min(0).values
+        # of the depths that explain the patch equally well, the farthest hides no other view's surface
+        index = (costs <= best + self.options.tie).int().argmax(0)
+        middle = patches.shape[2] // 2
+        points = patches[index, torch.arange(len(x)), middle]
+        good = (best < self.options.most_cost) & (_nearest(points, self.cameras) > self.depths[-1])
+        spacing = cell * self.depths[index] / camera.intrinsics[0, 0, 0].float()
+        return SeedPoints(points[good], own[good].mean(1), spacing[good])
+
+    def _neighbours(self, view: int) -> list[int]:
+        """The nearest views that look the same way from another place."""
+        centers = torch.cat([camera.centers for camera in self.cameras]).float()
+        forward = torch.cat([camera.world_from_camera[:, :3, 2] for camera in self.cameras]).float()
+        distance, same = (centers - centers[view]).norm(dim=1), forward @ forward[view]
+        least = self.reach * math.radians(self.options.least_angle_deg)
+        usable = (distance > least) & (same > self.options.least_cosine)
+        order = torch.where(usable, distance + self.reach * (1 - same), torch.inf).argsort()
+        return [int(j) for j in order[: self.options.neighbours] if usable[j]]
+
+
+def _nearest(points: Float[Tensor, "m 3"], cameras: Sequence[Cameras]) -> Float[Tensor, "m"]:
+    """Distance to the nearest camera: a point in front of another one would cover its view."""
+    return torch.cdist(points, torch.cat([camera.centers for camera in cameras]).float()).min(1).values
+
+
+def _rays(camera: Cameras, pixels: Float[Tensor, "m k 2"]) -> Float[Tensor, "m k 3"]:
+    """World directions of depth 1 through pixels."""
+    k, pose = camera.intrinsics[0].float(), camera.world_from_camera[0].float()
+    plane = torch.stack(
+        [(pixels[..., 0] - k[0, 2]) / k[0, 0], (pixels[..., 1] - k[1, 2]) / k[1, 1], torch.ones_like(pixels[..., 0])],
+        -1,
+    )
+    return plane @ pose[:3, :3].T
+
+
+def _project(points: Float[Tensor, "*n 3"], camera: Cameras) -> tuple[Tensor, Tensor]:
+    """Pixels and depths."""
+    pose, k = camera.camera_from_world[0].float(), camera.intrinsics[0].float()
+    x = points @ pose[:3, :3].T + pose[:3, 3]
+    z = x[..., 2:]
+    pixels = x[..., :2] / z.clamp_min(1e-6) * torch.stack([k[0, 0], k[1, 1]]) + torch.stack([k[0, 2], k[1, 2]])
+    return pixels, z[..., 0]
+
+
+def _sampled(image: Float[Tensor, "h w 3"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
+    """Bilinear samples."""
+    h, w, _ = image.shape
+    grid = pixels.reshape(1, 1, -1, 2) * torch.tensor([2 / w, 2 / h]) - 1
+    values = torch.nn.functional.grid_sample(
+        image.permute(2, 0, 1)[None], grid, padding_mode="border", align_corners=False
+    )
+    return values[0, :, 0].T.reshape(*pixels.shape[:-1], 3)
+
+
+def _cost(
+    patches: Float[Tensor, "d m k 3"], own: Float[Tensor, "m k 3"], camera: Cameras, image: Tensor
+) -> Float[Tensor, "d m"]:
+    """Mean absolute difference of patches; large where the patch's centre is out of view."""
+    pixels, depth = _project(patches, camera)
+    difference = (_sampled(image, pixels) - own).abs().mean((2, 3))
+    middle = pixels[:, :, pixels.shape[2] // 2]
+    inside = (middle >= 0).all(-1) & (middle < torch.tensor([camera.width, camera.height])).all(-1)
+    inside &= depth[:, :, depth.shape[2] // 2] > 0
+    return torch.where(inside, difference, 1.0)
+
+
+def _occupied(points: Tensor, camera: Cameras, cell: int, cells: tuple[int, int]) -> Bool[Tensor, "c"]:
+    columns, rows = cells
+    out = torch.zeros(rows * columns, dtype=torch.bool)
+    if len(points):
+        pixels, depth = _project(points, camera)
+        place = (pixels / cell).floor().long()
+        inside = (depth > 0) & (place >= 0).all(1) & (place[:, 0] < columns) & (place[:, 1] < rows)
+        out[place[inside, 1] * columns + place[inside, 0]] = True
+    return out
