@@ -1,0 +1,19 @@
+"""The value `SceneFile`: a trained scene as a file holds it, and what was found or assumed of its conventions."""
+
+from dataclasses import dataclass
+
+from splatgraft.core.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """A trained scene that was read from a file."""
+
+    gaussians: Gaussians
+    """In the file's order; axes as in a .ply of the original code where the format has others."""
+    axes: str = "RDF"
+    """Directions of x, y and z in the file (right or left, up or down, back or front); what was turned to RDF."""
+    up: tuple[float, float, float] | None = None
+    """Up direction in the frame of `gaussians`, where the file states one."""
+    notes: tuple[str, ...] = ()
+    """For the user: conventions that differ from a .ply of the original code, and how they were found."""
