@@ -14,7 +14,7 @@ from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.rendering import render
 
 TOOLS = Path(__file__).parent / "golden" / "tools"
-EXACT = {"means": 1e-6, "log_scales": 1e-6, "quaternions": 1e-6, "opacities": 1e-6, "dc": 1e-6, "bands": 1e-6}
+EXACT = {"means": 1e-6, "log_scales": 1e-6, "ellipsoids": 1e-5, "opacities": 1e-6, "dc": 1e-6, "bands": 1e-6}
 GLB = EXACT | {"log_scales": 3e-6, "opacities": 3e-6}  # exponentials and their inverses in float32
 BYTE = 0.5 / 255
 """Half a step of a byte of [0, 1]."""
@@ -23,7 +23,7 @@ SH_BYTE = BYTE / 0.2820948
 SPZ = {
     "means": 0.5 / 4096,  # 12 fractional bits
     "log_scales": 0.5 / 16,
-    "quaternions": 2e-3,  # 9 bits and a sign
+    "ellipsoids": 0.015,  # 9 bits and a sign; twice the difference of the axes times the angle
     "opacities": BYTE,
     "dc": BYTE / 0.15,
     "bands": 8.5 / 128,  # writers round bands 2 and 3 to 4 bits
@@ -31,15 +31,15 @@ SPZ = {
 COMPRESSED = {
     "means": 3e-3,  # 10 and 11 bits of an extent of 5
     "log_scales": 1.5e-3,
-    "quaternions": 2e-3,
+    "ellipsoids": 0.015,
     "opacities": BYTE,
     "dc": SH_BYTE,
     "bands": 4 / 256,
 }
 # the code books have 256 values for 120 numbers; positions are 16 bits of logarithms over 2.7, times 1 + |x| of up to 4
-SOG = {"means": 9e-5, "log_scales": 1e-2, "quaternions": 8e-3, "opacities": 2 * BYTE, "dc": 3e-3}
-SPLAT = {"means": 1e-6, "log_scales": 1e-6, "quaternions": 1.2e-2, "opacities": 2 * BYTE, "dc": 2 * SH_BYTE}
-HALF = {"means": 1e-4, "log_scales": 1e-3, "quaternions": 1e-3, "opacities": 2 * BYTE, "dc": 2 * SH_BYTE}
+SOG = {"means": 9e-5, "log_scales": 1e-2, "ellipsoids": 0.06, "opacities": 2 * BYTE, "dc": 3e-3}
+SPLAT = {"means": 1e-6, "log_scales": 1e-6, "ellipsoids": 0.1, "opacities": 2 * BYTE, "dc": 2 * SH_BYTE}
+HALF = {"means": 1e-4, "log_scales": 1e-3, "ellipsoids": 0.015, "opacities": 2 * BYTE, "dc": 2 * SH_BYTE}
 STEPS = {
     "scene.gsplat.ply": EXACT,
     "scene.glb": GLB,
@@ -72,11 +72,14 @@ def matched(original: Gaussians, found: Gaussians) -> Gaussians:
 def assert_within(original: Gaussians, found: Gaussians, steps: dict[str, float]) -> None:
     found = matched(original, found)
     k = found.sh.shape[1]
-    unit = [torch.nn.functional.normalize(g.quaternions, dim=1) for g in (original, found)]
+    # an ellipsoid is the same with its own axes reversed
+    ellipsoids = [
+        g.rotations @ torch.diag(torch.tensor([1.0, 2, 3])) @ g.rotations.transpose(1, 2) for g in (original, found)
+    ]
     differences = {
         "means": original.means - found.means,
         "log_scales": original.log_scales - found.log_scales,
-        "quaternions": 1 - (unit[0] * unit[1]).sum(1).abs().clamp_max(1),
+        "ellipsoids": ellipsoids[0] - ellipsoids[1],
         "opacities": original.opacities - found.opacities,
         "dc": original.sh[:, 0] - found.sh[:, 0],
         "bands": original.sh[:, 1:k] - found.sh[:, 1:],
@@ -129,7 +132,7 @@ def test_sog_as_a_folder_or_its_meta_json(original, tmp_path):
 def test_sog_of_version_1(original, tmp_path):
     folder = scene_writers.write_folder(tmp_path / "v1", scene_writers.sog_v1(original))
     # half a byte of ranges up to 3.4, 1.2 and, of logits, 9.5
-    steps = {"means": 9e-5, "log_scales": 7e-3, "quaternions": 8e-3, "opacities": 5e-3, "dc": 3e-3, "bands": 3e-3}
+    steps = {"means": 9e-5, "log_scales": 7e-3, "ellipsoids": 0.06, "opacities": 5e-3, "dc": 3e-3, "bands": 3e-3}
     assert_within(original, formats.read_gaussians(folder), steps)
 
 
@@ -233,4 +236,5 @@ def test_glb_with_quantised_attributes(original, tmp_path):
     content["accessors"].append(accessor | {"count": 40, "type": "VEC4"})
     attributes["KHR_gaussian_splatting:ROTATION"] = len(content["accessors"]) - 1
     (tmp_path / "a.glb").write_bytes(scene_writers.glb(content, binary + packed))
-    assert_within(original, formats.read_gaussians(tmp_path / "a.glb"), GLB)
+    steps = GLB | {"ellipsoids": 2e-4}  # 16 bits
+    assert_within(original, formats.read_gaussians(tmp_path / "a.glb"), steps)

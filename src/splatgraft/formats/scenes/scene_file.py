@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from splatgraft.core.gaussians import Gaussians
 
+_WORDS = {"R": "right", "L": "left", "U": "up", "D": "down", "B": "back", "F": "front"}
+
 
 @dataclass(frozen=True)
 class SceneFile:
@@ -17,3 +19,14 @@ class SceneFile:
     """Up direction in the frame of `gaussians`, where the file states one."""
     notes: tuple[str, ...] = ()
     """For the user: conventions that differ from a .ply of the original code, and how they were found."""
+
+    def said(self) -> tuple[str, ...]:
+        """Sentences for the user: number and degree, axes, and the notes."""
+        g = self.gaussians
+        turned = "as in a .ply of structure from motion" if self.axes == "RDF" else "turned to RDF"
+        words = ", ".join(f"{name} {_WORDS[letter]}" for name, letter in zip("xyz", self.axes, strict=True))
+        return (
+            f"{g.count:,} Gaussians, SH degree {g.sh_degree}",
+            f"its axes are taken to be {self.axes} ({words}), {turned}; other ones are named by --axes",
+            *self.notes,
+        )
