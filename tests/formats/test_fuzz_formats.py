@@ -20,6 +20,7 @@ from splatgraft.core.images import read_alpha, read_mask, read_rgb, stored_size
 EXAMPLES = 60
 LEVELS = tuple(f"scene.level{level}.ksplat" for level in range(3))
 FROM_TOOLS = ("scene.sog", "scene.glb", "scene.v4.spz", *LEVELS)
+REST = ("v1.spz", *FROM_TOOLS)
 
 LIES = [
     b"0",
@@ -164,8 +165,7 @@ fuzzed = settings(
 
 @pytest.mark.parametrize(
     "name",
-    ["scene.ply", "scene.splat", "scene.spz", "ascii.ply", "faces.ply", "supersplat.compressed.ply"]
-    + ["v1.spz", *FROM_TOOLS],
+    ["scene.ply", "scene.splat", "scene.spz", "ascii.ply", "faces.ply", "supersplat.compressed.ply", *REST],
 )
 @given(damage=anything)
 @fuzzed
