@@ -75,8 +75,8 @@ class MotionTracker:
         """Median displacement of the corners that are found again, and their share."""
         if len(corners) < self._options.least_corners:
             return 0.0, 0.0
-        there, seen, _ = cv2.calcOpticalFlowPyrLK(old, new, corners, None)
-        back, seen_back, _ = cv2.calcOpticalFlowPyrLK(new, old, there, None)
+        there, seen, _ = cv2.calcOpticalFlowPyrLK(old, new, corners, np.empty_like(corners))
+        back, seen_back, _ = cv2.calcOpticalFlowPyrLK(new, old, there, np.empty_like(corners))
         error = np.linalg.norm(back - corners, axis=-1)[:, 0]
         good = (seen[:, 0] == 1) & (seen_back[:, 0] == 1) & (error < self._options.returned_px)
         if not good.any():
