@@ -59,7 +59,7 @@ class Compose:
         where = ", ".join(f"{x:.3f}" for x in placed.support.point.tolist())
         context.console.say(f"placed at ({where}), scale {placed.target_from_object.scale:.3f}")
         for warning in placed.warnings:
-            context.console.say(f"warning: {warning}")
+            context.console.warn(warning)
         return Placement(objects=(ObjectPlacement(target_from_object=placed.target_from_object),))
 
 
