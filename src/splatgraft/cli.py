@@ -53,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # torch and numba each have a pool of threads; one that spins while it waits takes the cores from the other
     # (measured on 2 busy cores: a reconstruction in 5 s instead of 80)
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # FFmpeg inside OpenCV prints lines of its own about videos that our one line explains
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         print(_help(_HEAD, COMMANDS) + _TAIL)

@@ -9,6 +9,7 @@ from pathlib import Path
 import format_files
 import numpy as np
 import pytest
+import scene_writers
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -17,6 +18,9 @@ from splatgraft import formats
 from splatgraft.core.images import read_alpha, read_mask, read_rgb, stored_size
 
 EXAMPLES = 60
+LEVELS = tuple(f"scene.level{level}.ksplat" for level in range(3))
+FROM_TOOLS = ("scene.sog", "scene.glb", "scene.v4.spz", *LEVELS)
+REST = ("v1.spz", *FROM_TOOLS)
 
 LIES = [
     b"0",
@@ -127,6 +131,13 @@ def seeds(tmp_path_factory) -> Path:
         for name in ("a.png", "b.png"):
             format_files.write_photo(root / "images" / name)
     shutil.copy(format_files.GOLDEN / "supersplat.compressed.ply", folder)
+    for name in FROM_TOOLS:
+        shutil.copy(format_files.GOLDEN / "tools" / name, folder)
+    g = format_files.random_gaussians(20, 1)
+    scene_writers.write_folder(folder / "sog", scene_writers.sog_v1(g))
+    (folder / "v1.spz").write_bytes(
+        scene_writers.spz_of_version_1(g.means.numpy(), extensions=scene_writers.coordinate_system(7), flags=2)
+    )
     for i in range(2):
         format_files.write_photo(folder / "nerf" / "masks" / f"{i:04d}.png")
     for suffix in ("png", "jpg", "webp", "tif", "bmp"):
@@ -153,12 +164,35 @@ fuzzed = settings(
 
 
 @pytest.mark.parametrize(
-    "name", ["scene.ply", "scene.splat", "scene.spz", "ascii.ply", "faces.ply", "supersplat.compressed.ply"]
+    "name",
+    ["scene.ply", "scene.splat", "scene.spz", "ascii.ply", "faces.ply", "supersplat.compressed.ply", *REST],
 )
 @given(damage=anything)
 @fuzzed
 def test_scenes(seeds, name, damage):
-    fuzz(seeds, name, formats.read_gaussians, damage)
+    fuzz(seeds, name, formats.read_scene, damage)
+
+
+@pytest.mark.parametrize("name", ["meta.json", "means_u.webp", "quats.webp", "shN_centroids.webp", "shN_labels.webp"])
+@given(damage=anything)
+@fuzzed
+def test_folder_of_pictures(seeds, name, damage):
+    fuzz(seeds, f"sog/{name}", lambda path: formats.read_scene(path.parent / "meta.json"), damage)
+
+
+@given(damage=anything)
+@fuzzed
+def test_json_of_glb(seeds, damage):
+    """Damage inside the JSON alone, which damage of the whole file seldom leaves to be JSON."""
+    data = (seeds / "scene.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+
+    def inside(whole: bytes) -> bytes:
+        text = damage(whole[20 : 20 + length])
+        binary = whole[20 + length :]
+        return struct.pack("<IIIII", 0x46546C67, 2, 20 + len(text) + len(binary), len(text), 0x4E4F534A) + text + binary
+
+    fuzz(seeds, "scene.glb", formats.read_scene, inside)
 
 
 @pytest.mark.parametrize("name", ["points.ply", "ascii.ply", "scene.ply"])

@@ -3,6 +3,7 @@
 from splatgraft.capture.orientation import upright
 from splatgraft.capture.plausibility import Doubt, Found, Lens, Plausible, find_doubts
 from splatgraft.capture.pose_report import POSE_REPORT_FILE, PoseReport, Unposed, read_pose_report, write_pose_report
+from splatgraft.capture.scene_fit import misfit_of
 from splatgraft.capture.structure_from_motion import PoseOptions, pose_photos
 from splatgraft.capture.video import extract_frames
 from splatgraft.capture.virtual_cameras import (
@@ -25,6 +26,7 @@ __all__ = [
     "VirtualCameras",
     "extract_frames",
     "find_doubts",
+    "misfit_of",
     "place_virtual_cameras",
     "pose_photos",
     "read_pose_report",

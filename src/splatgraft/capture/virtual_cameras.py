@@ -101,6 +101,7 @@ def place_virtual_cameras(
     scene: Gaussians,
     options: VirtualCameraOptions,
     *,
+    stated_up: tuple[float, float, float] | None = None,
     orientation: SceneOrientationOptions = SceneOrientationOptions(),
     progress: Progress = silent,
 ) -> VirtualCameras:
@@ -109,6 +110,7 @@ def place_virtual_cameras(
     Args:
         scene: A trained scene in any frame.
         options: Number, size and kind of the views.
+        stated_up: Up direction that the scene's file states; `options.up` goes before it.
         orientation: How dense part and up are found.
         progress: Called after each view.
 
@@ -117,10 +119,12 @@ def place_virtual_cameras(
     """
     solid = _solid(scene, orientation)
     centre, radius = dense_part(solid.means, orientation.trim_rounds)
-    if options.up is None:
+    given = options.up or stated_up
+    if given is None:
         up, reason = estimate_scene_up(solid.means, centre, radius, options=orientation)
     else:
-        up, reason = torch.nn.functional.normalize(torch.tensor(options.up), dim=0), "as given"
+        up = torch.nn.functional.normalize(torch.tensor(given), dim=0)
+        reason = "as given" if options.up else "as the file's header states; another is named by --up"
     positions = positions_around if options.look == "around" else positions_within
     candidates = positions(centre, radius, up=up, views=options.views)
     poses, dropped = unoccluded_poses(scene, candidates, up=up, progress=progress)
@@ -129,7 +133,7 @@ def place_virtual_cameras(
     cameras = pinhole(poses, focal, width=width, height=width * 3 // 4, prefix="look")
     report = [
         f"a scene without photographs: {len(cameras)} pictures are made of it, from {options.look} {_shown(centre)}",
-        f"up is taken to be {_shown(up)}: {reason}",
+        f"up is taken to be {_shown(up)}{_axis(up, orientation)}: {reason}",
     ]
     if dropped:
         report.append(f"{dropped} of {options.views} views were left out: something stands in their way")
@@ -218,6 +222,14 @@ def _solid(scene: Gaussians, options: SceneOrientationOptions) -> Gaussians:
         least = options.least_points
         raise ValueError(f"scene: expected at least {least} solid Gaussians, found {len(which)} of {scene.count}")
     return scene.select(which[:: math.ceil(len(which) / options.most_points)])
+
+
+def _axis(up: Float[Tensor, "3"], options: SceneOrientationOptions) -> str:
+    """The axis of the file that points up or down, where one does."""
+    axis = int(up.abs().argmax())
+    if abs(float(up[axis])) < math.cos(math.radians(options.aligned_deg)):
+        return ""
+    return f", thus {'xyz'[axis]} {'up' if up[axis] > 0 else 'down'}"
 
 
 def _shown(vector: Float[Tensor, "3"]) -> str:

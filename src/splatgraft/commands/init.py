@@ -23,7 +23,7 @@ class Init:
     """The project's folder; made where it does not exist."""
     source: Path
     """The capture with the object: photos, a video, a COLMAP folder or a folder with transforms.json; or a trained
-    scene (.ply, .spz, .splat) without photographs."""
+    scene (.ply, .spz, .splat, .sog, .glb, .ksplat) without photographs."""
     target: Path
     """The capture or the scene that receives it."""
     full: bool = False

@@ -9,11 +9,20 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures import cameras_json, colmap, transforms_json
 from splatgraft.formats.captures.points_ply import read_points, write_points
+from splatgraft.formats.scenes.axes import with_axes
+from splatgraft.formats.scenes.gaussian_glb import read_gaussian_glb
 from splatgraft.formats.scenes.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from splatgraft.formats.scenes.ksplat import read_ksplat
+from splatgraft.formats.scenes.plausible import with_plausible_conventions
+from splatgraft.formats.scenes.scene_file import SceneFile
+from splatgraft.formats.scenes.sog import read_sog
+from splatgraft.formats.scenes.sog_container import files_of, is_sog_folder
 from splatgraft.formats.scenes.splat import read_splat, write_splat
 from splatgraft.formats.scenes.spz import read_spz, write_spz
 
 __all__ = [
+    "SCENE_SUFFIXES",
+    "SceneFile",
     "is_scene",
     "list_capture_images",
     "read_cameras",
@@ -21,6 +30,8 @@ __all__ = [
     "read_gaussians",
     "read_images",
     "read_points",
+    "read_scene",
+    "scene_files",
     "write_cameras",
     "write_capture",
     "write_gaussians",
@@ -28,30 +39,73 @@ __all__ = [
 ]
 
 
-_READERS = {".ply": read_gaussian_ply, ".splat": read_splat, ".spz": read_spz}
+_READERS = {
+    ".ply": read_gaussian_ply,
+    ".spz": read_spz,
+    ".splat": read_splat,
+    ".sog": read_sog,
+    ".glb": read_gaussian_glb,
+    ".ksplat": read_ksplat,
+}
 _WRITERS = {".ply": write_gaussian_ply, ".splat": write_splat, ".spz": write_spz}
+
+SCENE_SUFFIXES = tuple(_READERS)
+"""Suffixes of trained scenes that can be read; a folder of SOG pictures has none."""
 
 
 def is_scene(path: Path) -> bool:
-    """Whether the suffix is that of a trained scene."""
-    return path.suffix.lower() in _READERS
+    """Whether the suffix is that of a trained scene, or it is a folder of SOG pictures or the meta.json of one."""
+    return path.suffix.lower() in _READERS or is_sog_folder(path)
+
+
+def scene_files(path: Path) -> tuple[Path, ...]:
+    """The files of a trained scene: itself, or the files of a folder of SOG pictures."""
+    return files_of(path) if is_sog_folder(path) else (path,)
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """Read a trained scene.
+    """Read a trained scene, taking the word of the file's layout.
 
     Args:
-        path: A .ply (of 3DGS, or SuperSplat's compressed form), .splat or .spz file.
+        path: A .ply (of 3DGS, or SuperSplat's compressed form), .spz, .splat, .sog, .glb or .ksplat file, or a folder
+            of SOG pictures.
 
     Returns:
-        Its Gaussians, in the file's order and frame.
+        Its Gaussians, in the file's order, and in the axes of a .ply where the format has others.
 
     Raises:
         ValueError: The suffix is another, or the file is not what its suffix says.
     """
     path = Path(path)
     with _readable(path):
-        return _by_suffix(path, _READERS)(path)
+        return _read(path).gaussians
+
+
+def read_scene(path: Path | str, *, axes: str | None = None) -> SceneFile:
+    """Read a trained scene of another program, with the conventions that its data show.
+
+    Args:
+        path: As for `read_gaussians`.
+        axes: Directions of the file's x, y and z, such as RDF or RUB; those of the format, or that the file states,
+            where None.
+
+    Returns:
+        Its Gaussians; the file's up direction where it states one; notes for the user on what was found. Of a .ply
+        linear scales, linear opacities and quaternions xyzw are recognised.
+
+    Raises:
+        ValueError: The suffix is another, the file is not what its suffix says, or `axes` are none.
+    """
+    path = Path(path)
+    with _readable(path):
+        scene = _read(path)
+        if path.suffix.lower() == ".ply":
+            scene = with_plausible_conventions(scene)
+        return scene if axes is None else with_axes(scene, axes)
+
+
+def _read(path: Path) -> SceneFile:
+    return read_sog(path) if is_sog_folder(path) else _by_suffix(path, _READERS)(path)
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:

@@ -18,7 +18,7 @@ TEMPLATE = """\
 
 [source]
 # photos, a video, a COLMAP folder or a folder with transforms.json; masks are in masks/ beside images/
-# or, beside it or instead of it, a trained scene (.ply, .spz, .splat); without a capture, pictures are made of it:
+# or, beside it or instead of it, a trained scene (.ply, .spz, .splat, .sog, .glb, .ksplat); alone, pictures are made:
 # scene = "trained.ply"
 {source}
 

@@ -1,7 +1,7 @@
 """The steps of a project as a graph: which step reads the folder of which other."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +106,15 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
         trained = file.scene(side)
         kind, given = (Reconstruct, given) if trained is None else (Adopt, given | {"scene": trained})
         steps[f"{side}/reconstruct"] = file.step(kind, given, out=layout.scene(side), side=side)
+        steps[f"{side}/reconstruct"] = _with_axes_of(steps[f"{side}/capture"], steps[f"{side}/reconstruct"])
     return Flow(layout, steps | _joint_steps(file, layout), file.renamed)
+
+
+def _with_axes_of(capture: Step, scene: Step) -> Step:
+    """A trained scene is read with the axes that its capture names."""
+    if isinstance(capture, Capture) and isinstance(scene, Adopt) and scene.axes is None:
+        return replace(scene, axes=capture.axes)
+    return scene
 
 
 def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:

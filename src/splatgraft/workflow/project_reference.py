@@ -16,8 +16,8 @@ _CAPTURE_KEYS = {
 _SIDE_KEYS = (
     Key("capture", "path", "required without scene", "Photos, a video, a COLMAP folder or one with transforms.json.",
         example='"photos"'),
-    Key("scene", "path", "none", "A trained scene (.ply, .spz, .splat), which is taken over instead of being "
-        "reconstructed; without a capture, pictures are made of it.", example='"trained.ply"'),
+    Key("scene", "path", "none", "A trained scene (.ply, .spz, .splat, .sog, .glb, .ksplat), which is taken "
+        "over instead of being reconstructed; without a capture, pictures are made of it.", example='"trained.ply"'),
 )  # fmt: skip
 
 

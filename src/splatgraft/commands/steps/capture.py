@@ -18,7 +18,7 @@ from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs, has_poses
 from splatgraft.folders.photo_exposures import exposure_warnings
-from splatgraft.formats import is_scene, read_capture, read_gaussians, write_capture
+from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, write_capture
 from splatgraft.formats.captures.given_poses import pose_files, read_given_poses
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.project.step import Context, Inputs, Positional
@@ -30,7 +30,8 @@ class Capture:
     trained scene without photographs, pictures are made from all around."""
 
     capture: Positional
-    """A folder of photos, a video, a COLMAP folder, a folder with transforms.json, or a .ply, .spz or .splat."""
+    """A folder of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene (.ply, .spz,
+    .splat, .sog, .glb, .ksplat)."""
     out: Path = Path("capture")
     """Folder for transforms.json and points.ply."""
     poses: Path | None = None
@@ -39,11 +40,15 @@ class Capture:
     """Longest side at which images are served from here on, pixels; 0 keeps all."""
     accept_doubtful: bool = False
     """Whether `run` goes on with poses that are not plausible; without it, it stops after this step."""
+    axes: str | None = None
+    """Of a trained scene: directions of x, y and z (RDF: right, down, front), where those of its format are wrong."""
     options: PoseOptions = field(default_factory=PoseOptions)
     look: VirtualCameraOptions = field(default_factory=VirtualCameraOptions)
 
     def inputs(self) -> Inputs:
         """The photos, or the video, or the scene, or the files of the posed capture."""
+        if is_scene(self.capture):
+            return {"photos": scene_files(self.capture)}
         if self.poses is None and has_poses(self.capture):
             return capture_inputs(self.capture, read_capture(self.capture), masks=True)
         if not self.capture.is_dir():
@@ -97,9 +102,10 @@ class Capture:
 
     def _pictures(self, folder: Path, context: Context) -> PosedImages:
         """Pictures of a scene that came without photographs."""
-        scene = read_gaussians(self.capture)
-        found = place_virtual_cameras(scene, self.look, progress=context.progress)
-        for sentence in found.report:
+        read = read_scene(self.capture, axes=self.axes)
+        scene = read.gaussians
+        found = place_virtual_cameras(scene, self.look, stated_up=read.up, progress=context.progress)
+        for sentence in (*read.said(), *found.report):
             context.console.say(f"{self.capture}: {sentence}")
         (folder / "images").mkdir()
         paths = {name: folder / "images" / f"{name}.png" for name in found.cameras.names}
@@ -119,7 +125,13 @@ class Capture:
 
     def _photos(self, folder: Path, context: Context) -> PhotoFiles:
         if not self.capture.is_dir():
-            return PhotoFiles(tuple(extract_frames(self.capture, folder / "frames", progress=context.progress)))
+            frames = extract_frames(
+                self.capture,
+                folder / "frames",
+                progress=context.progress,
+                say=lambda sentence: context.console.say(f"{self.capture}: {sentence}"),
+            )
+            return PhotoFiles(tuple(frames))
         photos = find_photos(self.capture)
         masks = describe_masks(photos.paths, photos.masks)
         context.console.say(f"{self.capture}: {len(photos.paths)} photos; {masks}")

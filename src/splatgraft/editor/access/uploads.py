@@ -3,11 +3,11 @@
 import re
 from pathlib import Path
 
-from splatgraft.formats import read_gaussians
+from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
 from splatgraft.runtime.atomic_file import atomic_write
 
 UPLOADS_FOLDER = "uploads"
-SCENES = (".ply", ".spz", ".splat")
+SCENES = SCENE_SUFFIXES
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 SUFFIXES = (*SCENES, *VIDEOS)
 LIMIT_BYTES = 1 << 30

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _HELP = (
     "A capture is a folder of photos, a video, a COLMAP folder, or a folder with a `transforms.json`. "
-    "A trained scene (`.ply`, `.spz`, `.splat`) works as well: its images are rendered from cameras around it."
+    "A trained scene (`.ply`, `.spz`, `.sog`, ...) works as well: its images are rendered from cameras around it."
 )
 _SIDES: tuple[tuple[Side, str], ...] = (("source", "Object from"), ("target", "Place into"))
 _UPS: dict[str, Triple | None] = {
@@ -46,8 +46,12 @@ class OpenPhase:
         self._trained = gui.add_folder("Scenes trained on these captures", expand_by_default=False)
         with self._trained:
             self._scenes = (
-                gui.add_text("Of the first", "", hint="A .ply, .spz or .splat in the same frame as its capture"),
-                gui.add_text("Of the second", "", hint="A .ply, .spz or .splat in the same frame as its capture"),
+                gui.add_text(
+                    "Of the first", "", hint="A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
+                ),
+                gui.add_text(
+                    "Of the second", "", hint="A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
+                ),
             )
         # viser shows upload buttons even where `visible` is false; the folder hides it
         self._uploads = gui.add_folder("From this computer")

@@ -57,7 +57,7 @@ class PlacePhase:
         self._operations = gui.add_button_group("Move", ("Drop", "Upright", "Fit size"))
         self._object_buttons = gui.add_button_group("Object ", ("Duplicate", "Delete"))
         with gui.add_folder("Another object", expand_by_default=False):
-            self._path = gui.add_text("File", "", hint="A .ply, .spz or .splat of the object alone")
+            self._path = gui.add_text("File", "", hint="A trained scene (.ply, .spz, .sog, ...) of the object alone")
             self._add = gui.add_button("Add this file", icon=viser.Icon.PLUS, color="gray")
             self._upload = gui.add_upload_button("Upload a file", icon=viser.Icon.UPLOAD, color="gray")
         with gui.add_folder("Erase from the target", expand_by_default=False):

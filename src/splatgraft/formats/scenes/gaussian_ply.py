@@ -3,6 +3,7 @@
 Layout of the original code (Kerbl et al. 2023): x y z, nx ny nz (zeros), f_dc_0..2, f_rest (channel-major), opacity,
 scale_0..2, rot_0..3 (wxyz), all float32. Read in any order, with extra properties or without normals and f_rest.
 Values that are not finite are kept, so that reading and writing copies a file exactly; renderers cull them.
+Variants: red, green, blue in place of f_dc (nerfstudio), filter_3D (Mip-Splatting), two scales (2DGS), degree 4.
 """
 
 import re
@@ -15,17 +16,28 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes import ply
 from splatgraft.formats.scenes.compressed_ply import is_compressed, read_compressed_ply
+from splatgraft.formats.scenes.ply_variants import (
+    disks_thickened,
+    header_notes,
+    header_up,
+    smoothed,
+    with_colors,
+    without_degree_4,
+)
+from splatgraft.formats.scenes.scene_file import SceneFile
 from splatgraft.runtime.atomic_file import atomic_write
 
 _MEANS = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_RGB = ("red", "green", "blue")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_FILTER = "filter_3D"
 _ROWS_PER_WRITE = 1 << 14
-_REST_COUNTS = tuple(3 * (spherical_harmonics.coefficient_count(d) - 1) for d in range(4))
+_REST_COUNTS = tuple(3 * (spherical_harmonics.coefficient_count(d) - 1) for d in range(5))
 
 
-def read_gaussian_ply(path: Path) -> Gaussians:
+def read_gaussian_ply(path: Path) -> SceneFile:
     """The scene in a 3DGS .ply, or SuperSplat's compressed form of one; other number types become float32.
 
     Raises: ValueError where the file is no whole PLY with the properties of Gaussians.
@@ -34,33 +46,51 @@ def read_gaussian_ply(path: Path) -> Gaussians:
     vertex = header.element("vertex")
     if vertex is None:
         raise ValueError(f"{path}: expected an element 'vertex', found {[e.name for e in header.elements]}")
+    up, notes = header_up(header), header_notes(header)
     if is_compressed(header):
-        return read_compressed_ply(header)
+        return SceneFile(read_compressed_ply(header), up=up, notes=notes)
     rest = _rest_names(path, vertex)
-    _require_gaussians(path, vertex)
+    has_rgb = not set(_DC) & set(vertex.names) and set(_RGB) <= set(vertex.names)
+    scales = _SCALES if _SCALES[2] in vertex.names or not set(_SCALES[:2]) <= set(vertex.names) else _SCALES[:2]
+    _require_gaussians(path, vertex, _RGB if has_rgb else _DC, scales)
     n, k = vertex.count, 1 + len(rest) // 3
-    means, log_scales = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+    means, log_scales = np.empty((n, 3), np.float32), np.full((n, 3), -np.inf, np.float32)
     quaternions, logits = np.empty((n, 4), np.float32), np.empty((n, 1), np.float32)
-    sh = np.empty((n, k, 3), np.float32)
+    sh, filters = np.empty((n, k, 3), np.float32), np.empty(n if _FILTER in vertex.names else 0, np.float32)
     columns = [
         *((name, means[:, i]) for i, name in enumerate(_MEANS)),
-        *((name, log_scales[:, i]) for i, name in enumerate(_SCALES)),
+        *((name, log_scales[:, i]) for i, name in enumerate(scales)),
         *((name, quaternions[:, i]) for i, name in enumerate(_QUATERNION)),
         ("opacity", logits[:, 0]),
-        *((name, sh[:, 0, i]) for i, name in enumerate(_DC)),
+        *((name, sh[:, 0, i]) for i, name in enumerate(_RGB if has_rgb else _DC)),
         *((name, sh[:, 1 + i % (k - 1), i // (k - 1)]) for i, name in enumerate(rest)),
+        *([(_FILTER, filters)] if len(filters) else []),
     ]
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is culled as such
         for start, rows in ply.read_chunks(header, vertex):
             for name, column in columns:
                 column[start : start + len(rows)] = rows[name]
-    return Gaussians(
+    gaussians = Gaussians(
         means=torch.from_numpy(means),
         log_scales=torch.from_numpy(log_scales),
         quaternions=torch.from_numpy(quaternions),
         opacity_logits=torch.from_numpy(logits[:, 0]),
         sh=torch.from_numpy(sh),
     )
+    scene = SceneFile(gaussians, up=up, notes=notes)
+    if has_rgb:
+        scene = with_colors(scene, _range_of(vertex))
+    if len(scales) == 2:
+        scene = disks_thickened(scene)
+    if len(filters):
+        scene = smoothed(scene, torch.from_numpy(filters))
+    return without_degree_4(scene)
+
+
+def _range_of(vertex: ply.Element) -> float:
+    """The value of full red: 255 for bytes, 1 for floats."""
+    kind = next(p.type for p in vertex.properties if p.name == _RGB[0])
+    return 1.0 if kind.startswith("f") else 255.0
 
 
 def _rest_names(path: Path, vertex: ply.Element) -> tuple[str, ...]:
@@ -70,12 +100,13 @@ def _rest_names(path: Path, vertex: ply.Element) -> tuple[str, ...]:
     missing = [name for name in names if name not in vertex.names]
     if count not in _REST_COUNTS or missing:
         detail = f"{count}, without {missing[0]}" if missing else str(count)
-        raise ValueError(f"{path}: expected 0, 9, 24 or 45 properties f_rest_0 .. (SH degree 0 to 3), found {detail}")
+        counts = "0, 9, 24, 45 or 72"
+        raise ValueError(f"{path}: expected {counts} properties f_rest_0 .. (SH degree 0 to 4), found {detail}")
     return names
 
 
-def _require_gaussians(path: Path, vertex: ply.Element) -> None:
-    needed = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATERNION)
+def _require_gaussians(path: Path, vertex: ply.Element, colors: tuple[str, ...], scales: tuple[str, ...]) -> None:
+    needed = (*_MEANS, *colors, "opacity", *scales, *_QUATERNION)
     missing = [name for name in needed if name not in vertex.names]
     if not missing:
         return

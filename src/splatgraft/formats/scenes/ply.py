@@ -78,6 +78,8 @@ class PlyHeader:
     elements: tuple[Element, ...]
     data_start: int
     """Offset of the first byte after the header."""
+    comments: tuple[str, ...] = ()
+    """Texts of the comment lines, in order."""
 
     def element(self, name: str) -> Element | None:
         """The element called `name`, or None."""
@@ -100,7 +102,8 @@ def read_header(path: Path) -> PlyHeader:
         raise ValueError(f"{path}: expected 'end_header' within the first {len(head)} bytes, found none")
     lines = head[: end.start()].decode("utf-8", "replace").splitlines()[1:]
     order, elements = _parse(path, lines)
-    header = PlyHeader(path=path, order=order, elements=elements, data_start=end.end())
+    comments = tuple(line[8:].strip() for line in lines if line.startswith("comment "))
+    header = PlyHeader(path=path, order=order, elements=elements, data_start=end.end(), comments=comments)
     _check_size(header)
     return header
 

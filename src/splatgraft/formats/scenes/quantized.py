@@ -14,6 +14,12 @@ def logits_from_bytes(alphas: UInt8[Tensor, "n"]) -> Float[Tensor, "n"]:
     return (alphas.float().clamp(0.25, 254.75) / 255).logit()
 
 
+def logits_from_unit(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Opacity logits of linear opacities; 0 and 1 become finite, by a quarter step of 16 bits."""
+    step = 0.25 / 65535
+    return opacities.clamp(step, 1 - step).logit()
+
+
 def bytes_from_unit(values: Float[Tensor, "*n"]) -> UInt8[Tensor, "*n"]:
     """The nearest byte of values meant for [0, 1]; those outside saturate."""
     return (values * 255).round().clamp(0, 255).to(torch.uint8)

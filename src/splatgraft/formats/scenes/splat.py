@@ -12,6 +12,7 @@ import torch
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, require_finite
+from splatgraft.formats.scenes.scene_file import SceneFile
 from splatgraft.runtime.atomic_file import atomic_write
 
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)])
@@ -19,7 +20,7 @@ _SMALLEST_SCALE = 1e-30
 """World units; replaces a scale of exactly 0, since the logarithm is stored."""
 
 
-def read_splat(path: Path) -> Gaussians:
+def read_splat(path: Path) -> SceneFile:
     """The scene in a .splat file, SH degree 0.
 
     Raises: ValueError where the file is no whole number of records, or they hold no positions and scales.
@@ -33,13 +34,14 @@ def read_splat(path: Path) -> Gaussians:
     positions, scales = rows["position"].astype(np.float32), rows["scale"].astype(np.float32)
     if not (np.isfinite(positions).all() and np.isfinite(scales).all() and (scales >= 0).all()):
         raise ValueError(f"{path}: expected finite positions and scales of 0 or more, found others: is this a .splat?")
-    return Gaussians(
+    gaussians = Gaussians(
         means=torch.from_numpy(positions),
         log_scales=torch.from_numpy(scales).clamp_min(_SMALLEST_SCALE).log(),
         quaternions=(torch.from_numpy(rows["quaternion"].astype(np.float32)) - 128) / 128,
         opacity_logits=logits_from_bytes(torch.from_numpy(rows["rgba"][:, 3].copy())),
         sh=spherical_harmonics.dc_from_rgb(torch.from_numpy(rows["rgba"][:, :3].astype(np.float32)) / 255)[:, None],
     )
+    return SceneFile(gaussians, notes=("the format has colours without view dependence",))
 
 
 def write_splat(path: Path, gaussians: Gaussians) -> None:

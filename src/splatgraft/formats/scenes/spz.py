@@ -1,6 +1,6 @@
-"""Reads and writes .spz scenes (Niantic, versions 2 and 3): gzip of one quantised array per field.
+"""Reads .spz scenes (Niantic, versions 1 to 4) and writes version 3: quantised arrays, one per field.
 
-Stored axes are right-up-back, ours and a .ply's are right-down-front: scenes are rotated by half a turn about x.
+Stored axes are right-up-back unless the file says otherwise, ours and a .ply's are right-down-front.
 """
 
 import struct
@@ -14,76 +14,60 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, require_finite
+from splatgraft.formats.scenes.scene_file import SceneFile
+from splatgraft.formats.scenes.spz_container import unpack
 from splatgraft.runtime.atomic_file import atomic_write
 
 _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
 _GZIP = 31
-_DEFLATE_LIMIT = 1032
-"""deflate cannot expand a byte to more than this."""
 _COLOR_SCALE = 0.15
 _HALF_SQRT2 = 0.5**0.5
-_FLIP = torch.tensor([1.0, -1.0, -1.0])
 
 
-def read_spz(path: Path) -> Gaussians:
+def read_spz(path: Path) -> SceneFile:
     """The scene in a .spz file.
 
     Raises: ValueError where the file is cut, damaged, or of another version.
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected a .spz file, found none")
-    data = path.read_bytes()
-    if data[:4] == struct.pack("<I", _MAGIC):
-        raise ValueError(f"{path}: expected .spz version 2 or 3 (gzip), found version 4 or later")
-    inflate = zlib.decompressobj(_GZIP)
-    head = _inflated(path, inflate, data, _HEADER.size)
-    magic, version, n, degree, fractional_bits, _, _ = _HEADER.unpack(head)
-    if magic != _MAGIC or version not in (2, 3) or degree > spherical_harmonics.MAX_DEGREE or fractional_bits > 24:
-        raise ValueError(
-            f"{path}: expected a .spz of version 2 or 3, SH degree up to 3, up to 24 fractional bits, "
-            f"found magic {magic:#x}, version {version}, degree {degree}, {fractional_bits} bits"
-        )
-    k = spherical_harmonics.coefficient_count(degree) - 1
-    widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * k)
-    if n * sum(widths) > _DEFLATE_LIMIT * len(data):
-        raise ValueError(f"{path}: expected {n} Gaussians as the header says, found only {len(data)} compressed bytes")
-    body = _inflated(path, inflate, inflate.unconsumed_tail, n * sum(widths))
-    rest = _step(path, inflate, inflate.unconsumed_tail, 1)
-    if rest or not inflate.eof or inflate.unused_data:
-        raise ValueError(f"{path}: expected the end of the gzip stream after {n} Gaussians, found more or a cut end")
-    ends = np.cumsum([n * width for width in widths])
-    fields = np.split(np.frombuffer(body, np.uint8), ends[:-1])
-    positions, alphas, colors, scales, rotations, bands = (
-        torch.from_numpy(field.reshape(n, width).copy()) for field, width in zip(fields, widths, strict=True)
+    gaussians, axes, notes = decode_spz(path, path.read_bytes())
+    return SceneFile(change_axes(gaussians, rdf_from(axes)), axes, notes=notes)
+
+
+def decode_spz(path: Path, data: bytes) -> tuple[Gaussians, str, tuple[str, ...]]:
+    """The scene in the bytes of a .spz, in its own axes; their name; and what is said of it.
+
+    Raises: ValueError where the bytes are cut, damaged, or of another version.
+    """
+    packed = unpack(path, data)
+    notes = []
+    if packed.antialiased:
+        notes.append('trained with an anti-aliasing filter: set low_pass = "antialiased" in [render] and [consolidate]')
+    if packed.degree > spherical_harmonics.MAX_DEGREE:
+        notes.append(f"SH degree {packed.degree}: bands above {spherical_harmonics.MAX_DEGREE} are left out")
+    positions, alphas, colors, scales, rotations, bands = (torch.from_numpy(field.copy()) for field in packed.fields)
+    kept = spherical_harmonics.coefficient_count(min(packed.degree, spherical_harmonics.MAX_DEGREE)) - 1
+    bands = bands.reshape(len(bands), bands.shape[1] // 3, 3)[:, :kept]
+    gaussians = Gaussians(
+        means=_half_floats(path, positions) if packed.version == 1 else _means(positions, packed.fractional_bits),
+        log_scales=scales.float() / 16 - 10,
+        quaternions=_smallest_three(rotations) if packed.version >= 3 else _first_three(rotations),
+        opacity_logits=logits_from_bytes(alphas[:, 0]),
+        sh=torch.cat([((colors.float() / 255 - 0.5) / _COLOR_SCALE)[:, None], (bands.float() - 128) / 128], 1),
     )
-    sh = torch.cat(
-        [((colors.float() / 255 - 0.5) / _COLOR_SCALE)[:, None], (bands.float().reshape(n, k, 3) - 128) / 128], 1
-    )
-    return _half_turn(
-        Gaussians(
-            means=_means(positions, fractional_bits),
-            log_scales=scales.float() / 16 - 10,
-            quaternions=_first_three(rotations) if version == 2 else _smallest_three(rotations),
-            opacity_logits=logits_from_bytes(alphas[:, 0]),
-            sh=sh,
-        )
-    )
+    return gaussians, packed.axes, tuple(notes)
 
 
-def _inflated(path: Path, inflate, data: bytes, size: int) -> bytes:
-    out = _step(path, inflate, data, size) if size else b""
-    if len(out) < size:
-        raise ValueError(f"{path}: expected {size} bytes in the gzip stream, found {len(out)}")
-    return out
-
-
-def _step(path: Path, inflate, data: bytes, limit: int) -> bytes:
-    try:
-        return inflate.decompress(data, limit)
-    except zlib.error as error:
-        raise ValueError(f"{path}: expected a whole gzip stream, found {error}") from None
+def _half_floats(path: Path, positions: UInt8[Tensor, "n 6"]) -> Float[Tensor, "n 3"]:
+    """Version 1: three 16-bit floats."""
+    means = torch.from_numpy(positions.numpy().view("<f2").astype(np.float32))
+    if not bool(means.isfinite().all()):
+        raise ValueError(f"{path}: expected finite positions, found others")
+    return means
 
 
 def _means(positions: UInt8[Tensor, "n 9"], fractional_bits: int) -> Float[Tensor, "n 3"]:
@@ -118,7 +102,7 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
     Raises: ValueError where a Gaussian is not finite or further out than 8 million units.
     """
     require_finite(path, gaussians)
-    g = _half_turn(gaussians.map(lambda tensor: tensor.detach().cpu().float()))
+    g = change_axes(gaussians.map(lambda tensor: tensor.detach().cpu().float()), rdf_from("RUB"))
     extent = float(g.means.abs().max()) if g.count else 1.0
     bits = max(b for b in range(-64, 24) if b < -60 or extent * 2.0**b <= 0x7FFFFF)
     if bits < 0:
@@ -150,18 +134,3 @@ def _packed(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
     fields = magnitude | (three < 0).to(torch.int64) << 9
     packed = largest[:, 0] << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
     return packed.numpy().astype("<u4")
-
-
-def _half_turn(gaussians: Gaussians) -> Gaussians:
-    """The scene rotated by half a turn about x, by exact changes of sign; its own inverse."""
-    g = gaussians
-    # every basis function is even or odd under the rotation; the sign at one generic direction decides which
-    direction = torch.nn.functional.normalize(torch.tensor([0.31, 0.53, 0.79]), dim=0)
-    basis = [spherical_harmonics.basis(d, g.sh_degree) for d in (direction, direction * _FLIP)]
-    return Gaussians(
-        means=g.means * _FLIP,
-        log_scales=g.log_scales,
-        quaternions=g.quaternions * torch.cat([torch.ones(1), _FLIP]),
-        opacity_logits=g.opacity_logits,
-        sh=g.sh * (basis[0] * basis[1]).sign()[:, None],
-    )

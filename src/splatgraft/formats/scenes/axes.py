@@ -1,0 +1,72 @@
+"""Changes the axes of a scene exactly: signed permutations, named by the directions of x, y and z.
+
+Names are those of the .spz library: L or R, D or U, B or F for each of x, y, z. A .ply of the original code has RDF, as
+structure from motion has.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.formats.scenes.scene_file import SceneFile
+
+_DIRECTIONS = {"L": (-1, 0, 0), "R": (1, 0, 0), "U": (0, -1, 0), "D": (0, 1, 0), "B": (0, 0, -1), "F": (0, 0, 1)}
+"""In the axes RDF."""
+
+
+def require_axes(name: str) -> str:
+    """The name in capitals.
+
+    Raises: ValueError where it does not name three different axes.
+    """
+    found = name.upper()
+    if len(found) != 3 or any(sum(letter in pair for letter in found) != 1 for pair in ("LR", "UD", "BF")):
+        raise ValueError(f"axes: expected directions of x, y and z such as RDF, RUB or LUF, found {name[:20]!r}")
+    return found
+
+
+def rdf_from(name: str) -> Float[Tensor, "3 3"]:
+    """The matrix that takes coordinates in the axes `name`, such as RUB, to RDF; a reflection for left-handed axes."""
+    return torch.tensor([_DIRECTIONS[letter] for letter in name], dtype=torch.float32).T
+
+
+def change_axes(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians:
+    """The scene in other axes.
+
+    Args:
+        gaussians: In the old axes.
+        matrix: Signed permutation, new from old; its determinant may be -1.
+    """
+    g = gaussians
+    permutation = matrix.abs()
+    # matrix @ R @ matrix.T is a rotation whose axis turns as a pseudovector; it acts on permuted own axes
+    axis = torch.linalg.det(matrix).round() * (g.quaternions[:, 1:] @ matrix.T)
+    harmonics = spherical_harmonics.rotation_matrix(matrix, g.sh_degree)
+    if torch.equal(permutation, torch.eye(3)):
+        harmonics = harmonics.round()  # each basis function is even or odd under reflections in the axes
+    return Gaussians(
+        means=g.means @ matrix.T,
+        log_scales=g.log_scales @ permutation.T,
+        quaternions=torch.cat([g.quaternions[:, :1], axis], 1),
+        opacity_logits=g.opacity_logits,
+        sh=torch.einsum("jk,nkc->njc", harmonics.to(g.sh), g.sh),
+    )
+
+
+def with_axes(scene: SceneFile, axes: str) -> SceneFile:
+    """The scene, with the file's axes taken to be `axes` instead of those that were found.
+
+    Raises: ValueError where `axes` are none.
+    """
+    name = require_axes(axes)
+    if name == scene.axes:
+        return scene
+    matrix = rdf_from(name) @ rdf_from(scene.axes).T
+    if scene.up is not None:
+        x, y, z = (matrix @ torch.tensor(scene.up)).tolist()
+        scene = replace(scene, up=(x, y, z))
+    return replace(scene, gaussians=change_axes(scene.gaussians, matrix), axes=name)

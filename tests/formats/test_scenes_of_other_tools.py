@@ -1,0 +1,240 @@
+"""Scenes that published tools wrote, against the .ply that they were made from; see golden/tools/README.md."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import scene_writers
+import torch
+
+from splatgraft import formats
+from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.formats.scenes.axes import change_axes, rdf_from
+from splatgraft.rendering import render
+
+TOOLS = Path(__file__).parent / "golden" / "tools"
+EXACT = {"means": 1e-6, "log_scales": 1e-6, "ellipsoids": 1e-5, "opacities": 1e-6, "dc": 1e-6, "bands": 1e-6}
+GLB = EXACT | {"log_scales": 3e-6, "opacities": 3e-6}  # exponentials and their inverses in float32
+BYTE = 0.5 / 255
+"""Half a step of a byte of [0, 1]."""
+SH_BYTE = BYTE / 0.2820948
+"""The same of a colour, as band 0."""
+SPZ = {
+    "means": 0.5 / 4096,  # 12 fractional bits
+    "log_scales": 0.5 / 16,
+    "ellipsoids": 0.015,  # 9 bits and a sign; twice the difference of the axes times the angle
+    "opacities": BYTE,
+    "dc": BYTE / 0.15,
+    "bands": 8.5 / 128,  # writers round bands 2 and 3 to 4 bits
+}
+COMPRESSED = {
+    "means": 3e-3,  # 10 and 11 bits of an extent of 5
+    "log_scales": 1.5e-3,
+    "ellipsoids": 0.015,
+    "opacities": BYTE,
+    "dc": SH_BYTE,
+    "bands": 4 / 256,
+}
+# the code books have 256 values for 120 numbers; positions are 16 bits of logarithms over 2.7, times 1 + |x| of up to 4
+SOG = {"means": 9e-5, "log_scales": 1e-2, "ellipsoids": 0.06, "opacities": 2 * BYTE, "dc": 3e-3}
+SPLAT = {"means": 1e-6, "log_scales": 1e-6, "ellipsoids": 0.1, "opacities": 2 * BYTE, "dc": 2 * SH_BYTE}
+HALF = {"means": 1e-4, "log_scales": 1e-3, "ellipsoids": 0.015, "opacities": 2 * BYTE, "dc": 2 * SH_BYTE}
+STEPS = {
+    "scene.gsplat.ply": EXACT,
+    "scene.glb": GLB,
+    "scene.log_scales.glb": GLB,
+    "scene.v3.spz": SPZ,
+    "scene.v4.spz": SPZ,
+    "scene.compressed.ply": COMPRESSED,
+    "scene.gsplat.compressed.ply": COMPRESSED,
+    "scene.sog": SOG,
+    "scene.gsplat.splat": SPLAT,
+    "scene.level0.ksplat": SPLAT,
+    "scene.level1.ksplat": HALF | {"bands": 5e-4},
+    "scene.level2.ksplat": HALF | {"bands": 6e-3},  # bytes of [-1.2, 1.2]
+}
+
+
+@pytest.fixture(scope="module")
+def original() -> Gaussians:
+    return formats.read_gaussians(TOOLS / "scene.ply")
+
+
+def matched(original: Gaussians, found: Gaussians) -> Gaussians:
+    """`found` in the original's order, since most tools sort."""
+    assert found.count == original.count
+    nearest = torch.cdist(original.means, found.means).argmin(1)
+    assert len(nearest.unique()) == original.count
+    return found.select(nearest)
+
+
+def assert_within(original: Gaussians, found: Gaussians, steps: dict[str, float]) -> None:
+    found = matched(original, found)
+    k = found.sh.shape[1]
+    # an ellipsoid is the same with its own axes reversed
+    ellipsoids = [
+        g.rotations @ torch.diag(torch.tensor([1.0, 2, 3])) @ g.rotations.transpose(1, 2) for g in (original, found)
+    ]
+    differences = {
+        "means": original.means - found.means,
+        "log_scales": original.log_scales - found.log_scales,
+        "ellipsoids": ellipsoids[0] - ellipsoids[1],
+        "opacities": original.opacities - found.opacities,
+        "dc": original.sh[:, 0] - found.sh[:, 0],
+        "bands": original.sh[:, 1:k] - found.sh[:, 1:],
+    }
+    for name, step in steps.items():
+        # a hundredth for values in float32
+        worst = float(differences[name].abs().amax()) if differences[name].numel() else 0.0
+        assert worst <= step * 1.01, f"{name}: {worst} above {step}"
+
+
+def cameras() -> Cameras:
+    eyes = torch.tensor([[0.0, 0, -6], [4.0, -3, 4], [-5.0, 2, 1]])
+    poses = look_at(eyes, torch.zeros(3), up=torch.tensor([0.0, -1, 0]))
+    return pinhole(poses, 60.0, width=64, height=48)
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_values_are_those_of_the_original(original, name):
+    assert_within(original, formats.read_scene(TOOLS / name).gaussians, STEPS[name])
+
+
+@pytest.mark.parametrize("name", [name for name in STEPS if "bands" in STEPS[name]])
+def test_pictures_are_those_of_the_original(original, name):
+    found = formats.read_gaussians(TOOLS / name)
+    expected = render(original.with_sh_degree(found.sh_degree), cameras()).color
+    error = (render(found, cameras()).color - expected).abs()
+    assert float(expected.std()) > 0.05  # there is something to see
+    # colours are off by up to a step of each band, and most pixels see few Gaussians
+    assert float(error.mean()) < 0.01
+
+
+def test_sog_is_decoded_as_its_own_tool_decodes_it():
+    ours = formats.read_gaussians(TOOLS / "scene.sog")
+    theirs = formats.read_gaussians(TOOLS / "scene.sog.ply")
+    assert_within(theirs, ours, EXACT | {"means": 3e-6})  # exponentials in float32 and float64
+
+
+def test_sog_as_a_folder_or_its_meta_json(original, tmp_path):
+    import zipfile
+
+    with zipfile.ZipFile(TOOLS / "scene.sog") as archive:
+        archive.extractall(tmp_path / "scene")
+    for path in (tmp_path / "scene", tmp_path / "scene" / "meta.json"):
+        assert formats.is_scene(path)
+        assert_within(original, formats.read_gaussians(path), SOG)
+        assert len(formats.scene_files(path)) == 8
+    assert not formats.is_scene(tmp_path)
+
+
+def test_sog_of_version_1(original, tmp_path):
+    folder = scene_writers.write_folder(tmp_path / "v1", scene_writers.sog_v1(original))
+    # half a byte of ranges up to 3.4, 1.2 and, of logits, 9.5
+    steps = {"means": 9e-5, "log_scales": 7e-3, "ellipsoids": 0.06, "opacities": 5e-3, "dc": 3e-3, "bands": 3e-3}
+    assert_within(original, formats.read_gaussians(folder), steps)
+
+
+def test_spz_that_was_written_without_turning_the_axes(original):
+    path = TOOLS / "scene.unturned.spz"
+    assert formats.read_scene(path).axes == "RUB"
+    assert_within(original, formats.read_scene(path, axes="rdf").gaussians, SPZ)
+
+
+@pytest.mark.parametrize(("number", "axes"), [(0, "RUB"), (4, "RUB"), (6, "RDF"), (7, "LUF"), (8, "RUF"), (12, "RFU")])
+def test_spz_that_states_its_axes(tmp_path, number, axes):
+    means = torch.randn(30, 3, generator=torch.Generator().manual_seed(0))
+    data = scene_writers.spz_of_version_1(means.numpy(), extensions=scene_writers.coordinate_system(number), flags=2)
+    (tmp_path / "a.spz").write_bytes(data)
+    found = formats.read_scene(tmp_path / "a.spz")
+    assert found.axes == axes
+    torch.testing.assert_close(found.gaussians.means, means @ rdf_from(axes).T, atol=2e-3, rtol=0)  # half floats
+
+
+def test_spz_of_version_1(tmp_path):
+    means = torch.randn(30, 3, generator=torch.Generator().manual_seed(0))
+    (tmp_path / "a.spz").write_bytes(scene_writers.spz_of_version_1(means.numpy()))
+    g = formats.read_gaussians(tmp_path / "a.spz")
+    torch.testing.assert_close(g.means, means * torch.tensor([1.0, -1, -1]), atol=2e-3, rtol=0)  # half floats
+    torch.testing.assert_close(g.log_scales, torch.full((30, 3), -4.0))
+    torch.testing.assert_close(g.rotations, torch.eye(3).expand(30, 3, 3), atol=0.02, rtol=0)  # 128 is half a step off
+
+
+@pytest.mark.parametrize("axes", ["RDF", "RUB", "LUF", "RUF", "RFU", "LBD", "UFR"])
+def test_changed_axes_show_the_same_scene(original, axes):
+    """A mirrored scene is seen by mirrored cameras: colours along mirrored directions, ellipsoids mirrored."""
+    matrix = rdf_from(axes)
+    turned = change_axes(original, matrix)
+    torch.testing.assert_close(turned.means, original.means @ matrix.T)
+    covariances = matrix @ original.covariances @ matrix.T
+    torch.testing.assert_close(turned.covariances, covariances, atol=1e-6, rtol=1e-4)  # float32
+    from splatgraft.core import spherical_harmonics
+
+    directions = torch.nn.functional.normalize(original.means, dim=1)
+    torch.testing.assert_close(
+        spherical_harmonics.colors(turned.sh, directions @ matrix.T),
+        spherical_harmonics.colors(original.sh, directions),
+        atol=1e-5,  # float32
+        rtol=0,
+    )
+
+
+@pytest.mark.parametrize("axes", ["", "RD", "RDFX", "RRD", "RLF", "xyz", "RDÉ"])
+def test_axes_that_are_none(axes):
+    with pytest.raises(ValueError, match="expected directions of x, y and z"):
+        formats.read_scene(TOOLS / "scene.ply", axes=axes)
+
+
+def test_glb_places_its_mesh_by_its_nodes(original, tmp_path):
+    glb = scene_writers.parts_of_glb((TOOLS / "scene.glb").read_bytes())
+    content, binary = glb
+    turn = [0.0, 0.0, 2**-0.5, 2**-0.5]  # a quarter turn about z
+    content["nodes"] = [{"children": [1], "translation": [1, 2, 3]}, {"mesh": 0, "rotation": turn, "scale": [2, 2, 2]}]
+    (tmp_path / "a.glb").write_bytes(scene_writers.glb(content, binary))
+    found = formats.read_gaussians(tmp_path / "a.glb")
+    rotation = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    in_gltf = original.means * torch.tensor([-1.0, -1, 1])
+    expected = (2 * in_gltf @ rotation.T + torch.tensor([1.0, 2, 3])) * torch.tensor([-1.0, -1, 1])
+    torch.testing.assert_close(found.means, expected, atol=1e-5, rtol=0)  # float32
+    torch.testing.assert_close(found.log_scales, original.log_scales + torch.tensor(2.0).log())
+
+
+@pytest.mark.parametrize("change", [{"scale": [1, 2, 1]}, {"scale": [-1, 1, 1]}, {"scale": [0, 0, 0]}])
+def test_glb_whose_nodes_distort(tmp_path, change):
+    content, binary = scene_writers.parts_of_glb((TOOLS / "scene.glb").read_bytes())
+    content["nodes"][0] |= change
+    (tmp_path / "a.glb").write_bytes(scene_writers.glb(content, binary))
+    with pytest.raises(ValueError, match=r"a\.glb: expected nodes that rotate and scale uniformly"):
+        formats.read_gaussians(tmp_path / "a.glb")
+
+
+def test_glb_with_spz_inside(original, tmp_path):
+    data = (TOOLS / "scene.v3.spz").read_bytes()
+    name = "KHR_gaussian_splatting_compression_spz_2"
+    primitive = {"mode": 0, "extensions": {"KHR_gaussian_splatting": {"extensions": {name: {"bufferView": 0}}}}}
+    content = {
+        "asset": {"version": "2.0"},
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(data)}],
+    }
+    (tmp_path / "a.glb").write_bytes(scene_writers.glb(content, data))
+    found = formats.read_gaussians(tmp_path / "a.glb")
+    # the stream's own axes are glTF's, so that it is turned about z and not about x
+    assert_within(original, change_axes(found, torch.diag(torch.tensor([-1.0, 1, -1]))), SPZ)
+
+
+def test_glb_with_quantised_attributes(original, tmp_path):
+    content, binary = scene_writers.parts_of_glb((TOOLS / "scene.glb").read_bytes())
+    attributes = content["meshes"][0]["primitives"][0]["attributes"]
+    unit = torch.nn.functional.normalize(original.quaternions, dim=1)
+    rotated = change_axes(replace(original, quaternions=unit), rdf_from("LUF").T)  # back to glTF's axes
+    packed = (rotated.quaternions[:, [1, 2, 3, 0]] * 32767).round().to(torch.int16).numpy().tobytes()
+    content["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(packed)})
+    accessor = {"bufferView": len(content["bufferViews"]) - 1, "componentType": 5122, "normalized": True}
+    content["accessors"].append(accessor | {"count": 40, "type": "VEC4"})
+    attributes["KHR_gaussian_splatting:ROTATION"] = len(content["accessors"]) - 1
+    (tmp_path / "a.glb").write_bytes(scene_writers.glb(content, binary + packed))
+    steps = GLB | {"ellipsoids": 2e-4}  # 16 bits
+    assert_within(original, formats.read_gaussians(tmp_path / "a.glb"), steps)
