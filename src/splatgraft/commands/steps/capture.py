@@ -7,16 +7,21 @@ from pathlib import Path
 from splatgraft.capture import (
     PoseOptions,
     VirtualCameraOptions,
+    drawn_pictures,
     extract_frames,
     place_virtual_cameras,
     pose_photos,
     read_pose_report,
     render_pictures,
+    require_coverage,
+    usable_photos,
+    usable_views,
     write_pose_report,
+    write_reduced,
 )
 from splatgraft.core.images import list_images, write_image
-from splatgraft.core.posed_images import PosedImages
-from splatgraft.folders.capture_files import capture_inputs, has_poses
+from splatgraft.core.posed_images import LeftOut, PosedImages
+from splatgraft.folders.capture_files import capture_inputs, describe_left_out, has_poses
 from splatgraft.folders.photo_exposures import exposure_warnings
 from splatgraft.formats import is_scene, read_capture, read_gaussians, write_capture
 from splatgraft.project.step import Context, Inputs, Positional
@@ -32,7 +37,10 @@ class Capture:
     out: Path = Path("capture")
     """Folder for transforms.json and points.ply."""
     max_side: int = 1600
-    """Longest side at which images are served from here on, pixels; 0 keeps all."""
+    """Longest side at which images are served from here on, pixels; larger ones are reduced once and stored in the
+    result; 0 keeps all."""
+    keep_odd: bool = False
+    """Whether blurred photos and copies of other photos are used; without it they are named and left out."""
     accept_doubtful: bool = False
     """Whether `run` goes on with poses that are not plausible; without it, it stops after this step."""
     options: PoseOptions = field(default_factory=PoseOptions)
@@ -49,9 +57,10 @@ class Capture:
         if is_scene(self.capture):
             posed = self._pictures(folder, context)
         elif has_poses(self.capture):
-            posed = read_capture(self.capture)
-            context.console.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points")
+            posed = self._taken_over(context)
             self._warn_of_exposures(posed.image_paths, context)
+            if self.max_side > 0:
+                posed = write_reduced(posed, folder, self.max_side, progress=context.progress)
         else:
             photos = self._photos(folder, context)
             self._warn_of_exposures(photos, context)
@@ -66,7 +75,20 @@ class Capture:
             for doubt in report.doubts:
                 context.console.say(f"{self.capture}: doubtful: {doubt}")
             write_pose_report(folder, report)
-        write_capture(folder, _limited(posed, self.max_side))
+        require_coverage(posed, str(self.capture))
+        write_capture(folder, posed.limited(self.max_side) if self.max_side > 0 else posed)
+
+    def _taken_over(self, context: Context) -> PosedImages:
+        """The posed capture without what is not usable, which is said."""
+        given = read_capture(self.capture)
+        context.console.say(f"{self.capture}: {len(given)} posed images, {len(given.points)} points")
+        posed = usable_views(given, keep_odd=self.keep_odd, progress=context.progress)
+        self._say_left_out(len(posed), posed.left_out, context)
+        return posed
+
+    def _say_left_out(self, kept: int, left_out: Sequence[LeftOut], context: Context) -> None:
+        for sentence in describe_left_out(self.capture, kept, left_out):
+            context.console.say(sentence)
 
     def _pictures(self, folder: Path, context: Context) -> PosedImages:
         """Pictures of a scene that came without photographs."""
@@ -92,7 +114,13 @@ class Capture:
 
     def _photos(self, folder: Path, context: Context) -> list[Path]:
         if self.capture.is_dir():
-            return list_images(self.capture)
+            photos, odd = usable_photos(
+                list_images(self.capture), str(self.capture), keep_odd=self.keep_odd, progress=context.progress
+            )
+            self._say_left_out(len(photos), odd, context)
+            if (warning := drawn_pictures(photos)) is not None:
+                context.console.say(f"warning: {warning}")
+            return photos
         return extract_frames(self.capture, folder / "frames", progress=context.progress)
 
 
@@ -111,11 +139,6 @@ def doubt_about(step: Capture) -> str | None:
         f"changed, or give poses (a COLMAP folder or transforms.json); to go on with these poses, which are kept, set "
         f"accept_doubtful = true for this capture or use run --accept-doubtful"
     )
-
-
-def _limited(posed: PosedImages, max_side: int) -> PosedImages:
-    longest = int(posed.cameras.sizes.max()) if len(posed) else 0
-    return posed.resized(max_side / longest) if 0 < max_side < longest else posed
 
 
 COMMAND = Capture

@@ -3,19 +3,21 @@
 from dataclasses import replace
 from pathlib import Path
 
-from splatgraft.core.images import has_transparency, list_images, read_alpha, stored_size
-from splatgraft.formats.captures.view_record import ViewRecord, same_shape
+from splatgraft.core.images import has_transparency, list_images, read_alpha, same_shape, stored_size
+from splatgraft.core.posed_images import LeftOut
+from splatgraft.formats.captures.view_record import ViewRecord
 
 _ALPHA_SAMPLES = 8
 """Number of files decoded to decide whether alpha channels are masks."""
 
 
-def with_masks(views: list[ViewRecord], folder: Path) -> list[ViewRecord]:
+def with_masks(views: list[ViewRecord], folder: Path) -> tuple[list[ViewRecord], list[LeftOut]]:
     """The views with the masks in `folder`/masks, or, without that folder, with varying alpha channels as masks.
 
-    0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask that the view already has stays.
+    0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask that the view already has stays. A
+    mask that is missing, unreadable or of another shape is left out, with the reason.
 
-    Raises: ValueError where masks/ has no mask for any view, two for one, or one of another shape.
+    Raises: ValueError where masks/ has no mask for any view, or two for one.
     """
     masks = folder / "masks"
     if not any(view.mask_path for view in views):
@@ -26,13 +28,27 @@ def with_masks(views: list[ViewRecord], folder: Path) -> list[ViewRecord]:
                 raise ValueError(f"{masks}: expected masks named like the images ({views[0].name}), found none")
         else:
             views = _with_alpha_masks(views)
-    for view in views:
-        if view.mask_path is not None and view.mask_path != view.image_path:
-            found = stored_size(view.mask_path)
-            if not same_shape(found, view.size):
-                expected = f"{view.size[0]}x{view.size[1]} px, as its image has, or those scaled"
-                raise ValueError(f"{view.mask_path}: expected {expected}, found {found[0]}x{found[1]}")
-    return views
+    left_out: list[LeftOut] = []
+    for index, view in enumerate(views):
+        if view.mask_path is None or view.mask_path == view.image_path:
+            continue
+        try:
+            check_mask(view.mask_path, view.size)
+        except ValueError as error:
+            left_out.append(LeftOut(view.name, str(error), mask_only=True))
+            views[index] = replace(view, mask_path=None)
+    return views, left_out
+
+
+def check_mask(mask: Path, size: tuple[int, int]) -> None:
+    """Raise where a mask cannot be of an image with `size` (width, height).
+
+    Raises: ValueError where it has another shape or is no readable image.
+    """
+    found = stored_size(mask)
+    if not same_shape(found, size):
+        expected = f"{size[0]}x{size[1]} px, as its image has, or those scaled"
+        raise ValueError(f"{mask}: expected {expected}, found {found[0]}x{found[1]}")
 
 
 def _with_alpha_masks(views: list[ViewRecord]) -> list[ViewRecord]:
