@@ -26,6 +26,7 @@ def test_different_sharp_photos_all_stay(tmp_path):
     "blur",
     [
         lambda p: cv2.GaussianBlur(p, (0, 0), 2),
+        lambda p: cv2.GaussianBlur(p, (0, 0), 8),
         lambda p: motion(p, 9, 0),
         lambda p: motion(p, 9, 90),
         lambda p: motion(p, 15, 40),

@@ -1,7 +1,7 @@
 """Finds photos that do not belong among the others: unreadable, tiny, copies of another, or far more blurred.
 
 Blur is measured by the fine detail of a photo in relation to its coarse detail, which depends little on what is shown:
-mean square second differences at full size over those at a quarter of it, in the direction where this is least, since
+mean square second differences at full size over those at a sixteenth of it, in the direction where this is least, since
 a moving camera blurs in one direction only.
 """
 
@@ -19,6 +19,10 @@ from splatgraft.core.posed_images import LeftOut
 from splatgraft.runtime.progress import Progress, silent
 
 _THUMBNAIL_PX = 64
+_COARSE_HALVINGS = 4
+"""A blur that is wide enough to take coarse detail as well must not pass for sharp: a sixteenth holds up to 16 px."""
+_COARSE_PX = 8
+"""Least side at that size for its detail to mean anything."""
 _SAMPLES = 8
 """Photos that are looked at to tell drawings from photographs, evenly spaced."""
 _EVEN_SHARE = 0.8
@@ -37,7 +41,7 @@ class OddPhotoRule:
     larger than the others counts by what is left of it when it is as small."""
     blur_octaves: float = 1.5
     """Fine detail below the median, as a power of two. In four captures (three photographed, one rendered) the softest
-    photo lies 0.3 to 0.55 below; 9 px of motion blur or a Gaussian blur of 2 px take off 1.6 to 2.8."""
+    photo lies 0.4 to 0.8 below; 9 px of motion blur or a Gaussian blur of 2 px take off 1.5 to 3, mostly 2.4."""
     blur_deviations: float = 4.0
     """And this many robust standard deviations (1.4826 median absolute deviations) below it."""
     copy_levels: float = 4.0
@@ -148,9 +152,11 @@ def _examine(path: Path, smallest_px: int, measured_px: int) -> _Photo:
 
 
 def _log_detail(grey: np.ndarray) -> float:
-    """Half the binary logarithm of fine over coarse mean square second differences; nan where there is no detail."""
-    coarse = cv2.pyrDown(cv2.pyrDown(grey))
-    if min(coarse.shape) < 3:
+    """Half the binary logarithm of fine over coarse mean square second differences; nan where these are too few."""
+    coarse = grey
+    for _ in range(_COARSE_HALVINGS):
+        coarse = cv2.pyrDown(coarse)
+    if min(coarse.shape) < _COARSE_PX:
         return float("nan")
     fine_squares, coarse_squares = _second_differences(grey), _second_differences(coarse)
     # a tenth of a grey level is less than rounding: nothing to compare

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from splatgraft.core.images import list_images
 from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.formats.captures.colmap import is_colmap
 
@@ -36,6 +37,16 @@ def capture_inputs(path: Path, capture: PosedImages, *, masks: bool = False) -> 
     if masks:
         inputs["masks"] = tuple(p for p in capture.mask_paths if p is not None)
     return inputs
+
+
+def describe_unposed(path: Path, capture: PosedImages) -> str | None:
+    """One line where most of the images beside those of the capture at `path` have no pose, else None."""
+    folders = {image.parent for image in capture.image_paths}
+    total = sum(len(list_images(folder)) for folder in folders)
+    if len(capture) >= 0.5 * total:
+        return None
+    found = f"only {len(capture)} of the {total} images in {min(folders)} have a pose"
+    return f"{path}: warning: {found}; the others are not used"
 
 
 def camera_files(path: Path) -> tuple[Path, ...]:

@@ -21,7 +21,7 @@ from splatgraft.capture import (
 )
 from splatgraft.core.images import list_images, write_image
 from splatgraft.core.posed_images import LeftOut, PosedImages
-from splatgraft.folders.capture_files import capture_inputs, describe_left_out, has_poses
+from splatgraft.folders.capture_files import capture_inputs, describe_left_out, describe_unposed, has_poses
 from splatgraft.folders.photo_exposures import exposure_warnings
 from splatgraft.formats import is_scene, read_capture, read_gaussians, write_capture
 from splatgraft.project.step import Context, Inputs, Positional
@@ -82,6 +82,8 @@ class Capture:
         """The posed capture without what is not usable, which is said."""
         given = read_capture(self.capture)
         context.console.say(f"{self.capture}: {len(given)} posed images, {len(given.points)} points")
+        if (warning := describe_unposed(self.capture, given)) is not None:
+            context.console.say(warning)
         posed = usable_views(given, keep_odd=self.keep_odd, progress=context.progress)
         self._say_left_out(len(posed), posed.left_out, context)
         return posed
