@@ -29,7 +29,7 @@ def test_transfer_has_finite_slopes_everywhere():
     assert torch.isfinite(values.grad).all()
 
 
-@pytest.mark.parametrize("suffix", sorted(images.IMAGE_SUFFIXES))
+@pytest.mark.parametrize("suffix", sorted(images.WRITTEN_SUFFIXES))
 def test_write_and_read(tmp_path, suffix):
     image = torch.from_numpy(PIXELS).float() / 255
     path = tmp_path / f"a{suffix}"

@@ -104,18 +104,34 @@ def test_refusals(tmp_path):
     assert "transforms.json" in refusal(tmp_path / "empty")
     assert "nothing there" in refusal(tmp_path / "none")
     with_photos(tmp_path / "a")
-    (tmp_path / "a/images/b.png").unlink()
-    assert "b.png" in refusal(tmp_path / "a")
+    for name in ("a", "b"):
+        (tmp_path / f"a/images/{name}.png").unlink()
+    assert "a.png" in refusal(tmp_path / "a")
     with_photos(tmp_path / "b", camera=("OPENCV_FISHEYE", 24, 16, (20.0, 21.0, 12.0, 8.0, 0.0, 0.0, 0.0, 0.0)))
     message = refusal(tmp_path / "b")
     assert "OPENCV_FISHEYE" in message
     assert "SIMPLE_RADIAL" in message
     with_photos(tmp_path / "c")
-    format_files.write_photo(tmp_path / "c/images/a.png", 20, 20)
+    for name in ("a", "b"):
+        format_files.write_photo(tmp_path / f"c/images/{name}.png", 20, 20)
     assert "found 20x20" in refusal(tmp_path / "c")
     with_photos(tmp_path / "d")
     (tmp_path / "d/sparse/0/points3D.bin").unlink()
     assert "points3D" in refusal(tmp_path / "d")
+
+
+def test_missing_images_are_left_out_and_named(tmp_path):
+    with_photos(tmp_path, names=("a.png", "b.png", "c.png", "d.png"))
+    (tmp_path / "images/b.png").unlink()
+    capture = formats.read_capture(tmp_path)
+    assert capture.cameras.names == ("a.png", "c.png", "d.png")
+    assert [one.name for one in capture.left_out] == ["b.png"]
+    for name in ("a", "c"):
+        (tmp_path / f"images/{name}.png").unlink()
+    message = refusal(tmp_path)
+    assert "at least 50% of 4 images" in message
+    assert "found 1" in message
+    assert "a.png" in message
 
 
 @pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])

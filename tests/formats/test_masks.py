@@ -50,6 +50,11 @@ def test_mask_of_another_shape_is_refused(tmp_path):
     format_files.write_photo(tmp_path / "masks" / "0000.png", 16, 24)
     with pytest.raises(ValueError, match=r"masks/0000\.png: expected 24x16 px.*found 16x24"):
         formats.read_capture(tmp_path)
+    # one of two is half
+    format_files.write_photo(tmp_path / "masks" / "0001.png", 48, 32)
+    capture = formats.read_capture(tmp_path)
+    assert capture.mask_paths == (None, tmp_path / "masks" / "0001.png")
+    assert [str(one) for one in capture.left_out] == ["the mask of images/0000.png"]
 
 
 def test_mask_that_varies_in_alpha_only(tmp_path):

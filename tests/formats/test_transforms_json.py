@@ -7,6 +7,7 @@ import format_files
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from splatgraft import formats
 from splatgraft.core.cameras import Cameras, look_at, pinhole
@@ -165,10 +166,11 @@ MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
     ],
 )
 def test_refusals(tmp_path, frame, content, expected):
-    path = format_files.write_transforms(tmp_path, content)
+    path = format_files.write_transforms(tmp_path, content, frames=3)
     meta = json.loads(path.read_text())
     if meta["frames"] and isinstance(meta["frames"], list):
-        meta["frames"][0] |= frame
+        for broken in meta["frames"][:2]:  # more than half
+            broken.update(frame)
     path.write_text(json.dumps(meta))
     with pytest.raises(ValueError, match=r"expected .*found") as caught:
         formats.read_capture(tmp_path)
@@ -176,6 +178,58 @@ def test_refusals(tmp_path, frame, content, expected):
     assert str(tmp_path) in message
     assert expected in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("frame", "expected"),
+    [
+        ({"transform_matrix": [[float("nan")] * 4] * 4}, "finite"),
+        ({"transform_matrix": None}, "transform_matrix"),
+        ({"file_path": "images/9999.png"}, "images/9999.png"),
+        ({"file_path": 3}, "file_path"),
+        ({"fl_x": 0}, "focal length above 0"),
+        ({"fl_x": 10, "k1": -3.0}, "distortion that can be undone"),
+        ({"w": 48, "h": 48}, "found 24x16"),
+    ],
+)
+def test_one_frame_that_is_not_usable_is_left_out_and_named(tmp_path, frame, expected):
+    path = format_files.write_transforms(tmp_path, {}, frames=3)
+    meta = json.loads(path.read_text())
+    meta["frames"][1] |= frame
+    path.write_text(json.dumps(meta))
+    capture = formats.read_capture(tmp_path)
+    assert capture.cameras.names == ("0000.png", "0002.png")
+    assert len(capture.left_out) == 1
+    assert expected in capture.left_out[0].reason
+    assert str(tmp_path) in capture.left_out[0].reason
+    assert not capture.left_out[0].mask_only
+
+
+@pytest.mark.parametrize("content", [b"", b"no image", b"\x89PNG\r\n\x1a\n cut short"])
+def test_one_image_without_a_readable_header_is_left_out_and_named(tmp_path, content):
+    format_files.write_transforms(tmp_path, {"w": 24, "h": 16}, frames=3)
+    (tmp_path / "images/0001.png").write_bytes(content)
+    capture = formats.read_capture(tmp_path)
+    assert capture.cameras.names == ("0000.png", "0002.png")
+    assert [str(one) for one in capture.left_out] == ["images/0001.png"]
+
+
+def test_a_photo_posed_upright_is_read_upright(tmp_path):
+    # stored on its side, with EXIF orientation 6: the upright picture is turned clockwise from the stored one
+    path = format_files.write_transforms(tmp_path, {"w": 24, "h": 16})
+    pixels = np.random.default_rng(5).integers(0, 256, (24, 16, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(pixels).save(tmp_path / "images/0000.png", exif=exif)
+    upright = torch.from_numpy(np.rot90(pixels, -1).copy()).float() / 255
+    capture = formats.read_capture(path)
+    assert not capture.left_out
+    assert torch.equal(capture.image(0), upright)
+    # the same file, posed as it is stored: COLMAP ignores EXIF rotation
+    path.write_text(path.read_text().replace('"w": 24, "h": 16', '"w": 16, "h": 24'))
+    (tmp_path / "images/0001.png").unlink()
+    stored = formats.read_capture(path)
+    assert torch.equal(stored.image(0), torch.from_numpy(pixels).float() / 255)
 
 
 def test_json_that_is_none(tmp_path):

@@ -1,11 +1,15 @@
 """Capture: posed images from photos, from a video, or from a trained scene that comes without images."""
 
+from splatgraft.capture.odd_photos import drawn_pictures
 from splatgraft.capture.orientation import upright
+from splatgraft.capture.photos import write_reduced
 from splatgraft.capture.plausibility import Doubt, Found, Lens, Plausible, find_doubts
 from splatgraft.capture.pose_report import POSE_REPORT_FILE, PoseReport, Unposed, read_pose_report, write_pose_report
 from splatgraft.capture.scene_fit import misfit_of
 from splatgraft.capture.structure_from_motion import PoseOptions, pose_photos
+from splatgraft.capture.usable_views import readable_views, usable_photos, usable_views
 from splatgraft.capture.video import extract_frames
+from splatgraft.capture.view_coverage import CoverageRule, median_parallax_deg, require_coverage
 from splatgraft.capture.virtual_cameras import (
     VirtualCameraOptions,
     VirtualCameras,
@@ -15,6 +19,7 @@ from splatgraft.capture.virtual_cameras import (
 
 __all__ = [
     "POSE_REPORT_FILE",
+    "CoverageRule",
     "Doubt",
     "Found",
     "Lens",
@@ -24,13 +29,20 @@ __all__ = [
     "Unposed",
     "VirtualCameraOptions",
     "VirtualCameras",
+    "drawn_pictures",
     "extract_frames",
     "find_doubts",
+    "median_parallax_deg",
     "misfit_of",
     "place_virtual_cameras",
     "pose_photos",
     "read_pose_report",
+    "readable_views",
     "render_pictures",
+    "require_coverage",
     "upright",
+    "usable_photos",
+    "usable_views",
     "write_pose_report",
+    "write_reduced",
 ]

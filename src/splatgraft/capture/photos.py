@@ -1,19 +1,23 @@
-"""Photos made ready for structure from motion, grouped by camera, and freed of distortion after it."""
+"""Photos made ready for structure from motion, grouped by camera, reduced, and freed of distortion after it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
+from torch import Tensor
 
 from splatgraft.core.distortion import Distortion
-from splatgraft.core.images import read_mask, read_rgb, stored_size
+from splatgraft.core.images import opened, read_mask, read_rgb, shrink_on_decoding, stored_size, write_image
+from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures.exif import exif_of, read_exposure
 from splatgraft.formats.captures.masks import check_mask
 from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.progress import Progress, silent
 
-_EXIF_ORIENTATION = 0x0112
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -37,11 +41,10 @@ def working_copies(photos: Sequence[Path], folder: Path, max_size_px: int) -> li
         raise ValueError(f"{photos[0].parent}: expected one photo per name, found several of {Path(twice[0]).stem!r}")
     folder.mkdir(parents=True, exist_ok=True)
     for photo, name in zip(photos, names, strict=True):
-        read_rgb(photo)  # the one place that words the errors of unreadable images
-        with Image.open(photo) as image:
-            exif = image.getexif()
+        with opened(photo) as image:
+            exif = _saved_exif(image)
+            shrink_on_decoding(image, max_size_px)
             copy = _on_black(ImageOps.exif_transpose(image))
-        exif[_EXIF_ORIENTATION] = 1
         copy.thumbnail((max_size_px, max_size_px), Image.Resampling.LANCZOS)
         copy.save(folder / name, quality=97, subsampling=0, exif=exif)
     return [folder / name for name in names]
@@ -78,7 +81,7 @@ def working_masks(masks: Sequence[Path | None], copies: Sequence[Path], folder: 
         folder.mkdir(parents=True, exist_ok=True)
         coverage = Image.fromarray((read_mask(mask) * 255).round().to(torch.uint8).numpy())
         with Image.open(mask) as stored:
-            turned = _TURNS.get(stored.getexif().get(_EXIF_ORIENTATION, 1))
+            turned = _TURNS.get(stored.getexif().get(Base.Orientation, 1))
         coverage = coverage if turned is None else coverage.transpose(turned)
         size = stored_size(copy)
         if turned is None:
@@ -86,6 +89,16 @@ def working_masks(masks: Sequence[Path | None], copies: Sequence[Path], folder: 
         written[copy.name] = folder / f"{copy.name}.png"
         coverage.resize(size, Image.Resampling.BOX).save(written[copy.name])
     return written
+
+
+def _saved_exif(image: Image.Image) -> bytes:
+    """The metadata of an upright copy; none where they are damaged."""
+    try:
+        exif = image.getexif()
+        exif[Base.Orientation] = 1
+        return exif.tobytes()
+    except Exception:  # Pillow's parsers and writers raise more kinds than it documents
+        return b""
 
 
 def camera_groups(copies: Sequence[Path], shared: bool) -> list[list[str]]:
@@ -118,11 +131,56 @@ def write_undistorted(copy: Path, path: Path, distortion: Distortion) -> torch.T
     """Write the pinhole image of `copy` as JPEG with its exposure metadata, and give that pinhole's matrix (3, 3)."""
     width, height = distortion.size
     intrinsics = torch.from_numpy(distortion.pinhole())
-    pixels = distortion.undistort(read_rgb(copy), intrinsics, width=width, height=height)
+    _write_jpeg(path, distortion.undistort(read_rgb(copy), intrinsics, width=width, height=height), copy)
+    return intrinsics.float()
+
+
+def write_reduced(posed: PosedImages, folder: Path, longest_px: int, *, progress: Progress = silent) -> PosedImages:
+    """The capture at `longest_px` at most; larger image files are reduced once and written, undistorted.
+
+    Args:
+        posed: A capture of any sizes.
+        folder: An existing folder; images/ and masks/ are made in it where they are needed.
+        longest_px: Longest side, pixels.
+        progress: Moves a bar.
+
+    Returns:
+        Smaller images are referred to as before.
+    """
+    limited = posed.limited(longest_px)
+    sizes = [(int(width), int(height)) for width, height in limited.cameras.sizes.tolist()]
+    large = [max(stored_size(path, size)) > longest_px for path, size in zip(posed.image_paths, sizes, strict=True)]
+    stems = [Path(name).stem for name in posed.cameras.names]
+    images, masks = list(limited.image_paths), list(limited.mask_paths)
+    distortions = list(limited.distortions)
+    for index in [i for i, is_large in enumerate(large) if is_large]:
+        stem = stems[index] if stems.count(stems[index]) == 1 else posed.cameras.names[index]
+        pixels = limited.reduced_image(index)
+        mask = limited.mask(index)
+        images[index] = folder / "images" / f"{stem}.jpg"
+        images[index].parent.mkdir(exist_ok=True)
+        _write_jpeg(images[index], pixels, posed.image_paths[index])
+        if mask is not None:
+            path = folder / "masks" / f"{stem}.png"
+            path.parent.mkdir(exist_ok=True)
+            write_image(path, mask)
+            masks[index] = path
+        if distortions:
+            distortions[index] = None
+        progress(index + 1, len(posed), "reducing photos")
+    return replace(
+        limited,
+        image_paths=tuple(images),
+        mask_paths=tuple(masks),
+        distortions=tuple(distortions) if any(distortions) else (),
+    )
+
+
+def _write_jpeg(path: Path, pixels: Float[Tensor, "h w 3"], photo: Path) -> None:
+    """Write sRGB in [0, 1] with the exposure metadata of `photo`."""
     array = (pixels.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     with atomic_write(path) as stream:
-        Image.fromarray(array).save(stream, "JPEG", quality=95, subsampling=0, exif=exif_of(read_exposure(copy)))
-    return intrinsics.float()
+        Image.fromarray(array).save(stream, "JPEG", quality=95, subsampling=0, exif=exif_of(read_exposure(photo)))
 
 
 def write_undistorted_mask(mask: Path, path: Path, distortion: Distortion) -> None:

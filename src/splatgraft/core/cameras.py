@@ -83,7 +83,15 @@ class Cameras:
 
     def resized(self, factor: float) -> "Cameras":
         """Cameras of images resampled by `factor`; sizes are rounded, intrinsics follow the rounded size exactly."""
-        sizes = (self.sizes * factor).round().clamp_min(1).to(self.sizes.dtype)
+        return self._of_size(self.sizes * factor)
+
+    def limited(self, longest_px: int) -> "Cameras":
+        """Cameras of images of which each larger one is resampled to this longest side."""
+        longest = self.sizes.max(1, keepdim=True).values
+        return self._of_size(self.sizes * (longest_px / longest).clamp_max(1))
+
+    def _of_size(self, sizes: Float[Tensor, "v 2"]) -> "Cameras":
+        sizes = sizes.round().clamp_min(1).to(self.sizes.dtype)
         ratio = (sizes / self.sizes).to(self.intrinsics)
         scale = torch.diag_embed(torch.cat([ratio, torch.ones_like(ratio[:, :1])], 1))
         return replace(self, intrinsics=scale @ self.intrinsics, sizes=sizes)

@@ -1,8 +1,10 @@
 """Images as tensors: reading and writing files, the sRGB transfer function, resampling."""
 
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +13,18 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageOps
-from PIL.ExifTags import IFD
+from PIL.ExifTags import IFD, Base
 from torch import Tensor
 
 from splatgraft.runtime.atomic_file import atomic_write
 
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})
+WRITTEN_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})
+IMAGE_SUFFIXES = WRITTEN_SUFFIXES | {".heic", ".heif"}
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
+_HEIF_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
+"""At byte 8 of a HEIF file, after `ftyp` (ISO/IEC 23008-12)."""
+_TURNED_SIDEWAYS = (5, 6, 7, 8)
+"""EXIF orientations that exchange width and height."""
 _ALWAYS_ALLOWED_PIXELS = 1 << 24
 _PIXELS_PER_BYTE = 1 << 14
 """Above every real image: a black 1-bit PNG has 8256. Above 179 million pixels Pillow itself refuses."""
@@ -52,7 +59,7 @@ def read_rgb(path: Path | str) -> Float[Tensor, "h w 3"]:
     """Read a picture as a viewer shows it, with EXIF rotation applied.
 
     Args:
-        path: A .png, .jpg, .webp, .tif or .bmp file.
+        path: A .png, .jpg, .webp, .tif, .bmp or, with the extra `heic`, .heic file.
 
     Returns:
         sRGB in [0, 1]; transparent pixels are black.
@@ -63,21 +70,65 @@ def read_rgb(path: Path | str) -> Float[Tensor, "h w 3"]:
     return _rgb(ImageOps.exif_transpose(_open(Path(path))))
 
 
-def read_stored_rgb(path: Path) -> Float[Tensor, "h w 3"]:
+def read_stored_rgb(
+    path: Path, size: tuple[int, int] | None = None, *, longest_px: int | None = None
+) -> Float[Tensor, "h w 3"]:
     """sRGB in [0, 1] on the stored pixel grid, to which poses refer: COLMAP ignores EXIF rotation.
 
+    A file whose upright grid alone has the shape of the camera's image is turned: other programs heed EXIF rotation.
+
+    Args:
+        path: An image file.
+        size: Width and height of the camera's image; None takes the stored grid.
+        longest_px: A longer picture is reduced to this longest side; a JPEG is then decoded at less than its full size.
+
+    Raises:
+        ValueError: The file is no readable image.
+    """
+    with opened(path) as image:
+        if longest_px is not None:
+            shrink_on_decoding(image, longest_px)
+        sideways = size is not None and _is_sideways(image, size)
+        pixels = _rgb(ImageOps.exif_transpose(image) if sideways else image)
+    height, width = pixels.shape[:2]
+    factor = 1.0 if longest_px is None else min(1.0, longest_px / max(width, height))
+    return resize(pixels, max(1, round(width * factor)), max(1, round(height * factor)))
+
+
+def stored_size(path: Path, size: tuple[int, int] | None = None) -> tuple[int, int]:
+    """Width and height of the grid that `read_stored_rgb` reads at full size, without decoding it.
+
     Raises: ValueError where the file is no readable image.
     """
-    return _rgb(_open(path))
+    with opened(path) as image:
+        width, height = image.size
+        return (height, width) if size is not None and _is_sideways(image, size) else (width, height)
 
 
-def stored_size(path: Path) -> tuple[int, int]:
-    """Width and height of the stored pixel grid, without decoding it.
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes are those of one image scaled, with sides rounded to whole pixels."""
+    # with both sides scaled by one factor and rounded, the cross products differ by at most one longer side
+    return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
-    Raises: ValueError where the file is no readable image.
+
+def _is_sideways(image: Image.Image, size: tuple[int, int]) -> bool:
+    """Whether EXIF rotation, and it alone, gives the image the shape of `size`."""
+    if same_shape(image.size, size) or not same_shape((image.height, image.width), size):
+        return False
+    try:
+        return image.getexif().get(Base.Orientation) in _TURNED_SIDEWAYS
+    except Exception:  # as in read_exif
+        return False
+
+
+def shrink_on_decoding(image: Image.Image, longest_px: int) -> None:
+    """Let a JPEG that is not decoded yet be decoded at a half, quarter or eighth, at least twice `longest_px` long.
+
+    The factor of two leaves the final reduction to a better filter.
     """
-    with _opened(path) as image:
-        return image.size
+    factor = 2 * longest_px / max(image.size)
+    if factor < 1:
+        image.draft(None, (math.ceil(image.width * factor), math.ceil(image.height * factor)))
 
 
 def mean_luminance(path: Path) -> float:
@@ -85,7 +136,7 @@ def mean_luminance(path: Path) -> float:
 
     Raises: ValueError where the file is no readable image.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         image.draft(None, (_MEAN_PX, _MEAN_PX))
         image.load()
         linear = linear_from_srgb(_rgb(image)).mean((0, 1))
@@ -97,7 +148,7 @@ def read_grey(path: Path, longest_px: int) -> UInt8[np.ndarray, "h w"]:
 
     Raises: ValueError where the file is no readable image.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         image.draft(None, (longest_px, longest_px))
         image.load()
         grey = ImageOps.exif_transpose(image).convert("L")
@@ -110,7 +161,7 @@ def read_exif(path: Path) -> dict[int, Any]:
 
     Raises: ValueError where the file is no readable image.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         try:
             return dict(image.getexif().get_ifd(IFD.Exif))
         except Exception:  # Pillow's parsers raise more kinds than it documents; damaged metadata tells nothing
@@ -122,16 +173,18 @@ def has_transparency(path: Path) -> bool:
 
     Raises: ValueError where the file is no readable image.
     """
-    with _opened(path) as image:
+    with opened(path) as image:
         return image.has_transparency_data
 
 
-def read_alpha(path: Path) -> Float[Tensor, "h w"]:
-    """The alpha channel in [0, 1] on the stored pixel grid; ones where the file has none.
+def read_alpha(path: Path, size: tuple[int, int] | None = None) -> Float[Tensor, "h w"]:
+    """The alpha channel in [0, 1] on the pixel grid of `read_stored_rgb`; ones where the file has none.
 
     Raises: ValueError where the file is no readable image.
     """
     image = _open(path)
+    if size is not None and _is_sideways(image, size):
+        image = ImageOps.exif_transpose(image)
     if not image.has_transparency_data:
         return torch.ones(image.height, image.width)
     return torch.from_numpy(np.array(image.convert("RGBA").getchannel("A"))).float().div_(255)
@@ -168,25 +221,49 @@ def _grey(image: Image.Image) -> Float[Tensor, "h w"]:
 
 
 def _open(path: Path) -> Image.Image:
-    with _opened(path) as image:
+    with opened(path) as image:
         image.load()
         return image
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
-    """The opened image; all of Pillow's errors about a broken file become one ValueError."""
+def opened(path: Path) -> Iterator[Image.Image]:
+    """The opened image, not decoded yet; all of Pillow's errors about a broken file become one ValueError.
+
+    Raises: ValueError where the file is no readable image, also when it is decoded inside the context.
+    """
     if not path.is_file():
         raise ValueError(f"{path}: expected an image file, found none")
+    formats = (*_FORMATS, *_heif_format(path))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # odd metadata, and sizes that the next check refuses
-            with Image.open(path, formats=_FORMATS) as image:
+            with Image.open(path, formats=formats) as image:
                 if image.width * image.height > max(_ALWAYS_ALLOWED_PIXELS, _PIXELS_PER_BYTE * path.stat().st_size):
                     raise ValueError(f"{image.width}x{image.height} px claimed by {path.stat().st_size} bytes")
                 yield image
     except Exception as error:  # Pillow's decoders raise more kinds than it documents (IndexError, struct.error, ..)
         raise ValueError(f"{path}: expected a readable image, found {type(error).__name__}: {error}") from error
+
+
+def _heif_format(path: Path) -> tuple[str, ...]:
+    """Pillow's name of HEIF where the file is one, with the plugin loaded; else nothing.
+
+    Raises: ValueError where the plugin is not installed.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(12)
+    except OSError:
+        return ()  # worded by Pillow's opening
+    if head[4:8] != b"ftyp" or head[8:] not in _HEIF_BRANDS:
+        return ()
+    if find_spec("pillow_heif") is None:
+        raise ValueError(f"{path}: expected pillow-heif to read HEIC (pip install 'splatgraft[heic]'), found none")
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    return ("HEIF",)
 
 
 def write_image(path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"]) -> None:
@@ -201,8 +278,8 @@ def write_image(path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, 
     """
     path = Path(path)
     kind = Image.registered_extensions().get(path.suffix.lower())
-    if path.suffix.lower() not in IMAGE_SUFFIXES or kind is None:
-        raise ValueError(f"{path}: expected an image name that ends in {', '.join(sorted(IMAGE_SUFFIXES))}")
+    if path.suffix.lower() not in WRITTEN_SUFFIXES or kind is None:
+        raise ValueError(f"{path}: expected an image name that ends in {', '.join(sorted(WRITTEN_SUFFIXES))}")
     array = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     with atomic_write(path) as stream:
         Image.fromarray(array).save(stream, format=kind, **({"quality": 95} if kind == "JPEG" else {}))

@@ -13,6 +13,22 @@ from splatgraft.core.images import read_alpha, read_mask, read_stored_rgb, resiz
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """An image of a capture that is not used, or its mask."""
+
+    name: str
+    """The image, as the capture names it."""
+    reason: str
+    """What was expected and what was found, in one line."""
+    mask_only: bool = False
+    """Whether the image itself is used."""
+
+    def __str__(self) -> str:
+        """For people."""
+        return f"the mask of {self.name}" if self.mask_only else self.name
+
+
+@dataclass(frozen=True)
 class PosedImages:
     """v images with their cameras, and m sparse points from structure from motion."""
 
@@ -29,23 +45,38 @@ class PosedImages:
     capture has no masks."""
     distortions: tuple[Distortion | None, ...] = ()
     """Lens distortion of each image file, removed on reading; empty where no file has any."""
+    left_out: tuple[LeftOut, ...] = ()
+    """Images and masks that the capture's files name and that could not be used; remarks, no views."""
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     def image(self, index: int) -> Float[Tensor, "h w 3"]:
         """The image of camera `index`, sRGB, undistorted and resampled to that camera's size."""
-        return self._resampled(read_stored_rgb(self.image_paths[index]), index)
+        return self._resampled(read_stored_rgb(self.image_paths[index], self._size(index)), index)
+
+    def reduced_image(self, index: int) -> Float[Tensor, "h w 3"]:
+        """As `image`, faster for a file that is much larger than the camera's size: it is decoded at less."""
+        size = self._size(index)
+        # the removal of distortion interpolates, which softens by less than a pixel of what it works on
+        factor = 2 if self.distortions and self.distortions[index] is not None else 1
+        return self._resampled(read_stored_rgb(self.image_paths[index], size, longest_px=factor * max(size)), index)
 
     def mask(self, index: int) -> Float[Tensor, "h w"] | None:
         """The object mask of camera `index` in [0, 1], or None."""
         path = self.mask_paths[index] if self.mask_paths else None
         if path is None:
             return None
-        return self._resampled(read_alpha(path) if path == self.image_paths[index] else read_mask(path), index)
+        own = path == self.image_paths[index]
+        return self._resampled(read_alpha(path, self._size(index)) if own else read_mask(path), index)
+
+    def _size(self, index: int) -> tuple[int, int]:
+        """Width and height to which the image is resampled."""
+        width, height = self.cameras.sizes[index].tolist()
+        return width, height
 
     def _resampled(self, pixels: Float[Tensor, "h w *c"], index: int) -> Float[Tensor, "j i *c"]:
-        width, height = self.cameras.sizes[index].tolist()
+        width, height = self._size(index)
         distortion = self.distortions[index] if self.distortions else None
         if distortion is not None:
             pixels = distortion.undistort(pixels, self.cameras.intrinsics[index], width=width, height=height)
@@ -70,6 +101,10 @@ class PosedImages:
     def resized(self, factor: float) -> "PosedImages":
         """The same capture with images resampled by `factor`."""
         return replace(self, cameras=self.cameras.resized(factor))
+
+    def limited(self, longest_px: int) -> "PosedImages":
+        """The same capture with each larger image resampled to this longest side."""
+        return replace(self, cameras=self.cameras.limited(longest_px))
 
 
 def held_out(count: int, every: int = 8) -> Bool[Tensor, "v"]:

@@ -1,15 +1,20 @@
 """The files that a capture consists of, from which steps detect that it changed."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from splatgraft.core.posed_images import PosedImages
+from splatgraft.core.images import list_images
+from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.formats.captures.colmap import is_colmap
+
+_TRANSFORMS = ("transforms.json", "transforms_train.json")
+_NAMED = 8
+"""Most images that a message names."""
 
 
 def has_poses(path: Path) -> bool:
     """Whether `path` has camera poses, and is not only photos or a video."""
-    names = ("transforms.json", "transforms_train.json")
-    return path.suffix == ".json" or any((path / name).is_file() for name in names) or is_colmap(path)
+    return path.suffix == ".json" or any((path / name).is_file() for name in _TRANSFORMS) or is_colmap(path)
 
 
 def description_files(path: Path) -> tuple[Path, ...]:
@@ -32,3 +37,45 @@ def capture_inputs(path: Path, capture: PosedImages, *, masks: bool = False) -> 
     if masks:
         inputs["masks"] = tuple(p for p in capture.mask_paths if p is not None)
     return inputs
+
+
+def describe_unposed(path: Path, capture: PosedImages) -> str | None:
+    """One line where most of the images beside those of the capture at `path` have no pose, else None."""
+    folders = {image.parent for image in capture.image_paths}
+    total = sum(len(list_images(folder)) for folder in folders)
+    if len(capture) >= 0.5 * total:
+        return None
+    found = f"only {len(capture)} of the {total} images in {min(folders)} have a pose"
+    return f"{path}: warning: {found}; the others are not used"
+
+
+def camera_files(path: Path) -> tuple[Path, ...]:
+    """The files that the cameras of `path`, a file or a folder of a capture, are read from.
+
+    Raises: ValueError where there is no capture at `path`.
+    """
+    if not path.is_dir():
+        return (path,)
+    described = next((path / name for name in _TRANSFORMS if (path / name).is_file()), None)
+    if described is not None:
+        return (described,)
+    if is_colmap(path):
+        return tuple(file for file in description_files(path) if file.stem in ("cameras", "images"))
+    raise ValueError(f"{path}: expected transforms.json, or a COLMAP model in sparse/0, found neither")
+
+
+def describe_left_out(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[str]:
+    """One line that counts and names what of the capture at `path` is not used, and the reasons of the first.
+
+    Args:
+        path: The capture.
+        kept: Images that are used.
+        left_out: The others, and masks that are not used.
+    """
+    if not left_out:
+        return []
+    total = kept + sum(not one.mask_only for one in left_out)
+    more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
+    names = ", ".join(str(one) for one in left_out[:_NAMED])
+    head = f"{path}: warning: goes on with {kept} of {total} images, without {names}{more}"
+    return [head, *(f"left out: {one.reason}" for one in left_out[:_NAMED])]

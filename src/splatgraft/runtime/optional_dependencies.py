@@ -17,6 +17,7 @@ class OptionalDependency:
 OPTIONAL_DEPENDENCIES = {
     "cuda": OptionalDependency("splatting kernels for NVIDIA GPUs", {"gsplat": "gsplat", "packaging": "packaging"}),
     "sfm": OptionalDependency("poses for photos and videos that have none", {"pycolmap": "pycolmap"}),
+    "heic": OptionalDependency("photos in HEIC, as iPhones write them", {"pillow_heif": "pillow-heif"}),
     "flux": OptionalDependency(
         "the paper's image model and its training",
         {"diffusers": "diffusers", "accelerate": "accelerate"},

@@ -7,16 +7,21 @@ from pathlib import Path
 from splatgraft.capture import (
     PoseOptions,
     VirtualCameraOptions,
+    drawn_pictures,
     extract_frames,
     place_virtual_cameras,
     pose_photos,
     read_pose_report,
     render_pictures,
+    require_coverage,
+    usable_photos,
+    usable_views,
     write_pose_report,
+    write_reduced,
 )
 from splatgraft.core.images import write_image
-from splatgraft.core.posed_images import PosedImages
-from splatgraft.folders.capture_files import capture_inputs, has_poses
+from splatgraft.core.posed_images import LeftOut, PosedImages
+from splatgraft.folders.capture_files import capture_inputs, describe_left_out, describe_unposed, has_poses
 from splatgraft.folders.photo_exposures import exposure_warnings
 from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, write_capture
 from splatgraft.formats.captures.given_poses import pose_files, read_given_poses
@@ -37,7 +42,10 @@ class Capture:
     poses: Path | None = None
     """Poses that another program found for photos: a COLMAP folder, a transforms.json or Metashape's cameras as XML."""
     max_side: int = 1600
-    """Longest side at which images are served from here on, pixels; 0 keeps all."""
+    """Longest side at which images are served from here on, pixels; larger ones are reduced once and stored in the
+    result; 0 keeps all."""
+    keep_odd: bool = False
+    """Whether blurred photos and copies of other photos are used; without it they are named and left out."""
     accept_doubtful: bool = False
     """Whether `run` goes on with poses that are not plausible; without it, it stops after this step."""
     axes: str | None = None
@@ -66,10 +74,10 @@ class Capture:
         elif is_scene(self.capture):
             posed = self._pictures(folder, context)
         elif has_poses(self.capture):
-            posed = read_capture(self.capture)
-            masks = describe_masks(posed.image_paths, posed.mask_paths)
-            context.console.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points; {masks}")
+            posed = self._taken_over(context)
             self._warn_of_exposures(posed.image_paths, context)
+            if self.max_side > 0:
+                posed = write_reduced(posed, folder, self.max_side, progress=context.progress)
         else:
             photos = self._photos(folder, context)
             self._warn_of_exposures(photos.paths, context)
@@ -85,7 +93,23 @@ class Capture:
             for doubt in report.doubts:
                 context.console.warn(f"{self.capture}: doubtful: {doubt}")
             write_pose_report(folder, report)
-        write_capture(folder, _limited(posed, self.max_side))
+        require_coverage(posed, str(self.capture))
+        write_capture(folder, posed.limited(self.max_side) if self.max_side > 0 else posed)
+
+    def _taken_over(self, context: Context) -> PosedImages:
+        """The posed capture without what is not usable, which is said."""
+        given = read_capture(self.capture)
+        masks = describe_masks(given.image_paths, given.mask_paths)
+        context.console.say(f"{self.capture}: {len(given)} posed images, {len(given.points)} points; {masks}")
+        if (warning := describe_unposed(self.capture, given)) is not None:
+            context.console.warn(warning)
+        posed = usable_views(given, keep_odd=self.keep_odd, progress=context.progress)
+        self._say_left_out(len(posed), posed.left_out, context)
+        return posed
+
+    def _say_left_out(self, kept: int, left_out: Sequence[LeftOut], context: Context) -> None:
+        for sentence in describe_left_out(self.capture, kept, left_out):
+            context.console.warn(sentence)
 
     def _with_given_poses(self, poses: Path, context: Context) -> PosedImages:
         """Photos with the poses of another program."""
@@ -132,7 +156,12 @@ class Capture:
                 say=lambda sentence: context.console.say(f"{self.capture}: {sentence}"),
             )
             return PhotoFiles(tuple(frames))
-        photos = find_photos(self.capture)
+        found = find_photos(self.capture)
+        kept, odd = usable_photos(found.paths, str(self.capture), keep_odd=self.keep_odd, progress=context.progress)
+        self._say_left_out(len(kept), odd, context)
+        if (warning := drawn_pictures(kept)) is not None:
+            context.console.warn(warning)
+        photos = found.only(kept)
         masks = describe_masks(photos.paths, photos.masks)
         context.console.say(f"{self.capture}: {len(photos.paths)} photos; {masks}")
         return photos
@@ -153,11 +182,6 @@ def doubt_about(step: Capture) -> str | None:
         f"changed, or give poses (a COLMAP folder or transforms.json); to go on with these poses, which are kept, set "
         f"accept_doubtful = true for this capture or use run --accept-doubtful"
     )
-
-
-def _limited(posed: PosedImages, max_side: int) -> PosedImages:
-    longest = int(posed.cameras.sizes.max()) if len(posed) else 0
-    return posed.resized(max_side / longest) if 0 < max_side < longest else posed
 
 
 COMMAND = Capture

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from splatgraft.composition import PlaceOptions, place_object
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.composite_folder import composite_of, placement_files, write_composite
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.formats.placement import ObjectPlacement, Placement, read_placement
@@ -24,9 +25,10 @@ class Compose:
     placement: Path | None = None
     """placement.json; without it the object is rested on a surface, for which both captures' cameras are needed."""
     cameras: Path | None = None
-    """The target's cameras, a transforms.json: from them follow the up direction and what is in view."""
+    """The target's cameras, a capture folder or its transforms.json: from them follow the up direction and what is in
+    view."""
     object_cameras: Path | None = None
-    """The source's cameras."""
+    """The source's cameras, likewise."""
     surroundings: Path | None = None
     """The source without the object, a .ply: the surface that the object stood on gives the object's base."""
     options: PlaceOptions = field(default_factory=PlaceOptions)
@@ -36,8 +38,9 @@ class Compose:
         scenes = {"target": (self.target,), "object": (self.object,)}
         if self.placement is not None:
             return scenes | {"placement": placement_files(self.placement)}
-        optional = (self.cameras, self.object_cameras, self.surroundings)
-        return scenes | {"cameras": tuple(path for path in optional if path is not None)}
+        named = [path for path in (self.cameras, self.object_cameras) if path is not None]
+        cameras = tuple(file for path in named for file in camera_files(path))
+        return scenes | {"cameras": cameras + (() if self.surroundings is None else (self.surroundings,))}
 
     def write(self, folder: Path, context: Context) -> None:
         """Compose and write the scene."""

@@ -26,6 +26,7 @@ from splatgraft.evaluation import (
     write_report,
 )
 from splatgraft.fitting.perceptual_losses import lpips_vgg
+from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.evaluated_scenes import EvaluatedScenes, Pictures, TrueViews, truth_files
 from splatgraft.project.layout import RESULTS_IN_ORDER, SCENE_FILE
 from splatgraft.project.record import Record, StepWarning, read_record
@@ -42,7 +43,7 @@ class Evaluate:
     composite: Path
     """The folder of the composite: the object as it was captured."""
     cameras: Path
-    """The target's cameras, a transforms.json."""
+    """The target's cameras: a capture folder or its transforms.json."""
     out: Path = Path("report")
     """Folder for index.html, pictures and metrics.json."""
     ground_truth: Path | None = None
@@ -72,7 +73,12 @@ class Evaluate:
         composite = (self.composite / SCENE_FILE, self.composite / "is_object.npy")
         light = () if self.light is None else (self.light,)
         truth = truth_files(self.ground_truth, self.target_capture)
-        return {"scenes": (self.result, *composite), "cameras": (self.cameras,), "light": light, "truth": truth}
+        return {
+            "scenes": (self.result, *composite),
+            "cameras": camera_files(self.cameras),
+            "light": light,
+            "truth": truth,
+        }
 
     def recorded_options(self) -> dict[str, Any]:
         """The options in step.json, and the warnings that the page shows, where there are any."""

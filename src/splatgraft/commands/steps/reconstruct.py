@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from splatgraft.capture import readable_views, require_coverage
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import fit_color, psnr, ssim
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.folders.capture_files import capture_inputs
+from splatgraft.folders.capture_files import capture_inputs, describe_left_out
 from splatgraft.folders.photo_exposures import exposure_warnings
 from splatgraft.formats import read_capture, write_gaussians
 from splatgraft.project.layout import METRICS_FILE, SCENE_FILE
@@ -58,7 +59,10 @@ class Reconstruct:
 
     def write(self, folder: Path, context: Context) -> None:
         """Make scene.ply, and metrics.json where views are held out."""
-        capture = read_capture(self.capture)
+        capture = readable_views(read_capture(self.capture), progress=context.progress)
+        for sentence in describe_left_out(self.capture, len(capture), capture.left_out):
+            context.console.say(sentence)
+        require_coverage(capture, str(self.capture))
         device = choose_device(self.options.device, context.console)
         options = replace(self.options, device=str(device))
         if self.eval and not options.eval_every:

@@ -10,6 +10,7 @@ import torch
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.composite import Composite
 from splatgraft.core.images import write_image
+from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.photo_exposures import read_luminance_scale
 from splatgraft.folders.selection_file import write_selection
@@ -38,7 +39,7 @@ class Relight:
     placement: Path
     """placement.json in the composite's folder: it names the objects. The composite's scene.ply is not read."""
     cameras: Path
-    """The target's cameras, a transforms.json: from them follows the up direction."""
+    """The target's cameras, a capture folder or its transforms.json: from them follows the up direction."""
     out: Path = Path("relit")
     """Folder for scene.ply, is_object.npy, light.json, light.txt, which describes the light in words, and light.png and
     source_light_N.png, which show it."""
@@ -46,7 +47,7 @@ class Relight:
     """The source without its object, a .ply: from it the light on the object at capture is estimated and divided out.
     Objects of other files, and all of them without it, keep their mean brightness."""
     object_cameras: Path | None = None
-    """The source's cameras, a transforms.json."""
+    """The source's cameras, likewise."""
     taken: Path | None = None
     """File of the object that was taken from the source, as the placement names it; the first where not given."""
     light: Literal["transfer", "gain", "off"] = "transfer"
@@ -59,11 +60,12 @@ class Relight:
 
     def inputs(self) -> Inputs:
         """Scenes, placement and cameras."""
-        source = tuple(path for path in (self.surroundings, self.object_cameras) if path is not None)
+        source = () if self.surroundings is None else (self.surroundings,)
+        source += () if self.object_cameras is None else camera_files(self.object_cameras)
         placement = placement_files(self.placement)
         light = () if self.given_light is None else (self.given_light,)
         scenes = {"target": (self.target,), "placement": placement}
-        return scenes | {"cameras": (self.cameras,), "source": source, "light": light}
+        return scenes | {"cameras": camera_files(self.cameras), "source": source, "light": light}
 
     def write(self, folder: Path, context: Context) -> None:
         """Relight, write the scene and the light, and print the report."""

@@ -10,6 +10,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages, held_out
+from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.selection_file import read_selection
 from splatgraft.folders.view_folder import ViewFolder, file_stems
 from splatgraft.formats import read_cameras, read_gaussians, write_capture
@@ -46,12 +47,11 @@ class Render:
 
     def inputs(self) -> Inputs:
         """Scenes and cameras."""
-        cameras = self.cameras / "transforms.json" if self.cameras.is_dir() else self.cameras
         optional = {"is_object": self.is_object, "prior": self.prior}
         given = {role: (path,) for role, path in optional.items() if path is not None}
         if self.light is not None and self.light.is_file():
             given["light"] = (self.light,)
-        return {"scene": (self.scene,), "cameras": (cameras,), **given}
+        return {"scene": (self.scene,), "cameras": camera_files(self.cameras), **given}
 
     def _prior_confidence(self) -> float:
         if self.light is None:

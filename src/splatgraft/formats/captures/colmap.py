@@ -55,9 +55,10 @@ def is_colmap(folder: Path) -> bool:
 
 
 def read_capture(folder: Path) -> PosedImages:
-    """The model with the most registered images, ordered by image name.
+    """The model with the most registered images, ordered by image name, without those that are not usable.
 
-    Raises: ValueError where no whole model is there, its camera model is not supported, or an image is missing.
+    Raises: ValueError where no whole model is there, its camera model is not supported, or fewer than half of the
+    images are usable.
     """
     model, images = _largest_model(folder)
     points, colors = _read_points(_file(model, "points3D"))

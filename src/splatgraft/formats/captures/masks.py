@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatgraft.core.images import IMAGE_SUFFIXES, has_transparency, list_images, read_alpha, stored_size
-from splatgraft.formats.captures.view_record import ViewRecord, same_shape
+from splatgraft.core.images import IMAGE_SUFFIXES, has_transparency, list_images, read_alpha, same_shape, stored_size
+from splatgraft.core.posed_images import LeftOut
+from splatgraft.formats.captures.view_record import ViewRecord
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
 """Names under which photos lie in a capture: of COLMAP and nerfstudio, of 3DGS's convert.py, of RGB-D scanners."""
@@ -25,6 +26,11 @@ class PhotoFiles:
     """Sorted by name."""
     masks: tuple[Path | None, ...] = ()
     """White is the object; the photo itself where its alpha channel is the mask; empty where no photo has one."""
+
+    def only(self, paths: Sequence[Path]) -> "PhotoFiles":
+        """Some of the photos, with their masks."""
+        masks = dict(zip(self.paths, self.masks, strict=bool(self.masks)))
+        return PhotoFiles(tuple(paths), tuple(masks[path] for path in paths) if masks else ())
 
 
 def find_photos(folder: Path) -> PhotoFiles:
@@ -60,21 +66,28 @@ def describe_masks(images: Sequence[Path], masks: Sequence[Path | None]) -> str:
     return f"{len(found)} of {len(images)} photos have masks, in {', '.join(places)}"
 
 
-def with_masks(views: list[ViewRecord], folder: Path) -> list[ViewRecord]:
+def with_masks(views: list[ViewRecord], folder: Path) -> tuple[list[ViewRecord], list[LeftOut]]:
     """The views with the masks in `folder`/masks or mask, or, without these, beside the images or in alpha channels.
 
-    0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask that the view already has stays.
+    0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask that the view already has stays. A
+    mask that is missing, unreadable or of another shape is left out, with the reason.
 
-    Raises: ValueError where masks/ has no mask for any view, two for one, or one of another shape.
+    Raises: ValueError where masks/ has no mask for any view, or two for one.
     """
     if not any(view.mask_path for view in views):
         images = {view.image_path: view.name for view in views if view.image_path is not None}
         masks = _masks_of(images, [folder])
         views = [replace(view, mask_path=masks.get(view.image_path) if view.image_path else None) for view in views]
-    for view in views:
-        if view.mask_path is not None and view.mask_path != view.image_path:
+    left_out: list[LeftOut] = []
+    for index, view in enumerate(views):
+        if view.mask_path is None or view.mask_path == view.image_path:
+            continue
+        try:
             check_mask(view.mask_path, view.size)
-    return views
+        except ValueError as error:
+            left_out.append(LeftOut(view.name, str(error), mask_only=True))
+            views[index] = replace(view, mask_path=None)
+    return views, left_out
 
 
 def check_mask(mask: Path, size: tuple[int, int]) -> None:

@@ -4,6 +4,7 @@ import json
 import math
 import os
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import IMAGE_SUFFIXES, stored_size
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures.assembly import cameras_of, fitted_to_file, posed_images_of
+from splatgraft.formats.captures.assembly import cameras_of, fitted_to_file, posed_images_of, view_or_reason
 from splatgraft.formats.captures.points_ply import read_points, write_points
 from splatgraft.formats.captures.view_record import ViewRecord, existing_file, rigid
 from splatgraft.formats.json_file import array, excerpt, load, number, text, whole_side
@@ -28,9 +29,9 @@ _CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 
 
 def read_capture(path: Path) -> PosedImages:
-    """The capture that a transforms.json describes; every image file must exist.
+    """The capture that a transforms.json describes, without frames that are not usable (`PosedImages.left_out`).
 
-    Raises: ValueError where the file or one that it names is missing or broken.
+    Raises: ValueError where the file or its points are missing or broken, or fewer than half of the frames are usable.
     """
     images, meta = read_images(path), _load(path)
     if meta.get("ply_file_path") is None:
@@ -42,10 +43,14 @@ def read_capture(path: Path) -> PosedImages:
 def read_images(path: Path) -> PosedImages:
     """The capture without its points, whose file need not exist.
 
-    Raises: ValueError where the file or an image that it names is missing or broken.
+    Raises: ValueError as `read_capture`.
     """
-    none = torch.zeros(0, 3)
-    return posed_images_of(_views(path, _load(path)), path, folder=path.parent, points=none, colors=none)
+    none, meta = torch.zeros(0, 3), _load(path)
+    views = [
+        view_or_reason(_frame_name(index, frame), partial(_view, path, index, meta, frame))
+        for index, frame in enumerate(meta["frames"])
+    ]
+    return posed_images_of(views, path, folder=path.parent, points=none, colors=none)
 
 
 def read_views(path: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
@@ -72,7 +77,9 @@ def image_files(path: Path) -> list[Path]:
 
     Raises: ValueError where the file is missing or broken.
     """
-    return [view.image_path for view in _views(path, _load(path)) if view.image_path]
+    meta = _load(path)
+    views = (view_or_reason("", partial(_view, path, index, meta, frame)) for index, frame in enumerate(meta["frames"]))
+    return [view.image_path for view in views if isinstance(view, ViewRecord) and view.image_path]
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -116,6 +123,11 @@ def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> ViewRecor
     )
 
 
+def _frame_name(index: int, frame: Any) -> str:
+    name = frame.get("file_path") if isinstance(frame, dict) else None
+    return name if isinstance(name, str) and name.isprintable() else f"frame {index}"
+
+
 def _pose(path: Path, index: int, frame: dict[str, Any]) -> np.ndarray:
     matrix = array(path, frame, "transform_matrix", ((4, 4), (3, 4)))
     if len(matrix) == 3:
@@ -154,10 +166,7 @@ def _image_file(path: Path) -> Path | None:
 def _mask_file(path: Path, camera: dict[str, Any]) -> Path | None:
     if camera.get("mask_path") is None:
         return None
-    mask = path.parent / text(path, camera, "mask_path")
-    if existing_file(mask) is None:
-        raise ValueError(f"{path}: expected the mask {mask}, found no such file")
-    return mask
+    return path.parent / text(path, camera, "mask_path")
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:

@@ -64,9 +64,3 @@ def existing_file(path: Path) -> Path | None:
         return path if path.is_file() else None
     except (OSError, ValueError):
         return None
-
-
-def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes are those of one image scaled, with sides rounded to whole pixels."""
-    # with both sides scaled by one factor and rounded, the cross products differ by at most one longer side
-    return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)

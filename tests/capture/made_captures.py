@@ -1,0 +1,58 @@
+"""Captures of made-up photos: noise with the spectrum of photographs, cameras on a ring."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.formats import write_capture
+
+SIZE = (160, 120)
+
+
+def texture(seed: int, size: tuple[int, int] = SIZE) -> np.ndarray:
+    """(h, w, 3) bytes of 1/f noise, the spectrum of photographs."""
+    width, height = size
+    noise = np.random.default_rng(seed).normal(size=(height, width, 3))
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
+    frequency[0, 0] = 1
+    total = np.fft.irfft2(np.fft.rfft2(noise, axes=(0, 1)) / frequency[..., None], s=(height, width), axes=(0, 1))
+    return (128 + 40 * total / total.std()).clip(0, 255).astype(np.uint8)
+
+
+def ring(count: int, radius: float = 2.0) -> Cameras:
+    angle = torch.arange(count) * (2 * math.pi / count)
+    eye = torch.stack([radius * angle.cos(), radius * angle.sin(), torch.full((count,), 1.0)], -1)
+    return pinhole(look_at(eye, torch.zeros(3), torch.tensor([0.0, 0, 1])), 150.0, width=SIZE[0], height=SIZE[1])
+
+
+def write_photos(folder: Path, count: int, suffix: str = ".png") -> list[Path]:
+    folder.mkdir(parents=True)
+    paths = [folder / f"{i:04d}{suffix}" for i in range(count)]
+    for i, path in enumerate(paths):
+        Image.fromarray(texture(i)).save(path)
+    return paths
+
+
+def write_posed(folder: Path, count: int = 10, *, masks: bool = False) -> list[Path]:
+    """A capture with transforms.json, and masks/ of discs; gives the photos."""
+    paths = write_photos(folder / "images", count)
+    if masks:
+        (folder / "masks").mkdir()
+        for path in paths:
+            Image.fromarray(disc()).save(folder / "masks" / path.name)
+    points = 0.3 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
+    posed = PosedImages(
+        image_paths=tuple(paths), cameras=ring(count), points=points, point_colors=torch.full((60, 3), 0.5)
+    )
+    write_capture(folder, posed)
+    return paths
+
+
+def disc() -> np.ndarray:
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+    return np.where((u - 80) ** 2 + (v - 60) ** 2 < 900, 255, 0).astype(np.uint8)
