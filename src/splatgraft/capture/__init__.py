@@ -1,5 +1,6 @@
 """Capture: posed images from photos, from a video, or from a trained scene that comes without images."""
 
+from splatgraft.capture.metric_scale import FoundScale, scale_from_length, scale_from_marker, triangulate
 from splatgraft.capture.orientation import upright
 from splatgraft.capture.plausibility import Doubt, Found, Lens, Plausible, find_doubts
 from splatgraft.capture.pose_report import POSE_REPORT_FILE, PoseReport, read_pose_report, write_pose_report
@@ -16,6 +17,7 @@ __all__ = [
     "POSE_REPORT_FILE",
     "Doubt",
     "Found",
+    "FoundScale",
     "Lens",
     "Plausible",
     "PoseOptions",
@@ -28,6 +30,9 @@ __all__ = [
     "pose_photos",
     "read_pose_report",
     "render_pictures",
+    "scale_from_length",
+    "scale_from_marker",
+    "triangulate",
     "upright",
     "write_pose_report",
 ]

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import list_images, read_mask, resize, stored_size, write_image
+from splatgraft.core.images import list_images, read_mask, resize, write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.prompts import ViewPrompt
 from splatgraft.folders.view_folder import file_stems
@@ -86,51 +86,6 @@ def masked_views(capture: PosedImages) -> MaskedViews:
         return mask
 
     return MaskedViews(capture, LazySequence(len(capture), read))
-
-
-def prompts_by_view(capture: PosedImages, prompts: Mapping[str, ViewPrompt], path: Path) -> dict[int, ViewPrompt]:
-    """The prompts of a file by the index of their view, in pixels of its camera, undistorted.
-
-    Args:
-        capture: The pictures.
-        prompts: By name of the picture, with or without folder and suffix, pixels of its file.
-        path: The file that they come from, for messages.
-
-    Raises:
-        ValueError: Where no picture, or more than one, has a name.
-    """
-    names = [PurePath(name) for name in capture.cameras.names]
-    found = {}
-    for name, prompt in prompts.items():
-        called = PurePath(name)
-        wanted = [i for i, other in enumerate(names) if name in (str(other), other.name, other.stem)]
-        wanted = wanted or [i for i, other in enumerate(names) if called.stem == other.stem]
-        if len(wanted) != 1:
-            raise ValueError(f"{path}: expected one picture called {name}, found {len(wanted)} of {len(names)}")
-        found[wanted[0]] = in_camera_pixels(capture, wanted[0], prompt)
-    return found
-
-
-def in_camera_pixels(capture: PosedImages, index: int, prompt: ViewPrompt) -> ViewPrompt:
-    """A prompt in pixels of the picture's file, in those of its undistorted camera."""
-    width, height = stored_size(capture.image_paths[index])
-    camera = capture.cameras[index]
-    distortion = capture.distortions[index] if capture.distortions else None
-    if distortion is None:
-        return prompt.scaled(camera.width / width, camera.height / height)
-
-    def moved(points: Tensor) -> Tensor:
-        at_size = points * torch.tensor([distortion.size[0] / width, distortion.size[1] / height])
-        return distortion.undistort_points(at_size, camera.intrinsics[0])
-
-    box = prompt.box
-    if box is not None:
-        x0, y0, x1, y1 = box
-        middle = [[(x0 + x1) / 2, y0], [(x0 + x1) / 2, y1], [x0, (y0 + y1) / 2], [x1, (y0 + y1) / 2]]
-        edges = moved(torch.tensor([[x0, y0], [x1, y0], [x0, y1], [x1, y1], *middle]))
-        (left, top), (right, bottom) = edges.amin(0).tolist(), edges.amax(0).tolist()
-        box = (left, top, right, bottom)
-    return ViewPrompt(moved(prompt.inside), moved(prompt.outside), box)
 
 
 def cut_masks(

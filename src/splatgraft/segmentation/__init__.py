@@ -8,7 +8,7 @@ from splatgraft.segmentation.lift import LiftOptions, lift_masks
 from splatgraft.segmentation.mask_agreement import LEAST_AGREEMENT, Agreement, measure_agreement
 from splatgraft.segmentation.object_region import ObjectRegion, default_box
 from splatgraft.segmentation.sam2 import Sam2, load_sam2
-from splatgraft.segmentation.seed_selection import Seed, seed_selection, surface_points
+from splatgraft.segmentation.seed_selection import Seed, seed_selection
 from splatgraft.segmentation.segment import Segmentation, segment
 from splatgraft.segmentation.selection import Keep, SelectOptions, select_object
 from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
@@ -46,5 +46,4 @@ __all__ = [
     "segment",
     "select_object",
     "solidify_object",
-    "surface_points",
 ]

@@ -20,7 +20,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.prompts import ViewPrompt
 from splatgraft.core.spherical_harmonics import rgb_from_dc
-from splatgraft.rendering import render
+from splatgraft.rendering import surface_points
 from splatgraft.segmentation.box import Box
 from splatgraft.segmentation.object_region import ObjectRegion, guess_region, region_of_box
 
@@ -108,26 +108,6 @@ def _points_on_surface(
         if len(pixels):
             found.append(surface_points(scene, cameras[index], pixels))
     return torch.cat(found)
-
-
-def surface_points(scene: Gaussians, camera: Cameras, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
-    """The points of the scene's surface that a picture shows at `pixels`; those that show nothing are left out.
-
-    Args:
-        scene: What is seen.
-        camera: One camera.
-        pixels: x and y, pixels of the camera's picture.
-    """
-    drawn = render(scene, camera, outputs=frozenset({"depth"}))
-    pixels = pixels.to(drawn.depth)
-    size = camera.sizes[0].to(pixels)
-    pixels = torch.minimum(pixels.clamp_min(0), size - 1)
-    column, row = pixels.long().unbind(-1)
-    solid = drawn.alpha[0][row, column] > 0.5
-    depth = drawn.depth[0][row, column]
-    rays = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1) @ torch.linalg.inv(camera.intrinsics[0].to(pixels)).T
-    pose = camera.world_from_camera[0].to(pixels)
-    return ((rays * depth[:, None]) @ pose[:3, :3].T + pose[:3, 3])[solid].detach()
 
 
 def _framed(points: Float[Tensor, "n 3"], cameras: Cameras, prompts: Mapping[int, ViewPrompt]) -> Bool[Tensor, "n"]:

@@ -23,9 +23,9 @@ from splatgraft.folders.object_masks import (
     cut_masks,
     masked_views,
     network_masks,
-    prompts_by_view,
     with_mask_folder,
 )
+from splatgraft.folders.picture_points import prompts_by_view
 from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.formats.corrections import read_corrections
