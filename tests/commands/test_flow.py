@@ -225,19 +225,6 @@ def test_no_masks_are_cut_from_the_images_and_the_choice_is_said(
         assert choice in line
 
 
-def test_clicks_in_a_file_are_an_input_of_the_selection(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.rmtree(project.parents[1] / "photos" / "source" / "masks")
-    prompts = project.parent / "prompts.toml"
-    prompts.write_text('["view_0000.png"]\ninside = [[24, 16]]\n[view_0003]\nbox = [10, 4, 38, 30]\n')
-    project.write_text(project.read_text().replace("[segment]", '[segment]\nprompts = "prompts.toml"'))
-    assert main(["run", str(project), "--to", "segment"]) == 0
-    assert "segment" not in stale(project, capsys)
-    prompts.write_text('["view_0009.png"]\ninside = [[24, 16]]\n')
-    assert "prompts" in stale(project, capsys)["segment"]
-    assert main(["run", str(project), "--to", "segment"]) == 2
-    assert "prompts.toml: expected one picture called view_0009.png, found 0 of 8" in capsys.readouterr().err
-
-
 def test_killed_inside_any_step_earlier_results_stay_whole_and_run_finishes(project: Path) -> None:
     """Every step is asked for again and shot down at a random moment of its work, then all is brought up to date."""
     generator = random.Random(0)

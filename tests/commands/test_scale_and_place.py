@@ -4,11 +4,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tiny_project import ball, photograph, plane
 
 from splatgraft.cli import main
+from splatgraft.core.gaussians import concatenate
 from splatgraft.formats import read_capture, write_gaussians
 from splatgraft.formats.metric_scale import read_scale
 from splatgraft.formats.placement import read_placement
@@ -115,6 +117,33 @@ def test_what_cannot_be_a_scale_is_said(captures: Path, capsys) -> None:
     (captures / "target" / "scale.json").write_text('{"metres_per_unit": -1}')
     assert composed(captures) == 2
     assert "scale.json: expected metres_per_unit above 0, found -1" in capsys.readouterr().err
+
+
+def test_clicks_in_a_file_select_the_object(captures: Path, capsys) -> None:
+    write_gaussians(captures / "scene.ply", concatenate([plane((0.3, 0.5, 0.3)), ball()]))
+    first, second = (pixel(captures, "source", index, (0.0, 0.0, 0.3)) for index in (0, 3))
+    name, _, click = first.partition(":")
+    prompts = captures / "prompts.toml"
+    prompts.write_text(f"[{name}]\ninside = [[{click}]]\n[{second.partition(':')[0]}]\nbox = [8, 2, 40, 32]\n")
+    words = [
+        "segment",
+        "--scene",
+        str(captures / "scene.ply"),
+        "--capture",
+        str(captures / "source"),
+        "--solidify",
+        "0",
+    ]
+    words += ["--out", str(captures / "object"), "--mask-source", "grabcut", "--prompts", str(prompts)]
+    assert main(words) == 0
+    selection = torch.from_numpy(np.load(captures / "object" / "selection.npy"))
+    # the ball's 80 Gaussians come last; a third of it is near the plane, which its large Gaussians reach
+    assert selection[-80:].float().mean() > 0.6
+    assert selection[:-80].float().mean() < 0.1
+    prompts.write_text("[view_0009]\ninside = [[24, 16]]\n")
+    capsys.readouterr()
+    assert main(words) == 2
+    assert "prompts.toml: expected one picture called view_0009, found 0 of 8" in capsys.readouterr().err
 
 
 def test_clicks_on_a_distorted_photo_are_undistorted() -> None:

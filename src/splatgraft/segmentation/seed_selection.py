@@ -31,8 +31,8 @@ class SeedOptions:
 
     least_opacity: float = 0.3
     """Of a Gaussian that is a surface point."""
-    color_step: float = 0.05
-    """Difference of colour, sRGB, at which a way is twice as long."""
+    color_step: float = 2.0
+    """Difference of colour at which a way is twice as long, over the median one of neighbours: texture and noise."""
     neighbours: int = 10
     """Nearest Gaussians to which a way leads."""
     touched: int = 6
@@ -85,7 +85,7 @@ def seed_selection(
     selection = region.contains(scene.means) & framed
     if known is not None:
         selection = selection & known
-    if len(inside):
+    if len(inside) and any(len(prompt.inside) for prompt in prompts.values()):
         selection = selection & _nearer_inside(scene, region, inside, outside=outside, options=options)
     if not bool((selection & opaque).any()):
         raise ValueError(
@@ -142,7 +142,8 @@ def _nearer_inside(
     distance, neighbour = tree.query(means, k=options.neighbours + 1)
     colors = rgb_from_dc(near.sh[:, 0]).detach().double().cpu().numpy()
     change = np.linalg.norm(colors[:, None] - colors[neighbour], axis=-1)
-    cost = distance * (1 + change / options.color_step) + 1e-12
+    step = options.color_step * max(float(np.median(change[:, 1:])), 1e-3)
+    cost = distance * (1 + change / step) + 1e-12
     rows = np.broadcast_to(np.arange(len(means))[:, None], cost.shape)
     graph = coo_array((cost.ravel(), (rows.ravel(), np.asarray(neighbour).ravel())), shape=(len(means),) * 2).tocsr()
 
