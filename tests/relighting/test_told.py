@@ -1,5 +1,7 @@
 """What is known of an object's capture (its light, its normals) is used as it is, instead of an estimate."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from shapes import ring, surfels
@@ -52,6 +54,21 @@ def test_an_object_told_to_have_stood_in_the_same_light_keeps_its_colours():
     # both irradiances come from the same samples; float32
     assert torch.allclose(shade, torch.ones_like(shade), atol=1e-4)
     assert any("as given" in sentence for sentence in relit.report[1:])
+
+
+def test_between_two_told_lights_the_level_changes_in_full():
+    sky = surfels(20 * even_directions(500), -even_directions(500), width=0.1)
+    at = Similarity(1.0, torch.eye(3), torch.zeros(3))
+    composite = Composite(sky, (PlacedObject(ball(), at),), torch.zeros(sky.count, dtype=torch.bool))
+    sources = (SourceScene(empty(), cameras(), light=LIGHT),)
+    dimmed = Light(
+        sources=tuple(replace(s, irradiance=tuple(0.25 * x for x in s.irradiance)) for s in LIGHT.sources),
+        ambient=0.25 * LIGHT.ambient,
+    )
+    relit = relight(composite, cameras(), sources=sources, light=dimmed)
+    shade = relit.shade[relit.is_object]
+    # both irradiances come from the same samples; float32
+    assert torch.allclose(shade, torch.full_like(shade, 0.25), rtol=1e-3)
 
 
 def test_told_normals_are_turned_with_the_object_and_believed():

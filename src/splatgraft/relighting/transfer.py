@@ -24,7 +24,14 @@ from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.prepared_object import PreparedObject, SourceScene, prepare_object
 from splatgraft.relighting.prepared_scene import PreparedScene, prepare_scene
 from splatgraft.relighting.shading.gloss import gloss_bands
-from splatgraft.relighting.shading.irradiance import irradiance, light_scale, shade_ratio, unknown_origin_ratio
+from splatgraft.relighting.shading.irradiance import (
+    KNOWN_LIGHTS,
+    ShadeSettings,
+    irradiance,
+    light_scale,
+    shade_ratio,
+    unknown_origin_ratio,
+)
 from splatgraft.relighting.shading.normals import raised
 from splatgraft.relighting.shading.reflected_light import reflected_light
 from splatgraft.relighting.shadows.receivers import RIM, Receivers, shade_receivers
@@ -140,10 +147,12 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
     source = prepared.source_lighting
     if source is None:
         return _LitObject(prepared, visibility, received, unknown_origin_ratio(received, opacities), None)
-    shade = shade_ratio(received, source.irradiance, opacities)
+    are_told = scene.estimate is None and source.estimate is None
+    settings = KNOWN_LIGHTS if are_told else ShadeSettings()
+    shade = shade_ratio(received, source.irradiance, opacities, settings=settings)
     if not bool(source.materials.glossy.any()):
         return _LitObject(prepared, visibility, received, shade, None)
-    scale = light_scale(received, source.irradiance, opacities)
+    scale = light_scale(received, source.irradiance, opacities, settings=settings)
     reflected = reflected_light(scene.light, scene.samples, shares).scaled(scale)
     gloss = gloss_bands(prepared.gaussians, normals.vectors, source.materials, reflected, shade=shade)
     return _LitObject(prepared, visibility, received, shade, gloss)

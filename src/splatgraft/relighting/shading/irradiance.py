@@ -22,13 +22,19 @@ class ShadeSettings:
     """Most factor by which a Gaussian's ratio may differ from the object's mean ratio; set by hand."""
     floor: float = 0.08
     """Share of the mean irradiance that is added to all: interreflections that no sample follows; set by hand."""
-    level_share: float = 0.75
+    level_share: float = 0.4
     """Share, in [0, 1], of the mean's gray part (in logarithms) that is applied, as each capture may have been exposed
-    for its own light and the estimated level is uncertain; set by hand on the training scenes."""
+    for its own light and the estimated level is uncertain. Chosen by benchmarks/fit_shading.py on scenes that the
+    light's numbers were not fitted to: there 0.2 to 0.4 are best, and what the light's own training scenes say is too
+    much."""
     tint_share: float = 1.0
     """Share, in [0, 1], of the mean's tint that is applied."""
     unknown_share: float = 0.5
     """Share of the new light's variation that an object of unknown source light takes on; set by hand."""
+
+
+KNOWN_LIGHTS = ShadeSettings(level_share=1.0, tint_share=1.0)
+"""Where both lights were told: nothing is uncertain."""
 
 
 def soft_cosine(cosine: Float[Tensor, "n k"], softness: Float[Tensor, "k"]) -> Float[Tensor, "n k"]:
