@@ -48,7 +48,7 @@ def load_birefnet(weights: Path | str = DEFAULT_REPOSITORY, *, threads: int = 2)
         ValueError: Where a package is missing, or the file is no such network.
     """
     path = weights if isinstance(weights, Path) else _from_hub(weights)
-    session = open_network(path, extra="birefnet", threads=threads)
+    session = open_network(path, method="birefnet", threads=threads)
     shape = session.get_inputs()[0].shape
     if len(shape) != 4 or shape[1] not in (3, "channels", "num_channels"):
         raise ValueError(f"{path}: expected an input of shape (1, 3, side, side), found {shape}")

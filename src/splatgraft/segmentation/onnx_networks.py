@@ -12,7 +12,7 @@ IMAGENET_STD = torch.tensor([0.229, 0.224, 0.225])
 """Of sRGB in [0, 1]; divided by before the networks see a picture."""
 
 
-def require(module: str, extra: str) -> None:
+def require(module: str, method: str) -> None:
     """Check that an optional package is there.
 
     Raises:
@@ -20,22 +20,22 @@ def require(module: str, extra: str) -> None:
     """
     if find_spec(module) is None:
         raise ValueError(
-            f"masks by {extra}: expected {module} (pip install 'splatgraft[{extra}]'), found none; or use grabcut"
+            f"masks by {method}: expected {module} (pip install 'splatgraft[birefnet]'), found none; or use grabcut"
         )
 
 
-def open_network(path: Path, *, extra: str, threads: int = 2) -> Any:
+def open_network(path: Path, *, method: str, threads: int = 2) -> Any:
     """An onnxruntime.InferenceSession on the CPU.
 
     Args:
         path: The .onnx file.
-        extra: The method, which is also the name of the optional extra with onnxruntime.
+        method: What makes the masks, for messages.
         threads: CPU threads.
 
     Raises:
         ValueError: Where onnxruntime is missing, or the file is no network.
     """
-    require("onnxruntime", extra)
+    require("onnxruntime", method)
     import onnxruntime
 
     if not path.is_file():

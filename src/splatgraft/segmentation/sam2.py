@@ -96,7 +96,7 @@ def load_sam2(encoder: Path, decoder: Path, *, threads: int = 2) -> Sam2:
     Raises:
         ValueError: Where onnxruntime is missing, or a file is no such network.
     """
-    encodes, decodes = (open_network(path, extra="sam2", threads=threads) for path in (encoder, decoder))
+    encodes, decodes = (open_network(path, method="sam2", threads=threads) for path in (encoder, decoder))
     shape = encodes.get_inputs()[0].shape
     if len(shape) != 4 or shape[1] != 3 or not isinstance(shape[2], int) or shape[2] != shape[3]:
         raise ValueError(f"{encoder}: expected an input of shape (1, 3, side, side), found {shape}")
