@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 _TABLE = (
     # command, module in splatgraft.commands, summary
     ("demo", "demo", "run a whole transfer on captures that come with the package"),
+    ("try", "first_try", "run a whole transfer on two captures of your own, at draft quality"),
+    ("check", "check", "look at photos before time is spent on them"),
     ("init", "init", "write a commented project.toml for two captures"),
     ("edit", "edit", "place the object and see the light, in the browser"),
     ("run", "run", "do what is stale in a project, resuming what was killed"),
@@ -77,7 +79,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, MemoryError) as error:
         if debug:
             raise
-        return _fail(" ".join(str(error).split()) or type(error).__name__, 2)
+        from splatgraft.runtime.help_link import help_link_of
+
+        return _fail(" ".join(str(error).split()) or type(error).__name__, 2, help_link_of(error))
 
 
 def _dispatch(words: list[str]) -> int:
@@ -137,6 +141,7 @@ def _help(head: str, commands: Mapping[str, str]) -> str:
     return "\n".join([f"{head}\n\ncommands:", *lines])
 
 
-def _fail(sentence: str, code: int) -> int:
-    print(f"splatgraft: {sentence}", file=sys.stderr)
+def _fail(sentence: str, code: int, link: str = "") -> int:
+    more = f" (see {link})" if link else ""
+    print(f"splatgraft: {sentence}{more}", file=sys.stderr)
     return code

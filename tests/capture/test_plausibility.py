@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from splatgraft.capture import Doubt, Found, Lens, PoseReport, find_doubts, read_pose_report, write_pose_report
+from splatgraft.capture import Doubt, Found, Lens, PoseReport, Unposed, find_doubts, read_pose_report, write_pose_report
 
 # a phone: 26 mm equivalent is 0.72 longest sides
 LENS = Lens(photos=("a", "b", "c"), size=(800, 600), focal_px=578.0, distortion=0.02)
@@ -48,7 +48,7 @@ def test_the_report_and_its_doubts_come_back_from_their_file(tmp_path: Path) -> 
     report = PoseReport(
         photos=4,
         registered=3,
-        missing=("d",),
+        missing=(Unposed("d", 900, 12),),
         mean_reprojection_px=0.4,
         points=1000,
         models=1,

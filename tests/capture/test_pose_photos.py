@@ -1,6 +1,7 @@
 """Capture, structure from motion: errors that help, and poses of made-up photos whose true poses are known."""
 
 import math
+from dataclasses import replace
 from importlib.util import find_spec
 
 import cv2
@@ -8,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from splatgraft.capture import PoseOptions, pose_photos, structure_from_motion
+from splatgraft.capture import PoseOptions, Unposed, pose_photos, structure_from_motion
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.images import write_image
+from splatgraft.formats.captures.masks import PhotoFiles
 
 UP = torch.tensor([0.0, 0, 1])
 
@@ -21,7 +23,7 @@ def photo_paths(folder, count):
     paths = [folder / f"{i:02d}.png" for i in range(count)]
     for path in paths:
         write_image(path, torch.rand(30, 40, 3, generator=generator))
-    return paths
+    return PhotoFiles(tuple(paths))
 
 
 def model_of(poses, focal=50.0, points=()):
@@ -30,7 +32,9 @@ def model_of(poses, focal=50.0, points=()):
         "models": 1,
         "method": "global",
         "explained": 0.8,
+        "seconds": {"features": 1.0, "matching": 2.0, "mapping": 0.5},
         "cpu_seconds": {"features": 1.0, "matching": 2.0, "mapping": 0.5},
+        "unposed": [{"name": f"{i:02d}.jpg", "features": 900, "matches": 12} for i in range(len(poses), 8)],
         "mean_reprojection_px": 0.4,
         "images": [
             {
@@ -59,7 +63,7 @@ def answer(monkeypatch):
 
     def give(*models):
         queue = list(models)
-        monkeypatch.setattr(structure_from_motion, "_run", lambda job, advance: queue.pop(0))
+        monkeypatch.setattr(structure_from_motion, "_run", lambda job, advance, say: queue.pop(0))
         return queue
 
     return give
@@ -79,15 +83,15 @@ def test_two_photos_are_too_few(tmp_path, answer):
 
 def test_photos_of_one_name_are_refused(tmp_path, answer):
     answer()
-    paths = photo_paths(tmp_path / "a", 3) + photo_paths(tmp_path / "b", 1)
+    paths = photo_paths(tmp_path / "a", 3).paths + photo_paths(tmp_path / "b", 1).paths
     with pytest.raises(ValueError, match="one photo per name"):
-        pose_photos(paths, tmp_path)
+        pose_photos(PhotoFiles(paths), tmp_path)
 
 
 def test_an_unreadable_photo_is_named(tmp_path, answer):
     answer()
     paths = photo_paths(tmp_path / "photos", 3)
-    paths[1].write_bytes(b"no image")
+    paths.paths[1].write_bytes(b"no image")
     with pytest.raises(ValueError, match=r"01\.png"):
         pose_photos(paths, tmp_path)
 
@@ -101,7 +105,7 @@ def test_under_half_registered_says_what_to_do(tmp_path, answer):
 def test_the_larger_of_both_efforts_is_taken_and_reported(tmp_path, answer):
     answer(model_of(circle(4)), model_of(circle(7)))
     posed, report = pose_photos(photo_paths(tmp_path / "photos", 8), tmp_path)
-    assert (report.registered, report.photos, report.missing) == (7, 8, ("07",))
+    assert (report.registered, report.photos, report.missing) == (7, 8, (Unposed("07", 900, 12),))
     assert "7 of 8 photos registered" in str(report)
     assert len(posed) == 7
     assert posed.image(0).shape == (30, 40, 3)
@@ -114,8 +118,48 @@ def test_a_full_quick_model_needs_no_second_effort(tmp_path, answer):
     assert len(left) == 1
 
 
+def test_masks_are_carried_along_undistorted_like_their_photos(tmp_path, answer):
+    answer(model_of(circle(3)))
+    photos = photo_paths(tmp_path / "photos", 3)
+    mask = torch.zeros(30, 40, 3)
+    mask[:, :20] = 1
+    write_image(tmp_path / "mask.png", mask)
+    posed, _ = pose_photos(replace(photos, masks=(None, tmp_path / "mask.png", None)), tmp_path)
+    assert [path and path.relative_to(tmp_path).as_posix() for path in posed.mask_paths] == [None, "masks/01.png", None]
+    carried = posed.mask(1)
+    assert carried.shape == posed.image(1).shape[:2]
+    # the middle column stays where it is, since the principal point is in the middle
+    assert carried[:, :19].min() == 1
+    assert carried[:, 21:].max() == 0
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path, answer):
+    answer()
+    photos = photo_paths(tmp_path / "photos", 3)
+    write_image(tmp_path / "mask.png", torch.zeros(40, 40, 3))
+    with pytest.raises(ValueError, match=r"mask\.png: expected 40x30 px.*found 40x40"):
+        pose_photos(replace(photos, masks=(None, tmp_path / "mask.png", None)), tmp_path)
+
+
+def test_before_a_second_attempt_it_is_said_why_and_for_how_long(tmp_path, answer):
+    said = []
+    first = model_of(circle(7)) | {"mean_reprojection_px": 2.0, "seconds": {"features": 20.0, "mapping": 10.0}}
+    answer(first, model_of(circle(8)))
+    pose_photos(photo_paths(tmp_path / "photos", 8), tmp_path, say=said.append)
+    assert "took 30 s (features 20, mapping 10)" in said[0]
+    for expected in ("mean reprojection error", "once more with more features", "about 10 min", "effort = quick"):
+        assert expected in said[1]
+
+
+def test_photos_without_a_pose_are_named_with_the_usual_reason(tmp_path, answer):
+    answer(model_of(circle(7)), model_of(circle(7)))
+    _, report = pose_photos(photo_paths(tmp_path / "photos", 8), tmp_path)
+    assert "without a pose: 07 (900 features, at most 12 matches: of another place" in str(report)
+
+
 def test_a_dying_process_is_reported_in_one_line(tmp_path, monkeypatch):
-    program = tmp_path / "colmap_process.py"
+    (tmp_path / "colmap_process").mkdir()
+    program = tmp_path / "colmap_process" / "__main__.py"
     program.write_text("import sys; print('nothing to match', file=sys.stderr); sys.exit(3)")
     monkeypatch.setattr(structure_from_motion, "__file__", str(tmp_path / "structure_from_motion.py"))
     monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: object())
@@ -159,7 +203,7 @@ def test_true_poses_come_back_up_to_a_similarity(tmp_path):
     paths = [tmp_path / "photos" / f"{name}.png" for name in truth.names]
     for camera, path in zip(truth, paths, strict=True):
         write_image(path, corner_photo(camera))
-    posed, report = pose_photos(paths, tmp_path, options=PoseOptions(effort="quick"))
+    posed, report = pose_photos(PhotoFiles(tuple(paths)), tmp_path, options=PoseOptions(effort="quick"))
     assert report.registered == 8
     # SIFT places features to about a third of a pixel
     assert report.mean_reprojection_px < 1

@@ -11,15 +11,15 @@ import pytest
 import torch
 
 from splatgraft.capture import PoseOptions, pose_photos
-from splatgraft.core.images import list_images
 from splatgraft.formats import read_capture
+from splatgraft.formats.captures.masks import find_photos
 
 BANANAS = Path(__file__).parents[2] / "src" / "splatgraft" / "demo_captures" / "bananas"
 
 
 @pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is an optional extra")
 def test_bananas_on_a_carpet_are_one_model_with_the_known_poses(tmp_path: Path) -> None:
-    posed, report = pose_photos(list_images(BANANAS / "images"), tmp_path, options=PoseOptions(effort="quick"))
+    posed, report = pose_photos(find_photos(BANANAS / "images"), tmp_path, options=PoseOptions(effort="quick"))
     # two photos have hardly a feature on the carpet that both SIFT runs find
     assert report.registered >= 13
     known = read_capture(BANANAS)

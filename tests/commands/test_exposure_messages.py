@@ -48,7 +48,7 @@ def test_photos_of_different_exposure_are_named(tmp_path: Path, capsys, command:
     assert main([command, str(tmp_path / "photos"), "--out", str(tmp_path / "out"), *more]) == 0
     said = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     assert len(said) == 1
-    assert said[0].startswith(f"{tmp_path / 'photos'}: warning: ")
+    assert said[0].startswith(f"warning: {tmp_path / 'photos'}: ")
     # f/8 to f/1.8 at ISO 100 and 50: 2 log2(8 / 1.8) - 1 = 3.3 stops
     assert "from 1/60 s f/8 ISO 100 to 1/60 s f/1.8 ISO 50, 3.3 stops apart" in said[0]
     assert "automatic white balance in 4 of 8 photos" in said[0]

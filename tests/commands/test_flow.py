@@ -104,7 +104,7 @@ def test_a_changed_option_reruns_its_step_and_identical_results_go_no_further(
     project.write_text(project.read_text().replace("frames = 3", "frames = 2"))
     assert stale(project, capsys) == {"evaluate": "frames is now 2, was 3"}
     assert main(["run", str(project), "--force", "harmonize"]) == 0
-    ran = [line.split()[0] for line in capsys.readouterr().err.splitlines() if "━" in line]
+    ran = [line.split()[0] for line in capsys.readouterr().err.splitlines() if line.endswith(" begins")]
     assert ran == ["harmonize", "evaluate"]
     assert stale(project, capsys) == {}
 

@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 
 from splatgraft import formats
+from splatgraft.formats.captures.masks import describe_masks, find_photos
 
 
 @pytest.mark.parametrize("names", [("0000.png", "0001.png"), ("0000.png.png", "0001.jpg"), ("0000.png", None)])
@@ -85,3 +86,35 @@ def test_alpha_that_is_full_everywhere_is_no_mask(tmp_path):
     for i in range(2):
         Image.fromarray(np.full((16, 24, 4), 255, np.uint8)).save(tmp_path / "images" / f"{i:04d}.png")
     assert formats.read_capture(tmp_path).mask_paths == ()
+
+
+@pytest.mark.parametrize("place", ["masks/0001.png", "mask/0001.png", "images/0001_mask.png", "images/0001.mask.png"])
+def test_masks_by_the_conventions_of_the_field(tmp_path, place):
+    """As Metashape and RealityCapture write them, too; for photos with poses and without."""
+    format_files.write_transforms(tmp_path, {})
+    format_files.write_photo(tmp_path / place)
+    expected = (None, tmp_path / place)
+    assert formats.read_capture(tmp_path).mask_paths == expected
+    for folder in (tmp_path, tmp_path / "images"):
+        found = find_photos(folder)
+        assert [path.name for path in found.paths] == ["0000.png", "0001.png"]
+        assert found.masks == expected
+        said = describe_masks(found.paths, found.masks)
+        assert said.startswith("1 of 2 photos have masks, in ")
+        assert ("NAME_mask" if "images/" in place else place.split("/")[0] + "/") in said
+
+
+def test_alpha_channels_of_photos_without_poses_are_masks(tmp_path):
+    rgba = np.zeros((16, 24, 4), np.uint8)
+    rgba[:8, :, 3] = 255
+    for i in range(3):
+        Image.fromarray(rgba).save(tmp_path / f"{i}.png")
+    found = find_photos(tmp_path)
+    assert found.masks == found.paths
+    assert describe_masks(found.paths, found.masks) == "3 of 3 photos have masks, in alpha channels"
+
+
+def test_a_folder_without_photos_says_what_is_there(tmp_path):
+    (tmp_path / "sparse").mkdir()
+    with pytest.raises(ValueError, match=r"expected photos, in the folder itself or in images/, found \['sparse'\]"):
+        find_photos(tmp_path)

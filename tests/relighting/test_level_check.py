@@ -36,11 +36,12 @@ def test_agreeing_levels_are_told_in_stops_and_lux(relit: Relit):
     # the target's white is 8 times the source's, and half as much of it arrives: 2 stops by the light and the photos
     found = describe_level(relit, target=LuminanceScale(800.0, 200.0), source=LuminanceScale(100.0, 50.0))
     assert len(found) == 1
-    assert "the new place is 2.0 stops brighter than the old one" in found[0]
-    assert "light on the object 2.0 stops brighter" in found[0]
-    assert "differ" not in found[0]
+    assert "the new place is 2.0 stops brighter than the old one" in found[0].text
+    assert "light on the object 2.0 stops brighter" in found[0].text
+    assert "differ" not in found[0].text
+    assert not found[0].is_doubtful
     # even radiance L gives pi L of illuminance on a convex body; the ball's own Gaussians take some of it
-    words = found[0].replace(",", "").split()
+    words = found[0].text.replace(",", "").split()
     there, old = (float(words[i - 1].lstrip("(")) for i, word in enumerate(words) if word in ("lux", "at"))
     assert there == pytest.approx(math.pi * 0.2 * 800, rel=0.15)
     assert there == pytest.approx(4 * old, rel=0.05)
@@ -48,14 +49,15 @@ def test_agreeing_levels_are_told_in_stops_and_lux(relit: Relit):
 
 def test_a_large_difference_and_a_darker_place_are_said(relit: Relit):
     (line,) = describe_level(relit, target=LuminanceScale(800.0, 10.0), source=LuminanceScale(100.0, 40.0))
-    assert "the new place is 2.0 stops darker than the old one" in line
-    assert "They differ by 4.0 stops" in line
-    assert "sun" not in line
+    assert "the new place is 2.0 stops darker than the old one" in line.text
+    assert "They differ by 4.0 stops" in line.text
+    assert line.is_doubtful
+    assert "sun" not in line.text
 
 
 def test_light_beyond_the_suns_is_said(relit: Relit):
     (line,) = describe_level(relit, target=LuminanceScale(8e5, 2e5), source=LuminanceScale(1e5, 5e4))
-    assert "more than sun and sky give" in line
+    assert "more than sun and sky give" in line.text
 
 
 def test_without_a_source_light_or_with_black_photos_nothing_is_compared(relit: Relit):

@@ -3,7 +3,7 @@
 from splatgraft.capture.metric_scale import FoundScale, scale_from_length, scale_from_marker, triangulate
 from splatgraft.capture.orientation import upright
 from splatgraft.capture.plausibility import Doubt, Found, Lens, Plausible, find_doubts
-from splatgraft.capture.pose_report import POSE_REPORT_FILE, PoseReport, read_pose_report, write_pose_report
+from splatgraft.capture.pose_report import POSE_REPORT_FILE, PoseReport, Unposed, read_pose_report, write_pose_report
 from splatgraft.capture.structure_from_motion import PoseOptions, pose_photos
 from splatgraft.capture.video import extract_frames
 from splatgraft.capture.virtual_cameras import (
@@ -22,6 +22,7 @@ __all__ = [
     "Plausible",
     "PoseOptions",
     "PoseReport",
+    "Unposed",
     "VirtualCameraOptions",
     "VirtualCameras",
     "extract_frames",

@@ -8,11 +8,22 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from splatgraft.core.distortion import Distortion
-from splatgraft.core.images import read_rgb
+from splatgraft.core.images import read_mask, read_rgb, stored_size
 from splatgraft.formats.captures.exif import exif_of, read_exposure
+from splatgraft.formats.captures.masks import check_mask
 from splatgraft.runtime.atomic_file import atomic_write
 
 _EXIF_ORIENTATION = 0x0112
+_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What makes a stored image upright, by its EXIF orientation."""
 
 
 def working_copies(photos: Sequence[Path], folder: Path, max_size_px: int) -> list[Path]:
@@ -29,11 +40,52 @@ def working_copies(photos: Sequence[Path], folder: Path, max_size_px: int) -> li
         read_rgb(photo)  # the one place that words the errors of unreadable images
         with Image.open(photo) as image:
             exif = image.getexif()
-            copy = ImageOps.exif_transpose(image).convert("RGB")
+            copy = _on_black(ImageOps.exif_transpose(image))
         exif[_EXIF_ORIENTATION] = 1
         copy.thumbnail((max_size_px, max_size_px), Image.Resampling.LANCZOS)
         copy.save(folder / name, quality=97, subsampling=0, exif=exif)
     return [folder / name for name in names]
+
+
+def _on_black(image: Image.Image) -> Image.Image:
+    """RGB; what is transparent is black, as for `read_rgb`."""
+    if not image.has_transparency_data:
+        return image.convert("RGB")
+    image = image.convert("RGBA")
+    return Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image).convert("RGB")
+
+
+def working_masks(masks: Sequence[Path | None], copies: Sequence[Path], folder: Path) -> dict[str, Path]:
+    """Masks at the size of the working copies, as COLMAP wants them: NAME.jpg.png, black where nothing counts.
+
+    A mask is upright as its photo is shown: its pixels as they are, or turned by the EXIF orientation of a photo whose
+    alpha channel it is.
+
+    Args:
+        masks: One per copy, or none at all.
+        copies: Working copies.
+        folder: Where the masks go.
+
+    Returns:
+        The masks by the name of their copy.
+
+    Raises: ValueError where a mask cannot be read, or has another shape than its photo.
+    """
+    written: dict[str, Path] = {}
+    for mask, copy in zip(masks, copies, strict=bool(masks)):
+        if mask is None:
+            continue
+        folder.mkdir(parents=True, exist_ok=True)
+        coverage = Image.fromarray((read_mask(mask) * 255).round().to(torch.uint8).numpy())
+        with Image.open(mask) as stored:
+            turned = _TURNS.get(stored.getexif().get(_EXIF_ORIENTATION, 1))
+        coverage = coverage if turned is None else coverage.transpose(turned)
+        size = stored_size(copy)
+        if turned is None:
+            check_mask(mask, size)
+        written[copy.name] = folder / f"{copy.name}.png"
+        coverage.resize(size, Image.Resampling.BOX).save(written[copy.name])
+    return written
 
 
 def camera_groups(copies: Sequence[Path], shared: bool) -> list[list[str]]:
@@ -71,3 +123,15 @@ def write_undistorted(copy: Path, path: Path, distortion: Distortion) -> torch.T
     with atomic_write(path) as stream:
         Image.fromarray(array).save(stream, "JPEG", quality=95, subsampling=0, exif=exif_of(read_exposure(copy)))
     return intrinsics.float()
+
+
+def write_undistorted_mask(mask: Path, path: Path, distortion: Distortion) -> None:
+    """Write the pinhole image of a working mask as PNG."""
+    width, height = distortion.size
+    intrinsics = torch.from_numpy(distortion.pinhole())
+    coverage = distortion.undistort(
+        read_mask(mask)[..., None].expand(-1, -1, 3), intrinsics, width=width, height=height
+    )
+    array = (coverage[..., 0].clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    with atomic_write(path) as stream:
+        Image.fromarray(array).save(stream, "PNG")

@@ -12,6 +12,34 @@ POSE_REPORT_FILE = "pose_report.json"
 
 
 @dataclass(frozen=True)
+class Unposed:
+    """A photo without a pose, and what speaks for a reason."""
+
+    name: str
+    """Without suffix."""
+    features: int
+    """Found in it."""
+    matches: int
+    """Verified matches with the photo that it has most in common with."""
+
+    def __str__(self) -> str:
+        """The name, and the usual reason for such figures."""
+        if self.features < _FEW_FEATURES:
+            reason = "blurred, dark or without texture"
+        elif self.matches < _FEW_MATCHES:
+            reason = "of another place, or too far from the next photo"
+        else:
+            reason = "something moved, is mirrored or repeats itself, or a step is missing"
+        return f"{self.name} ({self.features} features, at most {self.matches} matches: {reason})"
+
+
+_FEW_FEATURES = 500
+"""Features; a photo of a usual scene has some thousands, of which one in ten is found again in the next photo."""
+_FEW_MATCHES = 30
+"""Matches that a pose takes (COLMAP: abs_pose_min_num_inliers)."""
+
+
+@dataclass(frozen=True)
 class PoseReport:
     """How well structure from motion went."""
 
@@ -19,8 +47,8 @@ class PoseReport:
     """Photos given."""
     registered: int
     """Photos that have a pose now."""
-    missing: tuple[str, ...]
-    """Names of the others, without suffix."""
+    missing: tuple[Unposed, ...]
+    """The others."""
     mean_reprojection_px: float
     """Mean distance between where points are seen and where they project, pixels of the (shrunk) photos."""
     points: int
@@ -48,7 +76,7 @@ class PoseReport:
         alone = [lens.photos[0] for lens in self.lenses if len(lens.photos) == 1]
         if alone and len(alone) < len(self.lenses):
             line += f"; with a camera of their own: {', '.join(alone)}"
-        return line + (f"; without a pose: {', '.join(self.missing)}" if self.missing else "")
+        return line + (f"; without a pose: {', '.join(map(str, self.missing))}" if self.missing else "")
 
 
 def write_pose_report(folder: Path, report: PoseReport) -> None:
@@ -72,6 +100,7 @@ def read_pose_report(folder: Path) -> PoseReport | None:
             for lens in found.pop("lenses")
         )
         doubts = tuple(Doubt(**doubt) for doubt in found.pop("doubts"))
-        return PoseReport(missing=tuple(found.pop("missing")), lenses=lenses, doubts=doubts, **found)
+        missing = tuple(Unposed(**photo) for photo in found.pop("missing"))
+        return PoseReport(missing=missing, lenses=lenses, doubts=doubts, **found)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected figures of poses, found {type(error).__name__}: {error}") from error

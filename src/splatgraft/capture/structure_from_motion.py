@@ -1,33 +1,45 @@
-"""Poses, intrinsics and sparse points of photos by COLMAP, which runs in a process of its own (colmap_process.py)."""
+"""Poses, intrinsics and sparse points of photos by COLMAP, which runs in a process of its own (colmap_process/)."""
 
 import json
-import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 
+from splatgraft.capture.colmap_process.job import Job
 from splatgraft.capture.orientation import upright
-from splatgraft.capture.photos import camera_groups, working_copies, write_undistorted
+from splatgraft.capture.photos import (
+    camera_groups,
+    working_copies,
+    working_masks,
+    write_undistorted,
+    write_undistorted_mask,
+)
 from splatgraft.capture.plausibility import Doubt, Found, Lens, find_doubts
-from splatgraft.capture.pose_report import PoseReport
+from splatgraft.capture.pose_report import PoseReport, Unposed
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import stored_size
 from splatgraft.core.posed_images import PosedImages
+from splatgraft.formats.captures.masks import PhotoFiles
+from splatgraft.runtime.child_process import last_line, run_attached
 from splatgraft.runtime.progress import Progress, silent
 
-_PHASES = 3
 _ADVICE = (
     "take more photos, a step apart, with two thirds overlap, sharp, of a still scene with texture around plain or "
     "shiny things, at one zoom setting (or say that each photo has its own camera: lens = each)"
 )
+_THOROUGH_COST = 20
+"""Time of a thorough attempt over that of a quick one: features of affine shape, more of them, guided matching."""
 _SILENT: Callable[[str], None] = lambda sentence: None  # noqa: E731
+_PHASES = 4
+"""Of the COLMAP process."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +47,7 @@ class PoseOptions:
     """How structure from motion is run."""
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which pairs are compared: all, or neighbours in name order; `auto` is exhaustive for up to 80 photos."""
+    """Which pairs are compared first: all, or neighbours in name order; `auto` is exhaustive for up to 80 photos."""
     effort: Literal["auto", "quick", "thorough"] = "auto"
     """`thorough` finds and matches more features at about 20 times the cost; `auto` does so where quick is doubtful."""
     lens: Literal["shared", "each"] = "shared"
@@ -49,64 +61,70 @@ class PoseOptions:
 
 
 def pose_photos(
-    photos: Sequence[Path],
+    photos: PhotoFiles,
     workspace: Path,
     *,
+    scratch: Path | None = None,
     options: PoseOptions = PoseOptions(),
     progress: Progress = silent,
     say: Callable[[str], None] = _SILENT,
 ) -> tuple[PosedImages, PoseReport]:
     """Poses, intrinsics and sparse points of `photos`; upright undistorted images are written to `workspace`/images.
 
-    World: +z up, the support plane at z = 0, median camera distance 1 (see `upright`).
+    World: +z up, the support plane at z = 0, median camera distance 1 (see `upright`). Masks of the photos go to
+    `workspace`/masks, undistorted as well.
 
     Args:
-        photos: At least three, of different names.
+        photos: At least three, of different names; their masks are used where the whole photos give too little.
         workspace: An existing folder.
+        scratch: A folder for features, matches and models, which a run of the same photos and options that was killed
+            left to this one; None keeps nothing.
         options: How structure from motion is run.
         progress: Moves a bar.
-        say: Takes a sentence before a second, longer attempt.
+        say: Takes a sentence before a longer part begins, and the time that each part took.
 
     Returns:
         The photos with a pose, and figures that say how far to trust them (`PoseReport.doubts`).
 
     Raises:
-        ValueError: Where pycolmap is missing, names clash, a photo is unreadable, or under half get a pose.
+        ValueError: Where pycolmap is missing, names clash, a photo or mask is unreadable, or under half get a pose.
     """
     if find_spec("pycolmap") is None:
         raise ValueError("photos without poses: expected pycolmap (pip install 'splatgraft[sfm]'), found none")
-    if len(photos) < 3:
-        raise ValueError(f"{workspace}: expected at least 3 photos to pose, found {len(photos)}")
+    if len(photos.paths) < 3:
+        raise ValueError(f"{workspace}: expected at least 3 photos to pose, found {len(photos.paths)}")
     efforts = ("quick", "thorough") if options.effort == "auto" else (options.effort,)
     total = _PHASES * len(efforts) + 1
-    with tempfile.TemporaryDirectory(prefix=".colmap-", dir=workspace) as scratch:
+    with _folder(scratch, workspace) as kept:
         progress(0, total, "reading photos")
-        copies = working_copies(photos, Path(scratch) / "photos", options.max_size_px)
+        copies = working_copies(photos.paths, kept / "photos", options.max_size_px)
+        masks = working_masks(photos.masks, copies, kept / "masks")
         models: list[dict[str, Any]] = []
         for attempt, effort in enumerate(efforts):
 
             def advance(done: int, message: str, before: int = attempt * _PHASES) -> None:
                 progress(before + done, total, message)
 
-            models.append(_run(_job(copies, Path(scratch), options, effort), advance))
+            models.append(_run(_job(copies, masks, options, kept / effort), advance, say))
+            say(_times(models[-1]))
             doubts = _doubts(models[-1], copies)
             if not doubts:
                 break
             if effort != efforts[-1]:
                 say(_second_attempt(doubts, models[-1]))
         model = max(models, key=_score)
-        registered = {Path(image["name"]).stem for image in model["images"]}
-        if len(registered) < 0.5 * len(photos):
+        missing = _missing(model, copies)
+        if len(model["images"]) < 0.5 * len(copies):
             raise ValueError(
-                f"{photos[0].parent}: expected at least half of {len(photos)} photos to register, "
-                f"found {len(registered)}; {_ADVICE}"
+                f"{photos.paths[0].parent}: expected at least half of {len(copies)} photos to register, "
+                f"found {len(model['images'])}; {_ADVICE}; without a pose: {', '.join(map(str, missing))}"
             )
         progress(total - 1, total, "undistorting")
-        posed = _posed_images(model, Path(scratch) / "photos", workspace / "images")
+        posed = _posed_images(model, copies[0].parent, masks, workspace)
         report = PoseReport(
-            photos=len(photos),
-            registered=len(registered),
-            missing=tuple(sorted(photo.stem for photo in photos if photo.stem not in registered)),
+            photos=len(copies),
+            registered=len(model["images"]),
+            missing=missing,
             mean_reprojection_px=model["mean_reprojection_px"],
             points=len(posed.points),
             models=model["models"],
@@ -119,12 +137,23 @@ def pose_photos(
     return posed, report
 
 
-def _score(model: dict[str, Any]) -> float:
-    """As in colmap_process.py, where the number of photos is the same for all."""
+@contextmanager
+def _folder(scratch: Path | None, workspace: Path) -> Generator[Path]:
+    """`scratch`, or a folder that is removed afterwards."""
+    if scratch is not None:
+        scratch.mkdir(exist_ok=True)
+        yield scratch
+        return
+    with tempfile.TemporaryDirectory(prefix=".colmap-", dir=workspace) as folder:
+        yield Path(folder)
+
+
+def _score(model: Mapping[str, Any]) -> float:
+    """As in colmap_process/scores.py, where the number of photos is the same for all."""
     return model["explained"] * len(model["images"])
 
 
-def _doubts(model: dict[str, Any], copies: Sequence[Path]) -> tuple[Doubt, ...]:
+def _doubts(model: Mapping[str, Any], copies: Sequence[Path]) -> tuple[Doubt, ...]:
     return find_doubts(
         Found(
             photos=len(copies),
@@ -136,7 +165,7 @@ def _doubts(model: dict[str, Any], copies: Sequence[Path]) -> tuple[Doubt, ...]:
     )
 
 
-def _lenses(model: dict[str, Any], folder: Path) -> tuple[Lens, ...]:
+def _lenses(model: Mapping[str, Any], folder: Path) -> tuple[Lens, ...]:
     groups: dict[int, list[dict[str, Any]]] = {}
     for image in model["images"]:
         groups.setdefault(image["camera_id"], []).append(image)
@@ -151,69 +180,83 @@ def _lenses(model: dict[str, Any], folder: Path) -> tuple[Lens, ...]:
     )
 
 
-def _second_attempt(doubts: Sequence[Doubt], model: dict[str, Any]) -> str:
-    seconds = sum(model["cpu_seconds"].values())
-    return (
-        f"doubtful after {seconds:.0f} CPU seconds ({'; '.join(str(doubt) for doubt in doubts)}): features, matches "
-        f"and mapping once more with more features, which takes about 20 times as long (effort = quick does not)"
+def _missing(model: Mapping[str, Any], copies: Sequence[Path]) -> tuple[Unposed, ...]:
+    posed = {image["name"] for image in model["images"]}
+    figures = {found["name"]: found for found in model["unposed"]}
+    return tuple(
+        Unposed(copy.stem, figures[copy.name]["features"], figures[copy.name]["matches"])
+        for copy in sorted(copies)
+        if copy.name not in posed
     )
 
 
-def _job(copies: Sequence[Path], scratch: Path, options: PoseOptions, effort: str) -> dict[str, Any]:
-    models = scratch / f"models_{effort}"
-    models.mkdir()
-    return {
-        "photos": str(copies[0].parent),
-        "database": str(scratch / f"{effort}.db"),
-        "models": str(models),
-        "output": str(scratch / f"{effort}.json"),
-        "thorough": effort == "thorough",
-        "groups": camera_groups(copies, shared=options.lens == "shared"),
-        "exhaustive": options.matching == "exhaustive" or (options.matching == "auto" and len(copies) <= 80),
-        "threads": options.threads,
-        "seed": options.seed,
-    }
+def _times(model: Mapping[str, Any]) -> str:
+    """Where the time went."""
+    parts = ", ".join(f"{phase} {seconds:.0f}" for phase, seconds in model["seconds"].items())
+    all_seconds, cpu = (sum(model[name].values()) for name in ("seconds", "cpu_seconds"))
+    return f"structure from motion took {all_seconds:.0f} s ({parts}), {cpu:.0f} CPU-s"
 
 
-def _run(job: dict[str, Any], advance: Callable[[int, str], None]) -> dict[str, Any]:
+def _second_attempt(doubts: Sequence[Doubt], model: Mapping[str, Any]) -> str:
+    minutes = max(1, round(_THOROUGH_COST * sum(model["seconds"].values()) / 60))
+    return (
+        f"doubtful ({'; '.join(map(str, doubts))}): all is done once more with more features, which takes about "
+        f"{minutes} min; Ctrl-C ends it, and effort = quick goes on without it"
+    )
+
+
+def _job(copies: Sequence[Path], masks: Mapping[str, Path], options: PoseOptions, scratch: Path) -> Job:
+    scratch.mkdir(exist_ok=True)
+    return Job(
+        photos=str(copies[0].parent.resolve()),
+        masks=str(next(iter(masks.values())).parent.resolve()) if masks else "",
+        scratch=str(scratch.resolve()),
+        thorough=scratch.name == "thorough",
+        groups=camera_groups(copies, shared=options.lens == "shared"),
+        exhaustive=options.matching == "exhaustive" or (options.matching == "auto" and len(copies) <= 80),
+        threads=options.threads,
+        seed=options.seed,
+    )
+
+
+def _run(job: Job, advance: Callable[[int, str], None], say: Callable[[str], None]) -> dict[str, Any]:
     """Raises: ValueError where the process dies, with the last line it wrote."""
-    program = Path(__file__).with_name("colmap_process.py")
-    log = Path(job["output"]).with_suffix(".log")
-    effort = "thorough" if job["thorough"] else "quick"
-    command = [sys.executable, str(program), json.dumps(job)]
-    with (
-        log.open("w") as errors,
-        subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, text=True
-        ) as process,
-    ):
-        try:
-            assert process.stdout is not None
-            for line in process.stdout:
-                done, _, message = line.strip().partition(" ")
-                if done.isdigit():
-                    advance(int(done), f"{message} ({effort})")
-            code = process.wait()
-        except BaseException:
-            process.kill()
-            raise
-    output = Path(job["output"])
-    if code != 0 or not output.is_file():
-        last = (log.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
-        raise ValueError(f"{job['photos']}: expected COLMAP to finish, found exit code {code}: {last}")
-    return json.loads(output.read_text())
+    if not job.output.is_file():
+        program, log = Path(__file__).with_name("colmap_process"), job.folder / "log"
+        log.unlink(missing_ok=True)
+        effort = "thorough" if job.thorough else "quick"
+
+        def hear(line: str) -> None:
+            first, _, rest = line.partition(" ")
+            if first.isdigit():
+                advance(int(first), f"{rest} ({effort})")
+            elif first == "-":
+                say(rest)
+
+        code = run_attached([sys.executable, str(program), json.dumps(asdict(job))], log, on_line=hear)
+        if code != 0 or not job.output.is_file():
+            last = last_line(log) or "no message"
+            raise ValueError(f"{job.photos}: expected COLMAP to finish, found exit code {code}: {last}")
+    return json.loads(job.output.read_text())
 
 
-def _posed_images(model: dict[str, Any], photos: Path, folder: Path) -> PosedImages:
-    folder.mkdir(exist_ok=True)
+def _posed_images(model: Mapping[str, Any], photos: Path, masks: Mapping[str, Path], workspace: Path) -> PosedImages:
+    (workspace / "images").mkdir(exist_ok=True)
+    if masks:
+        (workspace / "masks").mkdir(exist_ok=True)
     poses, intrinsics, sizes, paths = [], [], [], []
+    mask_paths: list[Path | None] = []
     for image in model["images"]:
-        copy, path = photos / image["name"], folder / image["name"]
+        copy, path = photos / image["name"], workspace / "images" / image["name"]
         f, cx, cy, k = image["camera"]
         size = stored_size(copy)
         matrix = torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=torch.float64)
         distortion = Distortion(matrix, torch.tensor([k, 0, 0, 0, 0], dtype=torch.float64), size)
         intrinsics.append(write_undistorted(copy, path, distortion))
+        mask_paths.append(None)
+        if copy.name in masks:
+            mask_paths[-1] = workspace / "masks" / f"{copy.stem}.png"
+            write_undistorted_mask(masks[copy.name], mask_paths[-1], distortion)
         poses.append([*image["world_from_camera"], [0, 0, 0, 1]])
         sizes.append(size)
         paths.append(path)
@@ -232,4 +275,5 @@ def _posed_images(model: dict[str, Any], photos: Path, folder: Path) -> PosedIma
         cameras=upright_from_sfm.cameras(cameras),
         points=upright_from_sfm.points(rows[:, :3]),
         point_colors=rows[:, 3:6] / 255,
+        mask_paths=tuple(mask_paths) if masks else (),
     )

@@ -34,11 +34,22 @@ class Init:
         path = self.folder / PROJECT_FILE
         if path.exists():
             raise ValueError(f"{path}: expected no project here yet, found one")
+        text = self.text()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as stream:
+            stream.write(text.encode())
+        console.result(path)
+        return 0
+
+    def text(self) -> str:
+        """The content of project.toml.
+
+        Raises: ValueError where a capture does not exist.
+        """
         for capture in (self.source, self.target):
             if not capture.exists():
                 raise ValueError(f"{capture}: expected photos, a video, a posed capture or a scene, found nothing")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        source, target = self._key(self.source), self._key(self.target)
+        source, target = self.sides()
         if self.full:
             text = full_project_text(source=source, target=target)
         else:
@@ -46,10 +57,11 @@ class Init:
         if is_scene(self.source):
             # without photographs there are no masks: only a box tells where the object is
             text = with_keys(text, "segment", {"mask_source": "grabcut"})
-        with atomic_write(path) as stream:
-            stream.write(text.encode())
-        console.result(path)
-        return 0
+        return text
+
+    def sides(self) -> tuple[str, str]:
+        """The lines that name the captures of [source] and [target]."""
+        return self._key(self.source), self._key(self.target)
 
     def _key(self, capture: Path) -> str:
         # a JSON string is a TOML string

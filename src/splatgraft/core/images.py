@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image, ImageOps
 from PIL.ExifTags import IFD
 from torch import Tensor
@@ -90,6 +90,19 @@ def mean_luminance(path: Path) -> float:
         image.load()
         linear = linear_from_srgb(_rgb(image)).mean((0, 1))
     return float(linear @ LUMINANCE)
+
+
+def read_grey(path: Path, longest_px: int) -> UInt8[np.ndarray, "h w"]:
+    """Luma of a picture as a viewer shows it, at most `longest_px` long; a JPEG is decoded at a small size.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    with _opened(path) as image:
+        image.draft(None, (longest_px, longest_px))
+        image.load()
+        grey = ImageOps.exif_transpose(image).convert("L")
+        grey.thumbnail((longest_px, longest_px), Image.Resampling.BOX)
+        return np.array(grey)
 
 
 def read_exif(path: Path) -> dict[int, Any]:

@@ -5,7 +5,7 @@ from splatgraft.evaluation.light_change import change_map, describe_change
 from splatgraft.evaluation.measure import ComparedView, compare, measure
 from splatgraft.evaluation.pictures import side_by_side, write_animation
 from splatgraft.evaluation.regions import Regions, Truth, find_regions
-from splatgraft.evaluation.report import Report, ReportView, StepTime, write_report
+from splatgraft.evaluation.report import Report, ReportView, ReportWarning, StepTime, write_report
 from splatgraft.evaluation.turntable import TurntableOptions, turntable_cameras
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "Regions",
     "Report",
     "ReportView",
+    "ReportWarning",
     "StepTime",
     "Truth",
     "TurntableOptions",

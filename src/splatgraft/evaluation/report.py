@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from splatgraft.evaluation.pictures import write_animation
-from splatgraft.evaluation.report_page import ViewFiles, page_html
+from splatgraft.evaluation.report_page import ViewFiles, WarningText, page_html
 from splatgraft.runtime.atomic_file import atomic_write
 
 
@@ -40,6 +40,20 @@ class StepTime:
 
 
 @dataclass(frozen=True)
+class ReportWarning:
+    """Something that may be wrong with the result."""
+
+    step: str
+    """Name of the step that said it, such as "compose"."""
+    text: str
+    """What may be wrong."""
+    help: str = ""
+    """What helps, with the page that explains it."""
+    picture: Float[Tensor, "h w 3"] | None = None
+    """An sRGB image that shows it."""
+
+
+@dataclass(frozen=True)
 class Report:
     """The texts and metrics of the page."""
 
@@ -47,6 +61,8 @@ class Report:
     """One line."""
     subtitle: str
     """One sentence on object and target."""
+    warnings: tuple[ReportWarning, ...] = ()
+    """What may be wrong, in the order of the steps; it stands at the top."""
     metrics: dict | None = None
     """The content of metrics.json, see `measure`; None without ground truth."""
     changes: Mapping[str, float] = field(default_factory=dict)
@@ -92,12 +108,22 @@ def write_report(
         files.append(ViewFiles(name=view.name, held_out=view.held_out, files=paths, width=width, height=height))
     if turntable:
         write_animation(folder / "turntable.webp", turntable)
+    warned = [_write_warning(folder, number, warning) for number, warning in enumerate(report.warnings)]
     if report.metrics is not None:
         with atomic_write(folder / "metrics.json") as stream:
             stream.write(json.dumps(report.metrics, indent=1, allow_nan=False).encode())
     with atomic_write(folder / "index.html") as stream:
-        stream.write(page_html(report, files, turntable="turntable.webp" if turntable else None).encode())
+        stream.write(page_html(report, files, warned, turntable="turntable.webp" if turntable else None).encode())
     return folder / "index.html"
+
+
+def _write_warning(folder: Path, number: int, warning: ReportWarning) -> WarningText:
+    file = None
+    if warning.picture is not None:
+        (folder / "warnings").mkdir(exist_ok=True)
+        file = f"warnings/{number:02d}.webp"
+        _write_webp(folder / file, warning.picture)
+    return WarningText(step=warning.step, text=warning.text, help=warning.help, file=file)
 
 
 def _write_webp(path: Path, picture: Float[Tensor, "h w 3"]) -> None:

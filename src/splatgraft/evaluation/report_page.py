@@ -95,9 +95,26 @@ class ViewFiles:
     """Pixels."""
 
 
-def page_html(report: "Report", views: Sequence[ViewFiles], *, turntable: str | None) -> str:
+@dataclass(frozen=True)
+class WarningText:
+    """One warning as the page shows it."""
+
+    step: str
+    """Name of the step."""
+    text: str
+    """What may be wrong."""
+    help: str
+    """What helps; empty where nothing is known to."""
+    file: str | None
+    """A picture, relative to the page."""
+
+
+def page_html(
+    report: "Report", views: Sequence[ViewFiles], warnings: Sequence[WarningText] = (), *, turntable: str | None
+) -> str:
     """Format the page; `turntable` is the animation's file relative to the page."""
     sections = [
+        _warnings(warnings),
         viewer(views) if views else "",
         _turntable(turntable) if turntable else "",
         _numbers(report),
@@ -162,6 +179,19 @@ def viewer(views: Sequence[ViewFiles]) -> str:
 <div class="thumbs">{thumbnails}</div>
 </section>
 """
+
+
+def _warnings(warnings: Sequence[WarningText]) -> str:
+    if not warnings:
+        return ""
+    items = "".join(
+        f"<li><p><b>{escape(one.step)}</b> {escape(one.text)}</p>"
+        + (f'<p class="quiet">{escape(one.help)}</p>' if one.help else "")
+        + (f'<img loading="lazy" src="{escape(one.file)}" alt="What the warning is about">' if one.file else "")
+        + "</li>"
+        for one in warnings
+    )
+    return f'<section class="warnings"><h2>What may be wrong</h2><ul>{items}</ul></section>\n'
 
 
 def _turntable(file: str) -> str:

@@ -20,6 +20,7 @@ from splatgraft.fitting import adam
 from splatgraft.fitting.learning_rates import LearningRates
 from splatgraft.fitting.photometric import l1_dssim
 from splatgraft.rendering import RenderOptions, render
+from splatgraft.runtime.interruption import interruption_held
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 Loss = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], Float[Tensor, ""]]
@@ -135,7 +136,7 @@ def fit(
         options: Length, rates and loss.
         control: Called after every step, as for density control.
         progress: Called every ten steps.
-        checkpoint: Where the state is saved every 30 seconds, and from which a run is resumed.
+        checkpoint: Where the state is saved every 30 seconds and on Ctrl-C, and from which a run is resumed.
 
     Raises:
         ValueError: Where there is no view, or where loss or gradients are not finite.
@@ -146,31 +147,35 @@ def fit(
     saved = checkpoint.load()
     state = _start(gaussians, names) if saved is None else _unpacked(saved, gaussians.device)
     last_save, recent = time.monotonic(), 0.0
-    while state.iteration < options.iterations:
-        done = state.iteration / options.iterations
-        camera, image = views.at(_view_of(state.iteration, len(views), options.seed), done)
-        leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
-        drawn = render(replace(state.gaussians, **leaves), camera, options=options.rendering)
-        loss = options.loss(drawn.color[0], image)
-        value = float(loss.detach())
-        if not math.isfinite(value):
-            raise _diverged(state, f"a loss of {value}")
-        seen = drawn.visible[0]
-        gradients = dict(zip(names, torch.autograd.grad(loss, list(leaves.values())), strict=True))
-        values = {name: leaf.detach() for name, leaf in leaves.items()}
-        columns = {name: v[0].numel() if len(v) else 1 for name, v in values.items()}
-        rates = {name: options.rates.at(name, done, columns[name]) for name in names}
-        if not adam.step(values, gradients, moments=state.moments, rates=rates, visible=seen):
-            raise _diverged(state, "a gradient that is not finite")
-        rate = options.rates.means_at(done) if "means" in names else 0.0
-        state = control(replace(state, iteration=state.iteration + 1), Step(camera, seen, gradients, rate))
-        recent = value if recent == 0 else 0.95 * recent + 0.05 * value
-        if state.iteration % _REPORT_EVERY == 0 or state.iteration == options.iterations:
-            message = f"loss {recent:.4f}, {state.gaussians.count / 1000:.1f}k Gaussians"
-            progress(state.iteration, options.iterations, message)
-        if time.monotonic() - last_save > _CHECKPOINT_SECONDS and not isinstance(checkpoint, NoCheckpoint):
-            checkpoint.save(_packed(state))
-            last_save = time.monotonic()
+    with interruption_held() as interrupted:
+        while state.iteration < options.iterations:
+            done = state.iteration / options.iterations
+            camera, image = views.at(_view_of(state.iteration, len(views), options.seed), done)
+            leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
+            drawn = render(replace(state.gaussians, **leaves), camera, options=options.rendering)
+            loss = options.loss(drawn.color[0], image)
+            value = float(loss.detach())
+            if not math.isfinite(value):
+                raise _diverged(state, f"a loss of {value}")
+            seen = drawn.visible[0]
+            gradients = dict(zip(names, torch.autograd.grad(loss, list(leaves.values())), strict=True))
+            values = {name: leaf.detach() for name, leaf in leaves.items()}
+            columns = {name: v[0].numel() if len(v) else 1 for name, v in values.items()}
+            rates = {name: options.rates.at(name, done, columns[name]) for name in names}
+            if not adam.step(values, gradients, moments=state.moments, rates=rates, visible=seen):
+                raise _diverged(state, "a gradient that is not finite")
+            rate = options.rates.means_at(done) if "means" in names else 0.0
+            state = control(replace(state, iteration=state.iteration + 1), Step(camera, seen, gradients, rate))
+            recent = value if recent == 0 else 0.95 * recent + 0.05 * value
+            if state.iteration % _REPORT_EVERY == 0 or state.iteration == options.iterations:
+                message = f"loss {recent:.4f}, {state.gaussians.count / 1000:.1f}k Gaussians"
+                progress(state.iteration, options.iterations, message)
+            due = interrupted() or time.monotonic() - last_save > _CHECKPOINT_SECONDS
+            if due and not isinstance(checkpoint, NoCheckpoint):
+                checkpoint.save(_packed(state))
+                last_save = time.monotonic()
+            if interrupted():
+                raise KeyboardInterrupt
     return state.gaussians
 
 

@@ -15,7 +15,7 @@ def exposure_warnings(name: Path, photos: Sequence[Path]) -> list[str]:
     Raises: ValueError where a photo is no readable image.
     """
     found = describe_inconsistency([read_exposure(photo) for photo in photos])
-    return [] if found is None else [f"{name}: warning: {found}"]
+    return [] if found is None else [f"{name}: {found}"]
 
 
 def read_luminance_scale(cameras: Path) -> LuminanceScale | None:

@@ -13,6 +13,16 @@ STEP_FILE = "step.json"
 
 
 @dataclass(frozen=True)
+class StepWarning:
+    """Something that may be wrong with a result, as the step said it."""
+
+    text: str
+    """One or more sentences."""
+    picture: str | None = None
+    """An image that shows it, relative to the result's folder."""
+
+
+@dataclass(frozen=True)
 class Record:
     """The content of step.json: inputs, options and cost of the run that made a folder."""
 
@@ -30,6 +40,8 @@ class Record:
     """Wall time of the run that finished; earlier, killed runs do not count."""
     peak_memory_bytes: int
     """Largest resident memory while it ran."""
+    warnings: tuple[StepWarning, ...] = ()
+    """What may be wrong with the result, in the order in which it was said."""
 
 
 def read_record(folder: Path) -> Record | None:
@@ -44,7 +56,8 @@ def read_record(folder: Path) -> Record | None:
     try:
         found: dict[str, Any] = json.loads(path.read_text())
         inputs = {role: tuple(tuple(e) for e in files) for role, files in found.pop("inputs").items()}
-        return Record(inputs=inputs, outputs=tuple(found.pop("outputs")), **found)
+        warnings = tuple(StepWarning(**warning) for warning in found.pop("warnings", ()))
+        return Record(inputs=inputs, outputs=tuple(found.pop("outputs")), warnings=warnings, **found)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected the record of a step, found {type(error).__name__}: {error}") from error
 

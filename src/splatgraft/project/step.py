@@ -13,6 +13,8 @@ from splatgraft.project.folder_lock import locked
 from splatgraft.project.job import Job
 from splatgraft.project.replacement import replacing
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.disk_space import room_on_disk
+from splatgraft.runtime.help_link import help_link
 from splatgraft.runtime.progress import Progress
 
 Positional = Annotated[Path, tyro.conf.Positional]
@@ -85,9 +87,9 @@ def perform(step: Step, console: Console, *, name: str = "") -> Path:
     """
     job = job_of(step)
     _ = job.entries  # what is missing is said before anything is touched
-    with locked(job.folder):
+    with locked(job.folder), room_on_disk(job.folder), console.collecting(help_link(type(step).__module__)) as warned:
         checkpoint = FolderCheckpoint(job)
-        with console.bar(name or job.step) as progress, replacing(job) as folder:
+        with console.bar(name or job.step) as progress, replacing(job, warned) as folder:
             step.write(folder, Context(progress=progress, checkpoint=checkpoint, console=console, earlier=step.out))
         checkpoint.drop()
     return job.folder

@@ -12,6 +12,9 @@ from splatgraft.relighting.light.estimate import NoLight, panorama_at
 from splatgraft.relighting.shading.gain import GainOptions, LocalGain, apply_gain, local_gain
 from splatgraft.relighting.transfer import SourceScene
 
+PASTED = "It is pasted as it is."
+"""End of the sentence on an object that stays as it was captured."""
+
 
 def relight_by_gain(
     composite: Composite,
@@ -52,7 +55,7 @@ def relight_by_gain(
             report.append(name + gain.describe())
         else:
             recolored.append(placed.gaussians)
-            report.append(f"{name}{gain} It is pasted as it is.")
+            report.append(f"{name}{gain} {PASTED}")
     return composite.with_object_colors(tuple(recolored)), tuple(report)
 
 

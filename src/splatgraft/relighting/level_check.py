@@ -26,13 +26,23 @@ class LevelCheckSettings:
     """Sun and clear sky give up to 130,000; the rest is the error of cameras' speeds."""
 
 
+@dataclass(frozen=True)
+class LevelLine:
+    """What the photos' exposure says of the level of the light on one object."""
+
+    text: str
+    """One line."""
+    is_doubtful: bool
+    """Whether the estimated level does not agree with the photos, or is more than there is under the sun."""
+
+
 def describe_level(
     relit: Relit,
     *,
     target: LuminanceScale,
     source: LuminanceScale,
     settings: LevelCheckSettings = LevelCheckSettings(),
-) -> tuple[str, ...]:
+) -> tuple[LevelLine, ...]:
     """Compare how much brighter the new place is by the photos and by the light on each object, before any share.
 
     Args:
@@ -46,7 +56,7 @@ def describe_level(
     """
     if min(target.mean, source.mean) <= 0:
         return ()
-    lines: list[str] = []
+    lines: list[LevelLine] = []
     for i, (prepared, received) in enumerate(zip(relit.prepared, relit.received, strict=True), 1):
         if prepared.source_lighting is None:
             continue
@@ -58,21 +68,22 @@ def describe_level(
     return tuple(lines)
 
 
-def _line(number: int, by_photos: float, lux: tuple[float, float], settings: LevelCheckSettings) -> str:
+def _line(number: int, by_photos: float, lux: tuple[float, float], settings: LevelCheckSettings) -> LevelLine:
     new, old = lux
     by_light = math.log2(new / old)
-    line = (
+    plain = (
         f"Object {number}: by the exposure of the photos the new place is {_brighter(by_photos)} than the old one, by "
         f"the light on the object {_brighter(by_light)} ({_rounded(new)} lux there, {_rounded(old)} at the old place)."
     )
+    doubts = ""
     if abs(by_light - by_photos) > settings.most_difference:
-        line += (
+        doubts += (
             f" They differ by {abs(by_light - by_photos):.1f} stops: one of the lights may be wrong, or what the "
             f"photos of the two places show differs as much in reflectance."
         )
     if max(lux) > settings.most_lux:
-        line += " That is more than sun and sky give: the estimated light is too strong, or the metadata is wrong."
-    return line
+        doubts += " That is more than sun and sky give: the estimated light is too strong, or the metadata is wrong."
+    return LevelLine(plain + doubts, bool(doubts))
 
 
 def _mean_luminance(irradiance: Float[Tensor, "n 3"], weights: Float[Tensor, "n"]) -> float:

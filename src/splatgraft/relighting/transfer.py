@@ -131,9 +131,14 @@ def relight(
         if prepared.notes is not None:
             report.append(f"Where object {i + 1} comes from: {prepared.notes}")
         if prepared.source_lighting is None:
-            report.append(f"The light that object {i + 1} had is not known: it keeps its mean brightness.")
+            report.append(unknown_light(i + 1))
         objects.append(_lit_object(prepared, scene))
     return _assembled(scene, objects, cameras.spread(options.fitted_views), options=options, baked=baked, report=report)
+
+
+def unknown_light(number: int) -> str:
+    """The sentence on an object whose old light is not known."""
+    return f"The light that object {number} had is not known: it keeps its mean brightness."
 
 
 def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:

@@ -52,3 +52,30 @@ def last_line(log: Path) -> str:
     """The last line of `log` that is not blank; empty where there is none."""
     lines = log.read_text(errors="replace").strip().splitlines() if log.is_file() else []
     return lines[-1].strip() if lines else ""
+
+
+def run_attached(command: Sequence[str], log: Path, *, on_line: Callable[[str], None]) -> int:
+    """Run `command` with a standard input that stays open as long as this process lives, and wait for it.
+
+    A program that reads its standard input to the end notices when this process is killed.
+
+    Args:
+        command: Program and arguments; no shell is involved.
+        log: File to which standard error is appended.
+        on_line: Called with each line of the standard output, without its end, as soon as it is written.
+
+    Returns:
+        The exit code; negative where a signal ended the process.
+    """
+    with (
+        log.open("ab") as stream,
+        subprocess.Popen(list(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream) as process,
+    ):
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                on_line(line.decode(errors="replace").rstrip("\r\n"))
+            return process.wait()
+        except BaseException:
+            process.kill()
+            raise

@@ -1,13 +1,31 @@
-"""Console output while steps run: one progress bar per step and messages of one line."""
+"""Console output while steps run: one progress bar per step, or lines without a terminal, and messages of one line."""
 
-from collections.abc import Generator
+import time
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 
 import rich.console
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
 from splatgraft.runtime.progress import Progress
+
+_LINES = 10
+"""Lines per counter of a step without a terminal: one per 10%."""
+_LINE_SECONDS = 1.0
+"""Least time between two of these lines; a step of a second needs none."""
+
+
+@dataclass(frozen=True)
+class ConsoleWarning:
+    """Something that may be wrong with the result of a step, as it was said."""
+
+    text: str
+    """One or more sentences without line breaks."""
+    picture: Path | None
+    """An image that shows it: below the step's new result folder, or anywhere else."""
 
 
 class Console:
@@ -17,10 +35,39 @@ class Console:
         """Open standard error."""
         self._errors = rich.console.Console(stderr=True, highlight=False)
         self._results = rich.console.Console(highlight=False, soft_wrap=True)
+        self._warned: list[ConsoleWarning] = []
+        self._help = ""
 
     def say(self, sentence: str) -> None:
         """Print one line on standard error."""
         self._errors.print(sentence, markup=False, soft_wrap=True)
+
+    def warn(self, sentence: str, *, picture: Path | None = None) -> None:
+        """Print a warning on standard error; inside a step it also goes into step.json and to the top of the report.
+
+        Args:
+            sentence: What may be wrong, on one line.
+            picture: An image that shows it: in the folder that the step writes, or a photo.
+        """
+        self.say(f"warning: {sentence}{self._help}")
+        self._warned.append(ConsoleWarning(sentence, picture))
+
+    @contextmanager
+    def collecting(self, help_link: str) -> Generator[list[ConsoleWarning]]:
+        """Collect the warnings of a step.
+
+        Args:
+            help_link: The page that explains them, which is printed behind each.
+
+        Yields:
+            The warnings so far; the list grows.
+        """
+        outer = self._warned, self._help
+        self._warned, self._help = [], f" (see {help_link})"
+        try:
+            yield self._warned
+        finally:
+            self._warned, self._help = outer
 
     def result(self, text: object) -> None:
         """Print one line on standard output."""
@@ -28,11 +75,17 @@ class Console:
 
     @contextmanager
     def bar(self, name: str) -> Generator[Progress]:
-        """Show a progress bar; without a terminal, one line at its end.
+        """Show a progress bar; without a terminal a line at the start, per 10% and at the end.
 
         Yields:
             The function that moves the bar: steps done, steps in all, and a short text.
         """
+        if not self._errors.is_terminal:
+            began = time.monotonic()
+            self.say(f"{name:<20} begins")
+            yield _Lines(name, self.say)
+            self.say(f"{name:<20} done in {time.monotonic() - began:.1f} s")
+            return
         columns = (
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
@@ -48,3 +101,20 @@ class Console:
             yield move
             shown = bars.tasks[0]
             bars.update(task, total=shown.total or 1, completed=shown.total or 1)
+
+
+class _Lines:
+    """A `Progress` that prints a line where a counter passes a further tenth; a step may count several times."""
+
+    def __init__(self, name: str, say: Callable[[str], None]) -> None:
+        self._name, self._say = name, say
+        self._last, self._passed, self._printed = (0, 0), 0, time.monotonic()
+
+    def __call__(self, done: int, total: int, message: str) -> None:
+        if done < self._last[0] or total != self._last[1]:
+            self._passed = 0
+        self._last = (done, total)
+        passed = _LINES * done // max(total, 1)
+        if passed > self._passed and time.monotonic() - self._printed >= _LINE_SECONDS:
+            self._say(f"{self._name:<20} {100 * passed // _LINES:3d}%  {done}/{total} {message}".rstrip())
+            self._passed, self._printed = passed, time.monotonic()

@@ -14,11 +14,13 @@ from splatgraft.capture import (
     render_pictures,
     write_pose_report,
 )
-from splatgraft.core.images import list_images, write_image
+from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs, has_poses
 from splatgraft.folders.photo_exposures import exposure_warnings
 from splatgraft.formats import is_scene, read_capture, read_gaussians, write_capture
+from splatgraft.formats.captures.given_poses import pose_files, read_given_poses
+from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.project.step import Context, Inputs, Positional
 
 
@@ -31,6 +33,8 @@ class Capture:
     """A folder of photos, a video, a COLMAP folder, a folder with transforms.json, or a .ply, .spz or .splat."""
     out: Path = Path("capture")
     """Folder for transforms.json and points.ply."""
+    poses: Path | None = None
+    """Poses that another program found for photos: a COLMAP folder, a transforms.json or Metashape's cameras as XML."""
     max_side: int = 1600
     """Longest side at which images are served from here on, pixels; 0 keeps all."""
     accept_doubtful: bool = False
@@ -40,33 +44,56 @@ class Capture:
 
     def inputs(self) -> Inputs:
         """The photos, or the video, or the scene, or the files of the posed capture."""
-        if has_poses(self.capture):
+        if self.poses is None and has_poses(self.capture):
             return capture_inputs(self.capture, read_capture(self.capture), masks=True)
-        return {"photos": tuple(list_images(self.capture)) if self.capture.is_dir() else (self.capture,)}
+        if not self.capture.is_dir():
+            if self.poses is not None:
+                raise ValueError(f"{self.capture}: expected a folder of photos beside --poses, found none")
+            return {"photos": (self.capture,)}
+        photos = find_photos(self.capture)
+        files = {"photos": photos.paths, "masks": tuple(mask for mask in photos.masks if mask is not None)}
+        return files if self.poses is None else files | {"poses": pose_files(self.poses)}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the posed capture."""
-        if is_scene(self.capture):
+        if self.poses is not None:
+            posed = self._with_given_poses(self.poses, context)
+        elif is_scene(self.capture):
             posed = self._pictures(folder, context)
         elif has_poses(self.capture):
             posed = read_capture(self.capture)
-            context.console.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points")
+            masks = describe_masks(posed.image_paths, posed.mask_paths)
+            context.console.say(f"{self.capture}: {len(posed)} posed images, {len(posed.points)} points; {masks}")
             self._warn_of_exposures(posed.image_paths, context)
         else:
             photos = self._photos(folder, context)
-            self._warn_of_exposures(photos, context)
+            self._warn_of_exposures(photos.paths, context)
             posed, report = pose_photos(
                 photos,
                 folder,
+                scratch=context.checkpoint.folder / "colmap",
                 options=self.options,
                 progress=context.progress,
                 say=lambda sentence: context.console.say(f"{self.capture}: {sentence}"),
             )
             context.console.say(f"{self.capture}: {report}")
             for doubt in report.doubts:
-                context.console.say(f"{self.capture}: doubtful: {doubt}")
+                context.console.warn(f"{self.capture}: doubtful: {doubt}")
             write_pose_report(folder, report)
         write_capture(folder, _limited(posed, self.max_side))
+
+    def _with_given_poses(self, poses: Path, context: Context) -> PosedImages:
+        """Photos with the poses of another program."""
+        photos = self._photos(self.out, context)
+        self._warn_of_exposures(photos.paths, context)
+        given = read_given_poses(poses, photos)
+        say = context.console.say
+        say(f"{poses}: poses of {len(given.posed)} of {len(photos.paths)} photos, {len(given.posed.points)} points")
+        if given.without_pose:
+            say(f"{poses}: without a pose, left out: {', '.join(given.without_pose)}")
+        if given.without_photo:
+            say(f"{self.capture}: without a photo, left out: {', '.join(given.without_photo)}")
+        return given.posed
 
     def _pictures(self, folder: Path, context: Context) -> PosedImages:
         """Pictures of a scene that came without photographs."""
@@ -88,12 +115,15 @@ class Capture:
 
     def _warn_of_exposures(self, photos: Sequence[Path], context: Context) -> None:
         for warning in exposure_warnings(self.capture, photos):
-            context.console.say(warning)
+            context.console.warn(warning)
 
-    def _photos(self, folder: Path, context: Context) -> list[Path]:
-        if self.capture.is_dir():
-            return list_images(self.capture)
-        return extract_frames(self.capture, folder / "frames", progress=context.progress)
+    def _photos(self, folder: Path, context: Context) -> PhotoFiles:
+        if not self.capture.is_dir():
+            return PhotoFiles(tuple(extract_frames(self.capture, folder / "frames", progress=context.progress)))
+        photos = find_photos(self.capture)
+        masks = describe_masks(photos.paths, photos.masks)
+        context.console.say(f"{self.capture}: {len(photos.paths)} photos; {masks}")
+        return photos
 
 
 def doubt_about(step: Capture) -> str | None:

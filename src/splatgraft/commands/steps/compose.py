@@ -76,7 +76,7 @@ class Compose:
         context.console.say(f"placed at ({where}), scale {placed.target_from_object.scale:.3f}")
         context.console.say(_size(placed, self.options.scale, in_metres[0], in_metres[1]))
         for warning in placed.warnings:
-            context.console.say(f"warning: {warning}")
+            context.console.warn(warning)
         return Placement(objects=(ObjectPlacement(target_from_object=placed.target_from_object),))
 
 

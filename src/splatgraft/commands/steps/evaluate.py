@@ -2,16 +2,19 @@
 
 import os
 import platform
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.images import write_image
+from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.evaluation import (
     Report,
     ReportView,
+    ReportWarning,
     StepTime,
     TurntableOptions,
     change_map,
@@ -25,8 +28,9 @@ from splatgraft.evaluation import (
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.folders.evaluated_scenes import EvaluatedScenes, Pictures, TrueViews, truth_files
 from splatgraft.project.layout import RESULTS_IN_ORDER, SCENE_FILE
-from splatgraft.project.record import read_record
-from splatgraft.project.step import Context, Device, Inputs, choose_device
+from splatgraft.project.record import Record, StepWarning, read_record
+from splatgraft.project.remedies import remedy, step_help_link
+from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Evaluate:
     light: Path | None = None
     """The report of the light transfer, a text file."""
     project: Path | None = None
-    """The folder of all results: the page then shows the time of each step."""
+    """The folder of all results: the page then shows the warnings and the time of each step."""
     lpips_weights: Path | None = None
     """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache where not given."""
     pictured: int = 8
@@ -69,6 +73,11 @@ class Evaluate:
         light = () if self.light is None else (self.light,)
         truth = truth_files(self.ground_truth, self.target_capture)
         return {"scenes": (self.result, *composite), "cameras": (self.cameras,), "light": light, "truth": truth}
+
+    def recorded_options(self) -> dict[str, Any]:
+        """The options in step.json, and the warnings that the page shows, where there are any."""
+        warned = [f"{label}: {warning.text}" for label, _, warning in _warnings(self.project)]
+        return plain_options(vars(self)) | ({"warnings": warned} if warned else {})
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the report."""
@@ -90,6 +99,7 @@ class Evaluate:
         report = Report(
             title="Object transfer: before and after",
             subtitle=f"{int(scenes.is_object.sum()):,} Gaussians of the object among {scenes.result.count:,} in all.",
+            warnings=_report_warnings(self.project, best),
             metrics=metrics,
             changes={key: sum(c[key] for c in changes) / len(changes) for key in changes[0]} if changes else {},
             not_measured=missing,
@@ -117,6 +127,8 @@ class Evaluate:
         write_image(folder / "before_after.png", three)
 
 
+_WARNING_PX = 640
+"""Width of the pictures beside warnings: twice that at which the page shows them."""
 _LIMITS = (
     "There is no ground truth for these captures: the pictures show what was done, not how right it is.",
     "Viewpoints far from the captured ones show less than the captured ones do.",
@@ -147,14 +159,45 @@ def _turntable(scenes: EvaluatedScenes, frames: int, context: Context) -> list[t
     return pictures
 
 
-def _step_times(project: Path) -> tuple[StepTime, ...]:
-    times: list[StepTime] = []
-    for name in RESULTS_IN_ORDER:
+def _records(project: Path) -> Iterator[tuple[str, Path, Record]]:
+    """The steps before this one: what the page calls them, their folders and their records."""
+    for name in RESULTS_IN_ORDER[:-1]:
         if (record := read_record(project / name)) is not None:
-            label = f"{name.split('/')[0]}: {record.step}" if "/" in name else record.step
-            note = f"at most {record.peak_memory_bytes / 2**30:.2f} GiB of memory"
-            times.append(StepTime(name=label, seconds=record.seconds, note=note))
-    return tuple(times)
+            yield f"{name.split('/')[0]}: {record.step}" if "/" in name else record.step, project / name, record
+
+
+def _step_times(project: Path) -> tuple[StepTime, ...]:
+    return tuple(
+        StepTime(label, record.seconds, f"at most {record.peak_memory_bytes / 2**30:.2f} GiB of memory")
+        for label, _, record in _records(project)
+    )
+
+
+def _warnings(project: Path | None) -> Iterator[tuple[str, Path, StepWarning]]:
+    """All warnings of a project with the names and the folders of the steps that said them."""
+    if project is not None:
+        for label, folder, record in _records(project):
+            yield from ((label, folder, warning) for warning in record.warnings)
+
+
+def _report_warnings(project: Path | None, best: Pictures) -> tuple[ReportWarning, ...]:
+    """The warnings with their pictures; of a place or a light without one, the view that shows most of the object."""
+    shown = {"compose": best.copy_paste, "relight": best.result}
+    found: list[ReportWarning] = []
+    for label, folder, warning in _warnings(project):
+        step = label.split(": ")[-1]
+        words = [remedy(step, project) if project else None, f"see {step_help_link(step)}"]
+        picture = shown.get(step)
+        if warning.picture is not None and (path := folder / warning.picture).is_file():
+            picture = read_rgb(path)
+        small = None if picture is None else _at_most(picture, _WARNING_PX)
+        found.append(ReportWarning(label, warning.text, "; ".join(word for word in words if word), small))
+    return tuple(found)
+
+
+def _at_most(picture: torch.Tensor, width: int) -> torch.Tensor:
+    height = max(1, round(picture.shape[0] * width / picture.shape[1]))
+    return resize(picture.cpu(), width, height) if picture.shape[1] > width else picture
 
 
 COMMAND = Evaluate

@@ -14,6 +14,7 @@ from splatgraft.folders.capture_files import capture_inputs
 from splatgraft.folders.photo_exposures import exposure_warnings
 from splatgraft.formats import read_capture, write_gaussians
 from splatgraft.project.layout import METRICS_FILE, SCENE_FILE
+from splatgraft.project.record import read_record
 from splatgraft.project.step import Context, Inputs, Positional, choose_device
 from splatgraft.reconstruction import ReconstructOptions, predict_memory, reconstruct
 from splatgraft.rendering import RenderOptions, render
@@ -56,19 +57,21 @@ class Reconstruct:
         if self.eval and not options.eval_every:
             options = replace(options, eval_every=EVAL_EVERY)
         context.console.say(f"memory: at most about {predict_memory(capture, options) / 2**30:.1f} GiB")
-        for warning in exposure_warnings(self.capture, capture.image_paths):
-            context.console.say(warning)
+        if read_record(self.capture) is None:  # of its own results the command `capture` has said it
+            for warning in exposure_warnings(self.capture, capture.image_paths):
+                context.console.warn(warning)
         scene = reconstruct(capture, options, progress=context.progress, checkpoint=context.checkpoint)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
         if options.eval_every:
             metrics = _held_out_metrics(scene, options.served(capture), options)
             context.console.say(f"held out: {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}")
-            for sentence in far_worse(metrics["psnr_by_view"]):
-                context.console.say(sentence)
+            photo_of = dict(zip(capture.cameras.names, capture.image_paths, strict=True))
+            for name, sentence in far_worse(metrics["psnr_by_view"]).items():
+                context.console.warn(sentence, picture=photo_of[name])
             (folder / METRICS_FILE).write_text(json.dumps(metrics, indent=1))
 
 
-def far_worse(psnr_by_view: dict[str, float], rule: FarBelow = FarBelow()) -> list[str]:
+def far_worse(psnr_by_view: dict[str, float], rule: FarBelow = FarBelow()) -> dict[str, str]:
     """One sentence per held-out view that is far worse than the rest, the worst first.
 
     Args:
@@ -79,12 +82,12 @@ def far_worse(psnr_by_view: dict[str, float], rule: FarBelow = FarBelow()) -> li
     middle = float(np.median(values))
     spread = 1.4826 * float(np.median(np.abs(values - middle)))
     limit = middle - max(rule.deviations * spread, rule.decibels)
-    return [
-        f"held out: {name} is far worse than the rest: {value:.1f} dB, median {middle:.1f} dB; its pose may be wrong, "
-        f"or the photo blurred"
+    return {
+        name: f"held out: {name} is far worse than the rest: {value:.1f} dB, median {middle:.1f} dB; its pose may be "
+        f"wrong, or the photo blurred"
         for name, value in sorted(psnr_by_view.items(), key=lambda item: item[1])
         if value < limit
-    ]
+    }
 
 
 def _held_out_metrics(scene: Gaussians, capture: PosedImages, options: ReconstructOptions) -> dict[str, Any]:

@@ -17,12 +17,16 @@ from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
 from splatgraft.project.layout import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_PICTURE, LIGHT_TEXT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Inputs
-from splatgraft.relighting.gain_transfer import relight_by_gain
+from splatgraft.relighting.gain_transfer import PASTED, relight_by_gain
 from splatgraft.relighting.layers import LayerWeights, Relit
-from splatgraft.relighting.level_check import describe_level
+from splatgraft.relighting.level_check import LevelLine, describe_level
+from splatgraft.relighting.light.confidence import light_confidence
 from splatgraft.relighting.light.light import Light, light_from_json, light_to_json
 from splatgraft.relighting.light.light_picture import draw_light
-from splatgraft.relighting.transfer import RelightOptions, SourceScene, relight
+from splatgraft.relighting.transfer import RelightOptions, SourceScene, relight, unknown_light
+
+LEAST_CERTAIN = 0.5
+"""Share of the light that was captured and whose direction is certain, below which most of it is a guess."""
 
 
 @dataclass(frozen=True)
@@ -65,28 +69,36 @@ class Relight:
         """Relight, write the scene and the light, and print the report."""
         composite = read_composite(self.target, self.placement)
         found: Light | None = None
+        doubts: tuple[str, ...] = ()
         if self.light == "off":
             gaussians, is_object = composite.bake()
             sentences = ("The light transfer was off: the object is pasted as it was captured.",)
         elif self.light == "gain":
             adjusted, sentences = relight_by_gain(composite, read_cameras(self.cameras), sources=self._sources())
+            doubts = tuple(sentence for sentence in sentences if sentence.endswith(PASTED))
             gaussians, is_object = adjusted.bake()
         else:
             cameras, sources = read_cameras(self.cameras), self._sources()
             relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
             found = relit.light
             gaussians, is_object = relit.bake(self.weights)
-            sentences = (*relit.report, *self._level(relit))
+            levels = self._level(relit)
+            sentences = (*relit.report, *(line.text for line in levels))
+            doubts = (*_doubts(relit), *(line.text for line in levels if line.is_doubtful))
             _draw_lights(folder, relit, composite, sources)
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_selection(folder / IS_OBJECT_FILE, is_object)
         (folder / LIGHT_TEXT_FILE).write_text("\n".join(sentences) + "\n")
         if found is not None:
             (folder / LIGHT_FILE).write_text(light_to_json(found))
+        picture = folder / LIGHT_PICTURE
         for sentence in sentences:
-            context.console.say(sentence)
+            if sentence not in doubts:
+                context.console.say(sentence)
+        for doubt in doubts:
+            context.console.warn(doubt, picture=picture if picture.is_file() else None)
 
-    def _level(self, relit: Relit) -> tuple[str, ...]:
+    def _level(self, relit: Relit) -> tuple[LevelLine, ...]:
         """What the exposure metadata of both captures says of the level; their photos are no inputs, as only this
         depends on them."""
         if self.object_cameras is None:
@@ -94,7 +106,7 @@ class Relight:
         try:
             target, source = read_luminance_scale(self.cameras), read_luminance_scale(self.object_cameras)
         except ValueError as error:  # the transfer itself needs no photo
-            return (f"The photos' exposure was not compared with the light: {error}.",)
+            return (LevelLine(f"The photos' exposure was not compared with the light: {error}.", is_doubtful=True),)
         return () if target is None or source is None else describe_level(relit, target=target, source=source)
 
     def _given(self) -> Light | None:
@@ -116,6 +128,19 @@ class Relight:
             return [None] * len(paths)
         # all copies of the object have this source; objects of other files have none, as the report says
         return [source if path is not None and path.resolve() == taken.resolve() else None for path in paths]
+
+
+def _doubts(relit: Relit) -> tuple[str, ...]:
+    """What of the report tells that the light is not known, and a sentence where most of it is a guess."""
+    if relit.light is None:
+        return relit.report
+    doubts = [unknown_light(i) for i, one in enumerate(relit.prepared, 1) if one.source_lighting is None]
+    certain = light_confidence(relit.light)
+    if certain < LEAST_CERTAIN:
+        doubts.append(
+            f"Most of the light at the new place is a guess: {certain:.0%} of it was captured with a certain direction."
+        )
+    return tuple(doubts)
 
 
 def _draw_lights(folder: Path, relit: Relit, composite: Composite, sources: Sequence[SourceScene | None]) -> None:

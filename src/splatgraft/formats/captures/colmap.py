@@ -65,6 +65,15 @@ def read_capture(folder: Path) -> PosedImages:
     return posed_images_of(_views(model, images, folder), source, folder=folder, points=points, colors=colors)
 
 
+def read_views(folder: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    """The photos of the largest model, whose files need not exist, its points and their colours.
+
+    Raises: ValueError where no whole model is there, or its camera model is not supported.
+    """
+    model, images = _largest_model(folder)
+    return _views(model, images, folder), *_read_points(_file(model, "points3D"))
+
+
 def read_cameras(folder: Path) -> Cameras:
     """The cameras of the largest model; images need not exist.
 

@@ -1,57 +1,144 @@
-"""Finds the object mask of each photograph: by stem in a folder masks/, or in the photograph's alpha channel."""
+"""Finds photographs and the object mask of each: in a folder masks/ or mask/, as NAME_mask beside it, or in its alpha
+channel."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatgraft.core.images import has_transparency, list_images, read_alpha, stored_size
+from splatgraft.core.images import IMAGE_SUFFIXES, has_transparency, list_images, read_alpha, stored_size
 from splatgraft.formats.captures.view_record import ViewRecord, same_shape
 
+PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
+"""Names under which photos lie in a capture: of COLMAP and nerfstudio, of 3DGS's convert.py, of RGB-D scanners."""
+_MASK_FOLDERS = ("masks", "mask")
+_MASK_ENDINGS = ("_mask", ".mask")
+"""What comes before the suffix of a mask beside its photo: by default in Metashape, and in RealityCapture."""
 _ALPHA_SAMPLES = 8
 """Number of files decoded to decide whether alpha channels are masks."""
 
 
+@dataclass(frozen=True)
+class PhotoFiles:
+    """Photos without poses, and the mask of each."""
+
+    paths: tuple[Path, ...]
+    """Sorted by name."""
+    masks: tuple[Path | None, ...] = ()
+    """White is the object; the photo itself where its alpha channel is the mask; empty where no photo has one."""
+
+
+def find_photos(folder: Path) -> PhotoFiles:
+    """The photos in `folder`, or else in its images/, photos/, input/ or rgb/, with their masks.
+
+    Masks are looked for beside the photos and beside their folder; a file NAME_mask is a mask and no photo where
+    there is a photo NAME.
+
+    Raises: ValueError where there is no photo, or a folder of masks has none for any photo, or two for one.
+    """
+    photos = next(
+        (place for place in (folder, *(folder / name for name in PHOTO_FOLDERS)) if place.is_dir() and _photos(place)),
+        None,
+    )
+    if photos is None:
+        inside = sorted(entry.name for entry in folder.iterdir())[:6]
+        raise ValueError(f"{folder}: expected photos, in the folder itself or in images/, found {inside}")
+    paths = _photos(photos)
+    roots = [folder, photos, *([photos.parent] if photos.name in PHOTO_FOLDERS else [])]
+    masks = _masks_of({path: path.name for path in paths}, roots)
+    return PhotoFiles(tuple(paths), tuple(masks.get(path) for path in paths) if masks else ())
+
+
+def describe_masks(images: Sequence[Path], masks: Sequence[Path | None]) -> str:
+    """How many of `images` have masks, and where these were found, for people."""
+    found = {image: mask for image, mask in zip(images, masks, strict=bool(masks)) if mask is not None}
+    if not found:
+        return "no masks"
+    inner = sum(image == mask for image, mask in found.items())
+    beside = sum(_is_beside(image, mask) for image, mask in found.items())
+    folders = sorted({f"{m.parent.name}/" for i, m in found.items() if m != i and not _is_beside(i, m)})
+    places = [*(["alpha channels"] if inner else []), *(["NAME_mask beside NAME"] if beside else []), *folders]
+    return f"{len(found)} of {len(images)} photos have masks, in {', '.join(places)}"
+
+
 def with_masks(views: list[ViewRecord], folder: Path) -> list[ViewRecord]:
-    """The views with the masks in `folder`/masks, or, without that folder, with varying alpha channels as masks.
+    """The views with the masks in `folder`/masks or mask, or, without these, beside the images or in alpha channels.
 
     0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask that the view already has stays.
 
     Raises: ValueError where masks/ has no mask for any view, two for one, or one of another shape.
     """
-    masks = folder / "masks"
     if not any(view.mask_path for view in views):
-        if masks.is_dir():
-            files = _by_folder_and_stem(masks)
-            views = [replace(view, mask_path=_mask_of(view, masks, files)) for view in views]
-            if not any(view.mask_path for view in views):
-                raise ValueError(f"{masks}: expected masks named like the images ({views[0].name}), found none")
-        else:
-            views = _with_alpha_masks(views)
+        images = {view.image_path: view.name for view in views if view.image_path is not None}
+        masks = _masks_of(images, [folder])
+        views = [replace(view, mask_path=masks.get(view.image_path) if view.image_path else None) for view in views]
     for view in views:
         if view.mask_path is not None and view.mask_path != view.image_path:
-            found = stored_size(view.mask_path)
-            if not same_shape(found, view.size):
-                expected = f"{view.size[0]}x{view.size[1]} px, as its image has, or those scaled"
-                raise ValueError(f"{view.mask_path}: expected {expected}, found {found[0]}x{found[1]}")
+            check_mask(view.mask_path, view.size)
     return views
 
 
-def _with_alpha_masks(views: list[ViewRecord]) -> list[ViewRecord]:
+def check_mask(mask: Path, size: tuple[int, int]) -> None:
+    """Raise where a mask cannot be of an image with `size` (width, height).
+
+    Raises: ValueError where it has another shape or is no readable image.
+    """
+    found = stored_size(mask)
+    if not same_shape(found, size):
+        expected = f"{size[0]}x{size[1]} px, as its image has, or those scaled"
+        raise ValueError(f"{mask}: expected {expected}, found {found[0]}x{found[1]}")
+
+
+def _photos(folder: Path) -> list[Path]:
+    """Image files that are not masks of others."""
+    files = list_images(folder)
+    stems = {path.stem for path in files}
+    return [
+        path
+        for path in files
+        if not any(path.stem.endswith(end) and path.stem.removesuffix(end) in stems for end in _MASK_ENDINGS)
+    ]
+
+
+def _masks_of(images: dict[Path, str], roots: Sequence[Path]) -> dict[Path, Path]:
+    """Masks by image, from the first place that has any; `images` gives their names inside the capture."""
+    for folder in (root / name for root in roots for name in _MASK_FOLDERS):
+        if folder.is_dir():
+            files = _by_folder_and_stem(folder)
+            found = {path: mask for path, name in images.items() if (mask := _mask_of(name, folder, files))}
+            if not found:
+                first = next(iter(images.values()), "none")
+                raise ValueError(f"{folder}: expected masks named like the images ({first}), found none")
+            return found
+    beside = {path: mask for path in images if (mask := _mask_beside(path))}
+    return beside or _alpha_masks(list(images))
+
+
+def _alpha_masks(paths: list[Path]) -> dict[Path, Path]:
     """Alpha channels are masks where one of a few samples varies; many files have alpha 1 everywhere."""
-    transparent = [v.image_path is not None and has_transparency(v.image_path) for v in views]
-    paths = [v.image_path for v, t in zip(views, transparent, strict=True) if t and v.image_path]
-    sample = paths[:: max(1, len(paths) // _ALPHA_SAMPLES)]
+    transparent = [path for path in paths if has_transparency(path)]
+    sample = transparent[:: max(1, len(transparent) // _ALPHA_SAMPLES)]
     if not any(bool((read_alpha(path) < 1).any()) for path in sample):
-        return views
-    return [replace(v, mask_path=v.image_path) if t else v for t, v in zip(transparent, views, strict=True)]
+        return {}
+    return {path: path for path in transparent}
 
 
-def _mask_of(view: ViewRecord, masks: Path, files: dict[tuple[Path, str], list[Path]]) -> Path | None:
-    name = Path(view.name)
+def _mask_beside(image: Path) -> Path | None:
+    names = (f"{image.stem}{end}{suffix}" for end in _MASK_ENDINGS for suffix in sorted(IMAGE_SUFFIXES))
+    return next((path for name in names if (path := image.with_name(name)).is_file()), None)
+
+
+def _is_beside(image: Path, mask: Path) -> bool:
+    return any(mask.stem == image.stem + end for end in _MASK_ENDINGS) and image.parent == mask.parent
+
+
+def _mask_of(image: str, masks: Path, files: dict[tuple[Path, str], list[Path]]) -> Path | None:
+    name = Path(image)
     inner = Path(*name.parts[1:]) if name.parts[0] == "images" and len(name.parts) > 1 else name
+    stems = (name.stem, name.name, *(name.stem + end for end in _MASK_ENDINGS))
     for folder in dict.fromkeys([(masks / inner).parent, masks]):
-        found = [path for stem in (name.stem, name.name) for path in files.get((folder, stem), [])]
+        found = [path for stem in stems for path in files.get((folder, stem), [])]
         if len(found) > 1:
-            raise ValueError(f"{masks}: expected one mask for {view.name}, found {[p.name for p in found[:4]]}")
+            raise ValueError(f"{masks}: expected one mask for {image}, found {[p.name for p in found[:4]]}")
         if found:
             return found[0]
     return None

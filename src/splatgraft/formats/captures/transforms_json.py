@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
@@ -44,6 +46,17 @@ def read_images(path: Path) -> PosedImages:
     """
     none = torch.zeros(0, 3)
     return posed_images_of(_views(path, _load(path)), path, folder=path.parent, points=none, colors=none)
+
+
+def read_views(path: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    """The frames, whose image files need not exist where w and h are given, the points and their colours.
+
+    Raises: ValueError where the file or its points are broken.
+    """
+    meta = _load(path)
+    if meta.get("ply_file_path") is None:
+        return _views(path, meta), torch.zeros(0, 3), torch.zeros(0, 3)
+    return _views(path, meta), *read_points(path.parent / text(path, meta, "ply_file_path"))
 
 
 def read_cameras(path: Path) -> Cameras:

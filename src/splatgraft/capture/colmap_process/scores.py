@@ -1,0 +1,128 @@
+"""Figures of a model, and the one score by which models are compared.
+
+The score is the share of all photos with a pose times the share of verified matches that the model explains: both
+features of a match see one point, which `SEARCH.min_track` photos see with a mean error of at most
+`SEARCH.max_error_px`. It counts what COLMAP dropped, which a reprojection error does not.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .job import SEARCH
+
+Answer = dict[str, Any]
+"""A model as plain numbers: its images with poses and cameras, its points, and its score."""
+Matches = list[tuple[int, int, np.ndarray]]
+"""Numbers of two photos, and (n, 2) the numbers of their features that match."""
+
+
+def read_matches(database: Path) -> Matches:
+    """The verified matches of all pairs."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        pairs, geometries = opened.read_two_view_geometries()
+    return [
+        (*pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches)
+        for pair, geometry in zip(pairs, geometries, strict=True)
+        if len(geometry.inlier_matches)
+    ]
+
+
+def best_of(database: Path, models: list[Any], photos: int) -> Answer:
+    """The best of `models` as plain numbers; without images where there is none."""
+    matches = read_matches(database)
+    if not models:
+        return {"images": [], "points": [], "mean_reprojection_px": 0.0, "explained": 0.0, "score": 0.0}
+    best = max(models, key=lambda model: posed_and_explained(matches, model))
+    return _numbers(matches, best) | {"score": posed_and_explained(matches, best) / photos}
+
+
+def posed_and_explained(matches: Matches, model: Any) -> float:
+    """The number of photos with a pose that counts times the share of `matches` explained."""
+    seen = _seen_points(model)
+    explained = sum(_explained(seen, *match) for match in matches)
+    return len(seen) * explained / max(sum(len(rows) for *_, rows in matches), 1)
+
+
+def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
+    """By photo with a pose: the share of its matches with other such photos that the model explains."""
+    seen = _seen_points(model)
+    counts = {i: np.zeros(2) for i in model.reg_image_ids()}
+    for a, b, rows in matches:
+        if a in counts and b in counts:
+            for i in (a, b):
+                counts[i] += (_explained(seen, a, b, rows), len(rows))
+    return {i: float(explained / total) for i, (explained, total) in counts.items() if total}
+
+
+def connected_photos(database: Path) -> int:
+    """Photos that can have a pose at all: with enough verified matches to some other photo."""
+    return len({i for *pair, rows in read_matches(database) if len(rows) >= SEARCH.min_observations for i in pair})
+
+
+def _explained(seen: dict[int, np.ndarray], a: int, b: int, rows: np.ndarray) -> int:
+    if a not in seen or b not in seen:
+        return 0
+    points = seen[a][rows[:, 0]]
+    return int(((points >= 0) & (points == seen[b][rows[:, 1]])).sum())
+
+
+def _seen_points(model: Any) -> dict[int, np.ndarray]:
+    """By photo with a pose that counts: for each of its features the number of its point that counts, or -1."""
+    counts = {
+        i for i, p in model.points3D.items() if p.track.length() >= SEARCH.min_track and p.error <= SEARCH.max_error_px
+    }
+    seen = {
+        i: np.array([p.point3D_id if p.point3D_id in counts else -1 for p in image.points2D], dtype=np.int64)
+        for i, image in model.images.items()
+        if image.has_pose
+    }
+    return {i: points for i, points in seen.items() if (points >= 0).sum() >= SEARCH.min_observations}
+
+
+def _numbers(matches: Matches, model: Any) -> Answer:
+    seen = _seen_points(model)
+    explained = sum(_explained(seen, *match) for match in matches)
+    return {
+        "explained": explained / max(sum(len(rows) for *_, rows in matches), 1),
+        "mean_reprojection_px": float(model.compute_mean_reprojection_error()),
+        "images": [
+            {
+                "name": image.name,
+                "world_from_camera": image.cam_from_world().inverse().matrix().tolist(),
+                "camera": model.cameras[image.camera_id].params.tolist(),
+                "camera_id": image.camera_id,
+                "observations": int((seen[image.image_id] >= 0).sum()),
+            }
+            for image in sorted(model.images.values(), key=lambda image: image.name)
+            if image.image_id in seen
+        ],
+        "points": [
+            [*p.xyz.tolist(), *(int(c) for c in p.color), float(p.error), p.track.length()]
+            for p in model.points3D.values()
+        ],
+    }
+
+
+def unposed(database: Path, answer: Answer) -> list[dict[str, Any]]:
+    """For each photo without a pose: its name, its number of features, and its most matches with one other photo."""
+    import pycolmap
+
+    posed = {image["name"] for image in answer["images"]}
+    most: dict[int, int] = {}
+    for *pair, rows in read_matches(database):
+        for i in pair:
+            most[i] = max(most.get(i, 0), len(rows))
+    with pycolmap.Database.open(database) as opened:
+        return [
+            {
+                "name": image.name,
+                "features": opened.num_keypoints_for_image(image.image_id),
+                "matches": most.get(image.image_id, 0),
+            }
+            for image in sorted(opened.read_all_images(), key=lambda image: image.name)
+            if image.name not in posed
+        ]

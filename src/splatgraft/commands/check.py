@@ -1,0 +1,192 @@
+"""The command `check`: a look at the photos of a capture before time is spent on them."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+
+from splatgraft.capture.photo_findings import (
+    Finding,
+    find_in_count,
+    find_in_exposures,
+    find_in_photos,
+    find_in_sizes,
+    named,
+    verdict_of,
+)
+from splatgraft.capture.photo_inspection import SIDE_PX, Grey, inspect_photos
+from splatgraft.core.images import list_images, read_exif, read_grey, stored_size
+from splatgraft.folders.capture_files import has_poses
+from splatgraft.formats import is_scene, read_capture, read_gaussians
+from splatgraft.formats.captures.exif import read_exposure
+from splatgraft.project.step import Positional
+from splatgraft.runtime.console import Console
+
+_FRAMES = 40
+"""Frames of a video that are looked at; the command `capture` takes 120."""
+_POSE_SECONDS, _DRAFT_SECONDS = 2.5, 45.0
+"""Per photo for poses (73 photos of 800 px in 3 minutes), and for a draft of any size; two idle cores."""
+_FOCAL_LENGTH = 0x920A
+
+
+@dataclass(frozen=True)
+class Check:
+    """Look at a capture in seconds, before time is spent on it. Exit status: 0 usable, 1 not usable as it is."""
+
+    capture: Positional
+    """A folder of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene."""
+    json: bool = False
+    """Print the findings as JSON on standard output."""
+
+    def execute(self, console: Console) -> int:
+        """Print one line per subject and a verdict."""
+        findings = list(self._findings(console))
+        verdict = verdict_of(findings)
+        if self.json:
+            found = [asdict(finding) for finding in findings]
+            console.result(json.dumps({"capture": str(self.capture), "verdict": verdict, "findings": found}, indent=1))
+        else:
+            for finding in findings:
+                console.result(f"{finding.level:<9} {finding.subject:<10} {finding}")
+            console.result(f"verdict: {_VERDICTS[verdict]}")
+        return 1 if verdict == "unusable" else 0
+
+    def _findings(self, console: Console) -> Iterator[Finding]:
+        if not self.capture.exists():
+            raise ValueError(f"{self.capture}: expected photos, a video, a posed capture or a scene, found nothing")
+        if is_scene(self.capture):
+            count = read_gaussians(self.capture).count
+            yield Finding("scene", "good", f"a trained scene of {count:,} Gaussians: no photos to look at")
+            return
+        if self.capture.is_file() and not has_poses(self.capture):
+            yield from self._of_video(console)
+            return
+        posed = read_capture(self.capture) if has_poses(self.capture) else None
+        files = list(posed.image_paths) if posed is not None else list_images(self.capture)
+        if not files:
+            raise ValueError(f"{self.capture}: expected photos in this folder, found none")
+        readable, broken = _readable(files)
+        if broken:
+            names = tuple(path.name for path in broken)
+            text = f"{len(broken)} of {len(files)} photos cannot be read: {named(names)}"
+            yield Finding("files", "doubtful" if readable else "unusable", text, "replace or remove them", names)
+        yield find_in_count(len(readable))
+        if len(readable) < 2:
+            return
+        names = [path.name for path in readable]
+        yield find_in_sizes([stored_size(path) for path in readable], names)
+        if (copies := _identical(readable)) is not None:
+            yield copies
+        with console.bar("check") as progress:
+            greys = (read_grey(path, SIDE_PX) for path in readable)
+            found = inspect_photos(greys, count=len(readable), progress=progress)
+        yield from find_in_photos(found, names, has_poses=posed is not None)
+        yield find_in_exposures([read_exposure(path) for path in readable])
+        yield self._lens(readable)
+        if posed is not None:
+            yield Finding("poses", "good", f"given for {len(posed)} images, with {len(posed.points)} points")
+            yield _masks(sum(path is not None for path in posed.mask_paths))
+        else:
+            yield Finding("poses", "good", "none: structure from motion finds them")
+            yield _masks(max(map(_image_count, (self.capture / "masks", self.capture.parent / "masks"))))
+        yield _time(0 if posed is not None else len(readable))
+
+    def _of_video(self, console: Console) -> Iterator[Finding]:
+        frames = _frames(self.capture)
+        with console.bar("check") as progress:
+            found = inspect_photos(frames, count=len(frames), progress=progress)
+        names = [f"frame {i + 1} of {len(frames)}" for i in range(len(frames))]
+        yield Finding("video", "good", f"{len(frames)} frames spread over it were looked at")
+        # frames that lie three times as far apart as those that `capture` takes need not overlap
+        yield from find_in_photos(found, names, has_poses=True)
+        yield _masks(0)
+        yield _time(3 * len(frames))
+
+    def _lens(self, photos: Sequence[Path]) -> Finding:
+        known = sum(_FOCAL_LENGTH in read_exif(photo) for photo in photos)
+        if known == len(photos):
+            return Finding("lens", "good", "focal length in EXIF of all photos")
+        return Finding("lens", "good", f"focal length in EXIF of {known} of {len(photos)} photos: else it is estimated")
+
+
+_VERDICTS = {
+    "good": "good to go",
+    "doubtful": "usable, but the doubtful points above may cost quality",
+    "unusable": "not usable as it is; mend what is marked unusable first",
+}
+
+
+def _readable(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """The files that can be decoded, and the others."""
+    readable: list[Path] = []
+    broken: list[Path] = []
+    for path in files:
+        try:
+            read_grey(path, SIDE_PX)
+        except ValueError:
+            broken.append(path)
+        else:
+            readable.append(path)
+    return readable, broken
+
+
+def _identical(files: Sequence[Path]) -> Finding | None:
+    """Files of the same content, wherever they stand in the order."""
+    seen: dict[str, str] = {}
+    copies: list[str] = []
+    for path in files:
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        if digest in seen:
+            copies.append(path.name)
+        seen.setdefault(digest, path.name)
+    if not copies:
+        return None
+    level = "unusable" if 2 * len(copies) > len(files) else "doubtful"
+    text = f"{len(copies)} of {len(files)} files are copies of another: {named(copies)}"
+    return Finding("copies", level, text, "remove them", tuple(copies))
+
+
+def _image_count(folder: Path) -> int:
+    return len(list_images(folder)) if folder.is_dir() else 0
+
+
+def _masks(count: int) -> Finding:
+    text = f"{count} masks" if count else "none; a place needs none, an object is then cut out by a box or clicks"
+    return Finding("masks", "good", text)
+
+
+def _time(photos_to_pose: int) -> Finding:
+    minutes = (_POSE_SECONDS * photos_to_pose + _DRAFT_SECONDS) / 60
+    poses = f", of which poses take {_minutes(_POSE_SECONDS * photos_to_pose / 60)}" if photos_to_pose else ""
+    return Finding("time", "good", f"about {_minutes(minutes)} to a draft on two idle cores{poses}")
+
+
+def _minutes(minutes: float) -> str:
+    return f"{minutes:.0f} minutes" if minutes >= 1.5 else "1 minute"
+
+
+def _frames(video: Path) -> list[Grey]:
+    """Grey frames spread evenly over a video."""
+    source = cv2.VideoCapture(str(video))
+    try:
+        total = int(source.get(cv2.CAP_PROP_FRAME_COUNT)) if source.isOpened() else 0
+        found: list[Grey] = []
+        for k in range(min(_FRAMES, max(total, 0))):
+            source.set(cv2.CAP_PROP_POS_FRAMES, k * total // min(_FRAMES, total))
+            is_read, frame = source.read()
+            if is_read:
+                grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+                scale = min(1.0, SIDE_PX / max(grey.shape))
+                found.append(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    finally:
+        source.release()
+    if len(found) < 3:
+        raise ValueError(f"{video}: expected a video that OpenCV can read, of at least 3 frames, found {len(found)}")
+    return found
+
+
+COMMAND = Check

@@ -1,0 +1,136 @@
+"""The command `try`: the whole flow on two captures of one's own, at draft quality, with nothing to decide first."""
+
+import re
+import shlex
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatgraft.commands.init import Init
+from splatgraft.commands.steps.segment import Segment
+from splatgraft.core.images import list_images
+from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.folders.capture_files import has_poses
+from splatgraft.formats import is_scene, read_capture
+from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
+from splatgraft.project.record import read_record
+from splatgraft.project.remedies import remedy
+from splatgraft.project.step import Positional, Step
+from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.desktop import open_page
+from splatgraft.runtime.settings import read_toml
+from splatgraft.workflow.flow import Flow, read_flow
+from splatgraft.workflow.run_steps import run_steps
+
+
+@dataclass(frozen=True)
+class Try:
+    """Run the whole flow on two captures at draft quality, with nothing to decide first; the same command goes on after
+    an interruption. Poses that are not plausible are used and said to be so."""
+
+    object: Positional
+    """The capture with the object: photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene
+    (.ply, .spz, .splat)."""
+    place: Positional
+    """The capture or the scene that receives it."""
+    out: Path | None = None
+    """Folder of the project; OBJECT_into_PLACE here where not given."""
+    keep_closed: bool = False
+    """Only print the report's path, where there is a desktop to open it on."""
+
+    def execute(self, console: Console) -> int:
+        """Write the project, run it, and say what was unsure and what helps."""
+        folder = self.out or Path(f"{_name(self.object)}_into_{_name(self.place)}")
+        self._write_project(folder, console)
+        project = folder / PROJECT_FILE
+        run_steps(project, console, accept_doubtful=True)
+        flow = read_flow(project)
+        for line in refinements(flow, folder):
+            console.say(line)
+        page = flow.layout.report / REPORT_FILE
+        if not self.keep_closed and open_page(page):
+            console.say(f"{page}: opened in the browser")
+        return 0
+
+    def _write_project(self, folder: Path, console: Console) -> None:
+        """A project at draft quality; one that this command wrote earlier, and that may be refined, is kept.
+
+        Raises: ValueError where the folder holds a project of other captures, or a capture does not exist.
+        """
+        project = folder / PROJECT_FILE
+        init = Init(folder, source=self.object, target=self.place)
+        if project.is_file():
+            if not _same_captures(project, init.sides()):
+                raise ValueError(f"{project}: expected a project of these captures, found others; name --out FOLDER")
+            console.say(f"{project}: goes on with what is there")
+            return
+        text = with_keys(init.text(), "reconstruct", {"quality": "draft"})
+        if not _has_masks(self.object):
+            text = with_keys(text, "segment", {"mask_source": "grabcut"})
+            console.say(f"{self.object}: no masks found; the object is cut out by GrabCut in a box that is guessed")
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_write(project) as stream:
+            stream.write(text.encode())
+        console.say(f"{project}: written, at draft quality")
+
+
+def refinements(flow: Flow, folder: Path) -> list[str]:
+    """What was unsure in a finished project, in the order of the steps, what helps most, and how to get finer results.
+
+    Args:
+        flow: The project.
+        folder: As the user names it.
+    """
+    shown = Path(shlex.quote(str(folder)))
+    lines: list[str] = []
+    helps = ""
+    for name, step in flow:
+        record = read_record(step.out)
+        if record is None or not (doubts := [*_guesses(step), *(warning.text for warning in record.warnings)]):
+            continue
+        more = f" (and {len(doubts) - 1} more)" if len(doubts) > 1 else ""
+        lines.append(f"unsure: {name}: {doubts[0]}{more}")
+        helps = helps or remedy(record.step, shown) or ""
+    # later steps build on earlier ones: the first that was unsure is the one to mend
+    if not lines:
+        lines.append("no step warned of its result: look at the pictures; a cut that is off is what people mend most")
+        helps = remedy("segment", shown) or ""
+    lines.append(f"helps most: {helps}")
+    finer = f'quality = "standard" under [reconstruct] in {shown / PROJECT_FILE}'
+    return [*lines, f"finer: {finer}, then splatgraft run {shown}"]
+
+
+def _guesses(step: Step) -> list[str]:
+    """What a step had to guess because nothing was asked."""
+    if not isinstance(step, Segment):
+        return []
+    if step.mask_source == "grabcut" and step.box is None:
+        return ["no masks and no box were given: the object is what GrabCut found in a box that was guessed."]
+    return ["the object is all that lies in a box; masks cut it finer."] if step.mask_source == "box" else []
+
+
+def _name(capture: Path) -> str:
+    """A short name for folders: `photos/vase/images` is vase."""
+    path = capture.resolve()
+    path = path.parent if path.name in ("images", "photos", "transforms.json") else path
+    return re.sub(r"[^\w.-]+", "_", path.stem if path.is_file() else path.name)
+
+
+def _same_captures(project: Path, sides: tuple[str, str]) -> bool:
+    """Whether a project has the captures that two lines of project.toml name."""
+    content = read_toml(project)
+    wanted = zip(("source", "target"), map(tomllib.loads, sides), strict=True)
+    return all(content.get(side, {}).items() >= line.items() for side, line in wanted)
+
+
+def _has_masks(capture: Path) -> bool:
+    """Whether masks come with the photographs."""
+    if is_scene(capture) or (capture.is_file() and not has_poses(capture)):
+        return False
+    if has_poses(capture):
+        return any(path is not None for path in read_capture(capture).mask_paths)
+    return any((base / "masks").is_dir() and list_images(base / "masks") for base in (capture, capture.parent))
+
+
+COMMAND = Try

@@ -1,0 +1,60 @@
+"""Capture, --poses: photos in one place, poses of another program in another."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatgraft.cli import main
+from splatgraft.formats import read_capture
+
+
+def write_photos(folder: Path, count: int) -> None:
+    folder.mkdir(parents=True)
+    for i in range(count):
+        pixels = np.random.default_rng(i).integers(0, 256, (16, 24, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / f"{i}.jpg")
+
+
+def write_poses(folder: Path, names: list[str]) -> Path:
+    folder.mkdir()
+    frames = []
+    for i, name in enumerate(names):
+        pose = np.eye(4)
+        pose[0, 3] = i
+        frames.append({"file_path": f"somewhere/{name}", "transform_matrix": pose.tolist()})
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({"w": 24, "h": 16, "fl_x": 20.0, "frames": frames}))
+    return path
+
+
+def test_poses_and_masks_come_together_and_what_has_no_partner_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_photos(tmp_path / "mine" / "images", 4)
+    Image.new("L", (24, 16), 255).save(tmp_path / "mine" / "images" / "1_mask.png")
+    poses = write_poses(tmp_path / "theirs", ["0.png", "1.png", "3.png", "9.png"])
+    for given in (poses, poses.parent):
+        out = tmp_path / f"capture-{given.stem}"
+        assert main(["capture", str(tmp_path / "mine"), "--poses", str(given), "--out", str(out)]) == 0
+        found = read_capture(out)
+        assert [path.name for path in found.image_paths] == ["0.jpg", "1.jpg", "3.jpg"]
+        assert found.cameras.world_from_camera[:, 0, 3].tolist() == [0, 1, 2]
+        assert [path and path.name for path in found.mask_paths] == [None, "1_mask.png", None]
+        said = capsys.readouterr().err
+        for expected in (
+            "poses of 3 of 4 photos",
+            "without a pose, left out: 2.jpg",
+            "9.png",
+            "1 of 4 photos have masks",
+        ):
+            assert expected in said
+
+
+def test_poses_beside_a_video_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    poses = write_poses(tmp_path / "theirs", ["0.png"])
+    (tmp_path / "video.mp4").touch()
+    assert main(["capture", str(tmp_path / "video.mp4"), "--poses", str(poses), "--out", str(tmp_path / "out")]) == 2
+    assert "expected a folder of photos beside --poses" in capsys.readouterr().err

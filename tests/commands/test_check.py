@@ -1,0 +1,167 @@
+"""`splatgraft check` on generated photos: each fault is named with its photos, and good photos have none."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_project import ball, photograph, plane
+
+from splatgraft.capture.photo_inspection import blur_of
+from splatgraft.cli import main
+from splatgraft.core.exposure import Exposure
+from splatgraft.formats.captures.exif import exif_of
+
+COUNT = 24
+SIZE = (320, 240)
+
+
+def texture(seed: int) -> np.ndarray:
+    """Blotches of several sizes, which SIFT finds again."""
+    generator = np.random.default_rng(seed)
+    layers = [cv2.resize(generator.random((h, 2 * h), np.float32), (1600, 400), interpolation=2) for h in (25, 60, 200)]
+    mixed = sum(layers)
+    return (255 * (mixed - mixed.min()) / (mixed.max() - mixed.min())).astype(np.uint8)
+
+
+def walk(seed: int = 0, count: int = COUNT) -> list[np.ndarray]:
+    """Photos from a sideways walk along a wall with boards before it, which move twice as much in the picture."""
+    wall, boards = texture(seed), texture(seed + 100)
+    width, height = SIZE
+    photos: list[np.ndarray] = []
+    for i in range(count):
+        photo = wall[40 : 40 + height, 20 * i : 20 * i + width].copy()
+        near = boards[40 : 40 + height, 40 * i : 40 * i + width]
+        for left in range(100 - 40 * i % 200, width, 200):
+            photo[30:200, max(left, 0) : left + 80] = near[30:200, max(left, 0) : left + 80]
+        photos.append(photo)
+    return photos
+
+
+def save(folder: Path, photos: list[np.ndarray], *, exposure: Callable[[int], Exposure] | None = None) -> Path:
+    folder.mkdir(parents=True)
+    for i, photo in enumerate(photos):
+        exif = Image.Exif() if exposure is None else exif_of(exposure(i))
+        Image.fromarray(photo).convert("RGB").save(folder / f"{i:03d}.jpg", quality=95, exif=exif)
+    return folder
+
+
+def check(capture: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, dict], str]:
+    """Exit status, findings by subject and verdict."""
+    capsys.readouterr()
+    status = main(["check", str(capture), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    return status, {finding["subject"]: finding for finding in found["findings"]}, found["verdict"]
+
+
+def doubts(findings: dict[str, dict]) -> set[str]:
+    return {subject for subject, finding in findings.items() if finding["level"] != "good"}
+
+
+def test_good_photos_have_no_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, findings, verdict = check(save(tmp_path / "photos", walk()), capsys)
+    assert (status, verdict, doubts(findings)) == (0, "good", set())
+    assert "structure from motion" in findings["poses"]["text"]
+
+
+def test_people_get_one_line_per_subject_and_a_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = save(tmp_path / "photos", walk(count=10))
+    assert main(["check", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[:2] == ["doubtful", "count"]
+    assert lines[-1].startswith("verdict: usable")
+
+
+def test_faulty_photos_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photos = walk()
+    photos[4] = cv2.blur(photos[4], (15, 1))
+    photos[9] = texture(77)[:240, :320]
+    photos[15] = (255 * (photos[15] / 255 * 0.6)).astype(np.uint8)  # 0.6 of the values is 1.6 stops less light
+    photos[20] = photos[20][:200]
+    folder = save(tmp_path / "photos", photos)
+    (folder / "021.jpg").write_bytes((folder / "021.jpg").read_bytes()[:2000])
+    (folder / "022.jpg").write_bytes(b"")
+    shutil.copy(folder / "001.jpg", folder / "050.jpg")
+    status, findings, verdict = check(folder, capsys)
+    assert (status, verdict) == (0, "doubtful")
+    wanted = {
+        "sharpness": ["004.jpg"],
+        "overlap": ["009.jpg"],
+        "exposure": ["015.jpg"],
+        "sizes": ["020.jpg"],
+        "files": ["021.jpg", "022.jpg"],
+        "copies": ["050.jpg"],
+    }
+    assert {subject: findings[subject]["photos"] for subject in wanted} == wanted
+    assert doubts(findings) <= {*wanted, "movement"}
+    assert all(finding["remedy"] for subject, finding in findings.items() if subject in wanted)
+
+
+def test_one_photo_many_times_is_not_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, findings, verdict = check(save(tmp_path / "photos", [walk()[0]] * COUNT), capsys)
+    assert (status, verdict) == (1, "unusable")
+    assert findings["copies"]["level"] == findings["movement"]["level"] == "unusable"
+
+
+def test_pictures_of_nothing_in_common_are_not_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    screenshots = [texture(seed)[:240, :320] for seed in range(COUNT)]
+    status, findings, _ = check(save(tmp_path / "photos", screenshots), capsys)
+    assert status == 1
+    assert findings["overlap"]["level"] == "unusable"
+
+
+def test_photos_of_two_places_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    places = [*walk(count=14), *walk(seed=1, count=10)]
+    status, findings, _ = check(save(tmp_path / "photos", places), capsys)
+    assert status == 0
+    assert findings["overlap"]["photos"] == [f"{i:03d}.jpg" for i in range(14, 24)]
+
+
+def test_exposure_settings_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = [Exposure(1 / 60, 8.0, 100.0), Exposure(1 / 15, 8.0, 100.0)]
+    folder = save(tmp_path / "photos", walk(), exposure=lambda i: settings[i % 2])
+    _, findings, verdict = check(folder, capsys)
+    assert verdict == "doubtful"
+    assert "2.0 stops apart" in findings["settings"]["text"]
+
+
+def test_given_poses_and_masks_are_seen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photograph(tmp_path / "posed", plane((0.3, 0.5, 0.3)), ball())
+    _, findings, _ = check(tmp_path / "posed", capsys)
+    assert "given for 8 images" in findings["poses"]["text"]
+    assert findings["masks"]["text"] == "8 masks"
+    assert findings["overlap"]["level"] == "good"
+
+
+def test_a_video_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, SIZE)
+    for photo in walk():
+        writer.write(cv2.cvtColor(photo, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    status, findings, _ = check(path, capsys)
+    assert status == 0
+    assert findings["video"]["text"].startswith(f"{COUNT} frames")
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no video"])
+def test_what_is_no_capture_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes | None
+) -> None:
+    path = tmp_path / "clip.mp4"
+    if content is not None:
+        path.write_bytes(content)
+    (tmp_path / "empty").mkdir()
+    for given in (path, tmp_path / "empty"):
+        capsys.readouterr()
+        assert main(["check", str(given)]) == 2
+        assert f"{given}: expected" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_more_blur_is_a_larger_figure() -> None:
+    photo = walk(count=1)[0]
+    assert 0 <= blur_of(photo) < blur_of(cv2.blur(photo, (5, 5))) < blur_of(cv2.blur(photo, (11, 11))) <= 1

@@ -1,0 +1,76 @@
+"""Where there is no room on the disk, a run ends with one line, and what was there before is still whole."""
+
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_flow import contents
+from tiny_project import write_project
+
+from splatgraft.cli import main
+from splatgraft.workflow.flow import read_flow
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = write_project(tmp_path_factory.mktemp("full"))
+    assert main(["run", str(path)]) == 0
+    return path
+
+
+def run(project: Path, *words: str, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
+    """`splatgraft run` with a limit on the size of each file."""
+
+    def limited() -> None:
+        if most_bytes is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+
+    source = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2] / "src")}
+    command = [sys.executable, "-m", "splatgraft", "run", str(project), *words]
+    return subprocess.run(command, preexec_fn=limited, env=source, capture_output=True, text=True, check=False)
+
+
+def test_files_beyond_the_limit_are_one_line_and_earlier_results_stay(finished: Path) -> None:
+    wanted = {step.out: contents(step.out) for _, step in read_flow(finished)}
+    # the largest files of these steps are some hundred kB (scenes), some kB (pictures) and some kB (turntable)
+    for step, most in (("source/reconstruct", 20_000), ("render", 1_000), ("evaluate", 3_000)):
+        done = run(finished, "--to", step, "--force", step, most_bytes=most)
+        assert done.returncode == 2
+        assert "Traceback" not in done.stderr
+        last = done.stderr.splitlines()[-1]
+        assert re.match(r"splatgraft: .*: expected room to write the result, found a limit on the size of files", last)
+        assert str(read_flow(finished).steps[step].out) in last
+        assert {folder: contents(folder) for folder in wanted} == wanted
+        assert not list(finished.parent.rglob(".*.new"))
+    assert run(finished).returncode == 0
+    assert {folder: contents(folder) for folder in wanted} == wanted
+
+
+def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(finished: Path, tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(disk)]
+    if os.geteuid() != 0 or subprocess.run(words, capture_output=True, check=False).returncode != 0:
+        pytest.skip("needs the right to mount a small disk")
+    try:
+        shutil.copytree(finished.parents[1] / "photos", tmp_path / "photos")
+        project = disk / "project.toml"
+        project.write_text(finished.read_text().replace("../photos", str(tmp_path / "photos")))
+        done = run(project)
+        assert done.returncode == 2
+        assert "Traceback" not in done.stderr
+        assert "expected room to write the result, found the disk full" in done.stderr.splitlines()[-1]
+        made = {step.out: contents(step.out) for _, step in read_flow(project) if (step.out / "step.json").is_file()}
+        assert made
+        assert run(project).returncode == 2
+        assert {folder: contents(folder) for folder in made} == made
+        subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
+        assert run(project).returncode == 0
+        assert {folder: contents(folder) for folder in made} == made
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)

@@ -1,0 +1,74 @@
+"""`splatgraft try` on generated captures: no question, a report at the end, and what to do next."""
+
+import os
+import tomllib
+from pathlib import Path
+
+import pytest
+from tiny_project import ball, photograph, plane
+
+from splatgraft.cli import main
+from splatgraft.project.record import read_record
+from splatgraft.workflow.flow import read_flow
+
+
+@pytest.fixture
+def captures(tmp_path: Path) -> tuple[str, str]:
+    photograph(tmp_path / "ball" / "images_", plane((0.3, 0.5, 0.3)), ball())
+    photograph(tmp_path / "room", plane((0.5, 0.45, 0.6)), None)
+    return str(tmp_path / "ball" / "images_"), str(tmp_path / "room")
+
+
+def test_a_first_transfer_needs_nothing_but_two_captures(
+    captures: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    # a desktop that opens pages: a program that writes down what it is given
+    opener = tmp_path / "bin" / "xdg-open"
+    opener.parent.mkdir()
+    opener.write_text('#!/bin/sh\necho "$1" > opened.txt\n')
+    opener.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{opener.parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert main(["try", *captures]) == 0
+    printed = capsys.readouterr()
+    page = Path("images__into_room") / "report" / "index.html"
+    assert printed.out.splitlines()[-1] == str(page)
+    assert page.is_file()
+    project = tomllib.loads((page.parents[1] / "project.toml").read_text())
+    assert project["reconstruct"] == {"quality": "draft"}
+    assert "segment" not in project  # there are masks
+    said = printed.err.splitlines()
+    unsure = [line.split(": ")[1] for line in said if line.startswith("unsure: ")]
+    flow = read_flow(page.parents[1])
+    warned = [name for name, step in flow if (record := read_record(step.out)) and record.warnings]
+    assert unsure == warned != []
+    assert len([line for line in said if line.startswith("helps most: ") and "splatgraft " in line]) == 1
+    assert "splatgraft run images__into_room" in next(line for line in said if line.startswith("finer: "))
+    assert f"{page}: opened in the browser" in said
+    # a second time there is nothing to do, and a refined project is kept
+    toml = page.parents[1] / "project.toml"
+    toml.write_text(toml.read_text() + "# mine\n")
+    assert main(["try", *captures, "--keep-closed"]) == 0
+    again = capsys.readouterr().err
+    assert "begins" not in again
+    assert "opened" not in again
+    assert toml.read_text().endswith("# mine\n")
+
+
+def test_a_project_of_other_captures_is_not_replaced(
+    captures: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, target = captures
+    folder = str(tmp_path / "project")
+    assert main(["init", folder, "--source", source, "--target", target]) == 0
+    text = (tmp_path / "project" / "project.toml").read_text()
+    assert main(["try", target, source, "--out", folder]) == 2
+    assert "project.toml: expected a project of these captures" in capsys.readouterr().err
+    assert (tmp_path / "project" / "project.toml").read_text() == text
+
+
+def test_what_does_not_exist_leaves_nothing_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["try", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "out")]) == 2
+    assert f"{tmp_path / 'a'}: expected photos, a video" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

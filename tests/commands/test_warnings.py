@@ -1,0 +1,97 @@
+"""Every warning of a run stands in step.json of its step and, with its picture, at the top of the report."""
+
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from test_exposure_messages import exposed, fixed
+from tiny_project import write_project
+
+from splatgraft.cli import main
+from splatgraft.project.record import StepWarning, read_record
+from splatgraft.project.step import Context, Inputs, perform
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.flow import read_flow
+
+
+@dataclass(frozen=True)
+class Doubtful:
+    """A step that warns of its own picture and of a photo elsewhere."""
+
+    photo: Path
+    out: Path
+
+    def inputs(self) -> Inputs:
+        return {}
+
+    def write(self, folder: Path, context: Context) -> None:
+        Image.new("RGB", (4, 3)).save(folder / "doubt.png")
+        context.console.warn("This may be wrong.", picture=folder / "doubt.png")
+        context.console.warn("So may this.", picture=self.photo)
+        context.console.warn("Or all of it.")
+
+
+def test_a_warning_is_recorded_with_its_picture_relative_to_the_result(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    console = Console()
+    console.warn("Before any step.")
+    perform(Doubtful(tmp_path / "photos" / "a.jpg", tmp_path / "out"), console)
+    record = read_record(tmp_path / "out")
+    assert record is not None
+    assert record.warnings == (
+        StepWarning("This may be wrong.", "doubt.png"),
+        StepWarning("So may this.", "../photos/a.jpg"),
+        StepWarning("Or all of it."),
+    )
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    assert len(said) == 4
+    assert all("docs/troubleshooting.md#" in line for line in said[1:])
+
+
+@pytest.fixture(scope="module")
+def warned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project whose relighting is a guess, as almost nothing around the object was captured."""
+    path = write_project(tmp_path_factory.mktemp("warned"))
+    assert main(["run", str(path)]) == 0
+    return path
+
+
+def test_the_report_begins_with_all_warnings_of_the_run(warned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    layout = read_flow(warned).layout
+    relit = read_record(layout.relit)
+    assert relit is not None
+    assert [warning for warning in relit.warnings if "It is pasted as it is." in warning.text]
+    page = (layout.report / "index.html").read_text()
+    top = page.split('<section class="warnings">')[1].split("</section>")[0]
+    assert page.index('<section class="warnings">') < page.index('<section id="viewer"')
+    records = [read_record(step.out) for _, step in read_flow(warned)]
+    warnings = [warning for record in records if record is not None for warning in record.warnings]
+    assert all(escape(warning.text) in top for warning in warnings)
+    assert top.count("<li>") == len(warnings)
+    assert "step Light" in top
+    assert "docs/troubleshooting.md#relight-and-lightjson" in top
+    with Image.open(layout.report / "warnings" / f"{len(warnings) - 1:02d}.webp") as picture:
+        assert picture.size == (48, 36)
+    assert main(["status", str(warned)]) == 0
+    assert "stale" not in capsys.readouterr().out
+
+
+def test_a_report_that_lacks_a_warning_is_stale(warned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    step_file = read_flow(warned).layout.relit / "step.json"
+    step_file.write_text(step_file.read_text().replace("It is pasted", "It was pasted"))
+    assert main(["status", str(warned)]) == 0
+    stale = [line for line in capsys.readouterr().out.splitlines() if "stale" in line]
+    assert [line.split()[0] for line in stale] == ["evaluate"]
+
+
+def test_exposures_are_warned_of_once_in_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_project(tmp_path)
+    for side in ("source", "target"):
+        exposed(tmp_path / "photos" / side, [fixed(1 / 60), fixed(1 / 15)])
+    assert main(["run", str(path), "--to", "reconstruct"]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "expected one exposure" in line]
+    assert len(said) == 2
+    assert len(set(said)) == 2
