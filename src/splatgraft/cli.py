@@ -14,6 +14,7 @@ _TABLE = (
     ("edit", "edit", "place the object and see the light, in the browser"),
     ("run", "run", "do what is stale in a project, resuming what was killed"),
     ("status", "status", "say what is done, what is stale and why"),
+    ("scale", "scale", "say how large a capture is, by a known length or a marker"),
     ("capture", "steps.capture", "pose photos or a video, take over poses, or look at a scene from all around"),
     ("adopt", "steps.adopt", "take over a scene that was trained elsewhere"),
     ("reconstruct", "steps.reconstruct", "train a 3DGS scene on posed images"),

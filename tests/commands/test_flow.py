@@ -203,11 +203,25 @@ def test_views_of_a_ground_truth_that_no_step_saw_are_measured_apart(project: Pa
     assert [row["held_out"] for row in metrics["per_view"]] == [True] + [False] * 7
 
 
-def test_no_masks_and_no_box_names_the_choices(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_masks_are_cut_from_the_images_and_the_choice_is_said(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     shutil.rmtree(project.parents[1] / "photos" / "source" / "masks")
+    assert main(["run", str(project), "--to", "segment"]) == 0
+    said = capsys.readouterr().err
+    assert "no masks for all images; they are cut by grabcut" in said
+    assert "the masks agree with the object by" in said
+    folder = read_flow(project).layout.object
+    assert len(list((folder / "masks").iterdir())) == 8
+    agreement = json.loads((folder / "agreement.json").read_text())
+    assert len(agreement["views"]) == 8
+    assert read_rgb(folder / "views.png").shape[2] == 3
+    # up to date with the same source, named or not
+    assert "segment" not in stale(project, capsys)
+    project.write_text(project.read_text().replace("[segment]", '[segment]\nmask_source = "files"'))
     assert main(["run", str(project), "--to", "segment"]) == 2
     line = capsys.readouterr().err.splitlines()[-1]
-    for choice in ("--masks", "--mask-source grabcut", "--box", "--mask-source birefnet"):
+    for choice in ("--masks", "--mask-source grabcut", "--prompts", "--box", "birefnet"):
         assert choice in line
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from splatgraft.segmentation import birefnet, load_birefnet
+from splatgraft.segmentation import load_birefnet, onnx_networks
 
 
 @pytest.fixture
@@ -60,6 +60,6 @@ def test_bad_weights_are_named(tiny, tmp_path):
 
 
 def test_missing_package_names_the_extra(tmp_path, monkeypatch):
-    monkeypatch.setattr(birefnet, "find_spec", lambda name: None)
+    monkeypatch.setattr(onnx_networks, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"splatgraft\[birefnet\]"):
         load_birefnet(tmp_path / "any.onnx")

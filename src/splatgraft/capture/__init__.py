@@ -1,5 +1,6 @@
 """Capture: posed images from photos, from a video, or from a trained scene that comes without images."""
 
+from splatgraft.capture.metric_scale import FoundScale, scale_from_length, scale_from_marker, triangulate
 from splatgraft.capture.odd_photos import drawn_pictures
 from splatgraft.capture.orientation import upright
 from splatgraft.capture.photos import write_reduced
@@ -22,6 +23,7 @@ __all__ = [
     "CoverageRule",
     "Doubt",
     "Found",
+    "FoundScale",
     "Lens",
     "Plausible",
     "PoseOptions",
@@ -40,6 +42,9 @@ __all__ = [
     "readable_views",
     "render_pictures",
     "require_coverage",
+    "scale_from_length",
+    "scale_from_marker",
+    "triangulate",
     "upright",
     "usable_photos",
     "usable_views",

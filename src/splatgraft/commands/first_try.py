@@ -8,10 +8,7 @@ from pathlib import Path
 
 from splatgraft.commands.init import Init
 from splatgraft.commands.steps.segment import Segment
-from splatgraft.core.images import list_images
 from splatgraft.editor.session.toml_edit import with_keys
-from splatgraft.folders.capture_files import has_poses
-from splatgraft.formats import is_scene, read_capture
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
 from splatgraft.project.record import read_record
 from splatgraft.project.remedies import remedy
@@ -66,9 +63,6 @@ class Try:
             console.say(f"{project}: goes on with what is there")
             return
         text = with_keys(init.text(), "reconstruct", {"quality": "draft"})
-        if not _has_masks(self.object):
-            text = with_keys(text, "segment", {"mask_source": "grabcut"})
-            console.say(f"{self.object}: no masks found; the object is cut out by GrabCut in a box that is guessed")
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(project) as stream:
             stream.write(text.encode())
@@ -105,8 +99,8 @@ def _guesses(step: Step) -> list[str]:
     """What a step had to guess because nothing was asked."""
     if not isinstance(step, Segment):
         return []
-    if step.mask_source == "grabcut" and step.box is None:
-        return ["no masks and no box were given: the object is what GrabCut found in a box that was guessed."]
+    if (step.out / "masks").is_dir() and step.box is None and step.prompts is None:
+        return ["no masks and no clicks were given: the object is what stands where the cameras look."]
     return ["the object is all that lies in a box; masks cut it finer."] if step.mask_source == "box" else []
 
 
@@ -122,15 +116,6 @@ def _same_captures(project: Path, sides: tuple[str, str]) -> bool:
     content = read_toml(project)
     wanted = zip(("source", "target"), map(tomllib.loads, sides), strict=True)
     return all(content.get(side, {}).items() >= line.items() for side, line in wanted)
-
-
-def _has_masks(capture: Path) -> bool:
-    """Whether masks come with the photographs."""
-    if is_scene(capture) or (capture.is_file() and not has_poses(capture)):
-        return False
-    if has_poses(capture):
-        return any(path is not None for path in read_capture(capture).mask_paths)
-    return any((base / "masks").is_dir() and list_images(base / "masks") for base in (capture, capture.parent))
 
 
 COMMAND = Try

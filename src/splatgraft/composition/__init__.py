@@ -2,7 +2,7 @@
 
 from splatgraft.composition.assemble import compose
 from splatgraft.composition.object_base import ObjectBase, object_base
-from splatgraft.composition.place_suggestion import Suggestion, suggest_place
+from splatgraft.composition.place_suggestion import Suggestion, suggest_places
 from splatgraft.composition.placement import Placed, PlaceOptions, place_object
 from splatgraft.composition.point_visibility import hidden_fraction
 from splatgraft.composition.resting_pose import RestOptions, rest_on_surface
@@ -25,6 +25,6 @@ __all__ = [
     "object_base",
     "place_object",
     "rest_on_surface",
-    "suggest_place",
+    "suggest_places",
     "support_below",
 ]

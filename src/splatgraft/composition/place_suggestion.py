@@ -10,7 +10,7 @@ from splatgraft.composition.height_map import HeightMap, height_map
 from splatgraft.composition.object_base import ObjectBase
 from splatgraft.composition.point_visibility import project, small_cameras, visible_points
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import focus_point
+from splatgraft.core.capture_orientation import estimate_up, focus_point
 from splatgraft.core.gaussians import Gaussians
 
 
@@ -37,7 +37,9 @@ class SuggestionOptions:
     rounds: int = 8
     """Scales tried."""
     least_score: float = 0.01
-    """Below it there is no place."""
+    """Below it no place is level and in view."""
+    places: int = 6
+    """Most places that are given."""
     flat_slope: float = 0.08
     """Height difference that counts as level over the object's radius: noise and a slope of a few degrees."""
     image_margin: float = 0.05
@@ -56,9 +58,11 @@ class Suggestion:
     """Share of the ground under the object that is level, in [0, 1]."""
     visible_fraction: float
     """Share of the views that show the object's base point, in [0, 1]."""
+    reasons: tuple[str, ...] = ()
+    """Why it is not as good as wanted, one sentence each; none where it is."""
 
 
-def suggest_place(
+def suggest_places(
     target: Gaussians,
     base: ObjectBase,
     *,
@@ -66,11 +70,12 @@ def suggest_place(
     up: Float[Tensor, "3"],
     scale: float | None = None,
     options: SuggestionOptions = SuggestionOptions(),
-) -> Suggestion:
-    """A level, visible place near the point that the cameras look at, and a scale.
+) -> list[Suggestion]:
+    """Places near the point that the cameras look at, each with a scale: level ones in view of the cameras first.
 
     Captures have no common unit of length, so a scale that is not given is a guess from the size in the images; it is
-    reduced where no level place is large enough.
+    reduced where no level place is large enough. Where no place is level and in view, the nearest to it is given with
+    the reason.
 
     Args:
         target: The receiving scene.
@@ -80,36 +85,62 @@ def suggest_place(
         scale: Size in the target over size in the source; None guesses it.
         options: Search range and score.
 
+    Returns:
+        At least one, the best first, apart from each other by the object's radius.
+
     Raises:
-        ValueError: Where the cameras do not look at one place, or no level surface is in view.
+        ValueError: Where the scene has no surface near that point.
     """
-    focus = focus_point(cameras)
+    focus, reach, reasons = _search_area(target, cameras, options)
     up = torch.nn.functional.normalize(up.to(focus), dim=0)
-    away = cameras.centers - focus
-    across = (away - (away @ up)[:, None] * up).norm(dim=-1)
-    reach = options.reach * float(across.median())
     # surfaces lie below most cameras; ceilings and lamps do not
-    top = float((away @ up).median())
-    top = max(top, options.least_top * reach)
+    top = max(float(((cameras.centers - focus) @ up).median()), options.least_top * reach)
     ground = height_map(target, focus, up=up, radius=reach, top=top, size=options.map_size)
+    if not bool((ground.alpha > 0.5).any()):
+        raise ValueError(
+            "placement: expected a surface where the cameras look, found none; name a point (--at or --on)"
+        )
     visible = _visible_share(target, ground, cameras=cameras, options=options)
-    size = scale if scale is not None else scale_in_view(base, focus, cameras=cameras, options=options)
+    central = torch.exp(-0.5 * ((ground.points - focus).norm(dim=-1) / (options.center_spread * reach)) ** 2)
+    wanted = size = scale if scale is not None else scale_in_view(base, focus, cameras=cameras, options=options)
     for _ in range(options.rounds):
         flat = _flatness(ground, radius=max(size * base.radius, 2 * ground.pixel), slope=options.flat_slope)
-        distance = (ground.points - focus).norm(dim=-1)
-        score = flat**2 * visible * torch.exp(-0.5 * (distance / (options.center_spread * reach)) ** 2)
-        best = int(score.argmax())
-        if float(flat.flatten()[best]) > options.flat_enough or scale is not None:
+        score = flat**2 * visible * central
+        if float(flat.flatten()[int(score.argmax())]) > options.flat_enough or scale is not None:
             break
         size *= options.shrink
-    if not float(score.flatten()[best]) > options.least_score:
-        raise ValueError("placement: expected a level surface in view of the cameras, found none; name a point")
-    return Suggestion(
-        point=ground.points.reshape(-1, 3)[best],
-        scale=size,
-        flat_fraction=float(flat.flatten()[best]),
-        visible_fraction=float(visible.flatten()[best]),
-    )
+    if size < wanted:
+        reasons.append(f"The object was made smaller by {size / wanted:.2f}, as no larger level place is in view.")
+    if not float(score.max()) > options.least_score:
+        # nothing is level and in view: flatness and view each count a little by themselves
+        score = (0.05 + flat**2) * (0.05 + visible) * central * (ground.alpha > 0.5)
+        reasons.append("No level place is in view of the cameras: this one is the nearest to it.")
+    apart = max(size * base.radius, 2 * ground.pixel)
+    found: list[Suggestion] = []
+    score, points = score.flatten().clone(), ground.points.reshape(-1, 3)
+    while len(found) < options.places and float(score.max()) > 0:
+        best = int(score.argmax())
+        shares = float(flat.flatten()[best]), float(visible.flatten()[best])
+        found.append(Suggestion(points[best], size, *shares, tuple(reasons)))
+        score[(points - points[best]).norm(dim=-1) < apart] = 0
+    return found
+
+
+def _search_area(
+    target: Gaussians, cameras: Cameras, options: SuggestionOptions
+) -> tuple[Float[Tensor, "3"], float, list[str]]:
+    """Middle and half width of the searched square, and a reason where the cameras do not look at one place."""
+    up = estimate_up(cameras)
+    try:
+        focus = focus_point(cameras)
+    except ValueError:
+        focus = cameras.centers.median(0).values
+        away = (target.means[target.opacities > 0.5] - focus).norm(dim=1)
+        reach = options.reach * float(away.median()) if len(away) else 1.0
+        return focus, reach, ["The cameras do not look at one place: the object stands between them."]
+    away = cameras.centers - focus
+    across = (away - (away @ up)[:, None] * up).norm(dim=-1)
+    return focus, max(options.reach * float(across.median()), 1e-6), []
 
 
 def scale_in_view(

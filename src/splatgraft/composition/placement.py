@@ -3,13 +3,15 @@
 from dataclasses import dataclass, field, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.composition.facing_direction import facing_yaw_deg
 from splatgraft.composition.object_base import ObjectBase, object_base
-from splatgraft.composition.place_suggestion import scale_in_view, suggest_place
+from splatgraft.composition.place_suggestion import Suggestion, scale_in_view, suggest_places
 from splatgraft.composition.point_visibility import hidden_fraction
 from splatgraft.composition.resting_pose import RestOptions, rest_on_surface
-from splatgraft.composition.support_surface import Support
+from splatgraft.composition.support_surface import Support, support_below
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
@@ -68,18 +70,13 @@ def place_object(
         The placement, the surface that it rests on, and warnings.
 
     Raises:
-        ValueError: The object is empty, or there is no level surface.
+        ValueError: The object is empty, or there is no surface at all.
     """
     target_cameras, source_cameras = cameras
     up = estimate_up(target_cameras)
     base = object_base(object_, up=estimate_up(source_cameras), surroundings=surroundings)
-    if options.point is None:
-        found = suggest_place(target, base, cameras=target_cameras, up=up, scale=options.scale)
-        point, scale = found.point, found.scale
-    else:
-        point = torch.tensor(options.point)
-        scale = options.scale if options.scale is not None else scale_in_view(base, point, cameras=target_cameras)
-    rest = RestOptions(scale=scale, yaw_deg=options.yaw_deg or 0.0, offset=options.offset)
+    found = _best_place(target, base, target_cameras, up, options)
+    point, rest = found.point, RestOptions(scale=found.scale, yaw_deg=options.yaw_deg or 0.0, offset=options.offset)
     move, support = rest_on_surface(target, base, point=point, up=up, options=rest)
     if options.yaw_deg is None:
         to_source_cameras = (source_cameras.centers - base.point) @ move.rotation.T
@@ -91,8 +88,30 @@ def place_object(
         base=base,
         support=support,
         hidden_fraction=hidden,
-        warnings=_warnings(support, hidden),
+        warnings=found.reasons + _warnings(support, hidden),
     )
+
+
+def _best_place(
+    target: Gaussians, base: ObjectBase, cameras: Cameras, up: Float[Tensor, "3"], options: PlaceOptions
+) -> Suggestion:
+    """The named point, or of the suggested places the one with most level and free ground that most views show."""
+    if options.point is not None:
+        point = torch.tensor(options.point)
+        scale = options.scale if options.scale is not None else scale_in_view(base, point, cameras=cameras)
+        return Suggestion(point, scale, flat_fraction=1.0, visible_fraction=1.0)
+    places = suggest_places(target, base, cameras=cameras, up=up, scale=options.scale)
+    best, most = places[0], -1.0
+    for place in places:
+        try:
+            support = support_below(target, place.point, up=up, radius=place.scale * base.radius)
+        except ValueError:
+            continue
+        worth = support.flat_fraction * (1 - support.obstructed_fraction) * (0.1 + place.visible_fraction)
+        # an earlier place is nearer to where the cameras look: a later one has to be better by more than noise
+        if worth > 1.1 * most:
+            best, most = place, worth
+    return best
 
 
 def _warnings(support: Support, hidden: float) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ def rest_on_surface(
         options: Scale, yaw and offset.
 
     Raises:
-        ValueError: Where no level surface lies below `point`.
+        ValueError: Where no surface lies below `point`.
     """
     support = support_below(target, point, up=up, radius=options.scale * base.radius)
     yaw = rotation_about(support.normal, math.radians(options.yaw_deg))

@@ -20,10 +20,10 @@ class SupportOptions:
     """Height above the point from which the surface is searched downwards, where it is not given."""
     map_size: int = 64
     """Width and height of the height map, pixels."""
-    least_covered: float = 0.15
-    """Least share of the disc with something solid in it."""
-    least_flat: float = 0.15
-    """Least share of the disc that lies on the surface."""
+    least_pixels: int = 8
+    """Solid pixels of the height map below which there is no surface."""
+    widened: tuple[float, ...] = (1.0, 2.0, 4.0)
+    """Radii of the discs, over the given one, until one has a surface: the place may be a hole in the scene."""
     level_step: float = 0.05
     """Width of a bin of the histogram of heights."""
     tolerances: tuple[float, ...] = (0.3, 0.2, 0.12, 0.08, 0.06, 0.06)
@@ -61,7 +61,9 @@ def support_below(
     clearance: float | None = None,
     options: SupportOptions = SupportOptions(),
 ) -> Support:
-    """The level surface that fills most of a horizontal disc below `point`.
+    """The surface that fills most of a horizontal disc below `point`, level as far as one is.
+
+    It may be poor, as on a heap of things or a steep slope: `flat_fraction` says how much of the disc lies on it.
 
     Args:
         scene: What is seen from above.
@@ -73,24 +75,24 @@ def support_below(
         options: What counts as level.
 
     Raises:
-        ValueError: Where no level surface lies below.
+        ValueError: Where no surface lies below.
     """
     up = torch.nn.functional.normalize(up.to(scene.means), dim=0)
     point = point.to(scene.means)
     top = options.clearance * radius if clearance is None else clearance
-    ground = height_map(scene, point, up=up, radius=radius, top=top, size=options.map_size)
-    disc = ground.offsets.norm(dim=-1) <= radius
-    # what is half transparent is a floater or an edge
-    solid = disc & (ground.alpha > 0.5)
-    where = ", ".join(f"{x:.3g}" for x in point.tolist())
-    if int(solid.sum()) < options.least_covered * int(disc.sum()):
-        share = float(solid.sum() / disc.sum())
-        raise ValueError(f"placement: expected a surface below ({where}), found {share:.0%} of the ground covered")
+    for factor in options.widened:
+        ground = height_map(scene, point, up=up, radius=factor * radius, top=top, size=options.map_size)
+        disc = ground.offsets.norm(dim=-1) <= factor * radius
+        # what is half transparent is a floater or an edge
+        solid = disc & (ground.alpha > 0.5)
+        if int(solid.sum()) >= options.least_pixels:
+            break
+    else:
+        where = ", ".join(f"{x:.3g}" for x in point.tolist())
+        raise ValueError(f"placement: expected a surface below ({where}), found none; name another point")
     points = ground.points[solid] - point
     on_plane, normal, height = _fit_level_plane(points, ground.heights[solid], up=up, radius=radius, options=options)
     flat = float(on_plane.sum() / disc.sum())
-    if flat < options.least_flat:
-        raise ValueError(f"placement: expected a level surface below ({where}), found {flat:.0%} of the ground level")
     above = (points @ normal - height) > options.above * radius
     return Support(
         point=point + up * height / (normal @ up),

@@ -80,3 +80,23 @@ class Distortion:
         # samples beyond the outermost pixel centres lie at most half a pixel out: repeat the border
         moved = cv2.remap(pixels, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return torch.from_numpy(moved).reshape(image.shape)
+
+    def undistort_points(self, points: Float[Tensor, "k 2"], pinhole: Float[Tensor, "3 3"]) -> Float[Tensor, "k 2"]:
+        """Where a pinhole camera sees what the distorted picture shows at `points`.
+
+        Args:
+            points: x and y, pixels of a picture of `size`.
+            pinhole: Intrinsics of the pinhole camera.
+        """
+        if not len(points):
+            return points
+        found = cv2.undistortPoints(
+            points.double().cpu().numpy().reshape(-1, 1, 2),
+            self.intrinsics.numpy(),
+            self.coefficients.numpy(),
+            None,
+            None,
+            pinhole.double().cpu().numpy(),
+            (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-10),
+        )
+        return torch.from_numpy(found.reshape(-1, 2)).to(points)

@@ -1,7 +1,7 @@
-"""The sources of 2D masks for `segment`: files, GrabCut in a box, or the network BiRefNet."""
+"""The sources of 2D masks for `segment`: files, GrabCut or SAM 2 guided by the scene, or the network BiRefNet."""
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,14 +10,50 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import list_images, write_image
+from splatgraft.core.images import list_images, read_mask, resize, write_image
 from splatgraft.core.posed_images import PosedImages
+from splatgraft.core.prompts import ViewPrompt
 from splatgraft.folders.view_folder import file_stems
 from splatgraft.runtime.lazy_sequence import LazySequence
-from splatgraft.runtime.progress import Progress
-from splatgraft.segmentation import Box, default_box, grabcut_masks, load_birefnet, refine_masks
+from splatgraft.runtime.progress import Progress, silent
+from splatgraft.segmentation import (
+    Box,
+    CutViews,
+    ObjectRegion,
+    ViewCutter,
+    cut_object,
+    lift_masks,
+    load_birefnet,
+    seed_selection,
+)
 
-MaskSource = Literal["files", "grabcut", "birefnet", "box"]
+MaskSource = Literal["auto", "files", "grabcut", "sam2", "birefnet", "box"]
+
+CUT_SIDE_PX = 384
+"""Longest side at which pictures are cut: the masks of larger ones are the same within half a pixel of it, and GrabCut
+takes time with the area."""
+
+
+@dataclass(frozen=True)
+class CutRequest:
+    """What is known before the pictures are cut."""
+
+    cutter: ViewCutter
+    """The algorithm for one picture."""
+    box: Box | None = None
+    """Around the object, world units; guessed where None."""
+    prompts: Mapping[int, ViewPrompt] | None = None
+    """What the user says, by index of the picture, pixels of the capture's cameras."""
+
+
+@dataclass(frozen=True)
+class MaskedViews:
+    """Views of a capture that have an object mask, and the masks."""
+
+    views: PosedImages
+    """The pictures."""
+    masks: Sequence[Tensor]
+    """(h, w) in [0, 1], of the size of each view's camera, undistorted; read when asked for."""
 
 
 def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> PosedImages:
@@ -36,36 +72,66 @@ def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> P
     if not with_mask.any():
         raise ValueError(
             f"{folder or path}: expected masks named like the images ({capture.cameras.names[0]}), found none; "
-            "give --masks FOLDER, or --mask-source grabcut (with --box), or --mask-source birefnet, or box"
+            "give --masks FOLDER, or --mask-source grabcut (with --prompts or --box), sam2, birefnet or box"
         )
     return _with_masks(capture, paths, with_mask)
 
 
-def read_masks(capture: PosedImages) -> LazySequence[Tensor]:
-    """The masks of a capture in which every view has one, read when asked for."""
+def masked_views(capture: PosedImages) -> MaskedViews:
+    """A capture in which every view has a mask."""
 
     def read(index: int) -> Tensor:
         mask = capture.mask(index)
         assert mask is not None
         return mask
 
-    return LazySequence(len(capture), read)
+    return MaskedViews(capture, LazySequence(len(capture), read))
 
 
 def cut_masks(
-    capture: PosedImages, scene: Gaussians, *, box: Box | None, folder: Path, progress: Progress
-) -> PosedImages:
-    """The capture with masks from GrabCut in a box, refined until the views agree, and written to `folder`.
+    capture: PosedImages, scene: Gaussians, request: CutRequest, *, folder: Path, progress: Progress = silent
+) -> tuple[MaskedViews, ObjectRegion]:
+    """The capture with masks that agree in 3D, written to `folder`, and where the object was looked for.
 
-    Raises: ValueError where no view shows the box, or no box can be guessed.
+    Pictures are cut at `CUT_SIDE_PX`. Masks of some pictures that are there already tell where the object is.
+
+    Args:
+        capture: The pictures.
+        scene: Reconstructed from them.
+        request: The algorithm, and what the user says.
+        folder: For the masks; made here.
+        progress: Called per picture.
+
+    Raises:
+        ValueError: Where nothing tells where the object is, or hardly any picture shows it.
     """
-    images = LazySequence(len(capture), capture.image)
-    box = default_box(capture) if box is None else box
-    masks = grabcut_masks(images, capture.cameras, box, capture.points, progress=progress)
-    return _written(capture, refine_masks(masks, images, capture.cameras, scene, progress=progress), folder)
+    factor = min(1.0, CUT_SIDE_PX / int(capture.cameras.sizes.max()))
+    small = capture.resized(factor)
+    ratios = (small.cameras.sizes / capture.cameras.sizes).tolist()
+    prompts = {index: prompt.scaled(*ratios[index]) for index, prompt in (request.prompts or {}).items()}
+    cameras = small.cameras.to(scene.device)
+    seed = seed_selection(scene, cameras, box=request.box, prompts=prompts, known=_known(small, scene))
+    pictures = []
+    for index in range(len(small)):
+        progress(index, len(small), "reading pictures")
+        pictures.append((small.image(index) * 255).round().to(torch.uint8))
+    images = LazySequence(len(small), lambda index: pictures[index].float() / 255)
+    views = CutViews(images, cameras, prompts)
+    cut = cut_object(views, scene, seed.selection.float(), request.cutter, progress=progress)
+    sizes = capture.cameras.sizes.tolist()
+    grown = ((resize(mask, *sizes[index]) > 0.5).float() for index, mask in enumerate(cut.masks))
+    return _written(capture, grown, folder), seed.region
 
 
-def network_masks(capture: PosedImages, *, weights: Path | None, folder: Path, progress: Progress) -> PosedImages:
+def _known(capture: PosedImages, scene: Gaussians) -> Bool[Tensor, "n"] | None:
+    """The Gaussians that the masks of some pictures give to the object; None where no picture has a mask."""
+    masked = capture.with_masks()
+    if not len(masked):
+        return None
+    return lift_masks(scene, masked.cameras.to(scene.device), masked_views(masked).masks) > 0.5
+
+
+def network_masks(capture: PosedImages, *, weights: Path | None, folder: Path, progress: Progress) -> MaskedViews:
     """The capture with masks of the foreground from BiRefNet, written to `folder`.
 
     Raises: ValueError where a package or the weights are missing.
@@ -79,12 +145,13 @@ def network_masks(capture: PosedImages, *, weights: Path | None, folder: Path, p
     return _written(capture, LazySequence(len(capture), read), folder)
 
 
-def _written(capture: PosedImages, masks: Iterable[Tensor], folder: Path) -> PosedImages:
+def _written(capture: PosedImages, masks: Iterable[Tensor], folder: Path) -> MaskedViews:
     folder.mkdir()
     paths = tuple(folder / f"{stem}.png" for stem in file_stems(capture.cameras))
     for path, mask in zip(paths, masks, strict=True):
         write_image(path, mask)
-    return _with_masks(capture, paths, torch.ones(len(capture), dtype=torch.bool))
+    # they are as the undistorted cameras see them: the capture would undistort them once more
+    return MaskedViews(capture, LazySequence(len(paths), lambda index: read_mask(paths[index])))
 
 
 def _with_masks(capture: PosedImages, paths: tuple[Path | None, ...], which: Bool[Tensor, "v"]) -> PosedImages:

@@ -35,11 +35,12 @@ TEMPLATE = """\
 
 # [segment]
 # masks = "masks"            # where they are not beside the images
-# mask_source = "grabcut"    # no masks: from a box around the object, in the source's world
-# box = [-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]
+# prompts = "prompts.toml"   # no masks: points on and beside the object in two or three images say what is wanted
+# box = [-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]    # or a box around it, in the source's world
 
 # [compose]                  # placement.json beside this file, where there is one, comes first
 # point = [0.0, 0.0, 0.0]    # rest the object on the surface below or above this point of the target
+# on = "IMG_0031.jpg:1210,840"               # or on what an image of the target shows at this pixel
 
 # [harmonize]
 # method = "none"

@@ -1,7 +1,6 @@
 """Object masks of single images by the network BiRefNet (Zheng et al. 2024), run by onnxruntime."""
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import resize
+from splatgraft.segmentation.onnx_networks import IMAGENET_MEAN, IMAGENET_STD, open_network, require
 
 DEFAULT_REPOSITORY = "onnx-community/BiRefNet-ONNX"
 _FILE = "onnx/model.onnx"
-_MEAN = torch.tensor([0.485, 0.456, 0.406])
-_STD = torch.tensor([0.229, 0.224, 0.225])
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,7 @@ class BiRefNet:
 
     def mask(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
         """Share of each pixel that is foreground, in [0, 1]."""
-        square = (resize(image, self.side, self.side) - _MEAN) / _STD
+        square = (resize(image, self.side, self.side) - IMAGENET_MEAN) / IMAGENET_STD
         given = {self.session.get_inputs()[0].name: square.permute(2, 0, 1)[None].contiguous().numpy()}
         # the last output is the finest where a network gives several
         found = torch.from_numpy(np.asarray(self.session.run(None, given)[-1], np.float32))
@@ -49,19 +47,8 @@ def load_birefnet(weights: Path | str = DEFAULT_REPOSITORY, *, threads: int = 2)
     Raises:
         ValueError: Where a package is missing, or the file is no such network.
     """
-    _require("onnxruntime")
-    import onnxruntime
-
     path = weights if isinstance(weights, Path) else _from_hub(weights)
-    if not path.is_file():
-        raise ValueError(f"{path}: expected an .onnx file, found none")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.log_severity_level = 3
-    try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's own exceptions share no public base class
-        raise ValueError(f"{path}: expected an ONNX network, found {str(error).splitlines()[0]}") from error
+    session = open_network(path, method="birefnet", threads=threads)
     shape = session.get_inputs()[0].shape
     if len(shape) != 4 or shape[1] not in (3, "channels", "num_channels"):
         raise ValueError(f"{path}: expected an input of shape (1, 3, side, side), found {shape}")
@@ -69,15 +56,8 @@ def load_birefnet(weights: Path | str = DEFAULT_REPOSITORY, *, threads: int = 2)
     return BiRefNet(session=session, side=shape[2] if isinstance(shape[2], int) else 1024)
 
 
-def _require(module: str) -> None:
-    if find_spec(module) is None:
-        raise ValueError(
-            f"masks by birefnet: expected {module} (pip install 'splatgraft[birefnet]'), found none; or use grabcut"
-        )
-
-
 def _from_hub(repository: str) -> Path:
-    _require("huggingface_hub")
+    require("huggingface_hub", "birefnet")
     import huggingface_hub
 
     try:

@@ -92,6 +92,15 @@ def _closed_form(
         # one view's tile lists at a time, so that memory does not grow with the number of views
         total += _sums_of_view(view_operator(gaussians, camera, RenderOptions()), mask.to(gaussians.device))
     progress(len(masks), len(masks), "lifting masks")
+    return blended_share(total)
+
+
+def blended_share(total: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+    """Share of each Gaussian's blending weight, summed over views, that lies inside the masks; 0 where unseen.
+
+    Args:
+        total: Weight inside the masks and in all, pixels.
+    """
     return _ratio(total[:, 0], total[:, 1])
 
 

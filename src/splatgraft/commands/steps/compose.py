@@ -1,13 +1,16 @@
 """The command `compose`: place an object in a target scene, by a placement or where the object fits."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splatgraft.composition import PlaceOptions, place_object
+from splatgraft.composition import Placed, PlaceOptions, place_object
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.composite_folder import composite_of, placement_files, write_composite
-from splatgraft.formats import read_cameras, read_gaussians
+from splatgraft.folders.picture_points import point_in_world
+from splatgraft.formats import read_cameras, read_gaussians, read_images
+from splatgraft.formats.metric_scale import MetricScale, read_scale, scale_path
 from splatgraft.formats.placement import ObjectPlacement, Placement, read_placement
 from splatgraft.project.step import Context, Inputs
 
@@ -31,6 +34,8 @@ class Compose:
     """The source's cameras, likewise."""
     surroundings: Path | None = None
     """The source without the object, a .ply: the surface that the object stood on gives the object's base."""
+    on: str | None = None
+    """Rest the object on what an image of the target shows at a pixel, "IMAGE:X,Y", instead of --point (or --at)."""
     options: PlaceOptions = field(default_factory=PlaceOptions)
 
     def inputs(self) -> Inputs:
@@ -38,9 +43,11 @@ class Compose:
         scenes = {"target": (self.target,), "object": (self.object,)}
         if self.placement is not None:
             return scenes | {"placement": placement_files(self.placement)}
-        named = [path for path in (self.cameras, self.object_cameras) if path is not None]
-        cameras = tuple(file for path in named for file in camera_files(path))
-        return scenes | {"cameras": cameras + (() if self.surroundings is None else (self.surroundings,))}
+        captures = [path for path in (self.cameras, self.object_cameras) if path is not None]
+        cameras = [file for path in captures for file in camera_files(path)]
+        scales = [path for path in map(scale_path, captures) if path.is_file()]
+        surroundings = [] if self.surroundings is None else [self.surroundings]
+        return scenes | {"cameras": (*cameras, *surroundings, *scales)}
 
     def write(self, folder: Path, context: Context) -> None:
         """Compose and write the scene."""
@@ -56,14 +63,52 @@ class Compose:
             raise ValueError(
                 "compose: expected --placement, or --cameras and --object-cameras to find a place, found neither"
             )
+        if self.on is not None and self.options.point is not None:
+            raise ValueError("compose: expected --point or --on, found both")
         cameras = (read_cameras(self.cameras), read_cameras(self.object_cameras))
         surroundings = None if self.surroundings is None else read_gaussians(self.surroundings)
-        placed = place_object(target, object_, cameras=cameras, surroundings=surroundings, options=self.options)
+        options = self.options
+        if self.on is not None:
+            x, y, z = point_in_world(self.on, read_images(self.cameras), target, option="--on").tolist()
+            options = replace(options, point=(x, y, z))
+        in_metres = [read_scale(path) for path in (self.object_cameras, self.cameras)]
+        if options.scale is None and (own := in_metres[0]) is not None and (place := in_metres[1]) is not None:
+            options = replace(options, scale=own.metres_per_unit / place.metres_per_unit)
+        placed = place_object(target, object_, cameras=cameras, surroundings=surroundings, options=options)
         where = ", ".join(f"{x:.3f}" for x in placed.support.point.tolist())
         context.console.say(f"placed at ({where}), scale {placed.target_from_object.scale:.3f}")
+        context.console.say(_size(placed, self.options.scale, in_metres[0], in_metres[1]))
         for warning in placed.warnings:
             context.console.warn(warning)
         return Placement(objects=(ObjectPlacement(target_from_object=placed.target_from_object),))
+
+
+def _size(placed: Placed, given: float | None, own: MetricScale | None, place: MetricScale | None) -> str:
+    """How large the object became and why."""
+    parts = []
+    if own is not None:
+        parts.append(f"{100 * own.metres_per_unit * placed.base.height:.3g} cm tall in its capture ({own.source})")
+    if place is not None:
+        height = 100 * place.metres_per_unit * placed.target_from_object.scale * placed.base.height
+        parts.append(f"{height:.3g} cm tall in the target ({place.source})")
+    if given is not None:
+        why = "by the scale that was given"
+    elif own is not None and place is not None:
+        why = "as large as it was"
+    else:
+        missing = " and ".join(
+            name for name, scale in (("the object's capture", own), ("the target's capture", place)) if scale is None
+        )
+        why = (
+            f"a guess, three tenths of the image's height or what level ground there is, as the size of {missing} is "
+            "not known: splatgraft scale tells it, or --scale"
+        )
+    return f"size: {'; '.join([*parts, why])}"
+
+
+def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
+    """`--at` is another name of `--point`."""
+    return ["--point" if word == "--at" else word for word in words]
 
 
 COMMAND = Compose

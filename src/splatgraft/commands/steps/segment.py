@@ -1,35 +1,61 @@
 """The command `segment`: a scene and 2D masks become the object's Gaussians and the scene without them."""
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import resize
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs
-from splatgraft.folders.object_masks import MaskSource, cut_masks, network_masks, read_masks, with_mask_folder
+from splatgraft.folders.mask_sheet import write_mask_sheet
+from splatgraft.folders.object_masks import (
+    CUT_SIDE_PX,
+    CutRequest,
+    MaskedViews,
+    MaskSource,
+    cut_masks,
+    masked_views,
+    network_masks,
+    with_mask_folder,
+)
+from splatgraft.folders.picture_points import prompts_by_view
 from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.formats.corrections import read_corrections
+from splatgraft.formats.prompts import read_prompts
 from splatgraft.project.layout import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
-from splatgraft.project.step import Context, Device, Inputs, choose_device
+from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.segmentation import (
+    LEAST_AGREEMENT,
+    Agreement,
     Box,
+    GrabCut,
     Keep,
     LiftOptions,
     SelectOptions,
     SolidifyOptions,
+    ViewCutter,
     apply_corrections,
     lift_masks,
+    load_sam2,
+    measure_agreement,
     select_object,
     solidify_object,
 )
+
+SHEET_FILE = "views.png"
+AGREEMENT_FILE = "agreement.json"
+_PICTURED = 8
+"""Photographs on the sheet."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +67,22 @@ class Segment:
     capture: Path
     """The posed images that it was made of."""
     out: Path = Path("object")
-    """Folder for object.ply, surroundings.ply (the scene without it), selection.npy, feature.npy; masks/ where made."""
-    mask_source: MaskSource = "files"
-    """files: masks/ beside the images, or --masks. grabcut: from a box around the object. birefnet: from a network.
-    box: no masks, all Gaussians whose centre is in the box (of a scene that is the object alone: a box around all)."""
+    """Folder for object.ply, surroundings.ply (the scene without it), selection.npy, feature.npy, agreement.json and
+    views.png (how well the masks agree); masks/ where made."""
+    mask_source: MaskSource = "auto"
+    """files: masks/ beside the images, or --masks. grabcut, sam2: cut from the images, guided by the scene, --prompts
+    and --box. birefnet: from a network. box: no masks, all Gaussians whose centre is in the box (of a scene that is the
+    object alone: a box around all). auto: files where every image has one, else grabcut."""
     masks: Path | None = None
     """Folder of masks named like the images, white where the object is; views without one are left out."""
+    prompts: Path | None = None
+    """A .toml or .json with points and rectangles on the object in two or three images, for grabcut and sam2."""
     box: tuple[float, float, float, float, float, float] | None = None
-    """Least x, y, z, then greatest, around the object in the source's world; grabcut guesses it where not given."""
+    """Least x, y, z, then greatest, around the object in the source's world; guessed where not given."""
+    sam2_encoder: Path | None = None
+    """An .onnx file of SAM 2's image encoder, for sam2."""
+    sam2_decoder: Path | None = None
+    """An .onnx file of SAM 2's prompt decoder, for sam2."""
     birefnet: Path | None = None
     """An .onnx file of BiRefNet; fetched once from its hub where not given."""
     threshold: float = 0.75
@@ -64,32 +98,43 @@ class Segment:
     options: LiftOptions = field(default_factory=LiftOptions)
 
     def inputs(self) -> Inputs:
-        """The scene, the capture and the masks."""
+        """The scene, the capture, the masks and what the user says of the object."""
         capture = read_capture(self.capture)
-        if self.mask_source == "files":
+        source = self._source(capture)
+        if source == "files":
             capture = with_mask_folder(capture, self.masks, self.capture)
-        files = capture_inputs(self.capture, capture, masks=self.mask_source == "files")
-        weights = () if self.birefnet is None else (self.birefnet,)
-        by_hand = {} if self.corrections is None else {"corrections": (self.corrections,)}
-        return {"scene": (self.scene,), "weights": weights, **by_hand, **files}
+        files = capture_inputs(self.capture, capture, masks=source != "birefnet")
+        weights = tuple(path for path in (self.birefnet, self.sam2_encoder, self.sam2_decoder) if path is not None)
+        by_hand = {"corrections": self.corrections, "prompts": self.prompts}
+        given = {name: (path,) for name, path in by_hand.items() if path is not None}
+        return {"scene": (self.scene,), "weights": weights, **given, **files}
+
+    def recorded_options(self) -> dict[str, Any]:
+        """The options, with the source of masks that `auto` stands for."""
+        return plain_options(vars(self)) | {"mask_source": self._source(read_capture(self.capture))}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the object."""
         device = choose_device(self.device, context.console)
         scene = read_gaussians(self.scene).to(device)
         box = None if self.box is None else Box(torch.tensor(self.box[:3]), torch.tensor(self.box[3:]))
-        views, feature = None, _in_box(scene, box) if self.mask_source == "box" else None
-        if feature is None:
-            views = self._masked_views(scene, folder, box, context)
-            cameras = views.cameras.to(device)
-            feature = lift_masks(scene, cameras, read_masks(views), self.options, progress=context.progress)
+        capture = read_capture(self.capture)
+        masked, feature = None, None
+        if self._source(capture) == "box":
+            feature = _in_box(scene, box)
+        else:
+            masked = self._masked_views(capture, scene, folder, box, context)
+            cameras = masked.views.cameras.to(device)
+            feature = lift_masks(scene, cameras, masked.masks, self.options, progress=context.progress)
         selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=self.keep))
         if self.corrections is not None:
             selection = apply_corrections(selection, read_corrections(self.corrections))
         context.console.say(f"object: {int(selection.sum()):,} of {scene.count:,} Gaussians")
+        if masked is not None:
+            self._compare(masked, scene, selection, folder, context)
         chosen = scene.select(selection)
-        if self.solidify and views is not None:
-            masks = read_masks(views)
+        if self.solidify and masked is not None:
+            views, masks = masked.views, masked.masks
             photographs = LazySequence(len(views), lambda index: (views.image(index), masks[index]))
             options, cameras = SolidifyOptions(iterations=self.solidify), views.cameras.to(device)
             chosen = solidify_object(scene, selection, cameras, photographs, options=options, progress=context.progress)
@@ -99,14 +144,79 @@ class Segment:
         with atomic_write(folder / "feature.npy") as stream:
             np.save(stream, feature.cpu().numpy())
 
-    def _masked_views(self, scene: Gaussians, folder: Path, box: Box | None, context: Context) -> PosedImages:
-        capture = read_capture(self.capture)
-        if self.mask_source == "files":
-            return with_mask_folder(capture, self.masks, self.capture)
-        made = folder / "masks"
-        if self.mask_source == "grabcut":
-            return cut_masks(capture, scene, box=box, folder=made, progress=context.progress)
-        return network_masks(capture, weights=self.birefnet, folder=made, progress=context.progress)
+    def _source(self, capture: PosedImages) -> MaskSource:
+        """The source of masks that `auto` stands for."""
+        if self.mask_source != "auto":
+            return self.mask_source
+        given = self.masks is not None or len(capture.with_masks()) == len(capture)
+        return "files" if given and self.prompts is None else "grabcut"
+
+    def _masked_views(
+        self, capture: PosedImages, scene: Gaussians, folder: Path, box: Box | None, context: Context
+    ) -> MaskedViews:
+        source, made = self._source(capture), folder / "masks"
+        if source == "files":
+            return masked_views(with_mask_folder(capture, self.masks, self.capture))
+        if source == "birefnet":
+            return network_masks(capture, weights=self.birefnet, folder=made, progress=context.progress)
+        prompts = None
+        if self.prompts is not None:
+            prompts = prompts_by_view(capture, read_prompts(self.prompts), self.prompts)
+        if self.mask_source == "auto":
+            context.console.say(f"{self.capture}: no masks for all images; they are cut by grabcut")
+        request = CutRequest(self._cutter(source), box, prompts)
+        masked, region = cut_masks(capture, scene, request, folder=made, progress=context.progress)
+        size = " x ".join(f"{x:.3g}" for x in (region.box.upper - region.box.lower).tolist())
+        context.console.say(f"the object was looked for in {region.reason}, a box of {size}")
+        if not region.is_whole:
+            context.console.warn(
+                "what stands there goes on beyond that box, so a part of something may have been cut; give clicks in "
+                "two or three images (--prompts), or --box"
+            )
+        return masked
+
+    def _cutter(self, source: MaskSource) -> ViewCutter:
+        if source == "grabcut":
+            return GrabCut()
+        if self.sam2_encoder is None or self.sam2_decoder is None:
+            raise ValueError("--mask-source sam2: expected --sam2-encoder and --sam2-decoder beside it, found not both")
+        return load_sam2(self.sam2_encoder, self.sam2_decoder)
+
+    def _compare(
+        self, masked: MaskedViews, scene: Gaussians, selection: Bool[Tensor, "n"], folder: Path, context: Context
+    ) -> None:
+        """Measure how well the masks agree, and write it with a picture."""
+        factor = min(1.0, CUT_SIDE_PX / int(masked.views.cameras.sizes.max()))
+        cameras = masked.views.cameras.resized(factor).to(scene.device)
+        sizes = cameras.sizes.tolist()
+        small = LazySequence(len(sizes), lambda index: resize(masked.masks[index], *sizes[index]))
+        agreement = measure_agreement(small, scene, cameras, selection, progress=context.progress)
+        with atomic_write(folder / AGREEMENT_FILE) as stream:
+            stream.write((json.dumps(agreement.as_json(), indent=1) + "\n").encode())
+        doubtful = agreement.doubtful
+        others = [round(i) for i in torch.linspace(0, len(sizes) - 1, min(_PICTURED, len(sizes))).tolist()]
+        chosen = [*doubtful, *(i for i in dict.fromkeys(others) if i not in doubtful)][:_PICTURED]
+        write_mask_sheet(folder / SHEET_FILE, masked, chosen, scene=scene, selection=selection)
+        sheet = self.out / SHEET_FILE
+        context.console.say(
+            f"the masks agree with the object by {agreement.mean:.2f} (mean IoU over the images; 1 is perfect): {sheet}"
+        )
+        if (doubt := _doubt(agreement, sheet)) is not None:
+            context.console.warn(doubt, picture=folder / SHEET_FILE)
+
+
+def _doubt(agreement: Agreement, sheet: Path) -> str | None:
+    """What is wrong with the agreement; names the picture."""
+    names = [Path(agreement.names[index]).name for index in agreement.doubtful]
+    if agreement.mean < LEAST_AGREEMENT:
+        return (
+            f"the masks of the images do not agree on one object (mean IoU {agreement.mean:.2f}, expected at least "
+            f"{LEAST_AGREEMENT}); look at {sheet}, then give clicks in two or three images (--prompts) or --box"
+        )
+    if not names:
+        return None
+    shown = ", ".join(names[:_PICTURED]) + (" ..." if len(names) > _PICTURED else "")
+    return f"{len(names)} of {len(agreement.names)} masks are unlike the object ({shown}): {sheet}"
 
 
 def _in_box(scene: Gaussians, box: Box | None) -> Float[Tensor, "n"]:

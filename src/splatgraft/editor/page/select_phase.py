@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
 
 _SOURCES = {
+    "masks beside the photos, else cut from them": "auto",
     "masks beside the photos": "files",
     "a box around the object": "grabcut",
     "a network (BiRefNet)": "birefnet",
@@ -89,7 +90,7 @@ class SelectPhase:
         if session is None or not self._is_active:
             return
         state = session.state
-        name = next((n for n, value in _SOURCES.items() if value == (state.mask_source or "files")), None)
+        name = next((n for n, value in _SOURCES.items() if value == (state.mask_source or "auto")), None)
         if name is not None:
             self._source.value = name
         self._keep.value = state.keep or _KEEP[0]

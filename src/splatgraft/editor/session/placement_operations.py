@@ -57,7 +57,7 @@ def drop_to_surface(
     """Move vertically onto the surface and align with it; scale and rotation about the vertical stay.
 
     Raises:
-        ValueError: If nothing level lies below.
+        ValueError: If nothing lies below.
     """
     base_point = target_from_object.points(item.base.point)
     # start at half the object's height: a sunk object is lifted, and surfaces above the object are ignored
@@ -88,7 +88,7 @@ def plausible_scale(
     """The scale at which the object fills the default share of the views at its place.
 
     Raises:
-        ValueError: If nothing level lies below.
+        ValueError: If nothing lies below.
     """
     x, y, z = (
         target_from_object.points(item.base.point)

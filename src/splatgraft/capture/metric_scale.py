@@ -1,0 +1,161 @@
+"""Metres per world unit of a capture: from a known length, or from a square marker that the pictures show.
+
+A point is where the rays of its pixels meet by least squares. Markers are AprilTags and ArUco markers of OpenCV's
+dictionaries.
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.runtime.progress import Progress, silent
+
+_DICTIONARIES = (
+    "DICT_APRILTAG_36h11",
+    "DICT_APRILTAG_25h9",
+    "DICT_4X4_50",
+    "DICT_5X5_100",
+    "DICT_6X6_250",
+    "DICT_7X7_250",
+    "DICT_ARUCO_ORIGINAL",
+)
+"""The dictionaries in common use; the first numbers of a family's larger dictionaries are the same markers."""
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """When a scale is refused; values set by hand."""
+
+    most_miss_px: float = 3.0
+    """Mean distance, pixels, of a corner, projected, from where it was found: corners are found to a pixel, poses of a
+    plausible capture are right to one or two."""
+    least_angle: float = 1e-4
+    """Least sum of squared sines of the angles between the rays of a point: a degree between two."""
+
+
+@dataclass(frozen=True)
+class Triangulated:
+    """A point that several pictures show."""
+
+    point: Float[Tensor, "3"]
+    """World units."""
+    miss_px: float
+    """Mean distance of its projections from the given pixels."""
+
+
+@dataclass(frozen=True)
+class FoundScale:
+    """A scale and how it was found."""
+
+    metres_per_unit: float
+    """Metres in one world unit."""
+    source: str
+    """How it was found, for messages."""
+
+
+def triangulate(
+    cameras: Cameras, pixels: Float[Tensor, "v 2"], *, options: ScaleOptions = ScaleOptions()
+) -> Triangulated:
+    """The point nearest to the rays of the cameras through their pixels.
+
+    Args:
+        cameras: Two or more.
+        pixels: x and y, one per camera.
+        options: When rays are parallel.
+
+    Raises:
+        ValueError: The rays are parallel.
+    """
+    homogeneous = torch.cat([pixels.double(), torch.ones(len(pixels), 1, dtype=torch.float64)], 1)[..., None]
+    in_camera = torch.linalg.inv(cameras.intrinsics.double()) @ homogeneous
+    rays = torch.nn.functional.normalize((cameras.world_from_camera[:, :3, :3].double() @ in_camera)[..., 0], dim=1)
+    across = torch.eye(3, dtype=torch.float64) - rays[:, :, None] * rays[:, None, :]
+    if float(torch.linalg.eigvalsh(across.sum(0))[0]) < options.least_angle:
+        names = ", ".join(cameras.names)
+        raise ValueError(f"point: expected images from different directions, found almost the same in {names}")
+    point = torch.linalg.solve(across.sum(0), (across @ cameras.centers.double()[..., None])[..., 0].sum(0))
+    pose = cameras.camera_from_world.double()
+    seen = (cameras.intrinsics.double() @ (pose[:, :3, :3] @ point + pose[:, :3, 3])[..., None])[..., 0]
+    return Triangulated(point.float(), float((seen[:, :2] / seen[:, 2:] - pixels).norm(dim=1).mean()))
+
+
+def scale_from_length(ends: tuple[Float[Tensor, "3"], Float[Tensor, "3"]], metres: float) -> FoundScale:
+    """The scale at which the distance of two points is `metres`.
+
+    Raises:
+        ValueError: The points are one, or the length is not above 0.
+    """
+    distance = float((ends[0] - ends[1]).norm())
+    if not (distance > 0 and metres > 0):
+        raise ValueError(f"--length: expected two points apart and metres above 0, found {distance:g} and {metres:g}")
+    return FoundScale(metres / distance, f"a length of {metres:g} m between two points")
+
+
+def scale_from_marker(
+    images: Sequence[Float[Tensor, "_ _ 3"]],
+    cameras: Cameras,
+    side_m: float,
+    *,
+    options: ScaleOptions = ScaleOptions(),
+    progress: Progress = silent,
+) -> FoundScale:
+    """The scale at which a square marker that the pictures show has sides of `side_m` metres.
+
+    Args:
+        images: sRGB in [0, 1], one per camera.
+        cameras: Of the pictures.
+        side_m: Length of the black square's side, metres.
+        options: When corners do not meet.
+        progress: Called per picture.
+
+    Raises:
+        ValueError: No marker is in two pictures, or its corners do not meet.
+    """
+    seen = _marker_corners(images, progress)
+    several = {key: views for key, views in seen.items() if len(views) >= 2}
+    if not several:
+        raise ValueError(
+            f"--marker: expected an AprilTag or ArUco marker in two images, found {len(seen)} in one image"
+        )
+    key, views = max(several.items(), key=lambda item: len(item[1]))
+    chosen = cameras[sorted(views)]
+    corners = torch.stack([torch.from_numpy(views[i]) for i in sorted(views)])
+    found = [triangulate(chosen, corners[:, corner], options=options) for corner in range(4)]
+    miss = max(each.miss_px for each in found)
+    if miss > options.most_miss_px:
+        raise ValueError(
+            f"--marker: expected corners that meet within {options.most_miss_px:g} px, found {miss:.1f} px"
+        )
+    points = torch.stack([each.point for each in found])
+    sides = (points - points.roll(-1, 0)).norm(dim=1)
+    spread = float((sides.amax() - sides.amin()) / sides.mean())
+    name = f"{key[0].removeprefix('DICT_')} marker {key[1]} of {side_m:g} m in {len(views)} images"
+    return FoundScale(side_m / float(sides.mean()), f"{name}, sides alike within {spread:.0%}")
+
+
+def _marker_corners(
+    images: Sequence[Float[Tensor, "_ _ 3"]], progress: Progress
+) -> dict[tuple[str, int], dict[int, Float[np.ndarray, "4 2"]]]:
+    """Corners by dictionary and number of the marker, and index of the picture; centres of pixels at 0.5."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detectors = {
+        name: cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)), parameters)
+        for name in _DICTIONARIES
+    }
+    seen: dict[tuple[str, int], dict[int, np.ndarray]] = defaultdict(dict)
+    for index, image in enumerate(images):
+        progress(index, len(images), "looking for markers")
+        grey = cv2.cvtColor((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy(), cv2.COLOR_RGB2GRAY)
+        for name, detector in detectors.items():
+            corners, numbers, _ = detector.detectMarkers(grey)
+            for four, number in zip(corners, [] if numbers is None else numbers.flatten(), strict=True):
+                seen[name, int(number)][index] = four.reshape(4, 2).astype(np.float32) + 0.5
+    return seen

@@ -1,0 +1,113 @@
+"""Points that a user names by pixels of pictures: in prompts, as a place, as the ends of a known length."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePath
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.capture import triangulate
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import stored_size
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.core.prompts import ViewPrompt
+from splatgraft.rendering import surface_points
+
+
+def prompts_by_view(capture: PosedImages, prompts: Mapping[str, ViewPrompt], path: Path) -> dict[int, ViewPrompt]:
+    """The prompts of a file by the index of their view, in pixels of its camera, undistorted.
+
+    Args:
+        capture: The pictures.
+        prompts: By name of the picture, with or without folder and suffix, pixels of its file.
+        path: The file that they come from, for messages.
+
+    Raises:
+        ValueError: Where no picture, or more than one, has a name.
+    """
+    found = {}
+    for name, prompt in prompts.items():
+        index = picture_called(capture.cameras.names, name, str(path))
+        found[index] = in_camera_pixels(capture, index, prompt)
+    return found
+
+
+def picture_called(names: Sequence[str], name: str, where: str) -> int:
+    """The index of the one picture of that name, with or without folder and suffix.
+
+    Args:
+        names: Of all pictures.
+        name: As a user writes it.
+        where: The file or option that has the name, for messages.
+
+    Raises:
+        ValueError: Where no picture, or more than one, has the name.
+    """
+    paths, called = [PurePath(other) for other in names], PurePath(name)
+    wanted = [i for i, other in enumerate(paths) if name in (str(other), other.name, other.stem)]
+    wanted = wanted or [i for i, other in enumerate(paths) if called.stem == other.stem]
+    if len(wanted) != 1:
+        raise ValueError(f"{where}: expected one picture called {name}, found {len(wanted)} of {len(names)}")
+    return wanted[0]
+
+
+def in_camera_pixels(capture: PosedImages, index: int, prompt: ViewPrompt) -> ViewPrompt:
+    """A prompt in pixels of the picture's file, in those of its undistorted camera."""
+    width, height = stored_size(capture.image_paths[index])
+    camera = capture.cameras[index]
+    distortion = capture.distortions[index] if capture.distortions else None
+    if distortion is None:
+        return prompt.scaled(camera.width / width, camera.height / height)
+
+    def moved(points: Tensor) -> Tensor:
+        at_size = points * torch.tensor([distortion.size[0] / width, distortion.size[1] / height])
+        return distortion.undistort_points(at_size, camera.intrinsics[0])
+
+    box = prompt.box
+    if box is not None:
+        x0, y0, x1, y1 = box
+        middle = [[(x0 + x1) / 2, y0], [(x0 + x1) / 2, y1], [x0, (y0 + y1) / 2], [x1, (y0 + y1) / 2]]
+        edges = moved(torch.tensor([[x0, y0], [x1, y0], [x0, y1], [x1, y1], *middle]))
+        (left, top), (right, bottom) = edges.amin(0).tolist(), edges.amax(0).tolist()
+        box = (left, top, right, bottom)
+    return ViewPrompt(moved(prompt.inside), moved(prompt.outside), box)
+
+
+def point_in_world(text: str, capture: PosedImages, scene: Gaussians | None, *, option: str) -> Float[Tensor, "3"]:
+    """The point that a user names.
+
+    Args:
+        text: "X,Y,Z" in the world; "IMAGE:X,Y", a pixel of a picture's file, on the surface that it shows; or the same
+            point in several pictures, "IMAGE:X,Y IMAGE:X,Y", where the rays meet.
+        capture: The pictures.
+        scene: Gives the surface of a single picture; None where there is none.
+        option: For messages.
+
+    Raises:
+        ValueError: The text is another, or nothing is seen there.
+    """
+    parts = text.split()
+    if len(parts) == 1 and ":" not in text and len(numbers := _numbers(text)) == 3:
+        return torch.tensor(numbers)
+    named = [part.rpartition(":") for part in parts]
+    if not named or not all(name and len(_numbers(pixel)) == 2 for name, _, pixel in named):
+        raise ValueError(f'{option}: expected "X,Y,Z", "IMAGE:X,Y" or "IMAGE:X,Y IMAGE:X,Y", found "{text}"')
+    indices = [picture_called(capture.cameras.names, name, option) for name, _, _ in named]
+    clicks = [ViewPrompt(inside=torch.tensor([_numbers(pixel)])) for _, _, pixel in named]
+    pixels = [in_camera_pixels(capture, i, click).inside for i, click in zip(indices, clicks, strict=True)]
+    if len(set(indices)) > 1:
+        return triangulate(capture.cameras[indices], torch.cat(pixels)).point
+    if scene is None:
+        raise ValueError(f'{option}: expected the point in two images, or a scene (--scene), found only "{text}"')
+    found = surface_points(scene, capture.cameras[indices[0]].to(scene.device), pixels[0])
+    if not len(found):
+        raise ValueError(f"{option}: expected a surface at {text}, found none in the scene")
+    return found[0].cpu()
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError:
+        return []

@@ -1,0 +1,65 @@
+"""scale.json: metres per world unit of a capture, and where the number is from.
+
+    {"metres_per_unit": 0.21, "source": "a length of 0.3 m between two points"}
+
+It lies in the capture's folder; of a capture that a step made, beside it, so that doing the step again keeps it.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatgraft.formats.json_file import excerpt, load, number
+from splatgraft.runtime.atomic_file import atomic_write
+
+SCALE_FILE = "scale.json"
+
+
+@dataclass(frozen=True)
+class MetricScale:
+    """The size of a capture's world unit."""
+
+    metres_per_unit: float
+    """Above 0."""
+    source: str
+    """Where the number is from, for messages."""
+
+
+def scale_path(capture: Path) -> Path:
+    """Where the scale of a capture is stored.
+
+    Args:
+        capture: Its folder, or a file in it such as transforms.json.
+    """
+    folder = capture if capture.is_dir() else capture.parent
+    return (folder.parent if (folder / "step.json").is_file() else folder) / SCALE_FILE
+
+
+def read_scale(capture: Path) -> MetricScale | None:
+    """The scale of a capture; None where it has none.
+
+    Args:
+        capture: Its folder, or a file in it.
+
+    Raises:
+        ValueError: Its scale.json is broken.
+    """
+    path = scale_path(capture)
+    if not path.is_file():
+        return None
+    content = load(path)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: expected an object with metres_per_unit, found {excerpt(content)}")
+    metres = number(path, content, "metres_per_unit")
+    if not metres > 0:
+        raise ValueError(f"{path}: expected metres_per_unit above 0, found {metres:g}")
+    return MetricScale(metres, str(content.get("source", "scale.json")))
+
+
+def write_scale(capture: Path, scale: MetricScale) -> Path:
+    """Store the scale of a capture; gives the file."""
+    path = scale_path(capture)
+    content = {"metres_per_unit": scale.metres_per_unit, "source": scale.source}
+    with atomic_write(path) as stream:
+        stream.write((json.dumps(content, indent=1) + "\n").encode())
+    return path
