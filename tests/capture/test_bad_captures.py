@@ -96,7 +96,7 @@ def test_images_without_a_pose_are_counted(tmp_path: Path, capsys: pytest.Captur
     assert "only 10 of the 30 images in" in capsys.readouterr().err
     change(tmp_path / "c", frames=frames[:3])
     assert capture(tmp_path / "c", tmp_path / "out") == 2
-    assert capsys.readouterr().err.splitlines()[-1].endswith("are usual), found 3")
+    assert "are usual), found 3 (see " in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_masks_of_one_colour_or_another_size_are_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

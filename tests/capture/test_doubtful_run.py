@@ -10,7 +10,7 @@ from splatgraft.cli import main
 from splatgraft.commands.steps.reconstruct import far_worse
 from splatgraft.core.images import write_image
 
-PHOTOS = 4
+PHOTOS = 8
 
 
 def project(folder: Path, key: str = "") -> Path:

@@ -33,22 +33,23 @@ def write_poses(folder: Path, names: list[str]) -> Path:
 def test_poses_and_masks_come_together_and_what_has_no_partner_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_photos(tmp_path / "mine" / "images", 4)
+    write_photos(tmp_path / "mine" / "images", 10)
     Image.new("L", (24, 16), 255).save(tmp_path / "mine" / "images" / "1_mask.png")
-    poses = write_poses(tmp_path / "theirs", ["0.png", "1.png", "3.png", "9.png"])
+    posed = [0, 1, *range(3, 10)]
+    poses = write_poses(tmp_path / "theirs", [*(f"{i}.png" for i in posed), "10.png"])
     for given in (poses, poses.parent):
         out = tmp_path / f"capture-{given.stem}"
         assert main(["capture", str(tmp_path / "mine"), "--poses", str(given), "--out", str(out)]) == 0
         found = read_capture(out)
-        assert [path.name for path in found.image_paths] == ["0.jpg", "1.jpg", "3.jpg"]
-        assert found.cameras.world_from_camera[:, 0, 3].tolist() == [0, 1, 2]
-        assert [path and path.name for path in found.mask_paths] == [None, "1_mask.png", None]
+        assert [path.name for path in found.image_paths] == [f"{i}.jpg" for i in posed]
+        assert found.cameras.world_from_camera[:, 0, 3].tolist() == list(range(9))
+        assert [path and path.name for path in found.mask_paths] == [None, "1_mask.png", *[None] * 7]
         said = capsys.readouterr().err
         for expected in (
-            "poses of 3 of 4 photos",
+            "poses of 9 of 10 photos",
             "without a pose, left out: 2.jpg",
-            "9.png",
-            "1 of 4 photos have masks",
+            "10.png",
+            "1 of 10 photos have masks",
         ):
             assert expected in said
 

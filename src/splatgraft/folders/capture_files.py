@@ -46,7 +46,7 @@ def describe_unposed(path: Path, capture: PosedImages) -> str | None:
     if len(capture) >= 0.5 * total:
         return None
     found = f"only {len(capture)} of the {total} images in {min(folders)} have a pose"
-    return f"{path}: warning: {found}; the others are not used"
+    return f"{path}: {found}; the others are not used"
 
 
 def camera_files(path: Path) -> tuple[Path, ...]:
@@ -65,7 +65,7 @@ def camera_files(path: Path) -> tuple[Path, ...]:
 
 
 def describe_left_out(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[str]:
-    """One line that counts and names what of the capture at `path` is not used, and the reasons of the first.
+    """What of the capture at `path` is not used: one line with number and names, then the reasons of the first.
 
     Args:
         path: The capture.
@@ -77,5 +77,5 @@ def describe_left_out(path: Path, kept: int, left_out: Sequence[LeftOut]) -> lis
     total = kept + sum(not one.mask_only for one in left_out)
     more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
     names = ", ".join(str(one) for one in left_out[:_NAMED])
-    head = f"{path}: warning: goes on with {kept} of {total} images, without {names}{more}"
+    head = f"{path}: goes on with {kept} of {total} images, without {names}{more}"
     return [head, *(f"left out: {one.reason}" for one in left_out[:_NAMED])]

@@ -1,7 +1,7 @@
 """Console output while steps run: one progress bar per step, or lines without a terminal, and messages of one line."""
 
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,6 +51,13 @@ class Console:
         """
         self.say(f"warning: {sentence}{self._help}")
         self._warned.append(ConsoleWarning(sentence, picture))
+
+    def warn_at_length(self, sentences: Sequence[str]) -> None:
+        """Warn with the first sentence, where there is one, and print the others, which explain it."""
+        for sentence in sentences[:1]:
+            self.warn(sentence)
+        for sentence in sentences[1:]:
+            self.say(sentence)
 
     @contextmanager
     def collecting(self, help_link: str) -> Generator[list[ConsoleWarning]]:

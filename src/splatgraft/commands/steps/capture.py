@@ -108,8 +108,7 @@ class Capture:
         return posed
 
     def _say_left_out(self, kept: int, left_out: Sequence[LeftOut], context: Context) -> None:
-        for sentence in describe_left_out(self.capture, kept, left_out):
-            context.console.warn(sentence)
+        context.console.warn_at_length(describe_left_out(self.capture, kept, left_out))
 
     def _with_given_poses(self, poses: Path, context: Context) -> PosedImages:
         """Photos with the poses of another program."""
