@@ -92,6 +92,11 @@ def place_object(
     )
 
 
+_CLEARLY_BETTER = 1.5
+"""By which factor a later place has to be better: an earlier one is nearer to where the cameras look. With 1.1 a second
+object was put on top of the first."""
+
+
 def _best_place(
     target: Gaussians, base: ObjectBase, cameras: Cameras, up: Float[Tensor, "3"], options: PlaceOptions
 ) -> Suggestion:
@@ -108,8 +113,7 @@ def _best_place(
         except ValueError:
             continue
         worth = support.flat_fraction * (1 - support.obstructed_fraction) * (0.1 + place.visible_fraction)
-        # an earlier place is nearer to where the cameras look: a later one has to be better by more than noise
-        if worth > 1.1 * most:
+        if worth > _CLEARLY_BETTER * most:
             best, most = place, worth
     return best
 
