@@ -5,11 +5,14 @@ from html import escape
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
 from test_exposure_messages import exposed, fixed
 from tiny_project import write_project
 
 from splatgraft.cli import main
+from splatgraft.core.similarity import Similarity
+from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.record import StepWarning, read_record
 from splatgraft.project.step import Context, Inputs, perform
 from splatgraft.runtime.console import Console
@@ -53,8 +56,10 @@ def test_a_warning_is_recorded_with_its_picture_relative_to_the_result(
 
 @pytest.fixture(scope="module")
 def warned(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A project whose relighting is a guess, as almost nothing around the object was captured."""
+    """A project whose object stands where nothing was captured, so that there is no light to be found."""
     path = write_project(tmp_path_factory.mktemp("warned"))
+    far = Similarity(1.0, torch.eye(3), torch.tensor([500.0, 0.0, 0.0]))
+    write_placement(path.parent / "placement.json", Placement(objects=(ObjectPlacement(target_from_object=far),)))
     assert main(["run", str(path)]) == 0
     return path
 
