@@ -3,6 +3,7 @@
 import math
 import random
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from splatgraft.harmonization.compact.features import apply_output
 from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
 from splatgraft.harmonization.compact.weights import read_weights
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
+from splatgraft.relighting.shading.irradiance import KNOWN_LIGHTS, shade_ratio
 from splatgraft.synthesis.pairs import write_manifest
 from splatgraft.training.compact import priors
 from splatgraft.training.compact.augmentation import augment
@@ -53,6 +55,8 @@ def silent(*words):
 
 def test_under_the_true_light_the_prior_removes_most_of_the_error(rendered, tmp_path, monkeypatch):
     monkeypatch.setattr(priors, "perturb_light", lambda light, rng: light)
+    # of an estimated light less is applied
+    monkeypatch.setattr(priors, "shade_ratio", partial(shade_ratio, settings=KNOWN_LIGHTS))
     priors.write_priors([rendered / "ball_0"], tmp_path / "priors", seed=0)
     pairs = CompactPairs(rendered, [tmp_path / "priors"], NOTHING)
     assert len(pairs.entries) == 4
