@@ -165,3 +165,14 @@ def test_what_is_no_capture_is_one_line(
 def test_more_blur_is_a_larger_figure() -> None:
     photo = walk(count=1)[0]
     assert 0 <= blur_of(photo) < blur_of(cv2.blur(photo, (5, 5))) < blur_of(cv2.blur(photo, (11, 11))) <= 1
+
+
+def test_photos_and_masks_are_found_where_capture_finds_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = save(tmp_path / "capture" / "images", walk(count=10))
+    for photo in sorted(folder.iterdir())[:3]:
+        Image.new("L", SIZE, 255).save(folder / f"{photo.stem}_mask.png")
+    _, findings, _ = check(tmp_path / "capture", capsys)
+    assert findings["count"]["text"].startswith("10 ")
+    assert findings["masks"]["text"] == "3 masks"

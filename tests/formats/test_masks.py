@@ -123,3 +123,12 @@ def test_a_folder_without_photos_says_what_is_there(tmp_path):
     (tmp_path / "sparse").mkdir()
     with pytest.raises(ValueError, match=r"expected photos, in the folder itself or in images/, found \['sparse'\]"):
         find_photos(tmp_path)
+
+
+def test_a_photo_that_cannot_be_read_does_not_hide_the_others(tmp_path):
+    for name in ("0.png", "1.png"):
+        format_files.write_photo(tmp_path / name)
+    (tmp_path / "2.jpg").write_bytes(b"")
+    found = find_photos(tmp_path)
+    assert [path.name for path in found.paths] == ["0.png", "1.png", "2.jpg"]
+    assert found.masks == ()

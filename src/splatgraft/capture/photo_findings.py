@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from splatgraft.capture.photo_inspection import Inspection
+from splatgraft.capture.view_coverage import CoverageRule
 from splatgraft.core.exposure import ConsistencyRule, Exposure, describe_inconsistency
 
 Level = Literal["good", "doubtful", "unusable"]
@@ -39,7 +40,7 @@ class Finding:
 class FindingRule:
     """Limits; measured on the two captures that ship, two public ones and a rendered room."""
 
-    fewest: int = 8
+    fewest: int = CoverageRule().views
     """Photos: with fewer no surface is seen from enough sides."""
     few: int = 20
     """Photos; the 16 of the shipped bananas are near the limit."""

@@ -7,12 +7,13 @@ from pathlib import Path
 import torch
 
 from splatgraft.capture.odd_photos import find_odd_photos, find_unreadable_photos
+from splatgraft.capture.view_coverage import CoverageRule
 from splatgraft.core.images import read_mask
 from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.runtime.progress import Progress, silent
 
-LEAST_PHOTOS = 8
-"""Different photos that are needed, with or without poses: see `CoverageRule.views`."""
+LEAST_PHOTOS = CoverageRule().views
+"""Different photos that are needed, with or without poses."""
 
 
 def usable_photos(

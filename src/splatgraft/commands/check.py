@@ -18,10 +18,11 @@ from splatgraft.capture.photo_findings import (
     verdict_of,
 )
 from splatgraft.capture.photo_inspection import SIDE_PX, Grey, inspect_photos
-from splatgraft.core.images import list_images, read_exif, read_grey, stored_size
+from splatgraft.core.images import read_exif, read_grey, stored_size
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture, read_gaussians
 from splatgraft.formats.captures.exif import read_exposure
+from splatgraft.formats.captures.masks import PhotoFiles, find_photos
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 
@@ -65,9 +66,8 @@ class Check:
             yield from self._of_video(console)
             return
         posed = read_capture(self.capture) if has_poses(self.capture) else None
-        files = list(posed.image_paths) if posed is not None else list_images(self.capture)
-        if not files:
-            raise ValueError(f"{self.capture}: expected photos in this folder, found none")
+        photos = find_photos(self.capture) if posed is None else PhotoFiles(posed.image_paths, posed.mask_paths)
+        files = photos.paths
         readable, broken = _readable(files)
         if broken:
             names = tuple(path.name for path in broken)
@@ -88,10 +88,9 @@ class Check:
         yield self._lens(readable)
         if posed is not None:
             yield Finding("poses", "good", f"given for {len(posed)} images, with {len(posed.points)} points")
-            yield _masks(sum(path is not None for path in posed.mask_paths))
         else:
             yield Finding("poses", "good", "none: structure from motion finds them")
-            yield _masks(max(map(_image_count, (self.capture / "masks", self.capture.parent / "masks"))))
+        yield _masks(sum(path is not None for path in photos.masks))
         yield _time(0 if posed is not None else len(readable))
 
     def _of_video(self, console: Console) -> Iterator[Finding]:
@@ -148,10 +147,6 @@ def _identical(files: Sequence[Path]) -> Finding | None:
     level = "unusable" if 2 * len(copies) > len(files) else "doubtful"
     text = f"{len(copies)} of {len(files)} files are copies of another: {named(copies)}"
     return Finding("copies", level, text, "remove them", tuple(copies))
-
-
-def _image_count(folder: Path) -> int:
-    return len(list_images(folder)) if folder.is_dir() else 0
 
 
 def _masks(count: int) -> Finding:

@@ -1,7 +1,7 @@
 """Finds photographs and the object mask of each: in a folder masks/ or mask/, as NAME_mask beside it, or in its alpha
 channel."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -127,12 +127,22 @@ def _masks_of(images: dict[Path, str], roots: Sequence[Path]) -> dict[Path, Path
 
 
 def _alpha_masks(paths: list[Path]) -> dict[Path, Path]:
-    """Alpha channels are masks where one of a few samples varies; many files have alpha 1 everywhere."""
-    transparent = [path for path in paths if has_transparency(path)]
+    """Alpha channels are masks where one of a few samples varies; many files have alpha 1 everywhere.
+
+    A photo that cannot be read has none: whether the capture goes on without it is not decided here.
+    """
+    transparent = [path for path in paths if _is_readable_with(has_transparency, path)]
     sample = transparent[:: max(1, len(transparent) // _ALPHA_SAMPLES)]
-    if not any(bool((read_alpha(path) < 1).any()) for path in sample):
+    if not any(_is_readable_with(lambda one: bool((read_alpha(one) < 1).any()), path) for path in sample):
         return {}
     return {path: path for path in transparent}
+
+
+def _is_readable_with(test: Callable[[Path], bool], path: Path) -> bool:
+    try:
+        return test(path)
+    except ValueError:
+        return False
 
 
 def _mask_beside(image: Path) -> Path | None:
