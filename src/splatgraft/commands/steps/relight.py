@@ -152,8 +152,10 @@ def _draw_lights(folder: Path, relit: Relit, composite: Composite, sources: Sequ
         write_image(folder / LIGHT_PICTURE, draw_light(relit.estimate, composite.target, center))
     if not relit.prepared:
         return  # there was no transfer
-    lit = [(i, p, s) for i, (p, s) in enumerate(zip(composite.objects, sources, strict=True), 1) if p.gaussians.count]
-    for one, (i, placed, source) in zip(relit.prepared, lit, strict=True):
+    # numbered as the report numbers them: objects without Gaussians are left out
+    pairs = zip(composite.objects, sources, strict=True)
+    lit = [(placed, source) for placed, source in pairs if placed.gaussians.count]
+    for i, (one, (placed, source)) in enumerate(zip(relit.prepared, lit, strict=True), 1):
         lighting = one.source_lighting
         if source is not None and lighting is not None and lighting.estimate is not None:
             center = bounding_sphere(placed.gaussians).center
