@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from tiny_project import ball, photograph, plane
 
+from splatgraft.capture.odd_photos import find_odd_photos
 from splatgraft.capture.photo_inspection import blur_of
 from splatgraft.cli import main
 from splatgraft.core.exposure import Exposure
@@ -89,22 +90,24 @@ def test_faulty_photos_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
     status, findings, verdict = check(folder, capsys)
     assert (status, verdict) == (0, "doubtful")
     wanted = {
-        "sharpness": ["004.jpg"],
         "overlap": ["009.jpg"],
         "exposure": ["015.jpg"],
         "sizes": ["020.jpg"],
-        "files": ["021.jpg", "022.jpg"],
-        "copies": ["050.jpg"],
+        "left out": ["004.jpg", "021.jpg", "022.jpg", "050.jpg"],
     }
     assert {subject: findings[subject]["photos"] for subject in wanted} == wanted
     assert doubts(findings) <= {*wanted, "movement"}
+    assert [one.name for one in find_odd_photos(sorted(folder.iterdir()))] == [
+        str(folder / name) for name in wanted["left out"]
+    ]
     assert all(finding["remedy"] for subject, finding in findings.items() if subject in wanted)
 
 
 def test_one_photo_many_times_is_not_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, findings, verdict = check(save(tmp_path / "photos", [walk()[0]] * COUNT), capsys)
     assert (status, verdict) == (1, "unusable")
-    assert findings["copies"]["level"] == findings["movement"]["level"] == "unusable"
+    assert findings["left out"]["level"] == findings["count"]["level"] == "unusable"
+    assert len(findings["left out"]["photos"]) == COUNT - 1
 
 
 def test_pictures_of_nothing_in_common_are_not_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

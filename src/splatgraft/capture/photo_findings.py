@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from splatgraft.capture.photo_inspection import Inspection
 from splatgraft.capture.view_coverage import CoverageRule
 from splatgraft.core.exposure import ConsistencyRule, Exposure, describe_inconsistency
+from splatgraft.core.posed_images import LeftOut
 
 Level = Literal["good", "doubtful", "unusable"]
 _NAMED = 6
@@ -44,10 +46,6 @@ class FindingRule:
     """Photos: with fewer no surface is seen from enough sides."""
     few: int = 20
     """Photos; the 16 of the shipped bananas are near the limit."""
-    blur_above: float = 0.08
-    """Blur of a photo above the median: what motion by 3 pixels at 640 adds."""
-    blur_deviations: float = 3.0
-    """And this many robust standard deviations above it: the usual three."""
     blur_of_all: float = 0.5
     """Median blur. Sharp captures have 0.23 to 0.37; motion by 5 pixels at 640 lifts these to 0.4 to 0.54."""
     jump_stops: float = ConsistencyRule().most_stops
@@ -78,6 +76,16 @@ def find_in_count(count: int, rule: FindingRule = FindingRule()) -> Finding:
     return Finding("count", "good", text)
 
 
+def find_in_odd_photos(odd: Sequence[LeftOut], count: int) -> Finding:
+    """The photos that the command `capture` leaves out, of `count`; at least one."""
+    names = tuple(Path(one.name).name for one in odd)
+    level: Level = "unusable" if 2 * len(odd) > count else "doubtful"
+    text = f"capture leaves out {len(odd)} of {count} photos: {named(names)}"
+    # the reason begins with the file's whole path, which the text has named already
+    why = odd[0].reason.removeprefix(f"{odd[0].name}: ")
+    return Finding("left out", level, text, f"{names[0]}: {why}", names)
+
+
 def find_in_photos(
     inspection: Inspection, names: Sequence[str], *, has_poses: bool, rule: FindingRule = FindingRule()
 ) -> tuple[Finding, ...]:
@@ -92,7 +100,7 @@ def find_in_photos(
     overlap = _overlap(inspection, names, rule)
     if has_poses and overlap.level != "good":
         overlap = Finding("overlap", "good", f"{overlap.text}; poses are given, which need none", photos=overlap.photos)
-    return _sharpness(inspection, names, rule), overlap, _copies(inspection, names), _jumps(inspection, names, rule)
+    return _sharpness(inspection, rule), overlap, _copies(inspection, names), _jumps(inspection, names, rule)
 
 
 def find_in_exposures(exposures: Sequence[Exposure]) -> Finding:
@@ -123,19 +131,13 @@ def _above(names: Sequence[str], values: Sequence[float], limit: float) -> tuple
     return tuple(name for value, name in pairs if value > limit)
 
 
-def _sharpness(inspection: Inspection, names: Sequence[str], rule: FindingRule) -> Finding:
+def _sharpness(inspection: Inspection, rule: FindingRule) -> Finding:
     blur = np.array(inspection.blur)
     middle = float(np.median(blur))
-    deviation = 1.4826 * float(np.median(np.abs(blur - middle)))
-    limit = middle + max(rule.blur_above, rule.blur_deviations * deviation)
-    blurred = _above(names, inspection.blur, limit)
     if middle > rule.blur_of_all:
         text = f"most photos are blurred (median blur {middle:.2f}, sharp captures have 0.23 to 0.37)"
-        return Finding("sharpness", "doubtful", text, "photograph again with shorter exposure and in focus", blurred)
-    if blurred:
-        text = f"{len(blurred)} photos are far more blurred than the rest: {named(blurred)}"
-        return Finding("sharpness", "doubtful", text, "leave them out", blurred)
-    return Finding("sharpness", "good", f"no photo stands out (blur {blur.min():.2f} to {blur.max():.2f})")
+        return Finding("sharpness", "doubtful", text, "photograph again with shorter exposure and in focus")
+    return Finding("sharpness", "good", f"the photos are sharp (blur {blur.min():.2f} to {blur.max():.2f})")
 
 
 def _overlap(inspection: Inspection, names: Sequence[str], rule: FindingRule) -> Finding:

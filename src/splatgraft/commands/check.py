@@ -1,6 +1,5 @@
 """The command `check`: a look at the photos of a capture before time is spent on them."""
 
-import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -8,13 +7,14 @@ from pathlib import Path
 
 import cv2
 
+from splatgraft.capture.odd_photos import find_odd_photos
 from splatgraft.capture.photo_findings import (
     Finding,
     find_in_count,
     find_in_exposures,
+    find_in_odd_photos,
     find_in_photos,
     find_in_sizes,
-    named,
     verdict_of,
 )
 from splatgraft.capture.photo_inspection import SIDE_PX, Grey, inspect_photos
@@ -67,31 +67,29 @@ class Check:
             return
         posed = read_capture(self.capture) if has_poses(self.capture) else None
         photos = find_photos(self.capture) if posed is None else PhotoFiles(posed.image_paths, posed.mask_paths)
-        files = photos.paths
-        readable, broken = _readable(files)
-        if broken:
-            names = tuple(path.name for path in broken)
-            text = f"{len(broken)} of {len(files)} photos cannot be read: {named(names)}"
-            yield Finding("files", "doubtful" if readable else "unusable", text, "replace or remove them", names)
-        yield find_in_count(len(readable))
-        if len(readable) < 2:
-            return
-        names = [path.name for path in readable]
-        yield find_in_sizes([stored_size(path) for path in readable], names)
-        if (copies := _identical(readable)) is not None:
-            yield copies
         with console.bar("check") as progress:
-            greys = (read_grey(path, SIDE_PX) for path in readable)
-            found = inspect_photos(greys, count=len(readable), progress=progress)
+            odd = find_odd_photos(photos.paths, progress=progress)
+        left_out = {Path(one.name) for one in odd}
+        used = [path for path in photos.paths if path not in left_out]
+        if odd:
+            yield find_in_odd_photos(odd, len(photos.paths))
+        yield find_in_count(len(used))
+        if len(used) < 2:
+            return
+        names = [path.name for path in used]
+        yield find_in_sizes([stored_size(path) for path in used], names)
+        with console.bar("check") as progress:
+            greys = (read_grey(path, SIDE_PX) for path in used)
+            found = inspect_photos(greys, count=len(used), progress=progress)
         yield from find_in_photos(found, names, has_poses=posed is not None)
-        yield find_in_exposures([read_exposure(path) for path in readable])
-        yield self._lens(readable)
+        yield find_in_exposures([read_exposure(path) for path in used])
+        yield self._lens(used)
         if posed is not None:
             yield Finding("poses", "good", f"given for {len(posed)} images, with {len(posed.points)} points")
         else:
             yield Finding("poses", "good", "none: structure from motion finds them")
         yield _masks(sum(path is not None for path in photos.masks))
-        yield _time(0 if posed is not None else len(readable))
+        yield _time(0 if posed is not None else len(used))
 
     def _of_video(self, console: Console) -> Iterator[Finding]:
         frames = _frames(self.capture)
@@ -116,37 +114,6 @@ _VERDICTS = {
     "doubtful": "usable, but the doubtful points above may cost quality",
     "unusable": "not usable as it is; mend what is marked unusable first",
 }
-
-
-def _readable(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """The files that can be decoded, and the others."""
-    readable: list[Path] = []
-    broken: list[Path] = []
-    for path in files:
-        try:
-            read_grey(path, SIDE_PX)
-        except ValueError:
-            broken.append(path)
-        else:
-            readable.append(path)
-    return readable, broken
-
-
-def _identical(files: Sequence[Path]) -> Finding | None:
-    """Files of the same content, wherever they stand in the order."""
-    seen: dict[str, str] = {}
-    copies: list[str] = []
-    for path in files:
-        with path.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        if digest in seen:
-            copies.append(path.name)
-        seen.setdefault(digest, path.name)
-    if not copies:
-        return None
-    level = "unusable" if 2 * len(copies) > len(files) else "doubtful"
-    text = f"{len(copies)} of {len(files)} files are copies of another: {named(copies)}"
-    return Finding("copies", level, text, "remove them", tuple(copies))
 
 
 def _masks(count: int) -> Finding:
