@@ -2,7 +2,7 @@
 
 Each `kind` is one way in which colour alone misleads: `plain` (it does not), `like_the_table` (the object has the
 colour of the wooden table), `two_parts` (a dark pot below green leaves, on a dark cloth), `crowded` (others stand
-beside it).
+beside it). `on_a_wall` hangs on one, beside a stain of its own colour and a shelf, and is photographed from the front.
 """
 
 import math
@@ -18,7 +18,7 @@ from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.rendering import render
 
 KINDS = ("plain", "like_the_table", "two_parts", "crowded")
-TABLE = 0.7
+TABLE, WALL = 0.7, 1.0
 WOOD, GREEN, DARK, CLAY = (0.55, 0.38, 0.24), (0.25, 0.42, 0.16), (0.18, 0.16, 0.16), (0.75, 0.30, 0.18)
 
 
@@ -42,7 +42,7 @@ def object_capture(kind: str, *, views: int = 12, size: tuple[int, int] = (160, 
     object_, rest = _object(kind, generator), _surroundings(kind, generator)
     scene = concatenate([object_, rest])
     is_object = torch.arange(scene.count) < object_.count
-    cameras = _cameras(views, size)
+    cameras = _cameras_before_wall(views, size) if kind == "on_a_wall" else _cameras(views, size)
     drawn = render(scene, cameras, features=is_object[:, None].float())
     noise = 0.01 * torch.randn(drawn.color.shape, generator=generator)
     moved = scene.means + 0.006 * torch.randn(scene.count, 3, generator=generator)
@@ -72,6 +72,12 @@ def _cameras(views: int, size: tuple[int, int]) -> Cameras:
     )
 
 
+def _cameras_before_wall(views: int, size: tuple[int, int]) -> Cameras:
+    turn = torch.linspace(-0.8, 0.8, views)
+    eyes = torch.stack([1.3 * turn.sin(), WALL - 1.3 * turn.cos(), 1.2 + 0.3 * (5 * turn).sin()], 1)
+    return pinhole(look_at(eyes, torch.tensor([0.0, WALL, 1.2]), UP), 0.95 * size[0], width=size[0], height=size[1])
+
+
 def _object(kind: str, generator: torch.Generator) -> Gaussians:
     if kind == "two_parts":
         pot = cylinder((0, 0, TABLE), radius=0.09, height=0.12, srgb=DARK, generator=generator)
@@ -80,12 +86,20 @@ def _object(kind: str, generator: torch.Generator) -> Gaussians:
             for x, y, z in ((0.05, 0.0, 0.2), (-0.06, 0.03, 0.22), (0.0, -0.06, 0.27), (0.01, 0.05, 0.3))
         ]
         return concatenate([pot, *leaves])
+    if kind == "on_a_wall":
+        plate = sheet((0, WALL - 0.03, 1.2), (0.12, 0, 0), (0, 0, 0.15), srgb=WOOD, generator=generator)
+        return concatenate([plate, ball((0, WALL - 0.13, 1.22), radius=0.1, srgb=CLAY, generator=generator)])
     color = WOOD if kind == "like_the_table" else CLAY
     parts = [cylinder((0, 0, TABLE), radius=0.1, height=0.2, srgb=color, generator=generator)]
     return concatenate([*parts, ball((0, 0, TABLE + 0.24), radius=0.08, srgb=color, generator=generator)])
 
 
 def _surroundings(kind: str, generator: torch.Generator) -> Gaussians:
+    if kind == "on_a_wall":
+        wall = sheet((0, WALL, 1.2), (1.2, 0, 0), (0, 0, 1), srgb=(0.7, 0.68, 0.62), generator=generator, width=0.03)
+        stain = sheet((-0.3, WALL - 0.002, 1.25), (0.3, 0, 0), (0, 0, 0.2), srgb=WOOD, generator=generator)
+        shelf = sheet((0.1, WALL - 0.06, 1.62), (0.5, 0, 0), (0, 0, 0.04), srgb=DARK, generator=generator)
+        return concatenate([wall, stain, shelf])
     parts = [
         sheet((0, 0, TABLE), (0.5, 0, 0), (0, 0.4, 0), srgb=DARK if kind == "two_parts" else WOOD, generator=generator),
         sheet((0, 0, 0), (2.5, 0, 0), (0, 2.5, 0), srgb=(0.45, 0.45, 0.5), generator=generator, width=0.05),

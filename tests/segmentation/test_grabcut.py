@@ -10,6 +10,7 @@ from splatgraft.segmentation import (
     Box,
     CutViews,
     Evidence,
+    FirstGuess,
     GrabCut,
     cut_object,
     measure_agreement,
@@ -21,7 +22,9 @@ from splatgraft.segmentation import (
 def cut(capture, *, box=None, prompts=None):
     seed = seed_selection(capture.scene, capture.cameras, box=box, prompts=prompts)
     views = CutViews(capture.images, capture.cameras, prompts or {})
-    return cut_object(views, capture.scene, seed.selection.float(), GrabCut())
+    return cut_object(
+        views, capture.scene, FirstGuess(seed.selection, seed.region.allows(capture.scene.means)), GrabCut()
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -37,6 +40,23 @@ def test_the_object_is_cut_out_whole_where_colour_alone_misleads(kind):
     agreement = measure_agreement(found.masks, capture.scene, capture.cameras, selection)
     assert agreement.mean > LEAST_AGREEMENT
     assert not agreement.doubtful
+
+
+def test_what_hangs_on_a_wall_is_cut_without_the_wall():
+    capture = object_capture("on_a_wall")
+    found = cut(capture)
+    overlaps = [iou(a, b) for a, b in zip(found.masks, capture.masks, strict=True)]
+    assert sum(overlaps) / len(overlaps) > 0.9
+
+
+def test_what_is_not_allowed_stays_outside_whatever_the_pictures_say():
+    capture = object_capture("plain")
+    seed = seed_selection(capture.scene, capture.cameras)
+    left = capture.scene.means[:, 0] < 0
+    views = CutViews(capture.images, capture.cameras)
+    found = cut_object(views, capture.scene, FirstGuess(seed.selection, left), GrabCut())
+    assert float(found.feature[~left].max()) == 0
+    assert float(found.feature[capture.is_object & left].mean()) > 0.5
 
 
 def test_a_box_that_cuts_the_table_gives_the_object_alone():
@@ -100,7 +120,7 @@ def test_the_other_views_correct_a_wrong_selection(scene, cameras, photographs, 
             return mask
 
     seed = (torch.arange(scene.count) < ball.count).float()
-    found = cut_object(CutViews(photographs, cameras), scene, seed, SpoilsOne())
+    found = cut_object(CutViews(photographs, cameras), scene, FirstGuess(seed), SpoilsOne())
     # a pixel of uncertain outline all around a disc of 15 px radius is 13% of its area
     assert iou(found.masks[2], masks[2]) > 0.87
 
@@ -129,4 +149,4 @@ def test_nothing_at_the_place_is_said(scene, cameras):
         seed_selection(scene, cameras, box=Box(torch.full((3,), 50.0), torch.full((3,), 51.0)))
     aside = torch.zeros(scene.count)
     with pytest.raises(ValueError, match="expected at least two pictures that show what was found"):
-        cut_object(CutViews([torch.zeros(72, 96, 3)] * 6, cameras), scene, aside, GrabCut())
+        cut_object(CutViews([torch.zeros(72, 96, 3)] * 6, cameras), scene, FirstGuess(aside), GrabCut())

@@ -59,3 +59,25 @@ def test_a_wall_supports_what_hangs_on_it():
     assert not region.contains(wall).any()
     assert float(region.contains(head).float().mean()) > 0.9
     assert region.is_whole
+    assert region.allows(head).all()
+    assert not region.allows(wall + torch.tensor([0.0, 0.05, 0.0])).any()
+
+
+def test_what_is_in_the_box_but_apart_is_not_the_object():
+    generator = torch.Generator().manual_seed(0)
+
+    def cube(count: int, lower: tuple[float, float, float], upper: tuple[float, float, float]) -> torch.Tensor:
+        low, high = torch.tensor(lower), torch.tensor(upper)
+        return low + (high - low) * torch.rand(count, 3, generator=generator)
+
+    # an L: its box has an empty corner, in which the end of something else lies
+    post, foot = cube(600, (-0.3, -0.1, 0.0), (-0.1, 0.1, 0.6)), cube(600, (-0.3, -0.1, 0.0), (0.3, 0.1, 0.15))
+    other = cube(100, (0.2, -0.1, 0.45), (0.3, 0.1, 0.6))
+    floor = cube(3000, (-2.0, -2.0, -0.02), (2.0, 2.0, -0.019))
+    turn = torch.arange(12) / 12 * 2 * torch.pi
+    eyes = torch.stack([2 * turn.cos(), 2 * turn.sin(), torch.full((12,), 1.0)], 1)
+    cameras = pinhole(look_at(eyes, torch.tensor([0.0, 0.0, 0.2]), UP), 120.0, width=160, height=120)
+    region = guess_region(cameras, torch.cat([post, foot, other, floor]))
+    assert region.box.contains(other).float().mean() > 0.9
+    assert not region.contains(other).any()
+    assert float(region.contains(torch.cat([post, foot])).float().mean()) > 0.9

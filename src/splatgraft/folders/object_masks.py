@@ -19,6 +19,7 @@ from splatgraft.runtime.progress import Progress, silent
 from splatgraft.segmentation import (
     Box,
     CutViews,
+    FirstGuess,
     ObjectRegion,
     ViewCutter,
     cut_object,
@@ -54,6 +55,8 @@ class MaskedViews:
     """The pictures."""
     masks: Sequence[Tensor]
     """(h, w) in [0, 1], of the size of each view's camera, undistorted; read when asked for."""
+    region: ObjectRegion | None = None
+    """Where the object was looked for; None where the masks were given."""
 
 
 def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> PosedImages:
@@ -90,8 +93,8 @@ def masked_views(capture: PosedImages) -> MaskedViews:
 
 def cut_masks(
     capture: PosedImages, scene: Gaussians, request: CutRequest, *, folder: Path, progress: Progress = silent
-) -> tuple[MaskedViews, ObjectRegion]:
-    """The capture with masks that agree in 3D, written to `folder`, and where the object was looked for.
+) -> MaskedViews:
+    """The capture with masks that agree in 3D, written to `folder`; with the region of the object.
 
     Pictures are cut at `CUT_SIDE_PX`. Masks of some pictures that are there already tell where the object is.
 
@@ -117,10 +120,11 @@ def cut_masks(
         pictures.append((small.image(index) * 255).round().to(torch.uint8))
     images = LazySequence(len(small), lambda index: pictures[index].float() / 255)
     views = CutViews(images, cameras, prompts)
-    cut = cut_object(views, scene, seed.selection.float(), request.cutter, progress=progress)
+    guess = FirstGuess(seed.selection, seed.region.allows(scene.means))
+    cut = cut_object(views, scene, guess, request.cutter, progress=progress)
     sizes = capture.cameras.sizes.tolist()
     grown = ((resize(mask, *sizes[index]) > 0.5).float() for index, mask in enumerate(cut.masks))
-    return _written(capture, grown, folder), seed.region
+    return replace(_written(capture, grown, folder), region=seed.region)
 
 
 def _known(capture: PosedImages, scene: Gaussians) -> Bool[Tensor, "n"] | None:

@@ -2,7 +2,7 @@
 
 from splatgraft.segmentation.birefnet import BiRefNet, load_birefnet
 from splatgraft.segmentation.box import Box
-from splatgraft.segmentation.cut_object import CutMasks, CutOptions, CutViews, cut_object
+from splatgraft.segmentation.cut_object import CutMasks, CutOptions, CutViews, FirstGuess, cut_object
 from splatgraft.segmentation.grabcut import GrabCut
 from splatgraft.segmentation.lift import LiftOptions, lift_masks
 from splatgraft.segmentation.mask_agreement import LEAST_AGREEMENT, Agreement, measure_agreement
@@ -24,6 +24,7 @@ __all__ = [
     "CutOptions",
     "CutViews",
     "Evidence",
+    "FirstGuess",
     "GrabCut",
     "Keep",
     "LiftOptions",

@@ -45,6 +45,16 @@ class CutViews:
 
 
 @dataclass(frozen=True)
+class FirstGuess:
+    """What is known of the object in 3D before a picture is cut."""
+
+    share: Float[Tensor, "n"] | Bool[Tensor, "n"]
+    """Of each Gaussian that is the object's, in [0, 1]."""
+    allowed: Bool[Tensor, "n"] | None = None
+    """Which Gaussians may be the object's whatever the pictures say; None for all."""
+
+
+@dataclass(frozen=True)
 class CutMasks:
     """The masks, and how the rounds went."""
 
@@ -59,7 +69,7 @@ class CutMasks:
 def cut_object(
     views: CutViews,
     scene: Gaussians,
-    seed: Float[Tensor, "n"] | Bool[Tensor, "n"],
+    guess: FirstGuess,
     cutter: ViewCutter,
     *,
     options: CutOptions = CutOptions(),
@@ -68,12 +78,13 @@ def cut_object(
     """Cut the object out of every picture, in rounds, until the masks no longer change.
 
     Each round renders the 3D selection into every picture, cuts the picture, and lifts all masks together to a new
-    selection: a mask that is wrong in one picture is outvoted by the others.
+    selection: a mask that is wrong in one picture is outvoted by the others, and what is not allowed stays outside, so
+    that masks do not grow from round to round over a wall of the object's colour.
 
     Args:
         views: The pictures.
         scene: n Gaussians.
-        seed: First selection, a share in [0, 1] for each Gaussian.
+        guess: First selection, and what may be added to it.
         cutter: The algorithm for one picture.
         options: When to stop.
         progress: Called per picture.
@@ -83,11 +94,13 @@ def cut_object(
     """
     count = len(views.images)
     voting = sorted({round(i) for i in torch.linspace(0, count - 1, min(count, options.voting)).tolist()})
-    feature, changes = seed.float().to(scene.device), []
+    feature, changes = guess.share.float().to(scene.device), []
+    allowed = torch.ones_like(feature) if guess.allowed is None else guess.allowed.float().to(scene.device)
     masks: dict[int, Tensor] = {}
     for round_ in range(options.rounds):
         before = masks
         masks, feature = _round(views, scene, feature, voting, cutter, _told(progress, f"round {round_ + 1}"))
+        feature = feature * allowed
         if before:
             same = torch.tensor([overlap(masks[i], before[i]) for i in voting])
             changes.append(float(same.nanmean()))
@@ -95,6 +108,7 @@ def cut_object(
                 break
     if len(voting) < count:
         masks, feature = _round(views, scene, feature, list(range(count)), cutter, _told(progress, "every picture"))
+        feature = feature * allowed
     progress(count, count, "masks cut")
     if sum(bool(mask.any()) for mask in masks.values()) < 2:
         raise ValueError(

@@ -53,6 +53,10 @@ class RegionOptions:
     """Share of points beyond either end of the box along each axis."""
     margin: float = 0.2
     """Added at each end, over the longest edge: parts without texture have no points."""
+    reach: float = 0.1
+    """Largest distance of a Gaussian of the object from the group of points, over the box's longest edge."""
+    beyond: float = 1.2
+    """Edges of the box that nothing of the object lies beyond, over those of the box."""
     level_normal_z: float = 0.99
     """Least z of the support's normal at which the box ends above the support."""
 
@@ -71,10 +75,22 @@ class ObjectRegion:
     """How the box was found, for messages."""
     is_whole: bool = True
     """False where the surface points that were found go on beyond the box."""
+    group: Float[Tensor, "k 3"] | None = None
+    """Surface points that belong together and are likely the object's; None where the box says it all."""
 
-    def contains(self, points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-        """Which points lie in the box and above the support."""
-        return self.box.contains(points) & points_above(points, self.support, self.least_height)
+    def contains(self, points: Float[Tensor, "n 3"], *, options: RegionOptions = RegionOptions()) -> Bool[Tensor, "n"]:
+        """Which points lie in the box, above the support, and near the group: what else is in the box is not it."""
+        inside = self.box.contains(points) & points_above(points, self.support, self.least_height)
+        if self.group is None:
+            return inside
+        reach = options.reach * float((self.box.upper - self.box.lower).max())
+        apart, _ = KDTree(self.group.cpu().numpy()).query(points.cpu().numpy(), distance_upper_bound=reach)
+        return inside & torch.from_numpy(np.isfinite(apart)).to(inside.device)
+
+    def allows(self, points: Float[Tensor, "n 3"], *, options: RegionOptions = RegionOptions()) -> Bool[Tensor, "n"]:
+        """Which points may be the object's whatever the pictures say: not behind the support, nor far from the box."""
+        inside = points_above(points, self.support, 0.0)
+        return inside & self.box.grown(options.beyond).contains(points) if self.is_whole else inside
 
 
 def default_box(capture: PosedImages) -> Box:
@@ -130,7 +146,7 @@ def guess_region(
         # the support stays outside, also where the box is used without the plane
         lower[2] = torch.maximum(lower[2], torch.as_tensor(support.offset + support.thickness).to(lower))
     why = f"the group of surface points that {source}"
-    return ObjectRegion(Box(lower, upper), support, least_height, why, found.is_whole)
+    return ObjectRegion(Box(lower, upper), support, least_height, why, found.is_whole, kept)
 
 
 def region_of_box(

@@ -126,6 +126,8 @@ class Segment:
             masked = self._masked_views(capture, scene, folder, box, context)
             cameras = masked.views.cameras.to(device)
             feature = lift_masks(scene, cameras, masked.masks, self.options, progress=context.progress)
+            if masked.region is not None:
+                feature = feature * masked.region.allows(scene.means)
         selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=self.keep))
         if self.corrections is not None:
             selection = apply_corrections(selection, read_corrections(self.corrections))
@@ -165,7 +167,9 @@ class Segment:
         if self.mask_source == "auto":
             context.console.say(f"{self.capture}: no masks for all images; they are cut by grabcut")
         request = CutRequest(self._cutter(source), box, prompts)
-        masked, region = cut_masks(capture, scene, request, folder=made, progress=context.progress)
+        masked = cut_masks(capture, scene, request, folder=made, progress=context.progress)
+        region = masked.region
+        assert region is not None
         size = " x ".join(f"{x:.3g}" for x in (region.box.upper - region.box.lower).tolist())
         context.console.say(f"the object was looked for in {region.reason}, a box of {size}")
         if not region.is_whole:
