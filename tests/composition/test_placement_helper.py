@@ -15,7 +15,7 @@ from splatgraft.composition import (
     rest_on_surface,
     support_below,
 )
-from splatgraft.composition.facing_direction import facing_yaw_deg
+from splatgraft.composition.facing_direction import facing_yaw_deg, unseen_share
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.capture_orientation import estimate_up, focus_point
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
@@ -313,3 +313,37 @@ def test_the_photographed_side_is_turned_to_the_cameras():
     assert facing_yaw_deg(arc, arc, up=UP) == 0
     ring = directions(*[15.0 * i for i in range(24)])
     assert facing_yaw_deg(ring, other, up=UP) == 0
+
+
+def test_sides_that_no_photo_shows_are_measured_and_said():
+    front, around = directions(-40.0, 0.0, 40.0), directions(*[15.0 * i for i in range(24)])
+    assert unseen_share(front, front) == 0
+    assert unseen_share(around, front) == 0
+    # 180 degrees are photographed: 80 between the outermost photos and 50 beyond each; 26.6 degrees of height less
+    assert unseen_share(front, around) == pytest.approx(0.45, abs=0.1)
+    thing = box((0.0, 0.0, 0.1), (0.05, 0.05, 0.1))
+    target = orbit(0.0, 2 * math.pi, count=12)
+    half = orbit(0.0, 0.6, count=6)
+    told = place_object(room(), thing, cameras=(target, half)).warnings
+    assert any("none of its photos shows" in line for line in told)
+    assert not any(
+        "none of its photos shows" in line for line in place_object(room(), thing, cameras=(target, target)).warnings
+    )
+
+
+def orbit(first, last, *, count):
+    angle = torch.linspace(first, last, count + 1)[:-1]
+    eyes = torch.stack([1.6 * angle.cos(), 1.6 * angle.sin(), torch.full_like(angle, TABLE + 0.8)], 1)
+    return pinhole(look_at(eyes, torch.tensor([0.0, 0.0, TABLE]), UP), 200.0, width=240, height=180)
+
+
+def test_corners_do_not_reach_over_the_table_s_edge():
+    # cameras that look at the table's edge
+    angle = torch.arange(12) / 12 * 2 * math.pi
+    eyes = torch.stack([0.55 + 1.6 * angle.cos(), 1.6 * angle.sin(), torch.full_like(angle, TABLE + 0.8)], 1)
+    cameras = pinhole(look_at(eyes, torch.tensor([0.55, 0.0, TABLE]), UP), 200.0, width=240, height=180)
+    thing = box((0.0, 0.0, 0.1), (0.12, 0.12, 0.1))
+    placed = place_object(room(), thing, cameras=(cameras, cameras), options=PlaceOptions(scale=1.0, yaw_deg=0.0))
+    corners = placed.target_from_object.points(thing.means)
+    assert corners[:, 0].max() < 0.6
+    assert corners[:, 1].abs().max() < 0.4

@@ -1,4 +1,7 @@
-"""Yaw that turns the photographed sides of an object towards the target's cameras, from camera directions alone."""
+"""Which sides of an object the target's cameras see, and the yaw that turns photographed ones towards them.
+
+From camera directions alone.
+"""
 
 import math
 from dataclasses import dataclass
@@ -20,6 +23,8 @@ class FacingOptions:
     """Between the yaws tried."""
     good_share: float = 0.98
     """Coverage over the best one above which the smallest turn is preferred."""
+    photographed_deg: float = 50.0
+    """Largest angle to a photograph's direction from which a side of the object was seen well enough."""
 
 
 def facing_yaw_deg(
@@ -48,6 +53,24 @@ def facing_yaw_deg(
     covered = torch.exp(-0.5 * (miss / math.radians(options.spread_deg)) ** 2).amax(2).mean(1)
     good = covered >= options.good_share * covered.max()
     return float(yaw[good][yaw[good].abs().argmin()])
+
+
+def unseen_share(
+    to_source_cameras: Float[Tensor, "s 3"],
+    to_target_cameras: Float[Tensor, "t 3"],
+    *,
+    options: FacingOptions = FacingOptions(),
+) -> float:
+    """Share of the target's cameras, in [0, 1], that see the object from where no photograph of it was taken.
+
+    Args:
+        to_source_cameras: From the object to the cameras of its own capture, in the target's frame.
+        to_target_cameras: From the object to the target's cameras, in the target's frame.
+        options: What counts as photographed.
+    """
+    source, target = (torch.nn.functional.normalize(x.double(), dim=1) for x in (to_source_cameras, to_target_cameras))
+    nearest = (target @ source.T).amax(1)
+    return float((nearest < math.cos(math.radians(options.photographed_deg))).double().mean())
 
 
 def _azimuth(directions: Float[Tensor, "n 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "n"]:

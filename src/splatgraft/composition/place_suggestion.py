@@ -30,6 +30,9 @@ class SuggestionOptions:
     """Width and height of the height map, pixels."""
     center_spread: float = 0.5
     """Standard deviation of the distance from the focus point in the score, over the half width."""
+    margin: float = 1.25
+    """Radius of the ground that is wanted level over the object's, which leaves out its outermost parts: corners must
+    not reach over the edge of a table."""
     flat_enough: float = 0.8
     """Share of level ground at which the object is not made smaller."""
     shrink: float = 0.8
@@ -104,7 +107,8 @@ def suggest_places(
     central = torch.exp(-0.5 * ((ground.points - focus).norm(dim=-1) / (options.center_spread * reach)) ** 2)
     wanted = size = scale if scale is not None else scale_in_view(base, focus, cameras=cameras, options=options)
     for _ in range(options.rounds):
-        flat = _flatness(ground, radius=max(size * base.radius, 2 * ground.pixel), slope=options.flat_slope)
+        wide = max(options.margin * size * base.radius, 2 * ground.pixel)
+        flat = _flatness(ground, radius=wide, slope=options.flat_slope)
         score = flat**2 * visible * central
         if float(flat.flatten()[int(score.argmax())]) > options.flat_enough or scale is not None:
             break

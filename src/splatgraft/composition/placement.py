@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.composition.facing_direction import facing_yaw_deg
+from splatgraft.composition.facing_direction import facing_yaw_deg, unseen_share
 from splatgraft.composition.object_base import ObjectBase, object_base
 from splatgraft.composition.place_suggestion import Suggestion, scale_in_view, suggest_places
 from splatgraft.composition.point_visibility import hidden_fraction
@@ -83,12 +83,14 @@ def place_object(
         yaw = facing_yaw_deg(to_source_cameras, target_cameras.centers - support.point, up=support.normal)
         move, support = rest_on_surface(target, base, point=point, up=up, options=replace(rest, yaw_deg=yaw))
     hidden = hidden_fraction(target, move.gaussians(object_), cameras=target_cameras)
+    to_source_cameras = (source_cameras.centers - base.point) @ move.rotation.T
+    unseen = unseen_share(to_source_cameras, target_cameras.centers - support.point)
     return Placed(
         target_from_object=move,
         base=base,
         support=support,
         hidden_fraction=hidden,
-        warnings=found.reasons + _warnings(support, hidden),
+        warnings=found.reasons + _warnings(support, hidden, unseen),
     )
 
 
@@ -118,8 +120,13 @@ def _best_place(
     return best
 
 
-def _warnings(support: Support, hidden: float) -> tuple[str, ...]:
+def _warnings(support: Support, hidden: float, unseen: float) -> tuple[str, ...]:
     out = []
+    if unseen > 0.2:
+        out.append(
+            f"{unseen:.0%} of the target's images show a side of the object that none of its photos shows, where it is "
+            "unknown: turn it (--yaw-deg), place it before a wall, or photograph it from there too."
+        )
     # the underside is always hidden: a sixth of a cube
     if hidden > 0.25:
         out.append(f"{hidden:.0%} of the object is hidden from every camera: it may stick in a wall or in furniture.")
