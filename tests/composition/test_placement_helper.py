@@ -342,8 +342,9 @@ def test_corners_do_not_reach_over_the_table_s_edge():
     angle = torch.arange(12) / 12 * 2 * math.pi
     eyes = torch.stack([0.55 + 1.6 * angle.cos(), 1.6 * angle.sin(), torch.full_like(angle, TABLE + 0.8)], 1)
     cameras = pinhole(look_at(eyes, torch.tensor([0.55, 0.0, TABLE]), UP), 200.0, width=240, height=180)
-    thing = box((0.0, 0.0, 0.1), (0.12, 0.12, 0.1))
+    # a bar that is too little of the object to count in its radius
+    bar = sheet((0, 0, 0.02), (0.165, 0, 0), (0, 0.005, 0), spacing=0.02)
+    thing = concatenate([box((0.0, 0.0, 0.1), (0.1, 0.1, 0.1), spacing=0.015), bar])
     placed = place_object(room(), thing, cameras=(cameras, cameras), options=PlaceOptions(scale=1.0, yaw_deg=0.0))
     corners = placed.target_from_object.points(thing.means)
     assert corners[:, 0].max() < 0.6
-    assert corners[:, 1].abs().max() < 0.4
