@@ -7,6 +7,7 @@ import torch
 from conftest import BALL, splats
 
 from splatgraft.core.gaussians import concatenate
+from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.rendering import render
 from splatgraft.segmentation import SolidifyOptions, solidify_object
 
@@ -32,6 +33,36 @@ def test_solid_inside_and_gone_outside(glassy, cameras, photographs, masks):
     assert after[inside].mean() > 0.93
     assert before[outside].max() > 0.5
     assert after[outside].max() < 0.35
+
+
+def test_a_coarse_object_gets_as_many_gaussians_as_its_photographs_show(scene, ball, cameras, masks):
+    # stripes that the Gaussians of a coarse ball cannot show
+    pictures = [photo * mask[..., None] for photo, mask in zip(striped(scene, cameras), masks, strict=True)]
+    coarse = concatenate([ball.select(torch.arange(BALL) % 8 == 0), scene.select(torch.arange(scene.count) >= BALL)])
+    wide = replace(coarse, log_scales=coarse.log_scales + 1.0)
+    selection = torch.arange(wide.count) < BALL // 8
+    views = list(zip(pictures, masks, strict=True))
+
+    def error(options):
+        solid = solidify_object(wide, selection, cameras, views, options=options)
+        drawn = render(solid, cameras).color
+        inside = torch.stack(masks)[..., None]
+        return solid.count, float((inside * (drawn - torch.stack(pictures))).square().sum() / inside.sum())
+
+    few, before = error(SolidifyOptions(iterations=200, pixels_per_gaussian=0.0))
+    many, after = error(SolidifyOptions(iterations=200, pixels_per_gaussian=2.0))
+    assert few == BALL // 8
+    median = float(torch.tensor([float(mask.sum()) for mask in masks]).median())
+    assert few < many <= median / 2
+    assert after < 0.8 * before
+
+
+def striped(scene, cameras):
+    """The scene photographed with dark and light stripes on the ball, 8 over its height."""
+    stripes = torch.where((scene.means[:, 2] * 20).sin() > 0, 0.2, 0.9)[:, None].expand(-1, 3)
+    is_ball = torch.arange(scene.count) < BALL
+    sh = torch.where(is_ball[:, None, None], dc_from_rgb(stripes)[:, None], scene.sh[:, :1])
+    return list(render(replace(scene, sh=sh), cameras).color)
 
 
 def test_nothing_to_see_is_said(glassy, cameras, photographs):

@@ -1,8 +1,11 @@
-"""Makes an extracted object opaque: fits it alone to its masked photographs over random backgrounds.
+"""Makes an extracted object opaque and finer: fits it alone to its masked photographs over random backgrounds.
 
 In its own capture an object may be half transparent and still look right, since the Gaussians behind it were fitted
 together with it; at its outline, neighbouring Gaussians may hide those that stick out. Both become visible in another
 scene. Only an opaque object inside its mask matches the photographs over every background.
+
+A reconstruction spends most of its Gaussians on the surroundings, which stay behind. So where the object has fewer than
+its size in the photographs asks for, those are split that have the largest gradient (3DGS, Sec. 5).
 """
 
 from collections.abc import Sequence
@@ -13,7 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.splitting import PIECES, split_along
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.progress import Progress, silent
 
@@ -22,8 +26,18 @@ from splatgraft.runtime.progress import Progress, silent
 class SolidifyOptions:
     """Length and learning rates of the fit; values set by hand."""
 
-    iterations: int = 400
+    iterations: int = 800
     """Steps, one view each."""
+    pixels_per_gaussian: float = 6.0
+    """Pixels of the object in the median view for each Gaussian that it should have; 0 splits none."""
+    most_share: float = 0.5
+    """Most Gaussians that it is split to, over those of the scene, whose number was chosen for the machine and time."""
+    densifications: int = 8
+    """How many times Gaussians are split, evenly spaced."""
+    densified: float = 0.6
+    """Share of the steps after which none is split."""
+    dead_opacity: float = 0.02
+    """Opacity below which a Gaussian is removed when others are split."""
     opacity_rate: float = 0.05
     """Of Adam, logits per step."""
     color_rate: float = 0.0025
@@ -61,7 +75,7 @@ def solidify_object(
     options: SolidifyOptions = SolidifyOptions(),
     progress: Progress = silent,
 ) -> Gaussians:
-    """Fit an extracted object alone to its masked images over random backgrounds, so that it becomes opaque.
+    """Fit an extracted object alone to its masked images over random backgrounds, so that it becomes opaque and fine.
 
     Pixels outside the mask where the object is hidden by something in front of it are not used.
 
@@ -74,7 +88,8 @@ def solidify_object(
         progress: Called with steps done, steps in all and a short text.
 
     Returns:
-        The object's Gaussians, changed in every field.
+        The object's Gaussians, changed in every field, and more of them where the photographs show it larger than they
+        are many.
 
     Raises:
         ValueError: All masks are empty.
@@ -87,43 +102,90 @@ def solidify_object(
     ]
     if not views:
         raise ValueError("object: expected a mask with some of it inside, found all empty")
-    radius = float((chosen.means - chosen.means.mean(0)).norm(dim=1).quantile(0.9))
-    leaves = {
-        name: getattr(chosen, name).detach().clone().requires_grad_()
-        for name in ("means", "log_scales", "quaternions", "opacity_logits")
-    }
-    base = chosen.sh[:, :1].detach().clone().requires_grad_()
-    higher = chosen.sh[:, 1:].detach().clone().requires_grad_()
-    optimizer = torch.optim.Adam(
-        [
-            {"params": [leaves["means"]], "lr": options.position_rate * radius},
-            {"params": [leaves["log_scales"]], "lr": options.scale_rate},
-            {"params": [leaves["quaternions"]], "lr": options.rotation_ratio * options.scale_rate},
-            {"params": [leaves["opacity_logits"]], "lr": options.opacity_rate},
-            {"params": [base], "lr": options.color_rate},
-            {"params": [higher], "lr": options.color_rate / 20},
-        ],
-        eps=1e-15,
-    )
+    wanted = min(_wanted_count(views, options), int(options.most_share * scene.count))
+    first, stop = chosen.count, options.densified * options.iterations
+    every = max(1, int(stop / options.densifications))
+    fit = _Fit(chosen, options)
     generator = torch.Generator().manual_seed(options.seed)
     for step in range(options.iterations):
         view = views[int(torch.randint(len(views), (1,), generator=generator))]
-        background = torch.rand(3, generator=generator)
-        fitted = replace(chosen, **leaves, sh=torch.cat([base, higher], 1))
+        loss = fit.step(view, torch.rand(3, generator=generator))
+        if step % 20 == 0:
+            progress(step, options.iterations, f"making the object solid, loss {loss:.4f}")
+        if wanted > first and 0 < step <= stop and step % every == 0:
+            allowed = int(first + (wanted - first) * step / stop)
+            fit = _Fit(_with_splits(fit.gaussians, fit.scores, allowed, options), options)
+    progress(options.iterations, options.iterations, "the object is solid")
+    return fit.gaussians
+
+
+class _Fit:
+    """Gaussians that are fitted, and their scores since the start."""
+
+    def __init__(self, gaussians: Gaussians, options: SolidifyOptions) -> None:
+        self._start = gaussians
+        radius = float((gaussians.means - gaussians.means.mean(0)).norm(dim=1).quantile(0.9))
+        self._base = gaussians.sh[:, :1].detach().clone().requires_grad_()
+        self._higher = gaussians.sh[:, 1:].detach().clone().requires_grad_()
+        rates = {
+            "means": options.position_rate * radius,
+            "log_scales": options.scale_rate,
+            "quaternions": options.rotation_ratio * options.scale_rate,
+            "opacity_logits": options.opacity_rate,
+        }
+        self._leaves = {name: getattr(gaussians, name).detach().clone().requires_grad_() for name in rates}
+        self._optimizer = torch.optim.Adam(
+            [
+                *({"params": [self._leaves[name]], "lr": rate} for name, rate in rates.items()),
+                {"params": [self._base], "lr": options.color_rate},
+                {"params": [self._higher], "lr": options.color_rate / 20},
+            ],
+            eps=1e-15,
+        )
+        self.scores = torch.zeros(gaussians.count, device=gaussians.device)
+        """Summed length of the loss gradient by the centre, over all pixels."""
+
+    def step(self, view: _CroppedView, background: Float[Tensor, "3"]) -> float:
+        """One step on one view over one background; gives the loss."""
+        fitted = replace(self._start, **self._leaves, sh=torch.cat([self._base, self._higher], 1))
         drawn = render(fitted, view.camera, options=RenderOptions(background=tuple(background.tolist()))).color
         target = view.mask * view.image + (1 - view.mask) * background.to(view.image)
         loss = (view.weight * (drawn[0] - target).abs()).mean()
-        optimizer.zero_grad(set_to_none=True)
+        self._optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        optimizer.step()
-        if step % 20 == 0:
-            progress(step, options.iterations, f"making the object solid, loss {loss.item():.4f}")
-    progress(options.iterations, options.iterations, "the object is solid")
-    return replace(
-        chosen,
-        **{name: leaf.detach() for name, leaf in leaves.items()},
-        sh=torch.cat([base, higher], 1).detach(),
-    )
+        if (gradient := self._leaves["means"].grad) is not None:
+            self.scores += gradient.norm(dim=1) * view.weight.numel()
+        self._optimizer.step()
+        return loss.item()
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """As fitted so far."""
+        leaves = {name: leaf.detach() for name, leaf in self._leaves.items()}
+        return replace(self._start, **leaves, sh=torch.cat([self._base, self._higher], 1).detach())
+
+
+def _wanted_count(views: Sequence[_CroppedView], options: SolidifyOptions) -> int:
+    """Gaussians that the object's size in the median view asks for."""
+    if options.pixels_per_gaussian <= 0:
+        return 0
+    pixels = torch.tensor([float(view.mask.sum()) for view in views])
+    return int(float(pixels.median()) / options.pixels_per_gaussian)
+
+
+def _with_splits(gaussians: Gaussians, scores: Float[Tensor, "n"], allowed: int, options: SolidifyOptions) -> Gaussians:
+    """At most `allowed` Gaussians: those with the highest scores split along their longest axis, transparent ones left
+    out."""
+    alive = gaussians.opacities > options.dead_opacity
+    count = int(alive.sum())
+    parents = min((allowed - count) // (PIECES - 1), count)
+    if parents <= 0:
+        return gaussians
+    chosen = torch.zeros_like(alive)
+    chosen[torch.where(alive, scores, -1.0).topk(parents).indices] = True
+    split = gaussians.select(chosen)
+    pieces, _ = split_along(split, split.log_scales.argmax(1))
+    return concatenate([gaussians.select(alive & ~chosen), pieces])
 
 
 def _cropped_view(

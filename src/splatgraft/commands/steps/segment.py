@@ -1,6 +1,7 @@
 """The command `segment`: a scene and 2D masks become the object's Gaussians and the scene without them."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,8 @@ from splatgraft.segmentation import (
 
 SHEET_FILE = "views.png"
 AGREEMENT_FILE = "agreement.json"
+_SOLID_SIDE_PX = 960
+"""Longest side at which the object is made solid: time and memory go with the area."""
 _PICTURED = 8
 """Photographs on the sheet."""
 
@@ -136,10 +139,10 @@ class Segment:
             self._compare(masked, scene, selection, folder, context)
         chosen = scene.select(selection)
         if self.solidify and masked is not None:
-            views, masks = masked.views, masked.masks
-            photographs = LazySequence(len(views), lambda index: (views.image(index), masks[index]))
+            views, photographs = _photographs(masked)
             options, cameras = SolidifyOptions(iterations=self.solidify), views.cameras.to(device)
             chosen = solidify_object(scene, selection, cameras, photographs, options=options, progress=context.progress)
+            context.console.say(f"object, made solid: {chosen.count:,} Gaussians")
         write_gaussians(folder / OBJECT_FILE, chosen.to("cpu"))
         write_gaussians(folder / SURROUNDINGS_FILE, scene.select(~selection).to("cpu"))
         write_selection(folder / SELECTION_FILE, selection)
@@ -207,6 +210,14 @@ class Segment:
         )
         if (doubt := _doubt(agreement, sheet)) is not None:
             context.console.warn(doubt, picture=folder / SHEET_FILE)
+
+
+def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tensor, Tensor]]]:
+    """The views at the size at which the object is made solid, and their images and masks, read when asked for."""
+    views = masked.views.limited(_SOLID_SIDE_PX)
+    sizes = views.cameras.sizes.tolist()
+    read = LazySequence(len(sizes), lambda index: (views.image(index), resize(masked.masks[index], *sizes[index])))
+    return views, read
 
 
 def _doubt(agreement: Agreement, sheet: Path) -> str | None:
