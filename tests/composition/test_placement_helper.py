@@ -225,6 +225,15 @@ def test_base_comes_from_the_surface_where_the_source_has_one():
     assert 0.1 < found.radius < 0.17
 
 
+def test_a_ledge_above_the_foot_of_what_hangs_is_not_its_ground():
+    thing = box((0, 0, 0.15), (0.1, 0.1, 0.15))
+    ledge = sheet((0, 0.22, 0.06), (0.3, 0, 0), (0, 0.11, 0))
+    base = object_base(thing, up=UP, surroundings=ledge)
+    assert base.stands_on == "extent"
+    # the lowest Gaussians reach 2 cm below their centres
+    assert abs(float(base.point[2])) < 0.03
+
+
 @pytest.mark.parametrize("move", [Similarity.identity(), TURN])
 def test_the_box_rests_upright_with_its_foot_on_the_table_in_any_source_frame(move):
     thing = box((0, 0, 0.15), (0.1, 0.08, 0.15))

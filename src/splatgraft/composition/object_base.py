@@ -41,8 +41,11 @@ class ObjectBaseOptions:
     """Height above the lowest part from which the ground is searched downwards, over the object's height."""
     disc_radius: float = 2.0
     """Radius of the searched disc over the object's: nothing was seen under the object, so its surroundings count."""
-    most_rise: float = 0.25
-    """Largest distance of the ground from the lowest part, over the height: masks are not wrong by more."""
+    most_rise: float = 0.1
+    """Largest height of the ground above the lowest part, over the object's: masks that take more of the ground are
+    rare, and what hangs on a wall has edges of other things beside it that look like ground."""
+    most_gap: float = 0.25
+    """Largest depth of the ground below the lowest part, over the height: masks do not miss more of a foot."""
     least_flat: float = 0.25
     """Least share of the disc that lies on the ground."""
 
@@ -97,7 +100,10 @@ def _on_own_surface(base: ObjectBase, surroundings: Gaussians, options: ObjectBa
     except ValueError:
         return base
     rise = float((found.point - base.point) @ base.up)
-    if abs(rise) > options.most_rise * base.height or found.flat_fraction < options.least_flat:
+    if (
+        not -options.most_gap * base.height <= rise <= options.most_rise * base.height
+        or found.flat_fraction < options.least_flat
+    ):
         return base
     point = found.point
     return ObjectBase(point=point, up=found.normal, height=base.height - rise, radius=base.radius, stands_on="surface")
