@@ -7,7 +7,7 @@ import torch
 from conftest import BALL, splats
 
 from splatgraft.core.gaussians import concatenate
-from splatgraft.core.spherical_harmonics import dc_from_rgb
+from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.rendering import render
 from splatgraft.segmentation import SolidifyOptions, solidify_object
 
@@ -55,6 +55,29 @@ def test_a_coarse_object_gets_as_many_gaussians_as_its_photographs_show(scene, b
     median = float(torch.tensor([float(mask.sum()) for mask in masks]).median())
     assert few < many <= median / 2
     assert after < 0.8 * before
+
+
+def test_what_no_photograph_shows_gets_the_colour_of_what_is_beside_it(scene, ball, cameras, masks):
+    # a red spot on the ball's far side, which no camera sees
+    behind = ball.means[:, 1] > 0.35
+    red = dc_from_rgb(torch.tensor([[0.9, 0.0, 0.0]]))
+    painted = torch.cat([behind, torch.zeros(scene.count - BALL, dtype=torch.bool)])
+    # wide enough to leave no gaps
+    wide = torch.where(torch.arange(scene.count) < BALL, 0.6, 0.0)[:, None]
+    spotted = replace(scene, sh=torch.where(painted[:, None, None], red, scene.sh), log_scales=scene.log_scales + wide)
+    pictures = [photo * mask[..., None] for photo, mask in zip(render(scene, cameras).color, masks, strict=True)]
+    views = list(zip(pictures, masks, strict=True))
+    options = SolidifyOptions(iterations=20, pixels_per_gaussian=0.0)
+    solid = solidify_object(spotted, torch.arange(scene.count) < BALL, cameras, views, options=options)
+    kept = solidify_object(
+        spotted, torch.arange(scene.count) < BALL, cameras, views, options=replace(options, hidden=0.0)
+    )
+    green = rgb_from_dc(solid.sh[:, 0])[:, 1]
+    assert float(rgb_from_dc(kept.sh[behind, 0])[:, 1].mean()) < 0.15
+    # the ball's own is 0.7
+    assert float(green[behind].mean()) > 0.55
+    front = ball.means[:, 1] < -0.2
+    assert torch.equal(solid.sh[front], kept.sh[front])
 
 
 def striped(scene, cameras):

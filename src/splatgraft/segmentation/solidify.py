@@ -5,7 +5,8 @@ together with it; at its outline, neighbouring Gaussians may hide those that sti
 scene. Only an opaque object inside its mask matches the photographs over every background.
 
 A reconstruction spends most of its Gaussians on the surroundings, which stay behind. So where the object has fewer than
-its size in the photographs asks for, those are split that have the largest gradient (3DGS, Sec. 5).
+its size in the photographs asks for, those are split that have the largest gradient (3DGS, Sec. 5). What no photograph
+shows, inside and behind, has colours by chance; it gets those of what is next to it.
 """
 
 from collections.abc import Sequence
@@ -13,12 +14,13 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.splitting import PIECES, split_along
-from splatgraft.rendering import RenderOptions, render
+from splatgraft.rendering import RenderOptions, render, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
 
@@ -38,6 +40,11 @@ class SolidifyOptions:
     """Share of the steps after which none is split."""
     dead_opacity: float = 0.02
     """Opacity below which a Gaussian is removed when others are split."""
+    hidden: float = 0.1
+    """Pixels in which a Gaussian shows, over the square of its width, below which its colour is not known; over the
+    median one. 0 keeps all colours."""
+    neighbours: int = 8
+    """Gaussians of known colour whose mean is taken then."""
     opacity_rate: float = 0.05
     """Of Adam, logits per step."""
     color_rate: float = 0.0025
@@ -116,7 +123,7 @@ def solidify_object(
             allowed = int(first + (wanted - first) * step / stop)
             fit = _Fit(_with_splits(fit.gaussians, fit.scores, allowed, options), options)
     progress(options.iterations, options.iterations, "the object is solid")
-    return fit.gaussians
+    return _with_known_colors(fit.gaussians, views, options)
 
 
 class _Fit:
@@ -186,6 +193,26 @@ def _with_splits(gaussians: Gaussians, scores: Float[Tensor, "n"], allowed: int,
     split = gaussians.select(chosen)
     pieces, _ = split_along(split, split.log_scales.argmax(1))
     return concatenate([gaussians.select(alive & ~chosen), pieces])
+
+
+def _with_known_colors(gaussians: Gaussians, views: Sequence[_CroppedView], options: SolidifyOptions) -> Gaussians:
+    """The Gaussians that hardly show in any view with the mean colour of the nearest that do, from all sides alike."""
+    shown = torch.zeros(gaussians.count, device=gaussians.device)
+    for view in views:
+        ones = torch.ones_like(view.mask)
+        shown += view_operator(gaussians, view.camera, RenderOptions()).blend_transpose(ones)[:, 0]
+    widths = gaussians.scales.sort(1, descending=True).values[:, :2]
+    known = shown / (widths.prod(1) * gaussians.opacities).clamp_min(1e-20)
+    hidden = known < options.hidden * known.median()
+    count = gaussians.count - int(hidden.sum())
+    if count == gaussians.count or count <= options.neighbours:
+        return gaussians
+    tree = KDTree(gaussians.means[~hidden].cpu().numpy())
+    _, nearest = tree.query(gaussians.means[hidden].cpu().numpy(), k=options.neighbours)
+    sh = gaussians.sh.clone()
+    sh[hidden] = 0
+    sh[hidden, 0] = gaussians.sh[~hidden, 0][torch.from_numpy(nearest).to(sh.device)].mean(1)
+    return replace(gaussians, sh=sh)
 
 
 def _cropped_view(
