@@ -3,8 +3,8 @@
     transformer/config.json, diffusion_pytorch_model*.safetensors   (or these in the folder itself)
     vae/  empty_prompt.safetensors  harmonizer.json                 (the base's where a folder has none)
 
-harmonizer.json is written by this package: {"variant": "image-mask"}. The authors' folders are named by their
-variant.
+harmonizer.json is written by this package: {"variant": "image-mask"}, and may name the "guidance" that a network made
+of FLUX.1-dev was trained with. The authors' folders are named by their variant.
 """
 
 import json
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from splatgraft.harmonization.flux.baked_modulation import GUIDANCE
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
 from splatgraft.harmonization.flux.weights.hub import download, licence_of
 from splatgraft.harmonization.flux.weights.safetensors_header import read_model_shapes
@@ -109,6 +110,20 @@ class FluxFolder:
             )
         return FluxFolder(folder, transformer, config, first[1] // out)
 
+    @property
+    def guidance(self) -> float | None:
+        """Guidance that a guidance-distilled network (FLUX.1-dev) is told; None for networks without.
+
+        Raises:
+            ValueError: harmonizer.json is broken.
+        """
+        if not self.config.get("guidance_embeds", False):
+            return None
+        found = _description(self.folder).get("guidance", GUIDANCE)
+        if not isinstance(found, int | float):
+            raise ValueError(f"{self.folder / DESCRIPTION_FILE}: expected a number as guidance, found {found!r}")
+        return float(found)
+
     def variant(self, requested: str) -> Variant:
         """Determine the variant: `requested`, or for `auto` that of harmonizer.json or of the folder's name.
 
@@ -143,13 +158,25 @@ def declared_variant(folder: Path) -> str | None:
     path = folder / DESCRIPTION_FILE
     if not path.is_file():
         return None
-    try:
-        variant = json.loads(path.read_text())["variant"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: expected a variant, found {type(error).__name__}: {error}") from error
+    description = _description(folder)
+    if "variant" not in description:
+        raise ValueError(f"{path}: expected a variant, found {_few(description)}")
+    variant = description["variant"]
     if variant not in VARIANTS:
         raise ValueError(f"{path}: expected variant {' or '.join(VARIANTS)}, found {variant}")
     return variant
+
+
+def _description(folder: Path) -> dict[str, Any]:
+    """The content of harmonizer.json; empty where there is no such file."""
+    path = folder / DESCRIPTION_FILE
+    try:
+        found = json.loads(path.read_text()) if path.is_file() else {}
+    except ValueError as error:
+        raise ValueError(f"{path}: expected a variant, found {type(error).__name__}: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: expected a variant, found a {type(found).__name__}")
+    return found
 
 
 def find_part(name: str, *folders: Path) -> Path:

@@ -27,6 +27,7 @@ from splatgraft.harmonization.flux.weights.folder import (
     local_folder,
 )
 from splatgraft.harmonization.flux.weights.lora import merge_lora
+from splatgraft.harmonization.flux.weights.lora_file import LowRankFile, read_lora
 from splatgraft.harmonization.flux.weights.placement import (
     PRECISIONS,
     Placement,
@@ -38,6 +39,7 @@ from splatgraft.harmonization.flux.weights.widening import FirstLayer, widen_lay
 
 Say = Callable[[str], None]
 BASE = "black-forest-labs/FLUX.1-schnell"
+_FIRST_LAYER = "x_embedder"
 
 
 @dataclass(frozen=True)
@@ -79,8 +81,11 @@ def load_flux(
         raise ValueError(f"--precision: expected auto, {', '.join(PRECISIONS)}, found {options.precision}")
     folder = local_folder(options.weights, say)
     checked = FluxFolder.open(folder)
-    lora_variant = options.variant if options.lora is None else _variant_of_lora(options)
-    variant = lora_variant if options.lora is not None and checked.inputs == 1 else checked.variant(options.variant)
+    lora = None if options.lora is None else read_lora(options.lora)
+    if lora is not None and checked.inputs == 1:
+        variant = _variant_of_lora(options, lora)
+    else:
+        variant = checked.variant(options.variant)
     base = _Base(folder, options.base, say)
     config = checked.config
     prompt = read_prompt(
@@ -93,15 +98,21 @@ def load_flux(
     say(placement.sentence)
     dtype = torch.float32 if placement.precision == "float32" else torch.bfloat16
     transformer = load_transformer(checked, dtype=dtype, quantized=placement.precision == "nf4")
-    if options.lora is not None:
+    if lora is not None:
         if placement.precision == "nf4":
             raise ValueError(f"{options.lora}: expected a precision that weights can be added to, found nf4")
         if checked.inputs == 1:
-            widen_transformer(transformer)
-        say(f"lora: {merge_lora(transformer, options.lora)} layers adapted by {options.lora}")
+            # a low-rank first layer counts from zeros, as diffusers widens for it; ours is stored whole
+            widen_transformer(transformer, "zero" if _FIRST_LAYER in lora.updates else "repeat")
+        say(f"lora: {merge_lora(transformer, lora)} layers adapted by {options.lora}")
+        if lora.unused:
+            say(f"lora: {lora.unused} tensors of text encoders are not used, since the prompt is precomputed")
     transformer.eval().requires_grad_(False)
     prompt = prompt.to(torch.device("cpu"), dtype)
-    removed = bake(transformer, prompt, schnell_levels(options.steps)[:-1])
+    guidance = checked.guidance
+    if guidance is not None:
+        say(f"flux: a guidance-distilled network (FLUX.1-dev); guidance {guidance:g}, noise levels in equal steps")
+    removed = bake(transformer, prompt, schnell_levels(options.steps)[:-1], guidance=guidance)
     if placement.precision != "nf4":
         fuse_projections(transformer)
     say(f"flux: {removed / 1e9:.2f} billion parameters of modulation replaced by a table")
@@ -165,7 +176,13 @@ class _Base:
         return (local_folder(self._base or BASE, self._say),)
 
 
-def _variant_of_lora(options: FluxWeights) -> Variant:
+def _variant_of_lora(options: FluxWeights, lora: LowRankFile) -> Variant:
+    """The variant of an adaptation that makes FLUX a harmoniser."""
+    if _FIRST_LAYER not in lora.updates and f"{_FIRST_LAYER}.weight" not in lora.whole:
+        raise ValueError(
+            f"{options.lora}: expected {_FIRST_LAYER} in an adaptation that makes FLUX a harmoniser, found none; give "
+            "the harmoniser that it was trained on as --weights"
+        )
     variant = options.variant if options.variant != "auto" else declared_variant(options.lora.parent)  # pyright: ignore
     if variant not in VARIANTS:
         raise ValueError(f"{options.lora}: expected harmonizer.json beside it or --variant, found neither")
