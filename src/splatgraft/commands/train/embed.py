@@ -9,7 +9,7 @@ from splatgraft.runtime.console import Console
 
 @dataclass(frozen=True)
 class TrainEmbed:
-    """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or of Stable Diffusion; needs transformers."""
+    """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or Stable Diffusion, or IC-Light's prompts."""
 
     out: Positional
     """File to write: empty_prompt.safetensors; a file beside the weights is found without an option."""
@@ -17,20 +17,23 @@ class TrainEmbed:
     """Folder or hub id with the text encoders and tokenizers."""
     tokens: int = 256
     """Length of FLUX's text sequence; schnell was distilled at 256."""
-    kind: Literal["flux", "stable-diffusion"] = "flux"
-    """The model whose text encoders are used."""
+    kind: Literal["flux", "stable-diffusion", "ic-light"] = "flux"
+    """The model whose text encoders are used; needs transformers (pip install 'splatgraft[text]')."""
 
     def execute(self, console: Console) -> int:
         """Write the file."""
         from splatgraft.harmonization.flux.weights.text_encoders import (
             embed_empty_prompt,
             embed_empty_prompt_stable_diffusion,
+            embed_ic_light_prompts,
         )
 
         if self.kind == "flux":
             embed_empty_prompt(self.base, self.out, tokens=self.tokens, say=console.say)
-        else:
+        elif self.kind == "stable-diffusion":
             embed_empty_prompt_stable_diffusion(self.base, self.out, say=console.say)
+        else:
+            embed_ic_light_prompts(self.base, self.out, say=console.say)
         console.result(self.out)
         return 0
 

@@ -52,6 +52,10 @@ class FluxNetwork:
     device: torch.device
     dtype: torch.dtype
     """Of the transformer's arithmetic."""
+    steps: int = 4
+    """Sampling steps that its modulations are precomputed for."""
+    strengths: tuple[float, ...] = (1.0,)
+    """Noise levels to start from that its modulations are precomputed for."""
 
 
 def velocity(

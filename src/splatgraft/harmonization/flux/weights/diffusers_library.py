@@ -28,6 +28,11 @@ def unet_class() -> Any:
     return _diffusers().UNet2DConditionModel
 
 
+def dpm_solver_class() -> Any:
+    """`DPMSolverMultistepScheduler`."""
+    return _diffusers().DPMSolverMultistepScheduler
+
+
 def nf4_config(compute_dtype: Any) -> Any:
     """Configuration of 4-bit NormalFloat weights; loading a model with it needs bitsandbytes."""
     return _diffusers().BitsAndBytesConfig(

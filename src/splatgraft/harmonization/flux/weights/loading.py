@@ -60,6 +60,8 @@ class FluxWeights:
     """Use torch.compile; worthwhile from about twenty views of one size on."""
     steps: int = 4
     """Sampling steps; the modulations are precomputed for their noise levels."""
+    strengths: tuple[float, ...] = (1.0,)
+    """Noise levels that sampling will start from, in (0, 1]."""
 
 
 def load_flux(
@@ -112,7 +114,8 @@ def load_flux(
     guidance = checked.guidance
     if guidance is not None:
         say(f"flux: a guidance-distilled network (FLUX.1-dev); guidance {guidance:g}, noise levels in equal steps")
-    removed = bake(transformer, prompt, schnell_levels(options.steps)[:-1], guidance=guidance)
+    levels = sorted({level for start in options.strengths for level in schnell_levels(options.steps, start=start)[:-1]})
+    removed = bake(transformer, prompt, tuple(levels), guidance=guidance)
     if placement.precision != "nf4":
         fuse_projections(transformer)
     say(f"flux: {removed / 1e9:.2f} billion parameters of modulation replaced by a table")
@@ -122,7 +125,9 @@ def load_flux(
         autoencoder.network.enable_tiling()
     if options.compiled:
         transformer.compile_repeated_blocks()
-    return FluxNetwork(transformer, autoencoder, prompt.to(device, dtype), variant, device, dtype)  # pyright: ignore
+    return FluxNetwork(
+        transformer, autoencoder, prompt.to(device, dtype), variant, device, dtype, options.steps, options.strengths
+    )
 
 
 def load_transformer(checked: FluxFolder, *, dtype: torch.dtype, quantized: bool = False) -> Any:
