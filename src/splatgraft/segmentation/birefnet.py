@@ -11,6 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import resize
+from splatgraft.runtime.weights.catalogue import ModelWeights
+from splatgraft.runtime.weights.hub import fetch
+from splatgraft.runtime.weights.store import folder_of, is_stored
 from splatgraft.segmentation.onnx_networks import IMAGENET_MEAN, IMAGENET_STD, open_network, require, runs_on_cuda
 
 DEFAULT_REPOSITORY = "onnx-community/BiRefNet-ONNX"
@@ -85,13 +88,12 @@ def load_birefnet(weights: Path | str = DEFAULT_REPOSITORY, *, threads: int | No
 
 
 def _from_hub(repository: str) -> Path:
-    require("huggingface_hub", "birefnet")
-    import huggingface_hub
-
-    try:
-        return Path(huggingface_hub.hf_hub_download(repository, _FILE))
-    except Exception as error:  # network, repository or file is missing: a user error in each case
-        raise ValueError(
-            f"{repository}: expected to download {_FILE} from the hub, found {type(error).__name__}; "
-            "give the path of an .onnx file, or use grabcut"
-        ) from error
+    folder = folder_of(repository)
+    model = ModelWeights(repository, "masks", repository, files=(_FILE,))
+    if not is_stored(folder, model):
+        require("huggingface_hub", "birefnet")
+        try:
+            fetch(model, folder, say=lambda sentence: None)
+        except ValueError as error:  # network, repository or file is missing
+            raise ValueError(f"{error}; or give the path of an .onnx file, or use grabcut") from error
+    return folder / _FILE

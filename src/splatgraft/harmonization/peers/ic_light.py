@@ -18,7 +18,7 @@ from splatgraft.harmonization.flux.latents import pad_by_reflection
 from splatgraft.harmonization.flux.network import Autoencoder
 from splatgraft.harmonization.flux.sampling import noise
 from splatgraft.harmonization.flux.weights.diffusers_library import dpm_solver_class, unet_class
-from splatgraft.harmonization.flux.weights.folder import find_part, local_folder
+from splatgraft.harmonization.flux.weights.folder import find_part, local_folder, weights_variant
 from splatgraft.harmonization.flux.weights.loading import load_autoencoder
 from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
 from splatgraft.harmonization.flux.weights.text_encoders import IC_LIGHT_PROMPT_FILE
@@ -112,9 +112,9 @@ def load_ic_light(options: ICLightOptions, context: HarmonizerContext) -> ICLigh
             "harmonizer ic-light: expected --weights iclight_sd15_fbc.safetensors (hub: lllyasviel/ic-light), "
             f"found {options.weights or 'none'}"
         )
-    base = local_folder(options.base or _BASE, context.say)
+    base = local_folder(options.base or _BASE, context.say, parts=("unet", "vae"))
     prompts = _read_prompts(Path(options.weights).parent, base)
-    unet = unet_class().from_pretrained(base / "unet")
+    unet = unet_class().from_pretrained(base / "unet", variant=weights_variant(base / "unet"))
     add_difference(unet, Path(options.weights))
     autoencoder = load_autoencoder(find_part("vae", base))
     dtype = torch.float16 if context.device.type == "cuda" else torch.float32

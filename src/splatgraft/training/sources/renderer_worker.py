@@ -63,6 +63,8 @@ def load(program):
     """The module of a program, its loading classes replaced."""
     name = os.path.splitext(os.path.basename(program))[0]
     spec = importlib.util.spec_from_file_location(name, program)
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     spec.loader.exec_module(module)

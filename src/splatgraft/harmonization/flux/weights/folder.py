@@ -1,6 +1,6 @@
 """Folders of FLUX harmonisers: finds their parts, reads the variant and checks shapes without loading weights.
 
-    transformer/config.json, diffusion_pytorch_model*.safetensors   (or these in the folder itself)
+    transformer/config.json, diffusion_pytorch_model*.safetensors   (or these in the folder itself; also .bf16.)
     vae/  empty_prompt.safetensors  harmonizer.json                 (the base's where a folder has none)
 
 harmonizer.json is written by this package: {"variant": "image-mask"}, and may name the "guidance" that a network made
@@ -8,16 +8,19 @@ of FLUX.1-dev was trained with. The authors' folders are named by their variant.
 """
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from splatgraft.harmonization.flux.baked_modulation import GUIDANCE
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
-from splatgraft.harmonization.flux.weights.hub import download, licence_of
 from splatgraft.harmonization.flux.weights.safetensors_header import read_model_shapes
 from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.weights.catalogue import ModelWeights
+from splatgraft.runtime.weights.hub import fetch
+from splatgraft.runtime.weights.layout import variant_in
+from splatgraft.runtime.weights.store import folder_of, is_stored
 
 Variant = Literal["image-mask", "image-background"]
 """The second condition beside the composite: the object's mask, or the scene without the object."""
@@ -27,26 +30,16 @@ CONDITIONS = 2
 DESCRIPTION_FILE = "harmonizer.json"
 AUTHORS = "nviolante/dot3d"
 WEIGHTS = "diffusion_pytorch_model"
-_PARTS = ("", "transformer/", "vae/", "unet/")
-_HUB_PATTERNS = [
-    # leaves out single-file models, half-precision copies and text encoders, which would double the download
-    *(
-        f"{part}{name}"
-        for part in _PARTS
-        for name in ("config.json", f"{WEIGHTS}.safetensors*", f"{WEIGHTS}-*.safetensors")
-    ),
-    *("model_index.json", DESCRIPTION_FILE, PROMPT_FILE),
-]
-
 Say = Callable[[str], None]
 
 
-def local_folder(weights: str, say: Say) -> Path:
-    """Resolve `weights` to a local folder, downloading it where it is a hub id.
+def local_folder(weights: str, say: Say, *, parts: Sequence[str] = ("transformer",)) -> Path:
+    """Resolve `weights` to a local folder; what a hub id needs is fetched once (`splatgraft weights`).
 
     Args:
         weights: a folder, or a hub id OWNER/NAME or OWNER/NAME/FOLDER.
-        say: receives the repository and its licence before a download.
+        say: receives the repository, its licence and the size before a download.
+        parts: folders of the model that are needed; vae/ is taken too where it is there.
 
     Raises:
         ValueError: it is neither, or the download fails.
@@ -54,18 +47,20 @@ def local_folder(weights: str, say: Say) -> Path:
     folder = Path(weights)
     if folder.is_dir():
         return folder
-    parts = weights.split("/")
-    if folder.exists() or folder.is_absolute() or weights.startswith(".") or len(parts) not in (2, 3) or not all(parts):
+    names = weights.split("/")
+    if folder.exists() or folder.is_absolute() or weights.startswith(".") or len(names) not in (2, 3) or not all(names):
         raise ValueError(
             f"{weights}: expected a folder with transformer/ or a hub id such as {AUTHORS}/image-mask, found "
             f"{'a file' if folder.exists() else 'none'}"
         )
-    repository, inner = "/".join(parts[:2]), "".join(parts[2:])
-    say(f"weights: {repository} from the Hugging Face hub; licence: {licence_of(repository)}, read it before use")
+    repository, inner = "/".join(names[:2]), "".join(names[2:])
     if repository == AUTHORS and not inner:
         inner = "image-mask"
-    patterns = [f"{inner}/{pattern}" for pattern in _HUB_PATTERNS] if inner else _HUB_PATTERNS
-    return download(repository, patterns) / inner
+    there = folder_of(repository)
+    wanted = ModelWeights(weights, "named by its id", repository, folder=inner, parts=tuple(parts), optional=("vae",))
+    if not is_stored(there, wanted):
+        fetch(wanted, there, say=say)
+    return there / inner
 
 
 @dataclass(frozen=True)
@@ -91,7 +86,7 @@ class FluxFolder:
         below = folder / "transformer"
         transformer = below if (below / "config.json").is_file() else folder
         config = read_config(transformer / "config.json", "FluxTransformer2DModel")
-        shapes = read_model_shapes(transformer, WEIGHTS)
+        shapes = read_model_shapes(transformer, WEIGHTS, weights_variant(transformer) or "")
         first, last = shapes.get("x_embedder.weight"), shapes.get("proj_out.weight")
         if first is None or last is None:
             raise ValueError(f"{transformer}: expected x_embedder.weight and proj_out.weight, found {_few(shapes)}")
@@ -147,6 +142,11 @@ class FluxFolder:
                 "neither; choose by --variant"
             )
         return chosen  # pyright: ignore
+
+
+def weights_variant(folder: Path) -> str | None:
+    """The variant of a model's weight files, `bf16` for *.bf16.safetensors; None for plain ones."""
+    return variant_in([path.name for path in folder.iterdir()] if folder.is_dir() else []) or None
 
 
 def declared_variant(folder: Path) -> str | None:

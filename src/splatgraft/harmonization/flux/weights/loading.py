@@ -17,6 +17,7 @@ from splatgraft.harmonization.flux.weights.diffusers_library import (
     flux_transformer_class,
     nf4_config,
 )
+from splatgraft.harmonization.flux.weights.eight_bit import multiplies_in_eight_bits, use_eight_bits
 from splatgraft.harmonization.flux.weights.folder import (
     CONDITIONS,
     VARIANTS,
@@ -25,6 +26,7 @@ from splatgraft.harmonization.flux.weights.folder import (
     declared_variant,
     find_part,
     local_folder,
+    weights_variant,
 )
 from splatgraft.harmonization.flux.weights.lora import merge_lora
 from splatgraft.harmonization.flux.weights.lora_file import LowRankFile, read_lora
@@ -36,6 +38,7 @@ from splatgraft.harmonization.flux.weights.placement import (
     decoder_bytes,
 )
 from splatgraft.harmonization.flux.weights.widening import FirstLayer, widen_layer
+from splatgraft.runtime.weights.store import folder_of
 
 Say = Callable[[str], None]
 BASE = "black-forest-labs/FLUX.1-schnell"
@@ -119,7 +122,8 @@ def load_flux(
     if placement.precision != "nf4":
         fuse_projections(transformer)
     say(f"flux: {removed / 1e9:.2f} billion parameters of modulation replaced by a table")
-    _place(transformer, placement, device, dtype)
+    if (more := _place(transformer, placement, device, dtype)) is not None:
+        say(more)
     autoencoder.network.to(device, dtype).eval().requires_grad_(False)
     if placement.tiled:
         autoencoder.network.enable_tiling()
@@ -137,11 +141,15 @@ def load_transformer(checked: FluxFolder, *, dtype: torch.dtype, quantized: bool
         ValueError: the weights do not fit the config.
     """
     settings = {"quantization_config": nf4_config(dtype)} if quantized else {}
+    folder = checked.transformer
     try:
-        return flux_transformer_class().from_pretrained(checked.transformer, torch_dtype=dtype, **settings)
+        loaded = flux_transformer_class().from_pretrained(
+            folder, torch_dtype=dtype, variant=weights_variant(folder), output_loading_info=True, **settings
+        )
     except (OSError, ValueError, RuntimeError) as error:
         found = " ".join(str(error).split())[:200]
-        raise ValueError(f"{checked.transformer}: expected weights that fit config.json, found {found}") from error
+        raise ValueError(f"{folder}: expected weights that fit config.json, found {found}") from error
+    return _complete(folder, *loaded)
 
 
 def load_autoencoder(folder: Path) -> Autoencoder:
@@ -151,10 +159,23 @@ def load_autoencoder(folder: Path) -> Autoencoder:
         ValueError: the folder has none.
     """
     try:
-        return Autoencoder(autoencoder_class().from_pretrained(folder))
+        # a variant in 16 bits becomes float32 too
+        loaded = autoencoder_class().from_pretrained(
+            folder, torch_dtype=torch.float32, variant=weights_variant(folder), output_loading_info=True
+        )
     except (OSError, ValueError, RuntimeError) as error:
         found = " ".join(str(error).split())[:200]
         raise ValueError(f"{folder}: expected an AutoencoderKL, found {found}") from error
+    return Autoencoder(_complete(folder, *loaded))
+
+
+def _complete(folder: Path, model: Any, about: Any) -> Any:
+    """The model, where the files had all its weights: of missing ones diffusers only warns."""
+    if missing := sorted(about["missing_keys"]):
+        raise ValueError(
+            f"{folder}: expected all weights of config.json, found {len(missing)} missing: {missing[0]} ..."
+        )
+    return model
 
 
 def widen_transformer(transformer: Any, init: FirstLayer = "repeat") -> None:
@@ -177,8 +198,8 @@ class _Base:
         if self._base is None and (beside / name).exists():
             return (beside,)
         if self._base is None and name == PROMPT_FILE:
-            return ()
-        return (local_folder(self._base or BASE, self._say),)
+            return (folder_of(BASE),)  # where `train embed` writes it
+        return (local_folder(self._base or BASE, self._say, parts=("vae",)),)
 
 
 def _variant_of_lora(options: FluxWeights, lora: LowRankFile) -> Variant:
@@ -215,11 +236,17 @@ def _placement(
     )
 
 
-def _place(transformer: Any, placement: Placement, device: torch.device, dtype: torch.dtype) -> None:
+def _place(transformer: Any, placement: Placement, device: torch.device, dtype: torch.dtype) -> str | None:
+    """Move the transformer; a sentence for the user where the precision has more to say."""
     if placement.precision == "offload":
         transformer.enable_group_offload(device, offload_type="block_level", num_blocks_per_group=1, use_stream=True)
-        return
-    if placement.precision == "fp8":
+        return None
+    sentence = None
+    if placement.precision == "fp8" and multiplies_in_eight_bits(device):
+        sentence = f"fp8: {use_eight_bits(transformer)} layers multiply in 8 bits, with a scale for each row"
+    elif placement.precision == "fp8":
         transformer.enable_layerwise_casting(storage_dtype=torch.float8_e4m3fn, compute_dtype=dtype)
+        sentence = f"fp8: weights are only stored in 8 bits and computed in {dtype}: no torch._scaled_mm on {device}"
     if placement.precision != "nf4":
         transformer.to(device)
+    return sentence
