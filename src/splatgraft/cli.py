@@ -36,6 +36,9 @@ _TABLE = (
     ("train compact", "train.compact", "train the compact harmoniser on rendered pairs"),
     ("train removal", "train.removal", "train the object removal on pairs"),
     ("train embed", "train.embed", "compute the empty prompt's embeddings once"),
+    ("weights list", "weights.list", "say which networks there are, their licences, sizes, and what is fetched"),
+    ("weights fetch", "weights.fetch", "fetch the weights of a network"),
+    ("weights verify", "weights.verify", "compare fetched weights with their hashes"),
     ("doctor", "doctor", "say what is installed, what is missing and how to get it"),
 )
 
@@ -44,6 +47,7 @@ COMMANDS = {command: summary for command, _, summary in _TABLE}
 
 GROUPS = {
     "synth": "synthetic training pairs and benchmark scenes",
+    "weights": "weights of the networks of other people",
     "train": "training of the harmonisers and of the object removal",
 }
 """First words that are no commands by themselves, with what their commands have in common."""

@@ -104,3 +104,29 @@ def test_the_empty_prompt_is_the_stock_pipeline_s(text_encoders):
         read_prompt(path, tokens_width=TEXT, pooled_width=POOLED)
     with pytest.raises(ValueError, match=r"nowhere: expected CLIPTokenizer in tokenizer/, found"):
         embed_empty_prompt(str(text_encoders / "nowhere"), path, tokens=6, say=said.append)
+
+
+def test_embedding_without_a_file_writes_where_harmonize_and_ic_light_look(
+    text_encoders, tmp_path, monkeypatch, capsys
+):
+    from splatgraft.cli import main
+    from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
+
+    monkeypatch.setattr("pathlib.Path.home", lambda: tmp_path / "home")
+    assert main(["train", "embed", "--base", str(text_encoders), "--tokens", "6"]) == 0
+    found = read_prompt(text_encoders / "empty_prompt.safetensors", tokens_width=TEXT, pooled_width=POOLED)
+    assert found.tokens.shape == (6, TEXT)
+    assert main(["train", "embed", "--kind", "ic-light", "--base", str(text_encoders)]) == 0
+    prompts = read_tensors(text_encoders / "ic_light_prompt.safetensors")
+    assert set(prompts) == {"positive", "negative"}
+    assert prompts["positive"].shape == prompts["negative"].shape == (77, POOLED)
+    # a hub id: in the folder of its weights, which is where `harmonize` looks; there is no network here
+    from splatgraft.harmonization.flux.weights import text_encoders as module
+    from splatgraft.harmonization.flux.weights.loading import BASE
+    from splatgraft.runtime.weights.store import folder_of
+
+    load = module._load
+    monkeypatch.setattr(module, "_load", lambda base, part, kind: load(str(text_encoders), part, kind))
+    assert main(["train", "embed", "--tokens", "6"]) == 0
+    assert (folder_of(BASE) / "empty_prompt.safetensors").is_file()
+    assert str(folder_of(BASE)) in capsys.readouterr().out

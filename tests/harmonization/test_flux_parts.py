@@ -13,6 +13,7 @@ from splatgraft.harmonization.flux.network import velocity
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
 from splatgraft.harmonization.flux.weights.loading import widen_transformer
 from splatgraft.harmonization.flux.weights.lora import LowRankLinear, add_lora, merge_lora, write_lora
+from splatgraft.harmonization.flux.weights.lora_file import read_lora
 from splatgraft.harmonization.flux.weights.widening import widen_layer
 
 pytestmark = list(quiet)
@@ -173,7 +174,7 @@ def test_an_adaptation_begins_at_nothing_and_merges_to_what_it_was(tmp_path):
                 module.lora_B.normal_(0, 0.1, generator=torch.Generator().manual_seed(1))
         wanted = velocity(adapted, latents, t, prompt)
     write_lora(tmp_path / "lora.safetensors", adapted.state_dict(), {})
-    assert merge_lora(stock, tmp_path / "lora.safetensors") == count
+    assert merge_lora(stock, read_lora(tmp_path / "lora.safetensors")) == count
     with torch.no_grad():
         # W x + B A x against (W + B A) x: float32 rounding over three blocks
         assert torch.allclose(velocity(stock, latents, t, prompt), wanted, atol=1e-4)
@@ -184,4 +185,4 @@ def test_an_adaptation_of_another_network_is_refused(tmp_path):
     add_lora(adapted, 2)
     write_lora(tmp_path / "lora.safetensors", adapted.state_dict(), {})
     with pytest.raises(ValueError, match=r"lora.safetensors: expected a network whose x_embedder.weight is \(32, 48\)"):
-        merge_lora(tiny_transformer(), tmp_path / "lora.safetensors")
+        merge_lora(tiny_transformer(), read_lora(tmp_path / "lora.safetensors"))

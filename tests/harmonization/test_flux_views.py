@@ -1,5 +1,6 @@
 """The command `harmonize` with a network: resumed after a kill, in batches, split over processes and over Ray."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +15,10 @@ from splatgraft.cli import main
 from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import read_rgb
+from splatgraft.folders import harmonized_views
 from splatgraft.folders.harmonized_views import Part, finished, harmonize_part, picture_folders
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import FluxOptions, HarmonizerInputs
+from splatgraft.harmonization import FluxOptions, Harmonized, HarmonizerInputs, NoneOptions
 from splatgraft.project.step import perform
 from splatgraft.runtime.console import Console
 
@@ -144,3 +146,62 @@ def test_workers_of_ray_make_the_same_files(views, weights):
     alone = perform(step(views, weights), Console())
     spread = perform(step(views, weights, "spread", processes=2, ray="local"), Console())
     assert images(spread) == images(alone)
+
+
+class Watched:
+    """A harmoniser that works only while the next view is read and the last one is written."""
+
+    def __init__(self, read, written):
+        self.read, self.written, self.done = read, written, 0
+
+    def harmonize(self, view):
+        later = self.done + 1
+        assert later >= len(self.read) or self.read[later].wait(20), "the next view is not read beside the model"
+        assert self.done == 0 or self.written[self.done - 1].wait(20), "the last view is not written beside the model"
+        self.done += 1
+        return Harmonized(view.prior)
+
+
+def test_files_are_read_and_written_beside_the_model(views, tmp_path, monkeypatch):
+    read, written = ([threading.Event() for _ in range(4)] for _ in range(2))
+    original, write = ViewFolder.read, harmonized_views._write
+    stems = ViewFolder.open(views).stems
+
+    def reading(folder, index):
+        view = original(folder, index)
+        read[index].set()
+        return view
+
+    def writing(kept, stem, result):
+        write(kept, stem, result)
+        written[stems.index(stem)].set()
+
+    monkeypatch.setattr(ViewFolder, "read", reading)
+    monkeypatch.setattr(harmonized_views, "_write", writing)
+    monkeypatch.setattr(harmonized_views, "make_harmonizer", lambda options, context: Watched(read, written))
+    (tmp_path / "kept").mkdir()
+    picture_folders(tmp_path / "kept")
+    named = []
+    harmonize_part(Part(views, FluxOptions(), tmp_path / "kept", device="cpu"), progress=lambda *w: named.append(w[2]))
+    assert named == ["a", "b", "c", "d"]
+    assert finished(tmp_path / "kept", ViewFolder.open(views)) == {0, 1, 2, 3}
+
+
+def test_a_damaged_view_is_one_line_and_those_before_it_are_kept(views, tmp_path):
+    (views / "composite" / "c.png").write_bytes(b"no picture")
+    (tmp_path / "kept").mkdir()
+    picture_folders(tmp_path / "kept")
+    with pytest.raises(ValueError, match=r"c.png: expected"):
+        harmonize_part(Part(views, NoneOptions(), tmp_path / "kept", device="cpu"))
+    assert {0, 1} <= finished(tmp_path / "kept", ViewFolder.open(views))
+
+
+def test_a_picture_that_cannot_be_written_ends_the_run(views, tmp_path, monkeypatch):
+    def full(kept, stem, result):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(harmonized_views, "_write", full)
+    (tmp_path / "kept").mkdir()
+    picture_folders(tmp_path / "kept")
+    with pytest.raises(OSError, match="No space left"):
+        harmonize_part(Part(views, NoneOptions(), tmp_path / "kept", device="cpu"))

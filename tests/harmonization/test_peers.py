@@ -1,4 +1,4 @@
-"""Harmonisers by other authors: each works with stand-ins of its parts, and names missing parts in one line."""
+"""Harmonisers by other authors: their published settings, stand-ins of their parts, missing parts named in one line."""
 
 import base64
 import io
@@ -119,40 +119,160 @@ def test_an_editing_service_that_fails_or_has_no_key_is_one_line(service):
         make_harmonizer(ImageEditingOptions(weights="ftp://x", max_cost=1.0))
 
 
-def test_mv_colight_runs_in_its_own_python_and_its_change_is_laid_on_the_composite(tmp_path):
-    python = tmp_path / "python"
-    program = tmp_path / "program.py"
-    # called as: PYTHON - MODEL_FOLDER INPUT OUTPUT
-    program.write_text("import sys, numpy as np; np.save(sys.argv[4], np.load(sys.argv[3])[:3] * 0.5)")
-    python.write_text(f'#!/bin/sh\nexec {sys.executable} {program} "$@"\n')
-    python.chmod(0o755)
-    image = MVCoLight(tmp_path, tmp_path, python).harmonize(view()).image
+@pytest.fixture
+def other_python(tmp_path):
+    """An interpreter that runs `program` instead of the adaptor's, as PYTHON - MODEL_FOLDER INPUT OUTPUT."""
+    python, file = tmp_path / "python", tmp_path / "program.py"
+
+    def make(program):
+        file.write_text(program)
+        python.write_text(f'#!/bin/sh\nexec {sys.executable} {file} "$@"\n')
+        python.chmod(0o755)
+        return MVCoLight(tmp_path, tmp_path, python)
+
+    return make
+
+
+def test_mv_colight_runs_in_its_own_python_and_its_change_is_laid_on_the_composite(other_python, tmp_path):
+    halves = "import sys, numpy as np; np.save(sys.argv[4], np.load(sys.argv[3])[:, :3] * 0.5)"
+    image = other_python(halves).harmonize(view()).image
     bright = view().composite.amin(-1) > 0.3
     # (x / 2 + 0.02) / (x + 0.02) at the network's size, above a half by less than 0.04 for x > 0.3
     assert ((image / view().composite)[bright] - 0.5).median() < 0.04
-    assert network_input(view()).shape == (7, 256, 256)
-    python.write_text("#!/bin/sh\necho 'ModuleNotFoundError: mmengine' >&2\nexit 1\n")
+    (tmp_path / "python").write_text("#!/bin/sh\necho 'ModuleNotFoundError: mmengine' >&2\nexit 1\n")
     with pytest.raises(ValueError, match="expected MV-CoLight to make a picture, found ModuleNotFoundError: mmengine"):
-        MVCoLight(tmp_path, tmp_path, python).harmonize(view())
+        MVCoLight(tmp_path, tmp_path, tmp_path / "python").harmonize(view())
 
 
-def test_ic_light_adds_its_difference_to_the_base(tmp_path):
-    pytest.importorskip("diffusers")
-    from tiny_models import removal_folder
+def test_mv_colight_sees_squares_whose_shorter_side_has_its_size_and_nothing_is_squeezed():
+    def shown(h, w):
+        y, x = torch.meshgrid(torch.arange(float(h)), torch.arange(float(w)), indexing="ij")
+        disc = ((x - w / 2) ** 2 + (y - h / 2) ** 2 < (h / 4) ** 2).float()
+        flat = disc[..., None].expand(-1, -1, 3)
+        return HarmonizerInputs(flat, flat, disc, 1 + disc, torch.zeros(h, w, 3), flat)
+
+    # as rescale_and_crop of its data sets: the shorter side to 256, the aspect kept
+    for h, w, count in ((496, 704, 2), (256, 256, 1), (300, 1000, 4), (704, 496, 2)):
+        squares = network_input(shown(h, w))
+        assert squares.shape == (count, 7, 256, 256)
+    disc = network_input(shown(496, 704))[0, 0] > 0.5
+    rows, columns = disc.any(1).sum(), disc.any(0).sum()
+    # the disc of a quarter of the height is as wide as it is high, if all of it is in the first square
+    assert abs(int(rows) - 128) <= 2
+    assert abs(int(columns) - 128) <= 2
+
+
+def test_mv_colight_s_squares_leave_no_seam(other_python):
+    # each square is darkened by a factor of its own; between them the factor changes smoothly
+    program = (
+        "import sys, numpy as np; given = np.load(sys.argv[3])[:, :3]; "
+        "np.save(sys.argv[4], given * np.linspace(1, 0.5, len(given))[:, None, None, None].astype('float32'))"
+    )
+    flat = torch.full((64, 96, 3), 0.5)
+    view = HarmonizerInputs(flat, flat, torch.ones(64, 96), torch.ones(64, 96), torch.zeros(64, 96, 3), flat)
+    row = other_python(program).harmonize(view).image[32, :, 0]
+    assert float(row[0]) == pytest.approx(0.5, abs=0.01)
+    assert float(row[-1]) < 0.3
+    # the change of a factor of two is spread over half a square: 32 of these pixels
+    assert float((row[1:] - row[:-1]).abs().max()) < 0.03
+
+
+def ic_light_files(folder):
+    from tiny_models import TEXT, removal_folder
 
     from splatgraft.harmonization.flux.weights.tensor_file import read_tensors, write_tensors
 
-    base = removal_folder(tmp_path / "base")
+    base = removal_folder(folder / "base")
     weights = read_tensors(base / "unet" / "diffusion_pytorch_model.safetensors")
     g = torch.Generator().manual_seed(0)
     weights["conv_in.weight"] = torch.cat([weights["conv_in.weight"]] * 3, 1)
     difference = {name: 0.01 * torch.randn(tensor.shape, generator=g) for name, tensor in weights.items()}
-    path = tmp_path / "iclight_sd15_fbc.safetensors"
-    write_tensors(path, difference)
-    options = ICLightOptions(weights=str(path), base=str(base))
+    write_tensors(folder / "iclight_sd15_fbc.safetensors", difference)
+    prompts = {name: torch.randn(5, TEXT, generator=g) for name in ("positive", "negative")}
+    write_tensors(base / "ic_light_prompt.safetensors", prompts)
+    return ICLightOptions(weights=str(folder / "iclight_sd15_fbc.safetensors"), base=str(base)), difference, prompts
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_ic_light_adds_its_difference_to_the_base(tmp_path):
+    pytest.importorskip("diffusers")
+    from splatgraft.harmonization.flux.weights.tensor_file import write_tensors
+
+    options, difference, _ = ic_light_files(tmp_path)
     image = make_harmonizer(options).harmonize(view()).image
     assert image.shape == (40, 60, 3)
     assert bool(image.isfinite().all())
-    write_tensors(path, {name: tensor for name, tensor in difference.items() if name != "conv_in.weight"})
+    write_tensors(
+        tmp_path / "iclight_sd15_fbc.safetensors", {n: t for n, t in difference.items() if n != "conv_in.weight"}
+    )
     with pytest.raises(ValueError, match=r"iclight_sd15_fbc.safetensors: expected conv_in.weight of .*, found none"):
         make_harmonizer(options)
+    (tmp_path / "base" / "ic_light_prompt.safetensors").unlink()
+    with pytest.raises(ValueError, match=r"ic_light_prompt.safetensors: expected IC-Light's prompt .*train embed"):
+        make_harmonizer(options)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_ic_light_samples_with_the_settings_of_its_authors(tmp_path):
+    pytest.importorskip("diffusers")
+    from splatgraft.harmonization.peers.ic_light import PUBLISHED
+
+    # gradio_demo_bg.py at commit 0351326f: the scheduler's arguments, and the defaults of its sliders
+    published = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "steps_offset": 1}
+    published |= {"algorithm_type": "sde-dpmsolver++", "use_karras_sigmas": True, "beta_schedule": "linear"}
+    found = PUBLISHED.scheduler().config
+    assert {name: found[name] for name in published} == published
+    assert (PUBLISHED.steps, PUBLISHED.guidance) == (20, 7.0)
+    options, _, prompts = ic_light_files(tmp_path)
+    harmonizer = make_harmonizer(options)
+    unet, seen = harmonizer._unet, []
+
+    class Watched(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.inner = unet
+
+        def forward(self, sample, step, prompts, return_dict):
+            seen.append((sample.clone(), prompts))
+            return self.inner(sample, step, prompts, return_dict=return_dict)
+
+    harmonizer._unet = Watched()
+    harmonizer.harmonize(view())
+    assert len(seen) == 20
+    sample, told = seen[0]
+    assert sample.shape[:2] == (2, 12)
+    assert torch.equal(sample[0], sample[1])  # both halves of the guidance see the same latents and conditions
+    assert torch.equal(told, torch.stack([prompts["negative"], prompts["positive"]]))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_ic_light_s_sampling_is_that_of_the_stock_pipeline_with_its_hook(tmp_path):
+    diffusers = pytest.importorskip("diffusers")
+    pytest.importorskip("transformers")
+    from splatgraft.harmonization.peers.ic_light import PUBLISHED
+
+    options, _, prompts = ic_light_files(tmp_path)
+    ours = make_harmonizer(options)
+    unet = ours._unet
+    g = torch.Generator().manual_seed(5)
+    condition, start = torch.randn(1, 8, 8, 8, generator=g), torch.randn(1, 4, 8, 8, generator=g)
+    wanted_steps = ours._sample(condition, start)
+    forward = unet.forward
+
+    def hooked(sample, step, encoder_hidden_states, **named):
+        joined = torch.cat([sample, condition.expand(len(sample), -1, -1, -1)], 1)
+        return forward(joined, step, encoder_hidden_states, return_dict=False)
+
+    unet.forward = hooked
+    unet.register_to_config(in_channels=4)
+    stock = diffusers.StableDiffusionPipeline(
+        vae=ours._autoencoder.network, text_encoder=None, tokenizer=None, unet=unet, scheduler=PUBLISHED.scheduler(),
+        safety_checker=None, requires_safety_checker=False, feature_extractor=None, image_encoder=None,
+    )  # fmt: skip
+    stock.set_progress_bar_config(disable=True)
+    made = stock(
+        prompt_embeds=prompts["positive"][None], negative_prompt_embeds=prompts["negative"][None], latents=start,
+        height=64, width=64, num_inference_steps=20, guidance_scale=7.0, output_type="latent",
+        generator=torch.Generator().manual_seed(0),
+    ).images  # fmt: skip
+    assert torch.allclose(made, wanted_steps, atol=1e-3)  # 20 steps that each amplify the rounding by up to 7

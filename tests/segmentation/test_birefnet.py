@@ -1,5 +1,7 @@
 """BiRefNet: images are scaled and normalised as in training, the output is a mask, bad weights are named."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -12,15 +14,15 @@ def tiny(tmp_path):
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
 
-    def make(channels=3, side=32, name="tiny.onnx", head="Identity"):
+    def make(channels=3, side=32, name="tiny.onnx", head="Identity", batch=1):
         float_ = onnx.TensorProto.FLOAT
         weight = onnx.helper.make_tensor("w", float_, [1, channels, 1, 1], [1.0] + [0.0] * (channels - 1))
         nodes = [
             onnx.helper.make_node("Conv", ["input_image", "w"], ["red"]),
             onnx.helper.make_node(head, ["red"], ["output_image"]),
         ]
-        given = onnx.helper.make_tensor_value_info("input_image", float_, [1, channels, side, side])
-        found = onnx.helper.make_tensor_value_info("output_image", float_, [1, 1, side, side])
+        given = onnx.helper.make_tensor_value_info("input_image", float_, [batch, channels, side, side])
+        found = onnx.helper.make_tensor_value_info("output_image", float_, [batch, 1, side, side])
         graph = onnx.helper.make_graph(nodes, "tiny", [given], [found], [weight])
         model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 13)], ir_version=8)
         onnx.save(model, tmp_path / name)
@@ -46,6 +48,44 @@ def test_probabilities_stay_as_they_are(tiny):
     dark = torch.zeros(16, 16, 3)
     # ImageNet's red mean and deviation; float32
     assert torch.allclose(network.mask(dark), torch.tensor(-0.485 / 0.229).sigmoid(), atol=1e-5)
+
+
+def test_batches_give_the_masks_of_one_by_one_and_sizes_may_differ(tiny):
+    g = torch.Generator().manual_seed(0)
+    images = [torch.rand(h, w, 3, generator=g) for h, w in ((20, 30), (16, 16), (40, 9))]
+    network = load_birefnet(tiny(batch="batch_size"))
+    alone = [network.mask(image) for image in images]
+    for at_once in (2, 3, 4):
+        together = list(replace(network, at_once=at_once).masks(iter(images)))
+        assert [mask.shape for mask in together] == [(20, 30), (16, 16), (40, 9)]
+        assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(alone, together, strict=True))
+
+
+def test_all_cores_work_and_cuda_is_taken_where_onnxruntime_has_it(tiny, monkeypatch):
+    import onnxruntime
+
+    path = tiny(batch="batch_size")
+    network = load_birefnet(path)
+    assert network.session.get_session_options().intra_op_num_threads == onnx_networks.usable_cores()
+    assert network.place == f"{onnx_networks.usable_cores()} cores"
+    assert network.at_once == 1
+    asked, there = [], ["CUDAExecutionProvider", "CPUExecutionProvider"]
+
+    class OnCuda:
+        def __init__(self, path, options, providers):
+            asked.append(providers)
+
+        def get_inputs(self):
+            return network.session.get_inputs()
+
+        def get_providers(self):
+            return asked[-1]
+
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: there)
+    monkeypatch.setattr(onnxruntime, "InferenceSession", OnCuda)
+    found = load_birefnet(path)
+    assert asked == [there]
+    assert (found.place, found.at_once) == ("CUDA", 4)
 
 
 def test_bad_weights_are_named(tiny, tmp_path):

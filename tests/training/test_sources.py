@@ -1,8 +1,6 @@
 """Sources of training pairs: composites as in the paper, held-out scenes, balanced choices, resuming; relighters."""
 
 import json
-import stat
-import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +21,7 @@ from splatgraft.training.sources.generate import Lighting, SamplePlan, UnrelitSa
 from splatgraft.training.sources.orida import Photograph, choose_balanced, read_orida
 from splatgraft.training.sources.pair_source import crop_to_size, sample_seed, split_mixture
 from splatgraft.training.sources.prompts import ANGLES, ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
-from splatgraft.training.sources.relighters import (
-    DiffusionRenderer,
-    RelightingInput,
-    SilhouetteRelighter,
-    inflated_normals,
-)
+from splatgraft.training.sources.relighters import RelightingInput, SilhouetteRelighter, inflated_normals
 from splatgraft.training.sources.relit_pairs import RelitPairs
 from splatgraft.training.sources.rendered_pairs import RenderedPairs
 
@@ -230,40 +223,3 @@ def test_a_dataset_of_another_layout_is_one_line(tmp_path):
     next(root.glob("*/*/masks/*.png")).unlink()
     with pytest.raises(ValueError, match=r"masks: expected a mask DSC_042\d"):
         read_orida(root)
-
-
-def installation(folder: Path, fails: bool = False) -> Path:
-    """Programs with the command line of DiffusionRenderer's, which only darken."""
-    folder.mkdir()
-    program = f"""
-import pathlib, shutil, sys
-if {fails}: sys.exit("CUDA is not there")
-words = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
-given, out = pathlib.Path(words["inference_input_dir"]), pathlib.Path(words["inference_save_dir"])
-if "envlight" in words: assert words["envlight"].endswith(".hdr']")
-for path in given.rglob("*.png"):
-    target = out / "picture" / path.name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copy(path, target)
-"""
-    for name in ("inference_svd_rgbx.py", "inference_svd_xrgb.py"):
-        (folder / name).write_text(program)
-    return folder
-
-
-def test_the_adaptor_calls_an_installation_and_gives_its_pictures(tmp_path):
-    python = tmp_path / "python"  # quick to start, and "import torch" does not load it
-    python.write_text(f'#!/bin/sh\n[ "$1" = -c ] && exit 0\nexec {sys.executable} -S "$@"\n')
-    python.chmod(python.stat().st_mode | stat.S_IXUSR)
-    draft = RelightingInput("a", next(iter(shipped_samples(1)))[1].target, torch.ones(32, 32))
-    light = environment(tmp_path / "maps", "left", "left")
-    relit = DiffusionRenderer(installation(tmp_path / "dr"), python).relight(draft, [light, light])
-    # 8 bits
-    assert [float((picture - draft.image).abs().max()) < 1 / 255 for picture in relit] == [True, True]
-    broken = DiffusionRenderer(installation(tmp_path / "broken", fails=True), python)
-    with pytest.raises(ValueError, match=r"inference_svd_rgbx.py: expected it to succeed, found CUDA is not there"):
-        broken.relight(draft, [light])
-    with pytest.raises(
-        ValueError, match=r"expected an installation of DiffusionRenderer \(cosmos\) with cosmos_predict1"
-    ):
-        DiffusionRenderer(tmp_path / "dr", python, "cosmos")

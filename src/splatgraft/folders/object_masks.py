@@ -1,6 +1,6 @@
 """The sources of 2D masks for `segment`: files, GrabCut or SAM 2 guided by the scene, or the network BiRefNet."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -142,11 +142,12 @@ def network_masks(capture: PosedImages, *, weights: Path | None, folder: Path, p
     """
     network = load_birefnet() if weights is None else load_birefnet(weights)
 
-    def read(index: int) -> Tensor:
-        progress(index + 1, len(capture), "masks from the network")
-        return network.mask(capture.image(index))
+    def made() -> Iterator[Tensor]:
+        for done, mask in enumerate(network.masks(capture.image(index) for index in range(len(capture)))):
+            progress(done + 1, len(capture), f"masks from the network on {network.place}")
+            yield mask
 
-    return _written(capture, LazySequence(len(capture), read), folder)
+    return _written(capture, made(), folder)
 
 
 def _written(capture: PosedImages, masks: Iterable[Tensor], folder: Path) -> MaskedViews:

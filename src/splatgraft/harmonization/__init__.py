@@ -2,7 +2,13 @@
 
 from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize
 from splatgraft.harmonization.inputs import render_views
-from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
+from splatgraft.harmonization.interface import (
+    BatchHarmonizer,
+    Harmonized,
+    Harmonizer,
+    HarmonizerInputs,
+    NoisyStartHarmonizer,
+)
 from splatgraft.harmonization.methods import HARMONIZERS, harmonizer_options, make_harmonizer
 from splatgraft.harmonization.options import (
     CompactOptions,
@@ -32,6 +38,7 @@ __all__ = [
     "ImageEditingOptions",
     "LbmOptions",
     "MVCoLightOptions",
+    "NoisyStartHarmonizer",
     "NoneOptions",
     "ReinhardOptions",
     "harmonize",

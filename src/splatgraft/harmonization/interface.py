@@ -50,6 +50,20 @@ class Harmonizer(Protocol):
 
 
 @runtime_checkable
+class NoisyStartHarmonizer(Protocol):
+    """A harmoniser that can start from a partly noisy image, which later iterative updates use (paper, ablations)."""
+
+    def harmonize_from(self, views: Sequence[HarmonizerInputs], strength: float) -> list[Harmonized]:
+        """Harmonise `views`, all of one size, conditioned on their composites, starting from their noisy priors.
+
+        Args:
+            views: In `prior`, renders of the scene to start from.
+            strength: Noise level to start from, in (0, 1]; 1 is noise alone.
+        """
+        ...
+
+
+@runtime_checkable
 class BatchHarmonizer(Protocol):
     """A harmoniser that also processes several views of one size in one pass."""
 

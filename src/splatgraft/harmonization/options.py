@@ -140,5 +140,7 @@ class HarmonizerContext:
     """Pixels per view: the memory of a network."""
     key: str | None = None
     """Of a service that asks for one."""
+    strengths: tuple[float, ...] = (1.0,)
+    """Noise levels that views will be started from, in (0, 1]."""
     say: Callable[[str], None] = _ignore
     """Takes messages for the user, one line each."""

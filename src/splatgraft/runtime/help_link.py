@@ -22,6 +22,8 @@ _SECTIONS = {
     "runtime.settings": "projecttoml",
     "project": "results-and-running-jobs",
     "runtime": "results-and-running-jobs",
+    "runtime.weights": "weights",
+    "commands.weights": "weights",
     "capture": "capture-photos-and-videos",
     "commands.check": "capture-photos-and-videos",
     "commands.steps.capture": "capture-photos-and-videos",

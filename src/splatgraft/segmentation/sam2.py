@@ -85,13 +85,13 @@ class Sam2:
         return points, np.array(labels)
 
 
-def load_sam2(encoder: Path, decoder: Path, *, threads: int = 2) -> Sam2:
+def load_sam2(encoder: Path, decoder: Path, *, threads: int | None = None) -> Sam2:
     """Load the networks.
 
     Args:
         encoder: An .onnx file of the image encoder.
         decoder: An .onnx file of the prompt decoder that belongs to it.
-        threads: CPU threads.
+        threads: CPU threads; all cores that this process may use where not given.
 
     Raises:
         ValueError: Where onnxruntime is missing, or a file is no such network.

@@ -46,7 +46,7 @@ class RemovalObjective:
         Raises:
             ValueError: a folder is of another kind or broken.
         """
-        folder = local_folder(base, say)
+        folder = local_folder(base, say, parts=("unet", "vae"))
         config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
         self._prompt_path = find_part(PROMPT_FILE, folder)
         if not self._prompt_path.is_file():

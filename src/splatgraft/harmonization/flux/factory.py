@@ -31,6 +31,7 @@ def make_flux(options: FluxOptions, context: HarmonizerContext) -> Harmonizer:
         precision=options.precision,
         compiled=options.compile,
         steps=options.sampling_steps,
+        strengths=context.strengths,
     )
     network = load_flux(wanted, context.device, say=context.say, pixels=context.pixels, views=options.batch)
     settings = FluxSettings(

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.harmonization.flux.baked_modulation import GUIDANCE
 from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
 from splatgraft.harmonization.flux.latents import pack, positions, unpack
 from splatgraft.harmonization.flux.weights.folder import Variant
@@ -51,6 +52,10 @@ class FluxNetwork:
     device: torch.device
     dtype: torch.dtype
     """Of the transformer's arithmetic."""
+    steps: int = 4
+    """Sampling steps that its modulations are precomputed for."""
+    strengths: tuple[float, ...] = (1.0,)
+    """Noise levels to start from that its modulations are precomputed for."""
 
 
 def velocity(
@@ -62,16 +67,19 @@ def velocity(
     """Predict the velocity eps - z_0.
 
     Args:
-        transformer: a `FluxTransformer2DModel`.
+        transformer: a `FluxTransformer2DModel`; one that was distilled with guidance is told `GUIDANCE`.
         latents: noisy latent, composite and condition, concatenated along channels (paper, Sec. 5); k = 3 c.
         level: noise levels in [0, 1].
         prompt: text embeddings, the same for all samples.
     """
     b, _, h, w = latents.shape
     text = prompt.tokens
+    config = getattr(transformer, "module", transformer).config  # the module within DistributedDataParallel
+    guidance = torch.full((b,), GUIDANCE, device=latents.device) if config.guidance_embeds else None
     tokens = transformer(
         hidden_states=pack(latents),
         timestep=level,
+        guidance=guidance,
         encoder_hidden_states=text.expand(b, -1, -1),
         pooled_projections=prompt.pooled.expand(b, -1),
         txt_ids=torch.zeros(text.shape[0], 3, device=latents.device),

@@ -11,15 +11,20 @@ Velocity = Callable[[Tensor, float], Tensor]
 """The velocity at noisy latents and a noise level in [0, 1]."""
 
 
-def schnell_levels(steps: int = 4) -> tuple[float, ...]:
-    """Noise levels from 1 to 0 in `steps` equal steps: FLUX.1-schnell's schedule, not shifted by resolution.
+def schnell_levels(steps: int = 4, *, start: float = 1.0) -> tuple[float, ...]:
+    """Noise levels from `start` to 0 in `steps` equal steps: from 1, FLUX.1-schnell's schedule, not shifted.
+
+    The number of steps does not depend on `start`: the paper's updates take the same time with both its schedules
+    (Table Iterative Dataset Update), though their levels differ.
 
     Raises:
-        ValueError: `steps` is below 1.
+        ValueError: `steps` is below 1, or `start` is outside (0, 1].
     """
     if steps < 1:
         raise ValueError(f"--sampling-steps: expected at least 1, found {steps}")
-    return (*(1 - i / steps for i in range(steps)), 0.0)
+    if not 0 < start <= 1:
+        raise ValueError(f"strength: expected a noise level above 0 and at most 1, found {start}")
+    return (*(start * (1 - i / steps) for i in range(steps)), 0.0)
 
 
 def noise(size: tuple[int, int, int], seed: int) -> Float[Tensor, "c h w"]:

@@ -1,6 +1,8 @@
 """MV-CoLight's single-view network (Ren et al. 2025), run in the user's own checkout and Python environment.
 
-A small program is run there and exchanges arrays through files. Untested with the real code and weights.
+A small program is run there and exchanges arrays through files. The input is prepared as in the authors' data set
+classes: the shorter side becomes 256 pixels and a square is cut out. They keep the one in the middle; here several
+squares cover the view and their changes are blended. Untested with the real code and weights.
 """
 
 import tempfile
@@ -38,8 +40,8 @@ network = build_module(config.model, MODELS).to(device).eval()
 newest = max(glob.glob(os.path.join(folder, "model_step_*.pt")), key=lambda name: int(name.split("_")[-1][:-3]))
 network.load_state_dict(torch.load(newest, map_location=device)["model_state_dict"])
 with torch.no_grad():
-    made = network(torch.from_numpy(np.load(given)).to(device)[None, None])
-np.save(out, made.reshape(3, *made.shape[-2:]).float().cpu().numpy())
+    made = [network(square.to(device)[None, None]) for square in torch.from_numpy(np.load(given))]
+np.save(out, np.stack([one.reshape(3, *one.shape[-2:]).float().cpu().numpy() for one in made]))
 """
 
 
@@ -68,16 +70,45 @@ class MVCoLight:
             if code != 0 or not out.is_file():
                 last = last_line(log) or "no output"
                 raise ValueError(f"{self._checkout}: expected MV-CoLight to make a picture, found {last[:200]}")
-            made = torch.from_numpy(np.load(out)).permute(1, 2, 0).clamp(0, 1)
-        ratio = (made + RATIO_OFFSET) / (small[:3].permute(1, 2, 0) + RATIO_OFFSET)
-        return Harmonized((view.composite * resize(ratio, width, height)).clamp(0, 1))
+            made = torch.from_numpy(np.load(out)).clamp(0, 1)
+        ratio = (made + RATIO_OFFSET) / (small[:, :3] + RATIO_OFFSET)
+        return Harmonized((view.composite * resize(_joined(ratio, height, width), width, height)).clamp(0, 1))
 
 
-def network_input(view: HarmonizerInputs) -> Float[Tensor, "7 256 256"]:
-    """Composite, background and depth divided by its maximum, at the network's size."""
+def network_input(view: HarmonizerInputs) -> Float[Tensor, "k 7 256 256"]:
+    """Squares of composite, background and depth divided by its maximum, the shorter side at the network's size."""
     depth = view.depth / view.depth.max().clamp_min(1e-6)
-    pictures = torch.cat([view.composite, view.background, depth[..., None]], -1)
-    return resize(pictures, SIDE, SIDE).permute(2, 0, 1).contiguous()
+    rows, columns = _reduced(*view.mask.shape)
+    # one by one: OpenCV shrinks at most four channels
+    parts = [resize(picture, columns, rows) for picture in (view.composite, view.background, depth[..., None])]
+    small = torch.cat(parts, -1).permute(2, 0, 1)
+    squares = [small[:, y : y + SIDE, x : x + SIDE] for y in _starts(rows) for x in _starts(columns)]
+    return torch.stack(squares).contiguous()
+
+
+def _reduced(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of the view whose shorter side is `SIDE`."""
+    scale = SIDE / min(height, width)
+    return max(SIDE, round(height * scale)), max(SIDE, round(width * scale))
+
+
+def _starts(length: int) -> list[int]:
+    """First pixels of evenly spaced squares that cover a side, neighbours overlapping where there are several."""
+    count = 1 if length == SIDE else -(-length // SIDE) if length % SIDE else length // SIDE + 1
+    return [round(i * (length - SIDE) / max(count - 1, 1)) for i in range(count)]
+
+
+def _joined(squares: Float[Tensor, "k 3 256 256"], height: int, width: int) -> Float[Tensor, "i j 3"]:
+    """The squares laid over each other, each with the weight of a tent."""
+    rows, columns = _reduced(height, width)
+    tent = torch.minimum(torch.arange(SIDE) + 1, SIDE - torch.arange(SIDE)).float()
+    weight = torch.minimum(tent[:, None], tent[None, :])
+    total, weights = torch.zeros(3, rows, columns), torch.zeros(rows, columns)
+    places = [(y, x) for y in _starts(rows) for x in _starts(columns)]
+    for (y, x), square in zip(places, squares, strict=True):
+        total[:, y : y + SIDE, x : x + SIDE] += weight * square
+        weights[y : y + SIDE, x : x + SIDE] += weight
+    return (total / weights).permute(1, 2, 0)
 
 
 def load_mv_colight(options: MVCoLightOptions) -> MVCoLight:

@@ -1,14 +1,12 @@
-"""Relighting of whole images for training: DiffusionRenderer in the user's own installation, or a simple stand-in.
+"""Relighting of whole images for training: the interface of relighters, and a simple one without a learned model.
 
 The relighter's name is written into the record of every sample.
 """
 
-import subprocess
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -17,17 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.core.images import linear_from_srgb, list_images, read_rgb, resize, srgb_from_linear, write_image
-from splatgraft.runtime.child_process import last_line, run_logged
-
-_PROGRAMS = {
-    "svd": ("inference_svd_rgbx.py", "inference_svd_xrgb.py"),
-    "cosmos": (
-        "cosmos_predict1/diffusion/inference/inference_inverse_renderer.py",
-        "cosmos_predict1/diffusion/inference/inference_forward_renderer.py",
-    ),
-}
-"""The programs for inverse and forward rendering, by variant."""
+from splatgraft.core.images import linear_from_srgb, resize, srgb_from_linear
 
 
 @dataclass(frozen=True)
@@ -80,102 +68,6 @@ class SilhouetteRelighter:
             linear = linear_from_srgb(draft.image) * (1 + inside * (ratio - 1))
             pictures.append(srgb_from_linear(linear).clamp(0, 1))
         return pictures
-
-
-class DiffusionRenderer:
-    """NVIDIA's DiffusionRenderer (Liang et al. 2025): inverse, then forward rendering, by its own programs.
-
-    `svd`: github.com/nv-tlabs/diffusion-renderer; `cosmos`: github.com/nv-tlabs/cosmos1-diffusion-renderer. The command
-    lines follow their documentation at the time of writing; untested with either.
-    """
-
-    licence = "pictures by NVIDIA's DiffusionRenderer, see its licence"
-
-    def __init__(self, checkout: Path, python: Path, variant: Literal["svd", "cosmos"] = "svd") -> None:
-        """Check an installation.
-
-        Args:
-            checkout: folder of its code.
-            python: interpreter that runs it.
-            variant: which of the two.
-
-        Raises:
-            ValueError: a program is missing, or the interpreter does not start.
-        """
-        self.name = f"DiffusionRenderer ({variant})"
-        self._checkout, self._python, self._variant = checkout.resolve(), python, variant
-        for program in _PROGRAMS[variant]:
-            if not (checkout / program).is_file():
-                raise ValueError(
-                    f"{checkout}: expected an installation of {self.name} with {program}, found none; or use "
-                    "--relighter stand-in"
-                )
-        try:
-            subprocess.run([str(python), "-c", "import torch"], check=True, capture_output=True, timeout=300)
-        except (OSError, subprocess.SubprocessError) as error:
-            raise ValueError(f"{python}: expected a Python that runs {self.name}, found {error}") from error
-
-    def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
-        """Relight the image by each environment map; results have its size.
-
-        Raises:
-            ValueError: a program fails or writes no image.
-        """
-        height, width = draft.mask.shape
-        with tempfile.TemporaryDirectory() as name:
-            given, buffers, out = (Path(name) / part for part in ("input", "buffers", "relit"))
-            (given / "picture").mkdir(parents=True)
-            write_image(given / "picture" / "frame000.png", draft.image)
-            size = f"[{max(64, height // 64 * 64)},{max(64, width // 64 * 64)}]"
-            self._run(self._inverse(given, buffers, size))
-            pictures = []
-            for number, light in enumerate(lights):
-                made = out / str(number)
-                self._run(self._forward(buffers, made, light.resolve(), size))
-                found = [path for folder in (made, *made.rglob("*")) if folder.is_dir() for path in list_images(folder)]
-                if not found:
-                    raise ValueError(f"{self._checkout}: expected a relit picture of {draft.name}, found none")
-                pictures.append(resize(read_rgb(found[0]), width, height).clamp(0, 1))
-            return pictures
-
-    def _inverse(self, given: Path, out: Path, size: str) -> list[str]:
-        if self._variant == "svd":
-            settings = ["inference_n_frames=1", "chunk_mode=first", f"inference_res={size}", "save_video_fps=1"]
-            config = ["--config", "configs/rgbx_inference.yaml"]
-            return [*config, f"inference_input_dir={given}", f"inference_save_dir={out}", *settings]
-        model = [
-            "--checkpoint_dir",
-            "checkpoints",
-            "--diffusion_transformer_dir",
-            "Diffusion_Renderer_Inverse_Cosmos_7B",
-        ]
-        shape = ["--num_video_frames", "1", "--group_mode", "folder", "--save_video=False"]
-        return [*model, f"--dataset_path={given}", f"--video_save_folder={out}", *shape]
-
-    def _forward(self, buffers: Path, out: Path, light: Path, size: str) -> list[str]:
-        if self._variant == "svd":
-            settings = ["inference_n_frames=1", f"inference_res={size}", "lora_scale=0.25", "rotate_light=false"]
-            config = ["--config", "configs/xrgb_inference.yaml", "save_video=false", f"envlight=['{light}']"]
-            return [*config, f"inference_input_dir={buffers}", f"inference_save_dir={out}", *settings]
-        model = [
-            "--checkpoint_dir",
-            "checkpoints",
-            "--diffusion_transformer_dir",
-            "Diffusion_Renderer_Forward_Cosmos_7B",
-        ]
-        maps = ["--use_custom_envmap=True", f"--envlight={light}", "--num_video_frames", "1", "--save_video=False"]
-        return [*model, f"--dataset_path={buffers / 'gbuffer_frames'}", f"--video_save_folder={out}", *maps]
-
-    def _run(self, arguments: list[str]) -> None:
-        inverse = any("rgbx" in word or "Inverse" in word for word in arguments)
-        program = _PROGRAMS[self._variant][0 if inverse else 1]
-        with tempfile.TemporaryDirectory() as name:
-            log = Path(name) / "log"
-            # standard output stays out of the log, whose last line is to be that of the error
-            command = [str(self._python), program, *arguments]
-            if run_logged(command, log, folder=self._checkout, on_line=lambda _: None) != 0:
-                last = last_line(log) or "no output"
-                raise ValueError(f"{self._checkout / program}: expected it to succeed, found {last[:200]}")
 
 
 def inflated_normals(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:

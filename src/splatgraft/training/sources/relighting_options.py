@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from splatgraft.training.sources.diffusion_renderer import DiffusionRenderer
 from splatgraft.training.sources.generate import Lighting
-from splatgraft.training.sources.relighters import DiffusionRenderer, Relighter, SilhouetteRelighter
+from splatgraft.training.sources.relighters import Relighter, SilhouetteRelighter
 
 
 @dataclass(frozen=True)

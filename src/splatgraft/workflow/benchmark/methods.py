@@ -20,7 +20,13 @@ from splatgraft.fitting.perceptual_losses import lpips_vgg, windowed_fourier
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
-from splatgraft.harmonization import HarmonizerContext, harmonizer_options, make_harmonizer, render_views
+from splatgraft.harmonization import (
+    HarmonizerContext,
+    NoisyStartHarmonizer,
+    harmonizer_options,
+    make_harmonizer,
+    render_views,
+)
 from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting import SourceScene, relight
@@ -130,8 +136,8 @@ class RelightWithTrueLight:
 class UpdateIteratively:
     """Harmonise and consolidate five times, each time from renders of the current scene (Iterative Dataset Update).
 
-    The strengths of the schedule are the shares of noise that a diffusion model would start from; a harmoniser without
-    noise takes the renders of the current scene as its prior at every strength.
+    The strengths of the schedule are the noise levels that a diffusion model starts from, on renders of the current
+    scene, conditioned on the composite; a harmoniser without noise takes these renders as its prior, and this is said.
     """
 
     composite: Path
@@ -165,15 +171,21 @@ class UpdateIteratively:
         )
         cameras = read_cameras(self.cameras).to(device)
         options = harmonizer_options(self.harmonizer, weights=self.model)
-        harmonizer = make_harmonizer(options, HarmonizerContext(device=device, say=context.console.say))
+        strengths = linear_schedule() if self.schedule == "linear" else geometric_schedule()
+        say = context.console.say
+        harmonizer = make_harmonizer(options, HarmonizerContext(device=device, say=say, strengths=strengths))
+        if not isinstance(harmonizer, NoisyStartHarmonizer):
+            say(f"{self.harmonizer}: no noise; each of {len(strengths)} updates begins at renders of the scene so far")
 
         def harmonize_at(scene: Gaussians, strength: float) -> LazySequence:
             views = render_views(composite, is_object, cameras, prior=scene)
-            images = [harmonizer.harmonize(view).image.to(device) for view in views]
+            if isinstance(harmonizer, NoisyStartHarmonizer):
+                images = [harmonizer.harmonize_from([view], strength)[0].image.to(device) for view in views]
+            else:
+                images = [harmonizer.harmonize(view).image.to(device) for view in views]
             return LazySequence(len(images), lambda index: images[index])
 
         loss = {"fourier": windowed_fourier, "l1-dssim": l1_dssim}.get(self.loss)
-        strengths = linear_schedule() if self.schedule == "linear" else geometric_schedule()
         consolidation = ConsolidateOptions(loss=loss or lpips_vgg(self.weights))
         scene = iterative_update(prior, cameras, harmonize_at, strengths, consolidation, progress=context.progress)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))

@@ -1,5 +1,6 @@
 """Classes of the diffusers library, imported on first use (the only module that imports diffusers)."""
 
+from pathlib import Path
 from typing import Any
 
 _INPUT_AND_OUTPUT_LAYERS = ("x_embedder", "context_embedder", "proj_out")
@@ -25,6 +26,11 @@ def autoencoder_class() -> Any:
 def unet_class() -> Any:
     """`UNet2DConditionModel`."""
     return _diffusers().UNet2DConditionModel
+
+
+def dpm_solver_class() -> Any:
+    """`DPMSolverMultistepScheduler`."""
+    return _diffusers().DPMSolverMultistepScheduler
 
 
 def nf4_config(compute_dtype: Any) -> Any:
@@ -54,6 +60,22 @@ def text_to_image_pipeline(base: str, **settings: Any) -> Any:
         return _diffusers().FluxPipeline.from_pretrained(base, **settings)
     except OSError as error:
         raise ValueError(f"{base}: expected a FLUX pipeline with its text encoders, found {one_line(error)}") from error
+
+
+def flux_lora_names(path: Path, tensors: dict[str, Any]) -> dict[str, Any]:
+    """Rename the tensors of a low-rank adaptation by another program to diffusers' names; scales are applied.
+
+    Raises:
+        ValueError: diffusers does not know these names.
+    """
+    _diffusers()
+    from diffusers.loaders.lora_pipeline import FluxLoraLoaderMixin
+
+    try:
+        return FluxLoraLoaderMixin.lora_state_dict(dict(tensors))  # pyright: ignore
+    except Exception as error:  # the converters fail with KeyError, ValueError, NotImplementedError and more
+        found = one_line(error)
+        raise ValueError(f"{path}: expected tensor names that diffusers can convert, found {found}") from error
 
 
 def one_line(error: Exception) -> str:

@@ -1,22 +1,26 @@
 """Folders of FLUX harmonisers: finds their parts, reads the variant and checks shapes without loading weights.
 
-    transformer/config.json, diffusion_pytorch_model*.safetensors   (or these in the folder itself)
+    transformer/config.json, diffusion_pytorch_model*.safetensors   (or these in the folder itself; also .bf16.)
     vae/  empty_prompt.safetensors  harmonizer.json                 (the base's where a folder has none)
 
-harmonizer.json is written by this package: {"variant": "image-mask"}. The authors' folders are named by their
-variant.
+harmonizer.json is written by this package: {"variant": "image-mask"}, and may name the "guidance" that a network made
+of FLUX.1-dev was trained with. The authors' folders are named by their variant.
 """
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from splatgraft.harmonization.flux.baked_modulation import GUIDANCE
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
-from splatgraft.harmonization.flux.weights.hub import download, licence_of
 from splatgraft.harmonization.flux.weights.safetensors_header import read_model_shapes
 from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.weights.catalogue import ModelWeights
+from splatgraft.runtime.weights.hub import fetch
+from splatgraft.runtime.weights.layout import variant_in
+from splatgraft.runtime.weights.store import folder_of, is_stored
 
 Variant = Literal["image-mask", "image-background"]
 """The second condition beside the composite: the object's mask, or the scene without the object."""
@@ -26,26 +30,16 @@ CONDITIONS = 2
 DESCRIPTION_FILE = "harmonizer.json"
 AUTHORS = "nviolante/dot3d"
 WEIGHTS = "diffusion_pytorch_model"
-_PARTS = ("", "transformer/", "vae/", "unet/")
-_HUB_PATTERNS = [
-    # leaves out single-file models, half-precision copies and text encoders, which would double the download
-    *(
-        f"{part}{name}"
-        for part in _PARTS
-        for name in ("config.json", f"{WEIGHTS}.safetensors*", f"{WEIGHTS}-*.safetensors")
-    ),
-    *("model_index.json", DESCRIPTION_FILE, PROMPT_FILE),
-]
-
 Say = Callable[[str], None]
 
 
-def local_folder(weights: str, say: Say) -> Path:
-    """Resolve `weights` to a local folder, downloading it where it is a hub id.
+def local_folder(weights: str, say: Say, *, parts: Sequence[str] = ("transformer",)) -> Path:
+    """Resolve `weights` to a local folder; what a hub id needs is fetched once (`splatgraft weights`).
 
     Args:
         weights: a folder, or a hub id OWNER/NAME or OWNER/NAME/FOLDER.
-        say: receives the repository and its licence before a download.
+        say: receives the repository, its licence and the size before a download.
+        parts: folders of the model that are needed; vae/ is taken too where it is there.
 
     Raises:
         ValueError: it is neither, or the download fails.
@@ -53,18 +47,20 @@ def local_folder(weights: str, say: Say) -> Path:
     folder = Path(weights)
     if folder.is_dir():
         return folder
-    parts = weights.split("/")
-    if folder.exists() or folder.is_absolute() or weights.startswith(".") or len(parts) not in (2, 3) or not all(parts):
+    names = weights.split("/")
+    if folder.exists() or folder.is_absolute() or weights.startswith(".") or len(names) not in (2, 3) or not all(names):
         raise ValueError(
             f"{weights}: expected a folder with transformer/ or a hub id such as {AUTHORS}/image-mask, found "
             f"{'a file' if folder.exists() else 'none'}"
         )
-    repository, inner = "/".join(parts[:2]), "".join(parts[2:])
-    say(f"weights: {repository} from the Hugging Face hub; licence: {licence_of(repository)}, read it before use")
+    repository, inner = "/".join(names[:2]), "".join(names[2:])
     if repository == AUTHORS and not inner:
         inner = "image-mask"
-    patterns = [f"{inner}/{pattern}" for pattern in _HUB_PATTERNS] if inner else _HUB_PATTERNS
-    return download(repository, patterns) / inner
+    there = folder_of(repository)
+    wanted = ModelWeights(weights, "named by its id", repository, folder=inner, parts=tuple(parts), optional=("vae",))
+    if not is_stored(there, wanted):
+        fetch(wanted, there, say=say)
+    return there / inner
 
 
 @dataclass(frozen=True)
@@ -90,7 +86,7 @@ class FluxFolder:
         below = folder / "transformer"
         transformer = below if (below / "config.json").is_file() else folder
         config = read_config(transformer / "config.json", "FluxTransformer2DModel")
-        shapes = read_model_shapes(transformer, WEIGHTS)
+        shapes = read_model_shapes(transformer, WEIGHTS, weights_variant(transformer) or "")
         first, last = shapes.get("x_embedder.weight"), shapes.get("proj_out.weight")
         if first is None or last is None:
             raise ValueError(f"{transformer}: expected x_embedder.weight and proj_out.weight, found {_few(shapes)}")
@@ -108,6 +104,20 @@ class FluxFolder:
                 f"{out * (CONDITIONS + 1)} (a harmoniser), found {_by(first)}"
             )
         return FluxFolder(folder, transformer, config, first[1] // out)
+
+    @property
+    def guidance(self) -> float | None:
+        """Guidance that a guidance-distilled network (FLUX.1-dev) is told; None for networks without.
+
+        Raises:
+            ValueError: harmonizer.json is broken.
+        """
+        if not self.config.get("guidance_embeds", False):
+            return None
+        found = _description(self.folder).get("guidance", GUIDANCE)
+        if not isinstance(found, int | float):
+            raise ValueError(f"{self.folder / DESCRIPTION_FILE}: expected a number as guidance, found {found!r}")
+        return float(found)
 
     def variant(self, requested: str) -> Variant:
         """Determine the variant: `requested`, or for `auto` that of harmonizer.json or of the folder's name.
@@ -134,6 +144,11 @@ class FluxFolder:
         return chosen  # pyright: ignore
 
 
+def weights_variant(folder: Path) -> str | None:
+    """The variant of a model's weight files, `bf16` for *.bf16.safetensors; None for plain ones."""
+    return variant_in([path.name for path in folder.iterdir()] if folder.is_dir() else []) or None
+
+
 def declared_variant(folder: Path) -> str | None:
     """Read the variant from harmonizer.json in `folder`; None where there is no such file.
 
@@ -143,13 +158,25 @@ def declared_variant(folder: Path) -> str | None:
     path = folder / DESCRIPTION_FILE
     if not path.is_file():
         return None
-    try:
-        variant = json.loads(path.read_text())["variant"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: expected a variant, found {type(error).__name__}: {error}") from error
+    description = _description(folder)
+    if "variant" not in description:
+        raise ValueError(f"{path}: expected a variant, found {_few(description)}")
+    variant = description["variant"]
     if variant not in VARIANTS:
         raise ValueError(f"{path}: expected variant {' or '.join(VARIANTS)}, found {variant}")
     return variant
+
+
+def _description(folder: Path) -> dict[str, Any]:
+    """The content of harmonizer.json; empty where there is no such file."""
+    path = folder / DESCRIPTION_FILE
+    try:
+        found = json.loads(path.read_text()) if path.is_file() else {}
+    except ValueError as error:
+        raise ValueError(f"{path}: expected a variant, found {type(error).__name__}: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: expected a variant, found a {type(found).__name__}")
+    return found
 
 
 def find_part(name: str, *folders: Path) -> Path:

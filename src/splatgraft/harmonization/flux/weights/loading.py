@@ -17,6 +17,7 @@ from splatgraft.harmonization.flux.weights.diffusers_library import (
     flux_transformer_class,
     nf4_config,
 )
+from splatgraft.harmonization.flux.weights.eight_bit import multiplies_in_eight_bits, use_eight_bits
 from splatgraft.harmonization.flux.weights.folder import (
     CONDITIONS,
     VARIANTS,
@@ -25,8 +26,10 @@ from splatgraft.harmonization.flux.weights.folder import (
     declared_variant,
     find_part,
     local_folder,
+    weights_variant,
 )
 from splatgraft.harmonization.flux.weights.lora import merge_lora
+from splatgraft.harmonization.flux.weights.lora_file import LowRankFile, read_lora
 from splatgraft.harmonization.flux.weights.placement import (
     PRECISIONS,
     Placement,
@@ -35,9 +38,11 @@ from splatgraft.harmonization.flux.weights.placement import (
     decoder_bytes,
 )
 from splatgraft.harmonization.flux.weights.widening import FirstLayer, widen_layer
+from splatgraft.runtime.weights.store import folder_of
 
 Say = Callable[[str], None]
 BASE = "black-forest-labs/FLUX.1-schnell"
+_FIRST_LAYER = "x_embedder"
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,8 @@ class FluxWeights:
     """Use torch.compile; worthwhile from about twenty views of one size on."""
     steps: int = 4
     """Sampling steps; the modulations are precomputed for their noise levels."""
+    strengths: tuple[float, ...] = (1.0,)
+    """Noise levels that sampling will start from, in (0, 1]."""
 
 
 def load_flux(
@@ -79,8 +86,11 @@ def load_flux(
         raise ValueError(f"--precision: expected auto, {', '.join(PRECISIONS)}, found {options.precision}")
     folder = local_folder(options.weights, say)
     checked = FluxFolder.open(folder)
-    lora_variant = options.variant if options.lora is None else _variant_of_lora(options)
-    variant = lora_variant if options.lora is not None and checked.inputs == 1 else checked.variant(options.variant)
+    lora = None if options.lora is None else read_lora(options.lora)
+    if lora is not None and checked.inputs == 1:
+        variant = _variant_of_lora(options, lora)
+    else:
+        variant = checked.variant(options.variant)
     base = _Base(folder, options.base, say)
     config = checked.config
     prompt = read_prompt(
@@ -93,25 +103,35 @@ def load_flux(
     say(placement.sentence)
     dtype = torch.float32 if placement.precision == "float32" else torch.bfloat16
     transformer = load_transformer(checked, dtype=dtype, quantized=placement.precision == "nf4")
-    if options.lora is not None:
+    if lora is not None:
         if placement.precision == "nf4":
             raise ValueError(f"{options.lora}: expected a precision that weights can be added to, found nf4")
         if checked.inputs == 1:
-            widen_transformer(transformer)
-        say(f"lora: {merge_lora(transformer, options.lora)} layers adapted by {options.lora}")
+            # a low-rank first layer counts from zeros, as diffusers widens for it; ours is stored whole
+            widen_transformer(transformer, "zero" if _FIRST_LAYER in lora.updates else "repeat")
+        say(f"lora: {merge_lora(transformer, lora)} layers adapted by {options.lora}")
+        if lora.unused:
+            say(f"lora: {lora.unused} tensors of text encoders are not used, since the prompt is precomputed")
     transformer.eval().requires_grad_(False)
     prompt = prompt.to(torch.device("cpu"), dtype)
-    removed = bake(transformer, prompt, schnell_levels(options.steps)[:-1])
+    guidance = checked.guidance
+    if guidance is not None:
+        say(f"flux: a guidance-distilled network (FLUX.1-dev); guidance {guidance:g}, noise levels in equal steps")
+    levels = sorted({level for start in options.strengths for level in schnell_levels(options.steps, start=start)[:-1]})
+    removed = bake(transformer, prompt, tuple(levels), guidance=guidance)
     if placement.precision != "nf4":
         fuse_projections(transformer)
     say(f"flux: {removed / 1e9:.2f} billion parameters of modulation replaced by a table")
-    _place(transformer, placement, device, dtype)
+    if (more := _place(transformer, placement, device, dtype)) is not None:
+        say(more)
     autoencoder.network.to(device, dtype).eval().requires_grad_(False)
     if placement.tiled:
         autoencoder.network.enable_tiling()
     if options.compiled:
         transformer.compile_repeated_blocks()
-    return FluxNetwork(transformer, autoencoder, prompt.to(device, dtype), variant, device, dtype)  # pyright: ignore
+    return FluxNetwork(
+        transformer, autoencoder, prompt.to(device, dtype), variant, device, dtype, options.steps, options.strengths
+    )
 
 
 def load_transformer(checked: FluxFolder, *, dtype: torch.dtype, quantized: bool = False) -> Any:
@@ -121,11 +141,15 @@ def load_transformer(checked: FluxFolder, *, dtype: torch.dtype, quantized: bool
         ValueError: the weights do not fit the config.
     """
     settings = {"quantization_config": nf4_config(dtype)} if quantized else {}
+    folder = checked.transformer
     try:
-        return flux_transformer_class().from_pretrained(checked.transformer, torch_dtype=dtype, **settings)
+        loaded = flux_transformer_class().from_pretrained(
+            folder, torch_dtype=dtype, variant=weights_variant(folder), output_loading_info=True, **settings
+        )
     except (OSError, ValueError, RuntimeError) as error:
         found = " ".join(str(error).split())[:200]
-        raise ValueError(f"{checked.transformer}: expected weights that fit config.json, found {found}") from error
+        raise ValueError(f"{folder}: expected weights that fit config.json, found {found}") from error
+    return _complete(folder, *loaded)
 
 
 def load_autoencoder(folder: Path) -> Autoencoder:
@@ -135,10 +159,23 @@ def load_autoencoder(folder: Path) -> Autoencoder:
         ValueError: the folder has none.
     """
     try:
-        return Autoencoder(autoencoder_class().from_pretrained(folder))
+        # a variant in 16 bits becomes float32 too
+        loaded = autoencoder_class().from_pretrained(
+            folder, torch_dtype=torch.float32, variant=weights_variant(folder), output_loading_info=True
+        )
     except (OSError, ValueError, RuntimeError) as error:
         found = " ".join(str(error).split())[:200]
         raise ValueError(f"{folder}: expected an AutoencoderKL, found {found}") from error
+    return Autoencoder(_complete(folder, *loaded))
+
+
+def _complete(folder: Path, model: Any, about: Any) -> Any:
+    """The model, where the files had all its weights: of missing ones diffusers only warns."""
+    if missing := sorted(about["missing_keys"]):
+        raise ValueError(
+            f"{folder}: expected all weights of config.json, found {len(missing)} missing: {missing[0]} ..."
+        )
+    return model
 
 
 def widen_transformer(transformer: Any, init: FirstLayer = "repeat") -> None:
@@ -161,11 +198,17 @@ class _Base:
         if self._base is None and (beside / name).exists():
             return (beside,)
         if self._base is None and name == PROMPT_FILE:
-            return ()
-        return (local_folder(self._base or BASE, self._say),)
+            return (folder_of(BASE),)  # where `train embed` writes it
+        return (local_folder(self._base or BASE, self._say, parts=("vae",)),)
 
 
-def _variant_of_lora(options: FluxWeights) -> Variant:
+def _variant_of_lora(options: FluxWeights, lora: LowRankFile) -> Variant:
+    """The variant of an adaptation that makes FLUX a harmoniser."""
+    if _FIRST_LAYER not in lora.updates and f"{_FIRST_LAYER}.weight" not in lora.whole:
+        raise ValueError(
+            f"{options.lora}: expected {_FIRST_LAYER} in an adaptation that makes FLUX a harmoniser, found none; give "
+            "the harmoniser that it was trained on as --weights"
+        )
     variant = options.variant if options.variant != "auto" else declared_variant(options.lora.parent)  # pyright: ignore
     if variant not in VARIANTS:
         raise ValueError(f"{options.lora}: expected harmonizer.json beside it or --variant, found neither")
@@ -193,11 +236,17 @@ def _placement(
     )
 
 
-def _place(transformer: Any, placement: Placement, device: torch.device, dtype: torch.dtype) -> None:
+def _place(transformer: Any, placement: Placement, device: torch.device, dtype: torch.dtype) -> str | None:
+    """Move the transformer; a sentence for the user where the precision has more to say."""
     if placement.precision == "offload":
         transformer.enable_group_offload(device, offload_type="block_level", num_blocks_per_group=1, use_stream=True)
-        return
-    if placement.precision == "fp8":
+        return None
+    sentence = None
+    if placement.precision == "fp8" and multiplies_in_eight_bits(device):
+        sentence = f"fp8: {use_eight_bits(transformer)} layers multiply in 8 bits, with a scale for each row"
+    elif placement.precision == "fp8":
         transformer.enable_layerwise_casting(storage_dtype=torch.float8_e4m3fn, compute_dtype=dtype)
+        sentence = f"fp8: weights are only stored in 8 bits and computed in {dtype}: no torch._scaled_mm on {device}"
     if placement.precision != "nf4":
         transformer.to(device)
+    return sentence

@@ -1,22 +1,21 @@
 """Low-rank adaptation (LoRA) of FLUX: added for training, saved under diffusers' names, merged for inference.
 
-W' = W + (alpha / rank) B A, with B = 0 at first (Hu et al. 2021).
+W' = W + (alpha / rank) B A, with B = 0 at first (Hu et al. 2021). Adaptations trained here have alpha = rank.
 """
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from splatgraft.harmonization.flux.weights.tensor_file import read_tensors, write_tensors
+from splatgraft.harmonization.flux.weights.lora_file import PREFIX, LowRankFile
+from splatgraft.harmonization.flux.weights.tensor_file import write_tensors
 
 TARGETS = ("to_q", "to_k", "to_v", "to_out.0", "add_q_proj", "add_k_proj", "add_v_proj", "to_add_out", "proj_mlp")
 """Name endings of the attention layers of a FLUX transformer that are adapted."""
 _FEED_FORWARD_TARGETS = ("ff.net.0.proj", "ff.net.2", "ff_context.net.0.proj", "ff_context.net.2")
-_PREFIX = "transformer."
 
 
 class LowRankLinear(nn.Module):
@@ -69,48 +68,44 @@ def write_lora(path: Path, state: dict[str, Tensor], about: dict[str, str]) -> N
     named = {}
     for name, tensor in state.items():
         if name.endswith(("lora_A", "lora_B")):
-            named[f"{_PREFIX}{name}.weight"] = tensor
+            named[f"{PREFIX}{name}.weight"] = tensor
         elif name.startswith("x_embedder."):
-            named[f"{_PREFIX}{name}"] = tensor
+            named[f"{PREFIX}{name}"] = tensor
     write_tensors(path, named, about)
 
 
-def merge_lora(network: nn.Module, path: Path, scale: float = 1.0) -> int:
-    """Add the low-rank products of a file to the network's weights, in place.
+def merge_lora(network: nn.Module, lora: LowRankFile) -> int:
+    """Add an adaptation to the network's weights, in place.
 
-    Layers that the file holds whole, such as the first one, replace those of `network`.
+    Parameters that the file holds whole, such as those of a widened first layer, replace the network's. Nothing is
+    changed where anything does not fit.
 
     Returns:
         The number of layers changed by low-rank products.
 
     Raises:
-        ValueError: the file is broken or belongs to another network.
+        ValueError: the adaptation belongs to another network.
     """
-    tensors = {name.removeprefix(_PREFIX): tensor for name, tensor in read_tensors(path).items()}
-    layers = sorted({name.split(".lora_")[0] for name in tensors if ".lora_" in name})
-    replaced = [name for name in tensors if ".lora_" not in name]
-    if not layers:
-        raise ValueError(f"{path}: expected a low-rank adaptation (.lora_A, .lora_B), found {_few(tensors)}")
     parameters = dict(network.named_parameters())
+    for name, tensor in lora.whole.items():
+        _check_shape(lora.path, name, parameters.get(name), tuple(tensor.shape))
+    for name, update in lora.updates.items():
+        _check_shape(lora.path, name, parameters.get(f"{name}.weight"), update.shape)
+        if update.bias is not None:
+            _check_shape(lora.path, f"{name}.bias", parameters.get(f"{name}.bias"), tuple(update.bias.shape))
     with torch.no_grad():
-        for name in replaced:
-            _check_shape(path, name, parameters.get(name), tuple(tensors[name].shape))
-            parameters[name].copy_(tensors[name])
-        for name in layers:
-            down, up = (tensors.get(f"{name}.lora_{part}.weight") for part in "AB")
-            if down is None or up is None:
-                raise ValueError(f"{path}: expected {name}.lora_A.weight and .lora_B.weight, found one of them")
-            weight = parameters.get(f"{name}.weight")
-            _check_shape(path, name, weight, (up.shape[0], down.shape[1]))
-            weight.add_((scale * (up.float() @ down.float())).to(weight))  # pyright: ignore
-    return len(layers)
+        for name, tensor in lora.whole.items():
+            parameters[name].copy_(tensor)
+        for name, update in lora.updates.items():
+            weight = parameters[f"{name}.weight"]
+            weight.add_(update.weight.to(weight))
+            if update.bias is not None:
+                bias = parameters[f"{name}.bias"]
+                bias.add_((update.scale * update.bias.float()).to(bias))
+    return len(lora.updates)
 
 
 def _check_shape(path: Path, name: str, found: Tensor | None, expected: tuple[int, ...]) -> None:
     shape = None if found is None else tuple(found.shape)
     if shape != expected:
         raise ValueError(f"{path}: expected a network whose {name} is {expected}, found {shape or 'no such layer'}")
-
-
-def _few(names: Iterable[str]) -> str:
-    return ", ".join(sorted(names)[:3]) or "nothing"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 Precision = Literal["bf16", "fp8", "nf4", "offload", "float32"]
-"""Weights in bfloat16, in 8 bits (fp8, cast per layer) or 4 bits (NF4), or kept on the CPU and fetched by block."""
+"""Weights in bfloat16, in 8 bits (fp8, multiplied so where the device can) or 4 bits (NF4), or on the CPU by block."""
 PRECISIONS: tuple[str, ...] = get_args(Precision)
 _BYTES = {"bf16": 2.0, "fp8": 1.0, "nf4": 0.56, "offload": 0.1, "float32": 4.0}
 """Per parameter on the device; nf4 includes its scales and the bf16 layers, offload the two groups in use."""
@@ -73,7 +73,7 @@ def choose_placement(
 def _sentence(precision: str, tiled: bool, need: int, free: int) -> str:
     names = {
         "bf16": "bf16",
-        "fp8": "fp8 weights cast layer by layer, since bf16 does not fit",
+        "fp8": "fp8 weights, since bf16 does not fit",
         "nf4": "4-bit weights (NF4), since fp8 does not fit",
         "offload": "blocks fetched from the CPU (slow), since no precision fits",
     }

@@ -32,24 +32,26 @@ def read_shapes(path: Path) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def read_model_shapes(folder: Path, index: str) -> Mapping[str, tuple[int, ...]]:
+def read_model_shapes(folder: Path, stem: str, variant: str = "") -> Mapping[str, tuple[int, ...]]:
     """Read the shapes of all tensors of a model.
 
     Args:
         folder: where the files are.
-        index: stem of the file names; with INDEX.safetensors.index.json the model is split over several files.
+        stem: of the file names; with STEM.safetensors.index.json the model is split over several files.
+        variant: as in STEM.VARIANT.safetensors and STEM.safetensors.index.VARIANT.json; empty for plain names.
 
     Raises:
         ValueError: a file is missing, truncated or broken.
     """
-    listing = folder / f"{index}.safetensors.index.json"
+    middle = f".{variant}" if variant else ""
+    listing = folder / f"{stem}.safetensors.index{middle}.json"
     if listing.is_file():
         try:
             names = sorted(set(json.loads(listing.read_text())["weight_map"].values()))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{listing}: expected a weight_map, found {type(error).__name__}: {error}") from error
     else:
-        names = [f"{index}.safetensors"]
+        names = [f"{stem}{middle}.safetensors"]
     shapes: dict[str, tuple[int, ...]] = {}
     for name in names:
         shapes |= read_shapes(folder / name)

@@ -25,6 +25,21 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         raise ValueError(f"{path}: expected a whole .safetensors file, found {one_line(error)}") from error
 
 
+def read_metadata(path: Path) -> dict[str, str]:
+    """Read the texts in the header of a .safetensors file.
+
+    Raises:
+        ValueError: the file is missing, truncated or of another format.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as opened:
+            return opened.metadata() or {}
+    except (OSError, SafetensorError) as error:
+        raise ValueError(f"{path}: expected a whole .safetensors file, found {one_line(error)}") from error
+
+
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, str] | None = None) -> None:
     """Write a .safetensors file atomically; `about` goes into its metadata, as JSON."""
     from safetensors.torch import save

@@ -10,6 +10,9 @@ from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding, write_pr
 from splatgraft.harmonization.flux.weights.tensor_file import write_tensors
 
 Say = Callable[[str], None]
+IC_LIGHT_PROMPT_FILE = "ic_light_prompt.safetensors"
+IC_LIGHT_PROMPTS = {"positive": "best quality", "negative": "lowres, bad anatomy, bad hands, cropped, worst quality"}
+"""The added and the negative prompt of IC-Light's own demo; the user's prompt before them is empty here."""
 
 
 def embed_empty_prompt(base: str, out: Path, *, tokens: int, say: Say) -> None:
@@ -49,6 +52,23 @@ def embed_empty_prompt_stable_diffusion(base: str, out: Path, *, say: Say) -> No
     with torch.no_grad():
         ids = tokenizer([""], padding="max_length", max_length=77, return_tensors="pt").input_ids
         write_tensors(out, {"tokens": clip(ids).last_hidden_state[0].float()}, {"text": "", "source": base})
+
+
+def embed_ic_light_prompts(base: str, out: Path, *, say: Say) -> None:
+    """Compute and write the embeddings of IC-Light's two prompts, by the CLIP of folder or hub id `base`.
+
+    Raises:
+        ValueError: `base` holds no such text encoder.
+    """
+    tokenizer, clip = _load(base, "tokenizer", "CLIPTokenizer"), _load(base, "text_encoder", "CLIPTextModel")
+    say(f"{base}: CLIP embeds IC-Light's prompts")
+    with torch.no_grad():
+        ids = {
+            name: tokenizer([text], padding="max_length", max_length=77, return_tensors="pt").input_ids
+            for name, text in IC_LIGHT_PROMPTS.items()
+        }
+        embedded = {name: clip(tokens).last_hidden_state[0].float() for name, tokens in ids.items()}
+    write_tensors(out, embedded, {**IC_LIGHT_PROMPTS, "source": base})
 
 
 def _load(base: str, part: str, kind: str) -> Any:

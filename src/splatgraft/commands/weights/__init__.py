@@ -1,0 +1,1 @@
+"""The commands `weights list`, `weights fetch` and `weights verify`."""
