@@ -122,10 +122,11 @@ def test_a_killed_run_keeps_its_views_and_does_no_more_than_the_rest(views, weig
     assert done == ["a", "b", "c", "d"]
 
 
-def test_two_processes_by_accelerate_make_the_same_files(views, weights):
+def test_two_processes_make_the_same_files(views, weights, capsys):
     alone = perform(step(views, weights), Console())
     split = perform(step(views, weights, "split", processes=2), Console())
     assert images(split) == images(alone)
+    assert capsys.readouterr().err.count("process 1 of 2 on cpu: 2 views\nprocess 2 of 2 on cpu: 2 views\n") == 1
     with pytest.raises(ValueError, match=r"config.json: expected the config of a FluxTransformer2DModel, found none"):
         perform(step(views, views, "broken", processes=2), Console())
 

@@ -64,19 +64,33 @@ def test_two_processes_train_as_one(tmp_path):
     launch = [
         sys.executable,
         "-m",
-        "accelerate.commands.launch",
-        "--cpu",
-        "--num_processes",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
         "2",
-        "--num_machines",
-        "1",
+        "-m",
+        "splatgraft",
     ]
-    launch += ["--mixed_precision", "no", "--dynamo_backend", "no", "--main_process_port", "0", "-m", "splatgraft"]
     done = subprocess.run([*launch, *words(tmp_path, "two")], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stderr.count("processes: 2 on cpu, gloo, all weights in each") == 1
     one, two = (torch.tensor(read_losses(tmp_path / out / "log.jsonl")) for out in ("one", "two"))
     # the same pairs and noise, halves summed in another order
     assert torch.allclose(one, two, rtol=1e-4)
+
+
+def test_another_way_to_split_the_weights_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ACCELERATE_USE_DEEPSPEED", "true")
+    assert main(words(tmp_path, "out")) == 2
+    line = "ACCELERATE_USE_DEEPSPEED: expected --parallel shards instead of DeepSpeed, which is not supported"
+    assert line in capsys.readouterr().err
+    monkeypatch.delenv("ACCELERATE_USE_DEEPSPEED")
+    for change, line in (
+        (["--optimizer", "adam8bit"], "--optimizer: expected adam with --parallel shards, found adam8bit"),
+        (["--precision", "fp16"], "--precision: expected bf16 or no with --parallel shards, found fp16"),
+    ):
+        assert main(words(tmp_path, "out", "--parallel", "shards", *change)) == 2
+        assert line in capsys.readouterr().err
 
 
 def test_generated_images_become_pairs(tmp_path, monkeypatch, capsys):

@@ -1,22 +1,25 @@
 """Training overfits, its model loads unchanged, a killed run resumes bit for bit, and errors are one line."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from torch.distributed.checkpoint import FileSystemReader
 
 pytest.importorskip("diffusers")
 
-from tiny_models import CHANNELS, flux_folder, quiet, removal_folder
-from tiny_pairs import relit_folder, rendered_folder
+from tiny_models import CHANNELS, quiet, removal_folder
+from tiny_pairs import rendered_folder
+from tiny_training import QUICK, silent, training
 
 from splatgraft.core.images import read_rgb
 from splatgraft.harmonization import FluxOptions, HarmonizerInputs, make_harmonizer
+from splatgraft.harmonization.flux.weights.tensor_file import write_tensors
 from splatgraft.training.flux_objective import FluxObjective, FluxTraining
 from splatgraft.training.latent_cache import LatentCache
-from splatgraft.training.loop_options import LoopOptions
 from splatgraft.training.removal_objective import RemovalObjective
 from splatgraft.training.sources.pair_source import crop_pair_to_size, split_mixture
 from splatgraft.training.sources.relit_pairs import RelitPairs
@@ -26,24 +29,6 @@ from splatgraft.training.training_log import LOG_FILE, read_losses
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 ROLES = RemovalObjective.roles
-QUICK = LoopOptions(
-    steps=6, batch=2, rate=1e-3, precision="no", save_every=2, validate_every=3, validation_pairs=2, cpu=True
-)
-
-
-def silent(*words):
-    pass
-
-
-def training(tmp_path, name, loop=QUICK, *, pairs=2, progress=silent, say=silent, **flux):
-    base, folder = tmp_path / "base", tmp_path / "pairs"
-    if not base.is_dir():
-        flux_folder(base)
-        relit_folder(folder, pairs)
-    objective = FluxObjective(FluxTraining(str(base), **flux), say)
-    mixture, held_out = split_mixture([RelitPairs(folder)], weights=(), held_out=0.5, seed=loop.seed)
-    cache = LatentCache(tmp_path / "latents", objective.encode, width=32, height=32, autoencoder="tiny")
-    return TrainingRun(objective, mixture, held_out, cache, loop, tmp_path / name, say, progress)
 
 
 def killed_at(step):
@@ -106,9 +91,9 @@ def test_a_killed_training_goes_on_to_the_same_curve_and_weights(tmp_path, optio
     assert (model / name).read_bytes() == (again / name).read_bytes()
     assert sorted(p.name for p in (tmp_path / "killed" / "states").iterdir()) == ["00000004", "00000006"]
     if options:
-        state = tmp_path / "killed" / "states" / "00000006" / "model.safetensors"
-        whole = model.parent.parent / "base" / "transformer" / "diffusion_pytorch_model.safetensors"
-        assert state.stat().st_size < whole.stat().st_size
+        saved = FileSystemReader(tmp_path / "killed" / "states" / "00000006").read_metadata().state_dict_metadata
+        assert saved
+        assert all("lora_" in name or "x_embedder" in name or "param_groups" in name for name in saved)
 
 
 def test_a_trained_adaptation_changes_what_the_base_makes(tmp_path):
@@ -189,10 +174,66 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_last_state(tmp_path):
             with torch.no_grad():
                 run.objective.network.proj_out.bias.fill_(float("nan"))
 
-    with pytest.raises(ValueError, match="expected a finite loss at step 3, found nan; the last state is kept"):
+    # the poison comes after step 2's weights were reported and before they are saved
+    line = "expected finite weights after step 2, found others; the state of step 1 is kept"
+    with pytest.raises(ValueError, match=line):
         train(replace(run, progress=poison))
-    # the poison came after step 2's weights were reported and before they were saved: step 1 is whole
-    assert "00000001" in {p.name for p in (tmp_path / "out" / "states").iterdir()}
+    assert {p.name for p in (tmp_path / "out" / "states").iterdir()} == {"00000001"}
+
+
+def test_a_pair_whose_loss_is_no_number_is_named_and_the_step_before_is_kept(tmp_path):
+    run = training(tmp_path, "out", replace(QUICK, batch=2, save_every=99, validate_every=99, steps=9), pairs=6)
+    step, bad = next(
+        (position // 2, run.mixture.draw(position))
+        for position in range(2, 18)
+        if all(
+            run.mixture.draw(earlier).index != run.mixture.draw(position).index for earlier in range(position // 2 * 2)
+        )
+    )
+    loaded = run.cache.load(bad, run.objective.roles)
+    latents = run.cache.encode_missing([loaded], run.objective.roles)["composite"][0]
+    write_tensors(loaded.paths["composite"], {"latents": latents.fill_(float("nan")).to(torch.bfloat16)})
+    name = bad.source.location(bad.index)
+    line = (
+        f"training: expected a finite loss at step {step + 1}, found nan for {name}; the state of step {step} is kept"
+    )
+    with pytest.raises(ValueError, match=re.escape(line)):
+        train(run)
+    assert {p.name for p in (tmp_path / "out" / "states").iterdir()} == {f"{step:08d}"}
+    whole = train(replace(training(tmp_path, "whole", replace(run.loop, steps=step), pairs=6), mixture=run.mixture))
+    # the state that is kept is that of the last good step, to the bit
+    loaded.paths["composite"].unlink()
+    kept = train(replace(training(tmp_path, "out", replace(run.loop, steps=step), pairs=6), mixture=run.mixture))
+    name = "transformer/diffusion_pytorch_model.safetensors"
+    assert (kept / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_a_picture_that_vanished_is_one_line_and_the_steps_before_are_kept(tmp_path):
+    run = training(tmp_path, "out", replace(QUICK, save_every=99, validate_every=99, steps=50), pairs=3)
+
+    def remove(done, total, message):
+        if done == 3:
+            for path in (tmp_path / "pairs").glob("*/relit_0.png"):
+                path.unlink()
+
+    with pytest.raises(ValueError, match=r"relit_0.png: expected a picture of a pair, found No such file"):
+        train(replace(run, progress=remove))
+    (state,) = (tmp_path / "out" / "states").iterdir()
+    assert int(state.name) >= 3
+
+
+def test_a_damaged_state_is_said_and_the_one_before_it_is_taken(tmp_path):
+    model = train(training(tmp_path, "out"))
+    before = (model / "transformer/diffusion_pytorch_model.safetensors").read_bytes()
+    file = tmp_path / "out" / "states" / "00000006" / "__0_0.distcp"
+    file.write_bytes(file.read_bytes()[:1000])
+    said = []
+    assert train(training(tmp_path, "out", say=said.append)) == model
+    assert (model / "transformer/diffusion_pytorch_model.safetensors").read_bytes() == before
+    assert "00000006: expected a whole state, found" in said[0]
+    assert "resumed from step 4" in said
+    with pytest.raises(ValueError, match=r"out: expected no states \(--resume never\), found .*00000006"):
+        train(training(tmp_path, "out", replace(QUICK, resume="never")))
 
 
 def test_too_little_memory_is_one_line(tmp_path, monkeypatch):

@@ -70,6 +70,18 @@ def read_rgb(path: Path | str) -> Float[Tensor, "h w 3"]:
     return _rgb(ImageOps.exif_transpose(_open(Path(path))))
 
 
+def read_straight_rgb(path: Path) -> Float[Tensor, "h w 3"]:
+    """sRGB in [0, 1] as stored, transparency left aside: at soft edges the full colour (straight alpha), not a share.
+
+    Raises:
+        ValueError: The file is no readable image.
+    """
+    image = _open(path)
+    if not image.has_transparency_data:
+        return _rgb(image)
+    return torch.from_numpy(np.array(image.convert("RGBA"))[..., :3].copy()).float().div_(255)
+
+
 def read_stored_rgb(
     path: Path, size: tuple[int, int] | None = None, *, longest_px: int | None = None
 ) -> Float[Tensor, "h w 3"]:

@@ -88,10 +88,13 @@ _SECTIONS = {
     "synthesis": "synthetic-scenes-and-the-benchmark",
     "workflow": "synthetic-scenes-and-the-benchmark",
     "commands.synth.orida": "training",
+    "commands.synth.pack": "training",
     "commands.train": "training",
     "training": "training",
     "training.removal_objective": "flux",
     "workflow.flux_training": "training",
+    "workflow.training_data": "training",
+    "workflow.training_recipe": "training",
 }
 """Section of the page by package or module; the longest name that fits counts."""
 _DEFAULT = "start-and-options"

@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.core.images import read_rgb
+from splatgraft.core.images import read_rgb, read_straight_rgb
 from splatgraft.synthesis import objects
 from splatgraft.synthesis.cameras import camera_arc
 from splatgraft.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take
@@ -173,7 +173,13 @@ def match_statistics(
 def composite(
     relit: Float[Tensor, "h w 3"], background: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """M * relit + (1 - M) * background (paper, Eq. 2)."""
+    """M * relit + (1 - M) * background (paper, Eq. 2).
+
+    Args:
+        relit: colours of the object, not multiplied by its coverage.
+        background: the scene without the object.
+        mask: M, coverage in [0, 1].
+    """
     return mask[..., None] * relit + (1 - mask[..., None]) * background
 
 
@@ -185,7 +191,7 @@ def load_pair(sample: PairSample) -> Pair:
     """
     target, background = read_rgb(sample.path(sample.object)), read_rgb(sample.path("background"))
     mask = read_rgb(sample.path(sample.object, "mask"))[..., 0]
-    relit = read_rgb(sample.path(f"{sample.object}_{sample.light}"))
+    relit = read_straight_rgb(sample.path(f"{sample.object}_{sample.light}"))
     depth_path = sample.path(sample.object, "depth")
     try:
         depth = torch.from_numpy(np.load(depth_path, allow_pickle=False).astype(np.float32))
@@ -223,7 +229,7 @@ def find_defect(sample: PairSample) -> str | None:
     """Describe the first defect of a pair in one line, or None: a missing, broken, empty, black or clipped picture."""
     try:
         pair = load_pair(sample)
-        relit = read_rgb(sample.path(f"{sample.object}_{sample.light}"))
+        relit = read_straight_rgb(sample.path(f"{sample.object}_{sample.light}"))
     except ValueError as error:
         return str(error)
     luma, inside = pair.target.mean(-1), pair.mask > 0.5

@@ -8,16 +8,18 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE, read_prompt
 from splatgraft.harmonization.flux.network import velocity
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
+from splatgraft.harmonization.flux.weights.diffusers_library import flux_transformer_class
 from splatgraft.harmonization.flux.weights.folder import FluxFolder, Variant, find_part, local_folder, write_description
 from splatgraft.harmonization.flux.weights.loading import load_autoencoder, load_transformer, widen_transformer
 from splatgraft.harmonization.flux.weights.lora import add_lora, write_lora
 from splatgraft.harmonization.flux.weights.widening import FirstLayer
-from splatgraft.training.objective import Latents
+from splatgraft.training.objective import Latents, Network
+from splatgraft.training.saved_weights import save_weights
 from splatgraft.training.sources.pair_source import Role
 
 Times = Literal["uniform", "logit-normal", "schnell"]
@@ -92,7 +94,7 @@ class FluxObjective:
         self.autoencoder.network.to(device)
         self.prompt = self.prompt.to(torch.device(device), torch.float32)
 
-    def loss(self, network: nn.Module, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
+    def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
         """Mean of || v(z_t, z_comp, z_mask, c, t) - (eps - z_0) ||^2 (paper, Eq. 1)."""
         clean = latents["target"]
         levels, eps = [], []
@@ -104,7 +106,7 @@ class FluxObjective:
         joined = torch.cat([noisy(clean, drawn, level), self._conditions(latents)], 1)
         return ((velocity(network, joined, level, self.prompt).float() - (drawn - clean)) ** 2).mean()
 
-    def predict(self, network: nn.Module, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
+    def predict(self, network: Network, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
         """Harmonise by schnell's four steps."""
         conditions = self._conditions(latents)
         b, device = conditions.shape[0], conditions.device
@@ -130,7 +132,7 @@ class FluxObjective:
                 folder / "lora.safetensors", state, {"rank": str(self._options.lora), "base": self._options.base}
             )
             return
-        self.network.save_pretrained(folder / "transformer", state_dict=state)
+        save_weights(flux_transformer_class(), self.network.config, state, folder / "transformer")
         self.autoencoder.network.save_pretrained(folder / "vae")
         shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
 

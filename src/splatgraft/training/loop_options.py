@@ -26,6 +26,10 @@ class LoopOptions:
     """adam8bit needs bitsandbytes."""
     precision: Literal["no", "bf16", "fp16"] = "bf16"
     """Arithmetic of the network; the optimiser's weights are float32."""
+    parallel: Literal["copies", "shards"] = "copies"
+    """Several processes: each has all weights, or a share of weights, gradients and optimiser (FSDP 2)."""
+    resume: Literal["auto", "never"] = "auto"
+    """auto goes on from the folder's last whole state; never refuses a folder with states."""
     save_every: int = 1000
     """Steps between states from which a killed run goes on."""
     validate_every: int = 1000
@@ -60,6 +64,11 @@ class LoopOptions:
                 raise ValueError(f"--{name.replace('_', '-')}: expected at least 1, found {getattr(self, name)}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"--ema: expected a decay from 0 to below 1, found {self.ema}")
+        if self.parallel == "shards":
+            if self.optimizer == "adam8bit":
+                raise ValueError("--optimizer: expected adam with --parallel shards, found adam8bit")
+            if self.precision == "fp16":
+                raise ValueError("--precision: expected bf16 or no with --parallel shards, found fp16")
         passes = processes * self.accumulate
         if self.batch % passes:
             raise ValueError(

@@ -37,7 +37,7 @@ class MemoryOptions:
     ema: bool = False
     checkpointing: bool = True
     shards: int = 1
-    """Processes that share weights, gradients and optimiser (FSDP, DeepSpeed stage 3)."""
+    """Processes that share weights, gradients and optimiser (`--parallel shards`)."""
     half: bool = True
     """Arithmetic in 16 bits."""
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class MovingAverage:
-    """A float32 moving average of the trainable parameters."""
+    """A float32 moving average of the trainable parameters; it is split over processes as they are."""
 
     def __init__(self, network: nn.Module, decay: float) -> None:
         """Start from the current weights; `decay` in [0, 1)."""
@@ -25,12 +25,11 @@ class MovingAverage:
     @contextmanager
     def applied(self) -> Generator[None]:
         """Put the averages into the network within the context."""
-        current = {name: p.detach().clone() for name, p in self._parameters.items()}
-        self._set(self._averages)
+        self._exchange()
         try:
             yield
         finally:
-            self._set(current)
+            self._exchange()
 
     def state_dict(self) -> dict[str, Tensor]:
         """The averages by parameter name."""
@@ -42,6 +41,9 @@ class MovingAverage:
             self._averages[name].copy_(tensor)
 
     @torch.no_grad()
-    def _set(self, values: dict[str, Tensor]) -> None:
+    def _exchange(self) -> None:
+        """Exchange weights and averages; one parameter at a time, so that no third copy of the weights is needed."""
         for name, parameter in self._parameters.items():
-            parameter.copy_(values[name])
+            current = parameter.detach().clone()
+            parameter.copy_(self._averages[name])
+            self._averages[name].copy_(current)

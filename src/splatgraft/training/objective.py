@@ -1,16 +1,18 @@
 """The protocol of training objectives: a network with its loss, predictions and file format."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from splatgraft.training.sources.pair_source import Role
 
 Latents = Mapping[str, Tensor]
 """Latents (b c h w) by role."""
+Network = Callable[..., Any]
+"""The objective's network, as it is called: spread over processes, in 16 bits."""
 
 
 @runtime_checkable
@@ -32,20 +34,20 @@ class Objective(Protocol):
         """Move the frozen parts to a device."""
         ...
 
-    def loss(self, network: nn.Module, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
+    def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
         """Compute the loss of a batch.
 
         Args:
-            network: `self.network` as wrapped by the loop.
+            network: `self.network`, or what calls it.
             latents: of the batch, for all `roles`.
             seeds: of the noise, one per pair.
         """
         ...
 
-    def predict(self, network: nn.Module, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
+    def predict(self, network: Network, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
         """Generate the images of a batch, sRGB in [0, 1]."""
         ...
 
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
-        """Write the network with the weights `state` in the format that inference loads."""
+        """Write exactly the weights `state` in the format that inference loads."""
         ...

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from splatgraft.harmonization.flux.ddim import NoiseSchedule, ddim
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
@@ -20,7 +20,8 @@ from splatgraft.harmonization.flux.weights.folder import find_part, local_folder
 from splatgraft.harmonization.flux.weights.loading import load_autoencoder
 from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
 from splatgraft.harmonization.flux.weights.widening import widen_layer
-from splatgraft.training.objective import Latents
+from splatgraft.training.objective import Latents, Network
+from splatgraft.training.saved_weights import save_weights
 from splatgraft.training.sources.pair_source import Role
 
 CONDITIONS = 2
@@ -84,7 +85,7 @@ class RemovalObjective:
         self.autoencoder.network.to(device)
         self.tokens = self.tokens.to(device)
 
-    def loss(self, network: nn.Module, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
+    def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
         """Mean squared error of the velocity."""
         clean = latents["background"]
         steps, eps = [], []
@@ -96,7 +97,7 @@ class RemovalObjective:
         predicted = self._velocity(network, self._schedule.noisy(clean, drawn, step), latents, step)
         return ((predicted.float() - self._schedule.velocity(clean, drawn, step)) ** 2).mean()
 
-    def predict(self, network: nn.Module, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
+    def predict(self, network: Network, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
         """Generate the images without the object."""
         target = latents["target"]
         size = tuple(target.shape[1:])
@@ -111,12 +112,12 @@ class RemovalObjective:
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
         """Write unet/, vae/ and the prompt embeddings."""
         folder.mkdir(parents=True, exist_ok=True)
-        self.network.save_pretrained(folder / "unet", state_dict=state)
+        save_weights(unet_class(), self.network.config, state, folder / "unet")
         self.autoencoder.network.save_pretrained(folder / "vae")
         shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
 
     def _velocity(
-        self, network: nn.Module, noisy: Float[Tensor, "b c h w"], latents: Latents, step: Tensor
+        self, network: Network, noisy: Float[Tensor, "b c h w"], latents: Latents, step: Tensor
     ) -> Float[Tensor, "b c h w"]:
         joined = torch.cat([noisy, latents["target"], latents["mask"]], 1)
         return network(joined, step, self.tokens.expand(joined.shape[0], -1, -1), return_dict=False)[0]

@@ -1,14 +1,13 @@
-"""The training loop, on one process or several through accelerate; a killed run resumes bit for bit.
+"""The training loop, on one process or several; a killed run resumes bit for bit on as many processes as before.
 
 The pairs of a step and their noise follow from the seed and the step alone. A saved state therefore holds only weights,
 optimiser and moving average, and the number of processes may change between runs.
 """
 
-import json
-import shutil
 import time
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,22 +15,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.interruption import interruption_held
 from splatgraft.runtime.progress import Progress
+from splatgraft.training.checkpoints import list_states, load_state, read_job, save_state, whole_weights
 from splatgraft.training.latent_cache import LatentCache, LoadedPair
 from splatgraft.training.loop_options import LoopOptions
-from splatgraft.training.moving_average import MovingAverage
 from splatgraft.training.objective import Objective
-from splatgraft.training.optimizers import make_optimizer
+from splatgraft.training.processes import Processes
 from splatgraft.training.sources.pair_source import Mixture, sample_seed
+from splatgraft.training.trained_network import TrainedNetwork
 from splatgraft.training.training_log import LOG_FILE, TrainingLog, truncate_log
 from splatgraft.training.validation import ValidationRun, validate
 
 MODEL_FOLDER = "model"
-_STATES = "states"
-_JOB_FILE = "job.json"
-_KEPT_STATES = 2
 _READERS = 4
+_STEPS_AHEAD = 4
+"""Steps whose pairs are read while the network computes."""
+_STOP, _UNREADABLE = 1, 2
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,12 @@ def train(run: TrainingRun) -> Path:
         The folder of the model.
 
     Raises:
-        ValueError: the loss is not finite, memory does not suffice, or the folder's state is of another training.
+        ValueError: the loss is not finite, a pair cannot be read, memory does not suffice, or the folder's state is of
+            another training. The last state is kept.
+        KeyboardInterrupt: Ctrl-C, or SIGTERM as cluster schedulers send it; the state of the finished steps is saved.
     """
-    with ThreadPoolExecutor(_READERS) as readers:
-        loop = _RunningLoop(run, readers)
+    with ThreadPoolExecutor(_READERS) as readers, interruption_held(terminate=True) as interrupted:
+        loop = _RunningLoop(run, readers, interrupted)
         try:
             return loop.run()
         except torch.OutOfMemoryError as error:
@@ -75,95 +77,123 @@ def train(run: TrainingRun) -> Path:
                 f"training: expected memory for {loop.pairs_per_pass} pairs a pass, found too little at step "
                 f"{loop.step}; the last state is kept: try --accumulate, --optimizer adam8bit or --lora"
             ) from error
+        finally:
+            readers.shutdown(wait=False, cancel_futures=True)
 
 
 class _RunningLoop:
     """The state of a running training."""
 
-    def __init__(self, run: TrainingRun, readers: ThreadPoolExecutor) -> None:
-        from accelerate import Accelerator
-
-        self._run, self._readers, loop = run, readers, run.loop
-        self._accelerator = Accelerator(
-            mixed_precision=loop.precision, gradient_accumulation_steps=loop.accumulate, cpu=loop.cpu
-        )
-        self.pairs_per_pass = loop.check(self._accelerator.num_processes)
+    def __init__(self, run: TrainingRun, readers: ThreadPoolExecutor, interrupted: Callable[[], bool]) -> None:
+        self._run, self._readers, self._interrupted = run, readers, interrupted
+        self._processes = Processes.join(cpu=run.loop.cpu)
+        self.pairs_per_pass = run.loop.check(self._processes.count)
         self.step = 0
-        self._sharded = str(self._accelerator.distributed_type).endswith(("FSDP", "DEEPSPEED"))
-        if self._sharded and loop.ema:
-            raise ValueError("--ema: expected 0 with FSDP or DeepSpeed, whose parts cannot be averaged here")
-        if (plugin := getattr(self._accelerator.state, "deepspeed_plugin", None)) is not None:
-            plugin.deepspeed_config["train_micro_batch_size_per_gpu"] = self.pairs_per_pass
-        network = run.objective.network.train()
-        self._trained = {name for name, p in network.named_parameters() if p.requires_grad}
-        optimizer = make_optimizer(loop.optimizer, [p for p in network.parameters() if p.requires_grad], loop.rate)
-        run.objective.to(self._accelerator.device)
-        self._average = MovingAverage(network, loop.ema) if loop.ema else None
-        self._network, self._optimizer = self._accelerator.prepare(network, optimizer)
-        if self._average:
-            self._accelerator.register_for_checkpointing(self._average)
-        if len(self._trained) < len(list(network.named_parameters())) and not self._sharded:
-            self._accelerator.register_save_state_pre_hook(self._save_trained_parameters)
-            self._accelerator.register_load_state_pre_hook(self._load_trained_parameters)
+        run.objective.to(self._processes.device)
+        self._network = TrainedNetwork(run.objective.network, run.loop, self._processes)
+        self._reading: deque[list[list[Future[LoadedPair]]]] = deque()
+        self._waited = 0.0
 
     def run(self) -> Path:
         """Run all remaining steps and write the model."""
         run, loop = self._run, self._run.loop
         self._resume()
-        log = TrainingLog(run.folder, loop.tensorboard) if self._accelerator.is_main_process else None
-        next_batches = self._begin_reading(self.step)
+        log = TrainingLog(run.folder, loop.tensorboard) if self._processes.is_first else None
         began, first = time.monotonic(), self.step
-        for step in range(self.step, loop.steps):
-            self.step = step
-            batches = next_batches
-            next_batches = self._begin_reading(step + 1) if step + 1 < loop.steps else []
-            loss = self._train_step(step, [[future.result() for future in batch] for batch in batches])
-            self.step = step + 1
+        while self.step < loop.steps:
+            batches = self._next_batches()
+            loss = self._train_step(batches)
+            self.step += 1
             if log:
-                log.add(self.step, loss, loop.rate_at(step))
-                speed = (self.step - first) * loop.batch / max(time.monotonic() - began, 1e-9)
-                run.progress(self.step, loop.steps, f"loss {log.smooth:.4f}, {speed:.2f} pairs/s")
+                log.add(self.step, loss, loop.rate_at(self.step - 1))
+                spent = max(time.monotonic() - began, 1e-9)
+                speed, waiting = (self.step - first) * loop.batch / spent, self._waited / spent
+                words = f"loss {log.smooth:.4f}, {speed:.2f} pairs/s, {waiting:.0%} of it waiting for pictures"
+                run.progress(self.step, loop.steps, words)
             if self.step % loop.save_every == 0 or self.step == loop.steps:
                 self._save()
             if self.step % loop.validate_every == 0 or self.step == loop.steps:
                 self._validate(log)
         if log:
             log.close()
+            if self.step > first:
+                spent = max(time.monotonic() - began, 1e-9)
+                speed = (self.step - first) * loop.batch / spent
+                run.say(f"throughput: {speed:.2f} pairs/s; {self._waited / spent:.0%} of the time waited for pictures")
         return self._finish()
 
-    def _train_step(self, step: int, batches: list[list[LoadedPair]]) -> float:
-        run, loop, accelerator = self._run, self._run.loop, self._accelerator
-        total = torch.zeros((), device=accelerator.device)
-        for group in self._optimizer.param_groups:
-            group["lr"] = loop.rate_at(step)
+    def _next_batches(self) -> list[list[LoadedPair]]:
+        """The pairs of this process in this step, pass by pass; the following steps are read meanwhile."""
+        last = min(self.step + _STEPS_AHEAD, self._run.loop.steps)
+        for step in range(self.step + len(self._reading), last):
+            self._reading.append(self._begin_reading(step))
+        began, problem, batches = time.monotonic(), "", []
+        try:
+            batches = [[future.result() for future in batch] for batch in self._reading.popleft()]
+        except ValueError as error:
+            problem = str(error)
+        self._waited += time.monotonic() - began
+        signal = self._processes.largest(_UNREADABLE if problem else _STOP if self._interrupted() else 0)
+        if signal == _UNREADABLE:
+            # all processes stop together: one alone would leave the others waiting for it
+            self._save()
+            raise ValueError(next(found for found in self._processes.gather(problem) if found))
+        if signal == _STOP:
+            self._save()
+            self._run.say(f"stopped after step {self.step}{': its state is saved' if self.step else ''}")
+            raise KeyboardInterrupt
+        return batches
+
+    def _train_step(self, batches: list[list[LoadedPair]]) -> float:
+        run, loop = self._run, self._run.loop
+        total = torch.zeros((), device=self._processes.device)
+        passes = []
         for number, loaded in enumerate(batches):
             latents = run.cache.encode_missing(loaded, run.objective.roles)
-            latents = {role: tensor.to(accelerator.device) for role, tensor in latents.items()}
-            seeds = [sample_seed(loop.seed, position) for position in self._positions(step, number)]
-            with accelerator.accumulate(self._network):
-                loss = run.objective.loss(self._network, latents, seeds)
-                accelerator.backward(loss)
-                if accelerator.sync_gradients and loop.clip:
-                    accelerator.clip_grad_norm_(self._network.parameters(), loop.clip)
-                self._optimizer.step()
-                self._optimizer.zero_grad()
+            latents = {role: tensor.to(self._processes.device) for role, tensor in latents.items()}
+            seeds = [sample_seed(loop.seed, position) for position in self._positions(self.step, number)]
+            passes.append((latents, seeds))
+            loss = run.objective.loss(self._network, latents, seeds)
+            self._network.backward(loss, last=number == len(batches) - 1)
             total += loss.detach() / loop.accumulate
-        value = float(accelerator.reduce(total, "mean"))  # pyright: ignore
-        if not value < float("inf"):
-            raise ValueError(
-                f"training: expected a finite loss at step {step + 1}, found {value}; the last state is kept"
-            )
-        if self._average:
-            self._average.update()
+        value = float(self._processes.mean(total))
+        if not abs(value) < float("inf"):
+            self._stop_at_broken_loss(passes, f"a finite loss at step {self.step + 1}, found {value}")
+        if not self._network.step(loop.rate_at(self.step)):
+            self._stop_at_broken_loss(passes, f"a finite gradient at step {self.step + 1}, found none")
         return value
+
+    @torch.no_grad()
+    def _stop_at_broken_loss(self, passes: list[tuple[dict[str, Tensor], list[int]]], wrong: str) -> None:
+        """Name the pairs at fault, and save the weights where they are whole: they are those of the step before."""
+        broken = []
+        for number, (latents, seeds) in enumerate(passes):
+            for i, position in enumerate(self._positions(self.step, number)):
+                one = {role: tensor[i : i + 1] for role, tensor in latents.items()}
+                loss = float(self._run.objective.loss(self._network, one, seeds[i : i + 1]))
+                if not abs(loss) < float("inf"):
+                    drawn = self._run.mixture.draw(position)
+                    broken.append(drawn.source.location(drawn.index))
+        names = list(dict.fromkeys(name for found in self._processes.gather(broken) for name in found))
+        cause = f"for {', '.join(names)}" if names else "from pairs that are finite one by one"
+        if self._network.is_finite():
+            self._network.optimizer.zero_grad()
+            self._save()
+        else:
+            cause = "for all pairs, as the weights had diverged before"
+        raise ValueError(f"training: expected {wrong} {cause}; {self._kept_state()}")
+
+    def _kept_state(self) -> str:
+        states = list_states(self._run.folder)
+        return f"the state of step {int(states[-1].name)} is kept" if states else "no state was saved before"
 
     def _positions(self, step: int, number: int) -> range:
         """Positions in the order of the mixture that this process takes in pass `number` of a step."""
         begin = step * self._run.loop.batch
-        begin += (number * self._accelerator.num_processes + self._accelerator.process_index) * self.pairs_per_pass
+        begin += (number * self._processes.count + self._processes.rank) * self.pairs_per_pass
         return range(begin, begin + self.pairs_per_pass)
 
-    def _begin_reading(self, step: int) -> list[list[Any]]:
+    def _begin_reading(self, step: int) -> list[list[Future[LoadedPair]]]:
         run = self._run
 
         def read(position: int) -> LoadedPair:
@@ -173,112 +203,63 @@ class _RunningLoop:
         return [[self._readers.submit(read, at) for at in self._positions(step, number)] for number in passes]
 
     def _save(self) -> None:
-        folder = self._run.folder / _STATES / f"{self.step:08d}"
-        partial = folder.with_name(f".{folder.name}.partial")
-        if self._accelerator.is_main_process:
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir(parents=True)
-        self._accelerator.wait_for_everyone()
-        self._accelerator.save_state(str(partial))
-        self._accelerator.wait_for_everyone()
-        if self._accelerator.is_main_process:
-            with atomic_write(partial / _JOB_FILE) as stream:
-                stream.write(json.dumps(self._run.fingerprint()).encode())
-            shutil.rmtree(folder, ignore_errors=True)
-            partial.rename(folder)
-            for old in _states(self._run.folder)[:-_KEPT_STATES]:
-                shutil.rmtree(old)
-        self._accelerator.wait_for_everyone()
+        if self.step == 0:
+            return
+        if not self._network.is_finite():
+            raise ValueError(
+                f"training: expected finite weights after step {self.step}, found others; {self._kept_state()}"
+            )
+        save_state(self._run.folder, self.step, self._network, self._run.fingerprint(), self._processes)
 
     def _resume(self) -> None:
-        run, states = self._run, _states(self._run.folder)
-        if self._accelerator.is_main_process:
-            truncate_log(run.folder / LOG_FILE, int(states[-1].name) if states else 0)
-        if not states:
-            return
-        path = states[-1] / _JOB_FILE
-        try:
-            saved = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{path}: expected the description of a training, found {error}") from error
-        current = json.loads(json.dumps(run.fingerprint()))
+        run, states = self._run, list_states(self._run.folder)
+        self._processes.wait()  # all have listed the states before one changes them
+        if states and run.loop.resume == "never":
+            raise ValueError(f"{run.folder}: expected no states (--resume never), found {states[-1]}")
+        for path in reversed(states):
+            self._check_job(path)
+            problem = load_state(path, self._network, self._processes)
+            if problem is None:
+                self.step = int(path.name)
+                run.say(f"resumed from step {self.step}")
+                break
+            run.say(f"{path}: expected a whole state, found {problem}; the one before it is tried")
+        if states and not self.step:
+            raise ValueError(f"{run.folder / 'states'}: expected a state that can be read, found none; another folder?")
+        if self._processes.is_first:
+            truncate_log(run.folder / LOG_FILE, self.step)
+
+    def _check_job(self, path: Path) -> None:
+        saved, current = read_job(path), self._run.fingerprint()
         if changed := [name for name in current if saved.get(name) != current[name]]:
             raise ValueError(
-                f"{run.folder}: expected the same training to go on with, found {changed[0]} "
+                f"{self._run.folder}: expected the same training to go on with, found {changed[0]} "
                 f"{saved.get(changed[0])} instead of {current[changed[0]]}; name another folder"
             )
-        self._accelerator.load_state(str(states[-1]))
-        self.step = int(states[-1].name)
-        run.say(f"resumed from step {self.step}")
 
     def _validate(self, log: TrainingLog | None) -> None:
         run = self._run
         mixture = run.held_out or run.mixture
-        validation = ValidationRun(
-            run.objective,
-            mixture.all()[: run.loop.validation_pairs],
-            run.cache,
-            self._accelerator.device,
-            run.loop.seed,
-        )
-        if not validation.pairs:
+        pairs = mixture.all()[: run.loop.validation_pairs]
+        if not pairs:
             return
-        self._network.eval()
-        if self._average:
-            with self._average.applied():
+        validation = ValidationRun(run.objective, pairs, run.cache, self._processes.device, run.loop.seed)
+        try:
+            with self._network.averaged():
                 result, sheet = validate(validation, self._network)
-        else:
-            result, sheet = validate(validation, self._network)
-        self._network.train()
+        except ValueError:  # a picture that vanished; all processes read the same ones
+            self._save()
+            raise
         if log:
             label = "held out" if run.held_out else "training pairs: no scene is held out"
             run.say(f"step {self.step}: {result.sentence} ({label})")
             log.add_validation(self.step, result.metrics, sheet)
 
     def _finish(self) -> Path:
-        run, folder = self._run, self._run.folder / MODEL_FOLDER
-        if self._average:
-            with self._average.applied():
-                state = self._weights()
-        else:
-            state = self._weights()
-        if self._accelerator.is_main_process:
-            run.objective.save(state, folder)
-        self._accelerator.wait_for_everyone()
+        folder = self._run.folder / MODEL_FOLDER
+        with self._network.averaged():
+            state = whole_weights(self._network)
+        if self._processes.is_first:
+            self._run.objective.save(state, folder)
+        self._processes.wait()
         return folder
-
-    def _weights(self) -> dict[str, Tensor]:
-        state: Any = self._accelerator.get_state_dict(self._network)
-        return {name: tensor.detach().cpu().clone() for name, tensor in state.items()}
-
-    def _save_trained_parameters(self, models: list[Any], weights: list[Any], output: str) -> None:
-        for i, state in enumerate(weights):
-            weights[i] = {name: tensor for name, tensor in state.items() if name in self._trained}
-
-    def _load_trained_parameters(self, models: list[Any], folder: str) -> None:
-        from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
-
-        while models:
-            network = self._accelerator.unwrap_model(models.pop())
-            network.load_state_dict(read_tensors(Path(folder) / "model.safetensors"), strict=False)
-
-
-def _states(folder: Path) -> list[Path]:
-    """Complete states, oldest first."""
-    return sorted(path for path in (folder / _STATES).glob("[0-9]*") if (path / _JOB_FILE).is_file())
-
-
-def process_counts(*, cpu: bool) -> tuple[int, int]:
-    """Number of processes that accelerate runs, and how many of them share one copy of the weights."""
-    from accelerate import PartialState
-
-    state = PartialState(cpu=cpu)
-    sharded = str(state.distributed_type).endswith(("FSDP", "DEEPSPEED"))
-    return state.num_processes, state.num_processes if sharded else 1
-
-
-def is_first_process(*, cpu: bool) -> bool:
-    """Whether this is the process that writes files and messages."""
-    from accelerate import PartialState
-
-    return PartialState(cpu=cpu).is_main_process

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from splatgraft.core.image_metrics import psnr, ssim
 from splatgraft.training.latent_cache import LatentCache
-from splatgraft.training.objective import Objective
+from splatgraft.training.objective import Network, Objective
 from splatgraft.training.sources.pair_source import PairReference, TrainingPair, crop_pair_to_size
 
 
@@ -40,7 +40,7 @@ class ValidationResult:
 
 
 @torch.no_grad()
-def validate(run: ValidationRun, network: nn.Module) -> tuple[ValidationResult, Float[Tensor, "h w 3"]]:
+def validate(run: ValidationRun, network: Network) -> tuple[ValidationResult, Float[Tensor, "h w 3"]]:
     """Compute the metrics, and a contact sheet with one row per pair: input, prediction, target."""
     rows, totals = [], {"psnr": 0.0, "ssim": 0.0, "psnr_object": 0.0, "psnr_input": 0.0}
     objective = run.objective

@@ -13,12 +13,19 @@ from splatgraft.runtime.console import Console
 from splatgraft.training.latent_cache import LatentCache
 from splatgraft.training.loop_options import LoopOptions
 from splatgraft.training.memory_estimate import MemoryOptions, TransformerSize, memory_table, training_bytes
-from splatgraft.training.sources.pair_source import split_mixture
-from splatgraft.training.sources.relit_pairs import RelitPairs
-from splatgraft.training.sources.rendered_pairs import RenderedPairs
-from splatgraft.training.trainer import TrainingRun, is_first_process, process_counts, train
+from splatgraft.training.processes import Processes
+from splatgraft.training.sources.pair_source import crop_pair_to_size
+from splatgraft.training.trainer import TrainingRun, train
 from splatgraft.workflow.image_size import parse_image_size
-from splatgraft.workflow.training_data import DataOptions
+from splatgraft.workflow.training_data import DataOptions, TrainingData, open_training_data
+from splatgraft.workflow.training_recipe import Recipe, TrainingCost, plan
+
+TINY = "tiny"
+"""In place of a base model: one of three million weights is made first, in OUT/base."""
+_BASE_PICTURES = 1200
+"""Most pictures that the tiny base model's autoencoder is trained on."""
+_REMOVAL_PARAMETERS = 865_000_000
+"""Of Stable Diffusion 2's UNet."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +33,7 @@ class FluxTrainingOptions:
     """Options of the training of the FLUX harmoniser (paper, Sec. 5)."""
 
     base: str = "black-forest-labs/FLUX.1-schnell"
-    """Folder or hub id with transformer/ and vae/; the folder of a harmoniser continues its training."""
+    """Folder or hub id with transformer/ and vae/ (a harmoniser's to go on); `tiny` makes a small one in OUT/base."""
     data: DataOptions = field(default_factory=DataOptions)
     loop: LoopOptions = field(default_factory=LoopOptions)
     condition: Literal["image-mask", "image-background"] = "image-mask"
@@ -41,6 +48,10 @@ class FluxTrainingOptions:
     """Keep activations instead of computing them twice: faster, several times the memory."""
     force: bool = False
     """Start although the estimate says that the memory is too small."""
+    recipe: str | None = None
+    """paper, without-blender, without-flux, without-orida, tiny or a .toml file: options where you give none."""
+    plan: bool = False
+    """Only print what would run: steps, hours, memory per device, disk, licences."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +64,17 @@ class RemovalTrainingOptions:
     loop: LoopOptions = field(default_factory=lambda: LoopOptions(steps=260_000, batch=8, rate=1e-5))
     no_checkpointing: bool = False
     """Keep activations instead of computing them twice: faster, several times the memory."""
+    recipe: str | None = None
+    """removal or a .toml file: options where you give none."""
+    plan: bool = False
+    """Only print what would run: steps, hours, memory per device, disk, licences."""
 
 
 def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Path | None:
     """Train a harmoniser.
 
     Returns:
-        The folder of the model; None in all but the first of several processes.
+        The folder of the model; None in all but the first of several processes, and where only the plan is printed.
 
     Raises:
         ValueError: Weights, pairs or options are not as expected, or the GPU's memory is too small.
@@ -67,20 +82,19 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
     from splatgraft.harmonization.flux.weights.folder import FluxFolder, local_folder
     from splatgraft.training.flux_objective import FluxObjective, FluxTraining
 
-    folder = local_folder(options.base, console.say)
-    config = FluxFolder.open(folder).config
-    width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
-    doubles, singles = config.get("num_layers", 19), config.get("num_single_layers", 38)
-    pixels = math.prod(parse_image_size(options.data.size, multiple_of=16))
-    size = TransformerSize(
-        # with the modulations that inference bakes: 6 a stream of a double block, 3 a single one
-        parameters=width**2 * (36 * doubles + 15 * singles),
-        blocks=doubles + singles,
-        width=width,
-        tokens=pixels // 256 + 512,
-        adapted=width * (36 * doubles + 20 * singles),
-    )
-    _say_memory(size, options, console)
+    recipe = Recipe.read(options.recipe) if options.recipe else None
+    if options.plan or recipe:
+        size = _transformer_size(_known_config(options.base), options)
+        _say_plan(recipe, size.parameters, options, console)
+        if options.plan:
+            _say_memory(size, options, console)
+            return None
+    data = open_training_data(options.data, options.loop.seed, recipe)
+    if options.base == TINY:
+        folder = _tiny_base(out, data, options, console)
+    else:
+        folder = local_folder(options.base, console.say)
+    _say_memory(_transformer_size(FluxFolder.open(folder).config, options), options, console)
     objective = FluxObjective(
         FluxTraining(
             base=str(folder),
@@ -94,14 +108,14 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
         ),
         console.say,
     )
-    return _train(objective, out, options, base=str(folder), console=console)
+    return _train(objective, data, out, options, base=str(folder), console=console)
 
 
 def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) -> Path | None:
     """Train the object removal.
 
     Returns:
-        The folder of the model; None in all but the first of several processes.
+        The folder of the model; None in all but the first of several processes, and where only the plan is printed.
 
     Raises:
         ValueError: Weights, pairs or options are not as expected.
@@ -109,59 +123,135 @@ def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) 
     from splatgraft.harmonization.flux.weights.folder import local_folder
     from splatgraft.training.removal_objective import RemovalObjective
 
+    recipe = Recipe.read(options.recipe) if options.recipe else None
+    if options.plan or recipe:
+        _say_plan(recipe, _REMOVAL_PARAMETERS, options, console)
+        if options.plan:
+            console.say(_removal_memory(_REMOVAL_PARAMETERS, options.loop))
+            return None
+    data = open_training_data(options.data, options.loop.seed, recipe)
     folder = local_folder(options.base, console.say, parts=("unet", "vae"))
     objective = RemovalObjective(str(folder), console.say, checkpointing=not options.no_checkpointing)
     count = sum(p.numel() for p in objective.network.parameters())
-    each = 16 - 6 * (options.loop.optimizer == "adam8bit") + 4 * (options.loop.ema > 0)
-    console.say(f"memory: {count * each / 1e9:.1f} GB for weights and optimiser, and activations")
-    return _train(objective, out, options, base=str(folder), console=console)
+    console.say(_removal_memory(count, options.loop))
+    return _train(objective, data, out, options, base=str(folder), console=console)
 
 
 def _train(
     objective: Any,
+    data: TrainingData,
     out: Path,
     options: FluxTrainingOptions | RemovalTrainingOptions,
     *,
     base: str,
     console: Console,
 ) -> Path | None:
-    width, height = parse_image_size(options.data.size, multiple_of=16)
-    data = options.data
-    sources = [RenderedPairs(folder) for folder in data.pairs]
-    sources += [RelitPairs(folder) for folder in (*data.generated, *data.orida)]
-    if not sources:
-        raise ValueError("training data: expected --pairs, --generated or --orida, found none")
-    mixture, held_out = split_mixture(sources, weights=data.weights, held_out=data.held_out, seed=options.loop.seed)
-    first = is_first_process(cpu=options.loop.cpu)
+    processes = Processes.join(cpu=options.loop.cpu)
+    first = processes.is_first
     say = console.say if first else lambda sentence: None
-    for source, indices in zip(mixture.sources, mixture.indices, strict=True):
-        say(f"data: {len(indices)} pairs to train on, {len(source) - len(indices)} held out, {source.name}")
+    if processes.count > 1:
+        backend = "NCCL" if processes.device.type == "cuda" else "gloo"
+        held = "a share of the weights" if options.loop.parallel == "shards" else "all weights"
+        say(f"processes: {processes.count} on {processes.device.type}, {backend}, {held} in each")
+    for line in data.lines():
+        say(line)
     vae = Path(base) / "vae" / "diffusion_pytorch_model.safetensors"
     name = f"{vae.resolve()}|{vae.stat().st_size if vae.is_file() else 0}"
-    cache = LatentCache(out / "latents", objective.encode, width=width, height=height, autoencoder=name)
+    cache = LatentCache(out / "latents", objective.encode, width=data.width, height=data.height, autoencoder=name)
     with console.bar("train") as progress:
-        run = TrainingRun(objective, mixture, held_out, cache, options.loop, out, say, progress)
+        run = TrainingRun(objective, data.mixture, data.held_out, cache, options.loop, out, say, progress)
         # the first of several processes locks the folder; the others write only latents, each file atomically
         with locked(out) if first else nullcontext():
             model = train(run)
     return model if first else None
 
 
+def _tiny_base(out: Path, data: TrainingData, options: FluxTrainingOptions, console: Console) -> Path:
+    """Make the tiny base model from training pictures, where it is not there; the other processes wait for it."""
+    from splatgraft.training.tiny_base import TinyBaseOptions, write_tiny_base
+
+    folder, processes = out / "base", Processes.join(cpu=options.loop.cpu)
+    if processes.is_first and not folder.is_dir():
+        pictures = []
+        for drawn in data.mixture.all()[: _BASE_PICTURES // 3]:
+            pair = crop_pair_to_size(drawn.source.read(drawn.index), data.width, data.height)
+            pictures += [pair.picture(role).permute(2, 0, 1) for role in ("target", "composite", "mask")]
+        out.mkdir(parents=True, exist_ok=True)
+        with console.bar("autoencoder") as progress, locked(out):
+            write_tiny_base(
+                folder, pictures, TinyBaseOptions(seed=options.loop.seed), say=console.say, progress=progress
+            )
+    processes.wait()
+    return folder
+
+
+def _known_config(base: str) -> dict[str, Any]:
+    """The transformer's config, or nothing where FLUX.1-schnell's holds: a plan fetches no weights."""
+    from splatgraft.harmonization.flux.weights.folder import FluxFolder
+    from splatgraft.training.tiny_base import TinyBaseOptions
+
+    if base == TINY:
+        tiny = TinyBaseOptions()
+        heads = {"num_attention_heads": tiny.heads, "attention_head_dim": tiny.head_width}
+        return {**heads, "num_layers": tiny.double_blocks, "num_single_layers": tiny.single_blocks}
+    return FluxFolder.open(Path(base)).config if Path(base).is_dir() else {}
+
+
+def _transformer_size(config: dict[str, Any], options: FluxTrainingOptions) -> TransformerSize:
+    width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
+    doubles, singles = config.get("num_layers", 19), config.get("num_single_layers", 38)
+    pixels = math.prod(parse_image_size(options.data.size, multiple_of=16))
+    return TransformerSize(
+        # with the modulations that inference bakes: 6 a stream of a double block, 3 a single one
+        parameters=width**2 * (36 * doubles + 15 * singles),
+        blocks=doubles + singles,
+        width=width,
+        tokens=pixels // 256 + 512,
+        adapted=width * (36 * doubles + 20 * singles),
+    )
+
+
+def _removal_memory(parameters: int, loop: LoopOptions) -> str:
+    each = 16 - 6 * (loop.optimizer == "adam8bit") + 4 * (loop.ema > 0)
+    return f"memory: {parameters * each / 1e9:.1f} GB a device for weights and optimiser, and activations"
+
+
+def _say_plan(
+    recipe: Recipe | None, parameters: int, options: FluxTrainingOptions | RemovalTrainingOptions, console: Console
+) -> None:
+    loop, processes = options.loop, Processes.join(cpu=options.loop.cpu)
+    cost = TrainingCost(
+        steps=loop.steps,
+        batch=loop.batch,
+        size=options.data.size,
+        parameters=parameters,
+        # a plan without a launcher is that of the recipe
+        processes=recipe.processes if recipe and processes.count == 1 else processes.count,
+        ema=loop.ema > 0,
+        removal=isinstance(options, RemovalTrainingOptions),
+    )
+    if processes.is_first:
+        for line in plan(recipe, cost, loop.rate):
+            console.say(line)
+
+
 def _say_memory(size: TransformerSize, options: FluxTrainingOptions, console: Console) -> None:
     loop: LoopOptions = options.loop
-    processes, shards = process_counts(cpu=loop.cpu)
+    processes = Processes.join(cpu=loop.cpu).count
+    if options.plan and options.recipe and processes == 1:
+        processes = Recipe.read(options.recipe).processes
     choice = MemoryOptions(
         pairs=max(1, loop.batch // (processes * loop.accumulate)),
         lora=options.lora,
         adam8bit=loop.optimizer == "adam8bit",
         ema=loop.ema > 0,
         checkpointing=not options.no_checkpointing,
-        shards=shards,
+        shards=processes if loop.parallel == "shards" else 1,
         half=loop.precision != "no",
     )
     for line in memory_table(size, choice):
         console.say(f"memory: {line}")
-    if torch.cuda.is_available() and not loop.cpu:
+    if torch.cuda.is_available() and not loop.cpu and not options.plan:
         free, need = torch.cuda.mem_get_info()[0], training_bytes(size, choice)
         if need > free and not options.force:
             raise ValueError(

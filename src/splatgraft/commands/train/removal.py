@@ -1,10 +1,12 @@
 """The command `train removal`: pairs become a network that takes objects out of pictures (paper, Sec. 5.2 and 5.3)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.flux_training import RemovalTrainingOptions, train_removal
+from splatgraft.workflow.training_recipe import arguments_with_recipe
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,11 @@ class TrainRemoval:
         if model is not None:
             console.result(model)
         return 0
+
+
+def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
+    """Put the options of --recipe before the user's own words."""
+    return arguments_with_recipe("train removal", words)
 
 
 COMMAND = TrainRemoval

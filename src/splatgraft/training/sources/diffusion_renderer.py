@@ -106,7 +106,8 @@ class DiffusionRenderer:
             ValueError: a program is missing, or the interpreter does not start.
         """
         self.name = f"DiffusionRenderer ({variant})"
-        self._checkout, self._variant = checkout.resolve(), variant
+        self._checkout = checkout.resolve()
+        self._variant: Variant = variant
         for program in _PROGRAMS[variant]:
             if not (checkout / program).is_file():
                 raise ValueError(

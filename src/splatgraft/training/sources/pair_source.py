@@ -56,6 +56,10 @@ class PairSource(Protocol):
         """A unique key of an image, which changes when its file does."""
         ...
 
+    def location(self, index: int) -> str:
+        """The file that tells a pair from others, for messages."""
+        ...
+
     def read(self, index: int) -> TrainingPair:
         """Read a pair.
 

@@ -13,10 +13,10 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.core.images import read_mask, read_rgb, write_image
+from splatgraft.core.images import write_image
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.atomic_folder import atomic_folder
-from splatgraft.synthesis.pairs import composite, match_statistics
+from splatgraft.training.sources.pair_files import read_pair
 from splatgraft.training.sources.pair_source import Role, TrainingPair
 from splatgraft.training.sources.rendered_pairs import file_fingerprint
 
@@ -94,19 +94,20 @@ class RelitPairs:
         folder, _, light = self._pairs[index]
         return file_fingerprint(folder / (f"relit_{light}.png" if role == "composite" else f"{role}.png")) + f"|{role}"
 
+    def location(self, index: int) -> str:
+        """The picture of the relit object."""
+        return str(self.files(index)["relit"])
+
+    def files(self, index: int) -> dict[str, Path]:
+        """The four pictures of a pair."""
+        folder, _, light = self._pairs[index]
+        names = {name: folder / f"{name}.png" for name in ("target", "background", "mask")}
+        return {**names, "relit": folder / f"relit_{light}.png"}
+
     def read(self, index: int) -> TrainingPair:
-        """Read a pair; its composite has the relit object at the exposure of the object in the scene.
+        """Read a pair.
 
         Raises:
             ValueError: a file is missing or broken.
         """
-        folder, _, light = self._pairs[index]
-        target, background = read_rgb(folder / "target.png"), read_rgb(folder / "background.png")
-        mask, relit = read_mask(folder / "mask.png"), read_rgb(folder / f"relit_{light}.png")
-        for name, picture in (("background", background), ("mask", mask), (f"relit_{light}", relit)):
-            if picture.shape[:2] != target.shape[:2]:
-                expected, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
-                raise ValueError(f"{folder / name}.png: expected {expected} pixels as target.png, found {found}")
-        return TrainingPair(
-            composite(match_statistics(relit, target, mask), background, mask), target, background, mask
-        )
+        return read_pair(self.files(index))

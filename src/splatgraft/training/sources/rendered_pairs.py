@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from splatgraft.synthesis.pairs import PairSample, load_pair, read_manifest
+from splatgraft.synthesis.pairs import PairSample, read_manifest
+from splatgraft.training.sources.pair_files import read_pair
 from splatgraft.training.sources.pair_source import Role, TrainingPair
 
 
@@ -29,14 +30,23 @@ class RenderedPairs:
         """Identify the file of a role by path, size and time."""
         return file_fingerprint(_file(self._samples[index], role)) + f"|{role}"
 
+    def location(self, index: int) -> str:
+        """The picture of the relit object."""
+        return str(_file(self._samples[index], "composite"))
+
+    def files(self, index: int) -> dict[str, Path]:
+        """The four pictures of a pair."""
+        sample = self._samples[index]
+        roles: dict[str, Role] = {"target": "target", "background": "background", "mask": "mask", "relit": "composite"}
+        return {name: _file(sample, role) for name, role in roles.items()}
+
     def read(self, index: int) -> TrainingPair:
         """Read a pair.
 
         Raises:
             ValueError: a file is missing or broken.
         """
-        pair = load_pair(self._samples[index])
-        return TrainingPair(pair.composite, pair.target, pair.background, pair.mask)
+        return read_pair(self.files(index))
 
 
 def file_fingerprint(path: Path) -> str:

@@ -51,7 +51,8 @@ def multiplies_in_eight_bits(device: torch.device) -> bool:
     try:
         ones = torch.ones(_MULTIPLE, _MULTIPLE, device=device).to(torch.float8_e4m3fn)
         scale = torch.ones(_MULTIPLE, 1, device=device)
-        torch._scaled_mm(ones, ones.t(), scale_a=scale, scale_b=scale.T.contiguous(), out_dtype=torch.bfloat16)
+        multiply = torch._scaled_mm  # pyright: ignore[reportPrivateImportUsage]
+        multiply(ones, ones.t(), scale_a=scale, scale_b=scale.T.contiguous(), out_dtype=torch.bfloat16)
     except (RuntimeError, AttributeError, TypeError, ValueError):
         return False
     return True

@@ -1,0 +1,133 @@
+"""A base model of three million parameters in FLUX's layout, of the same classes, for the recipe `tiny`.
+
+Its transformer is random. Its autoencoder is trained here for a few minutes on the pictures of the pairs, as a random
+one cannot show a picture; its latents are then scaled to mean 0 and deviation 1, as those of FLUX are.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE, PromptEmbedding, write_prompt
+from splatgraft.harmonization.flux.weights.diffusers_library import autoencoder_class, flux_transformer_class
+from splatgraft.runtime.atomic_folder import atomic_folder
+from splatgraft.runtime.progress import Progress
+
+_LATENTS, _TEXT, _POOLED = 8, 32, 32
+_MEAN_STEPS = 50
+"""Steps over which the autoencoder's error is averaged."""
+
+
+@dataclass(frozen=True)
+class TinyBaseOptions:
+    """Size and training of the tiny base model."""
+
+    heads: int = 4
+    head_width: int = 40
+    double_blocks: int = 2
+    single_blocks: int = 4
+    autoencoder_steps: int = 1500
+    batch: int = 8
+    rate: float = 2e-3
+    """Of Adam, falling to zero along a cosine."""
+    seed: int = 0
+
+
+def write_tiny_base(
+    folder: Path,
+    pictures: Sequence[Tensor],
+    options: TinyBaseOptions,
+    *,
+    say: Callable[[str], None],
+    progress: Progress,
+) -> None:
+    """Train the autoencoder on pictures and write the base model's folder.
+
+    Args:
+        folder: is replaced when all is written.
+        pictures: (3 h w), sRGB in [0, 1], all of one size.
+        options: sizes and training.
+        say: receives the sizes and the autoencoder's error.
+        progress: called after every step.
+    """
+    torch.manual_seed(options.seed)
+    autoencoder = _autoencoder()
+    stacked = torch.stack(list(pictures)) * 2 - 1
+    error = _train(autoencoder, stacked, options, progress)
+    _normalise(autoencoder, stacked)
+    transformer = _transformer(options)
+    count = sum(p.numel() for p in transformer.parameters())
+    psnr = -10 * torch.log10(torch.tensor(error / 4))
+    say(f"base: transformer of {count / 1e6:.1f} million parameters, autoencoder of {_count(autoencoder):.2f} million")
+    say(f"base: the autoencoder shows {len(pictures)} pictures at {float(psnr):.1f} dB")
+    with atomic_folder(folder) as new:
+        transformer.save_pretrained(new / "transformer")
+        autoencoder.save_pretrained(new / "vae")
+        prompt = PromptEmbedding(torch.randn(1, _TEXT), torch.randn(_POOLED))
+        write_prompt(new / PROMPT_FILE, prompt, "random: the recipe has no text")
+
+
+def _autoencoder() -> Any:
+    return autoencoder_class()(
+        block_out_channels=(24, 48, 64),
+        down_block_types=("DownEncoderBlock2D",) * 3,
+        up_block_types=("UpDecoderBlock2D",) * 3,
+        latent_channels=_LATENTS,
+        norm_num_groups=8,
+        layers_per_block=1,
+        scaling_factor=1.0,
+        shift_factor=0.0,
+        use_quant_conv=False,
+        use_post_quant_conv=False,
+    )
+
+
+def _transformer(options: TinyBaseOptions) -> Any:
+    width = options.head_width
+    return flux_transformer_class()(
+        in_channels=_LATENTS * 4,
+        num_layers=options.double_blocks,
+        num_single_layers=options.single_blocks,
+        attention_head_dim=width,
+        num_attention_heads=options.heads,
+        joint_attention_dim=_TEXT,
+        pooled_projection_dim=_POOLED,
+        axes_dims_rope=(width // 5, width // 5 * 2, width // 5 * 2),
+    )
+
+
+def _train(autoencoder: Any, pictures: Float[Tensor, "n 3 h w"], options: TinyBaseOptions, progress: Progress) -> float:
+    """Train on random pictures; gives the mean squared error at the end, of values in [-1, 1]."""
+    optimizer = torch.optim.Adam(autoencoder.parameters(), lr=options.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.autoencoder_steps)
+    generator, errors = torch.Generator().manual_seed(options.seed), []
+    for step in range(options.autoencoder_steps):
+        batch = pictures[torch.randint(len(pictures), (options.batch,), generator=generator)]
+        latents = autoencoder.encode(batch).latent_dist.mode()
+        shown = autoencoder.decode(latents, return_dict=False)[0]
+        error = ((shown - batch) ** 2).mean()
+        # absolute errors keep the smooth gradients of shading; a small pull keeps the latents near 0
+        loss = error + 0.1 * (shown - batch).abs().mean() + 1e-4 * (latents**2).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        errors = [*errors[1 - _MEAN_STEPS :], float(error.detach())]
+        progress(step + 1, options.autoencoder_steps, f"autoencoder, error {sum(errors) / len(errors):.4f}")
+    return sum(errors) / len(errors)
+
+
+@torch.no_grad()
+def _normalise(autoencoder: Any, pictures: Float[Tensor, "n 3 h w"]) -> None:
+    latents = torch.cat([autoencoder.encode(part).latent_dist.mode() for part in pictures[:64].split(8)])
+    shift, scale = float(latents.mean()), 1 / float(latents.std())
+    autoencoder.register_to_config(shift_factor=shift, scaling_factor=scale)
+
+
+def _count(network: Any) -> float:
+    return sum(p.numel() for p in network.parameters()) / 1e6
