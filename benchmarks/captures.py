@@ -3,9 +3,10 @@
 Every capture in FOLDER (with poses: transforms.json or COLMAP; without: a folder of photos, posed first by
 `splatgraft capture`) is reconstructed in a process of its own with every 8th view held out. One line each:
 
-    capture=NAME quality=standard views=9 psnr=.. psnr_fit=.. ssim=.. seconds=.. cpu_seconds=.. gaussians=.. peak_mb=..
+    capture=NAME quality=standard views=9 psnr=.. psnr_fit=.. ssim=.. flip=.. seconds=.. cpu_seconds=.. ..
 
-psnr and ssim compare with the views as photographed; psnr_fit after the colours of each render were mapped to its photo
+psnr, ssim and flip compare with the views as photographed; psnr_fit after the colours of each render were mapped to its
+photo
 by a least-squares affine map, which leaves exposure and white balance out. CPU seconds count all threads of the
 reconstruction; structure from motion is not part of either time.
 """
@@ -21,6 +22,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as cli.py does; read when
 
 import torch
 
+from splatgraft.core.flip import flip
 from splatgraft.core.image_metrics import fit_color, psnr, ssim
 from splatgraft.core.images import list_images
 from splatgraft.core.posed_images import held_out
@@ -69,16 +71,18 @@ def measure(name: str, folder: Path, quality: str) -> None:
     seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     peak = peak_memory_bytes() / 2**20
     served = options.served(capture)
-    rows: list[tuple[float, float, float]] = []
+    rows: list[tuple[float, ...]] = []
     for i in torch.nonzero(held_out(len(served), EVERY)).flatten().tolist():
         truth = served.image(i)
         picture = render(scene, served.cameras[i]).color[0].clamp(0, 1)
         fitted = fit_color(picture, truth)
-        rows.append((float(psnr(picture, truth)), float(psnr(fitted, truth)), float(ssim(picture, truth))))
-    decibel, of_fitted, similarity = (sum(column) / len(rows) for column in zip(*rows, strict=True))
+        found = (psnr(picture, truth), psnr(fitted, truth), ssim(picture, truth), flip(picture, truth))
+        rows.append(tuple(float(value) for value in found))
+    decibel, of_fitted, similarity, visible = (sum(column) / len(rows) for column in zip(*rows, strict=True))
     print(
         f"capture={name} quality={quality} views={len(rows)} psnr={decibel:.2f} psnr_fit={of_fitted:.2f} "
-        f"ssim={similarity:.3f} seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={scene.count} peak_mb={peak:.0f}",
+        f"ssim={similarity:.3f} flip={visible:.4f} "
+        f"seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={scene.count} peak_mb={peak:.0f}",
         flush=True,
     )
 

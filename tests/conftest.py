@@ -13,6 +13,7 @@ settings.register_profile("any machine", deadline=None, suppress_health_check=[H
 settings.load_profile("any machine")
 
 SLOW = (
+    "benchmarks/test_gpu.py",
     "capture/test_colmap_process.py",
     "capture/test_pose_photos.py",
     "commands",

@@ -7,10 +7,12 @@ from exam.scene_files import ExamScene
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting import Light, Relit, SourceScene, relight
 from splatgraft.relighting.gain_transfer import relight_by_gain
+from splatgraft.relighting.irradiance_ratio import relight_by_irradiance_ratio
 
 ROWS: Mapping[str, str] = {
     "paste": "the object as it was captured",
     "gain": "one gain per channel, from the light around both places",
+    "transplat": "the ratio of irradiances at each normal (TranSplat's diffuse path), both estimated; no shadow",
     "transfer": "the transfer, everything estimated",
     "told-new": "the transfer, told the true new light",
     "told-both": "the transfer, told both true lights",
@@ -31,6 +33,8 @@ def make_row(row: str, scene: ExamScene) -> tuple[Gaussians, Relit | None]:
         return scene.composite.bake()[0], None
     if row == "gain":
         return relight_by_gain(scene.composite, scene.cameras, sources=[scene.source])[0].bake()[0], None
+    if row == "transplat":
+        return relight_by_irradiance_ratio(scene.composite, sources=[scene.source])[0].bake()[0], None
     source, light = _told(row, scene)
     relit = relight(scene.composite, scene.cameras, sources=[source], light=light)
     return relit.bake()[0], relit

@@ -75,6 +75,8 @@ def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: C
     files = GroundTruthScene.from_folder(folder)
     composed = compose_scene(files, work, options, device="cpu", console=console)
     composite = read_composite(composed.target, composed.composite / PLACEMENT_FILE)
+    assert composed.surroundings is not None
+    assert composed.source_cameras is not None
     source = SourceScene(read_gaussians(composed.surroundings), read_cameras(composed.source_cameras))
     return ExamScene(
         name=folder.name,

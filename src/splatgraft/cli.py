@@ -26,6 +26,7 @@ _TABLE = (
     ("consolidate", "steps.consolidate", "fit the colours of the scene to the harmonised views"),
     ("evaluate", "steps.evaluate", "compare, picture and report"),
     ("evaluate benchmark", "evaluate_benchmark", "measure methods on scenes with a known truth"),
+    ("evaluate paper", "evaluate_paper", "write the paper's tables from the authors' data set"),
     ("synth pairs", "synth.pairs", "render training pairs with Blender"),
     ("synth benchmark", "synth.benchmark", "render benchmark scenes with ground truth"),
     ("synth check", "synth.check", "find damaged or empty pictures among rendered pairs or scenes"),

@@ -62,6 +62,7 @@ def test_the_truth_itself_scores_perfectly():
     truth = example_truth()
     found = compare(truth.image, truth, regions=find_regions(truth), background=truth.background)
     assert found["ssim"] == pytest.approx(1, abs=1e-6)
+    assert found["flip"] == found["object_flip"] == 0
     assert found["shadow_ratio_rmse"] == 0
     assert found["rest_max_change"] < 1e-6  # the example passed sRGB to linear and back
     assert found["object_psnr"] == float("inf")
@@ -73,6 +74,8 @@ def test_copy_paste_without_shadow_misses_exactly_the_shadow():
     found = compare(pasted, truth, regions=find_regions(truth), background=truth.background)
     # ratio 1 instead of 0.5 in the core; the 3x3 mean makes the outermost rows a third or two thirds of that
     assert 0.4 < found["shadow_ratio_rmse"] < 0.5
+    # what is seen is in the shadow, and blurred by the eye over some pixels around it
+    assert found["shadow_flip"] > 0.1 > 10 * found["object_flip"]
     assert found["rest_max_change"] == 0
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from random_lpips import write_random_lpips
 
 from splatgraft.fitting.perceptual_losses import HEADS_FILE, VGG_FILE, l1, lpips_vgg, windowed_fourier
 
@@ -58,20 +59,7 @@ def test_fourier_forgives_a_shift_that_l1_does_not():
 def weights(tmp_path_factory):
     """Files in the layout of the published ones, with random numbers."""
     folder = tmp_path_factory.mktemp("weights")
-    generator = torch.Generator().manual_seed(0)
-    vgg, below = {}, 3
-    channels = {0: 64, 2: 64, 5: 128, 7: 128, 10: 256, 12: 256, 14: 256}
-    channels |= dict.fromkeys((17, 19, 21, 24, 26, 28), 512)
-    for layer, above in channels.items():
-        vgg[f"features.{layer}.weight"] = torch.randn(above, below, 3, 3, generator=generator) * (2 / below / 9) ** 0.5
-        vgg[f"features.{layer}.bias"] = 0.1 * torch.randn(above, generator=generator)
-        below = above
-    torch.save(vgg, folder / VGG_FILE)
-    heads = {
-        f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1, generator=generator)
-        for i, c in enumerate((64, 128, 256, 512, 512))
-    }
-    torch.save(heads, folder / HEADS_FILE)
+    write_random_lpips(folder)
     return folder
 
 

@@ -3,9 +3,7 @@
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
-from splatgraft.evaluation.benchmark.published_datasets import PUBLISHED, download, find_scenes
 from splatgraft.project.folder_lock import locked
 from splatgraft.project.step import Positional
 from splatgraft.reconstruction import ReconstructOptions
@@ -22,7 +20,7 @@ class EvaluateBenchmark:
     """Measure methods on scenes with ground truth; finished results are kept."""
 
     scenes: Positional
-    """Folder of scenes that `synth benchmark` made, or of a published data set."""
+    """Folder of scenes that `synth benchmark` made; `evaluate paper` reads the authors' data set."""
     out: Path = Path("benchmark")
     """Folder for index.html, benchmark.json, benchmark.md and all results."""
     methods: tuple[str, ...] = ("copy-paste", "reinhard", "gain", "transfer", "true-light")
@@ -30,10 +28,6 @@ class EvaluateBenchmark:
     or NAME=FOLDER for pictures of another program, FOLDER/SCENE/VIEW.png."""
     only: tuple[str, ...] = ()
     """Names of scenes; all where none is given."""
-    published: Literal["none", "dot3d", "syncom"] = "none"
-    """Read the scenes as this published data set lays them out."""
-    download: bool = False
-    """Fetch the published data set into the folder first."""
     weights: Path | None = None
     """Folder with the weights of LPIPS and Inception; torch hub's cache where not given."""
     harmonizer_weights: str | None = None
@@ -63,13 +57,7 @@ class EvaluateBenchmark:
         return 1 if found.not_run else 0
 
     def _scenes(self) -> tuple[GroundTruthScene, ...]:
-        if self.published != "none":
-            layout = PUBLISHED[self.published]
-            if self.download:
-                download(layout, self.scenes)
-            found = [GroundTruthScene.from_published(scene) for scene in find_scenes(layout, self.scenes)]
-        else:
-            found = [GroundTruthScene.from_folder(path.parent) for path in sorted(self.scenes.glob("*/ground_truth"))]
+        found = [GroundTruthScene.from_folder(path.parent) for path in sorted(self.scenes.glob("*/ground_truth"))]
         if not found:
             raise ValueError(f"{self.scenes}: expected scenes with ground_truth/, found none")
         names = [scene.name for scene in found]

@@ -30,10 +30,10 @@ def evaluate(
         perceptual: A distance between two (h, w, 3) images such as LPIPS; without it there is no "lpips".
 
     Returns:
-        `psnr` (dB) and `ssim` of the whole image and of the regions object, shadow and rest; `shadow_ratio_rmse`, the
-        error of the shadow as a ratio of linear luminance; `rest_max_change` and `rest_mean_change` (sRGB). Each is
-        the mean over the views in which its region has at least 25 pixels (the maximum for `rest_max_change`), and
-        None where no view has.
+        `psnr` (dB), `ssim` and `flip` of the whole image and of the regions object, shadow and rest;
+        `shadow_ratio_rmse`, the error of the shadow as a ratio of linear luminance; `rest_max_change` and
+        `rest_mean_change` (sRGB). Each is the mean over the views in which its region has at least 25 pixels (the
+        maximum for `rest_max_change`), and None where no view has.
 
     Raises:
         ValueError: There is not one truth and one background per picture.

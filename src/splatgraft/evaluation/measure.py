@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.core.flip import flip_map
 from splatgraft.core.image_metrics import psnr, ssim_map
 from splatgraft.evaluation.regions import Regions, Truth, find_regions, luminance_ratio
 
@@ -60,11 +61,13 @@ def compare(
     """
     similarity = ssim_map(image, truth.image).mean(-1)
     inner = (slice(_SSIM_BORDER, -_SSIM_BORDER), slice(_SSIM_BORDER, -_SSIM_BORDER))
-    out = {"psnr": float(psnr(image, truth.image)), "ssim": float(similarity.mean())}
+    visible = flip_map(image, truth.image)
+    out = {"psnr": float(psnr(image, truth.image)), "ssim": float(similarity.mean()), "flip": float(visible.mean())}
     for name in ("object", "shadow", "rest"):
         region = getattr(regions, name)
         large_enough = int(region.sum()) >= SMALLEST_REGION
         out[f"{name}_psnr"] = float(psnr(image, truth.image, region)) if large_enough else math.nan
+        out[f"{name}_flip"] = float(visible[region].mean()) if large_enough else math.nan
         large_enough = int(region[inner].sum()) >= SMALLEST_REGION
         out[f"{name}_ssim"] = float(similarity[region[inner]].mean()) if large_enough else math.nan
     out["shadow_ratio_rmse"] = math.nan

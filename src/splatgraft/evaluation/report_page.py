@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 _METRICS = (
     ("psnr", "Whole image", "PSNR, dB", "{:.2f}", True, "Pixel error over the whole image."),
     ("ssim", "Structure", "SSIM", "{:.4f}", True, "Agreement of local contrast and texture over the whole image."),
+    ("flip", "Visible difference", "FLIP", "{:.4f}", False, "What an observer sees when the two images alternate."),
     (
         "lpips",
         "Perception",

@@ -115,6 +115,17 @@ class LpipsVgg:
         return torch.stack(parts).sum()
 
 
+def lpips_and_l1(folder: Path | None = None) -> ImageLoss:
+    """LPIPS plus L1, of equal weight: LPIPS alone leaves a constant error of brightness nearly free.
+
+    The paper's text names the perceptual loss only, and no weight of a second term.
+
+    Raises: ValueError where a file of LPIPS's weights is missing or holds something else.
+    """
+    perceptual = lpips_vgg(folder)
+    return lambda image, target: perceptual(image, target) + l1(image, target)
+
+
 def lpips_vgg(folder: Path | None = None) -> LpipsVgg:
     """LPIPS with the weights vgg16-397923af.pth and vgg.pth in `folder`, by default torch hub's cache.
 

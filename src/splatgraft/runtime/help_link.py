@@ -82,6 +82,7 @@ _SECTIONS = {
     "commands.edit": "editor",
     "editor": "editor",
     "commands.evaluate_benchmark": "synthetic-scenes-and-the-benchmark",
+    "commands.evaluate_paper": "synthetic-scenes-and-the-benchmark",
     "commands.synth": "synthetic-scenes-and-the-benchmark",
     "evaluation.benchmark": "synthetic-scenes-and-the-benchmark",
     "runtime.workers": "synthetic-scenes-and-the-benchmark",

@@ -7,7 +7,7 @@ from typing import Literal
 from splatgraft.consolidation import ConsolidateOptions, ViewErrorOptions, consolidate
 from splatgraft.core.images import read_mask, read_rgb
 from splatgraft.fitting import l1_dssim
-from splatgraft.fitting.perceptual_losses import ImageLoss, lpips_vgg, windowed_fourier
+from splatgraft.fitting.perceptual_losses import ImageLoss, lpips_and_l1, lpips_vgg, windowed_fourier
 from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.project.layout import SCENE_FILE
@@ -30,8 +30,9 @@ class Consolidate:
     """Folder for scene.ply."""
     method: Literal["fast", "adam"] = "fast"
     """fast: normal equations, then a short gradient descent. adam: the paper's gradient descent from the start."""
-    loss: Literal["fourier", "l1-dssim", "lpips"] = "fourier"
-    """Loss of the gradient descent: windowed Fourier magnitudes, that of 3DGS, or LPIPS (VGG; needs its weights)."""
+    loss: Literal["fourier", "l1-dssim", "lpips", "lpips-l1"] = "fourier"
+    """Loss of the gradient descent: windowed Fourier magnitudes, that of 3DGS, LPIPS (VGG; needs its weights), or LPIPS
+    and L1, the paper's."""
     nuisance: Literal["tint-flow", "none"] = "tint-flow"
     """Errors of each single view that are solved for together with the colours (fast only)."""
     iterations: int = 10_000
@@ -84,6 +85,8 @@ class Consolidate:
     def _loss(self) -> ImageLoss:
         if self.loss == "lpips":
             return lpips_vgg(self.lpips_weights)
+        if self.loss == "lpips-l1":
+            return lpips_and_l1(self.lpips_weights)
         return windowed_fourier if self.loss == "fourier" else l1_dssim
 
     def _images(self, views: ViewFolder) -> tuple[Path, ...]:

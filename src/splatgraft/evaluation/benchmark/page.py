@@ -14,7 +14,7 @@ def benchmark_html(benchmark: Benchmark, views: Sequence[ViewFiles]) -> str:
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)
     sections = [
         viewer(views) if views else "",
-        *(_section(table) for table in tables(benchmark)),
+        *(table_section(table) for table in tables(benchmark)),
         f"<section><h2>Limitations</h2><ul>{items}</ul></section>\n",
     ]
     scenes = len(benchmark.scenes)
@@ -23,7 +23,8 @@ def benchmark_html(benchmark: Benchmark, views: Sequence[ViewFiles]) -> str:
     return html_page("Benchmark of object transfer", subtitle, "".join(sections), views=views)
 
 
-def _section(table: Table) -> str:
+def table_section(table: Table) -> str:
+    """Format one table with its title."""
     head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table.head)
     rows = "".join(
         f'<tr><th scope="row">{escape(name)}</th>' + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"

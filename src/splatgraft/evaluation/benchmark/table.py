@@ -11,8 +11,11 @@ from splatgraft.evaluation.benchmark.view_metrics import REGIONS
 
 _RESAMPLES = 10_000
 """Of the bootstrap."""
-_FORMATS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}", "fid": "{:.1f}", "kid": "{:.4f}"}
-_LESS_IS_BETTER = ("lpips", "fid", "kid", "shadow_ratio_rmse", "disagreement", "rest_mean_change", "rest_max_change")
+_FORMATS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "flip": "{:.4f}", "lpips": "{:.4f}", "fid": "{:.1f}", "kid": "{:.4f}"}
+_METRICS = ("psnr", "ssim", "flip", "lpips", "fid", "kid")
+_LESS_IS_BETTER = (
+    "flip", "lpips", "fid", "kid", "shadow_ratio_rmse", "disagreement", "rest_mean_change", "rest_max_change",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,7 @@ class Summary:
 
 def metric_names() -> tuple[str, ...]:
     """Names of all metrics, in the order of the tables."""
-    by_region = [f"{metric}_{region}" for region in REGIONS for metric in ("psnr", "ssim", "lpips", "fid", "kid")]
+    by_region = [f"{metric}_{region}" for region in REGIONS for metric in _METRICS]
     return (*by_region, "shadow_ratio_rmse", "disagreement", "rest_mean_change", "rest_max_change")
 
 
@@ -159,13 +162,12 @@ def _missing(benchmark: Benchmark) -> list[str]:
 
 
 def _region_table(means: dict[str, dict[str, Summary | None]], region: str, benchmark: Benchmark) -> Table:
-    metrics = ("psnr", "ssim", "lpips", "fid", "kid")
-    head = ("method", *(f"{m.upper()} {'↓' if m in _LESS_IS_BETTER else '↑'}" for m in metrics))
+    head = ("method", *(f"{m.upper()} {'↓' if m in _LESS_IS_BETTER else '↑'}" for m in _METRICS))
     rows = []
     for method, found in means.items():
         cells = [
             _cell(f"{m}_{region}", found[f"{m}_{region}"], any(m in name.split() for name in benchmark.not_measured))
-            for m in metrics
+            for m in _METRICS
         ]
         rows.append((method, *cells))
     titles = {"whole": "Whole image", "object": "Object", "shadow": "Shadow band", "rest": "Untouched rest"}

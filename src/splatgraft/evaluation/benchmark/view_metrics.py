@@ -25,7 +25,7 @@ def measure_view(
     background: Float[Tensor, "h w 3"],
     perceptual: Perceptual | None = None,
 ) -> dict[str, float]:
-    """Compute PSNR, SSIM and LPIPS of every region, and the error of the shadow's strength.
+    """Compute PSNR, SSIM, FLIP and LPIPS of every region, and the error of the shadow's strength.
 
     Args:
         image: the method's result, sRGB in [0, 1].
@@ -38,9 +38,9 @@ def measure_view(
     """
     regions = find_regions(truth)
     plain = compare(image, truth, regions=regions, background=background)
-    out = {"psnr_whole": plain["psnr"], "ssim_whole": plain["ssim"]}
+    out = {"psnr_whole": plain["psnr"], "ssim_whole": plain["ssim"], "flip_whole": plain["flip"]}
     for name in REGIONS[1:]:
-        out |= {f"psnr_{name}": plain[f"{name}_psnr"], f"ssim_{name}": plain[f"{name}_ssim"]}
+        out |= {f"{metric}_{name}": plain[f"{name}_{metric}"] for metric in ("psnr", "ssim", "flip")}
     out |= {name: plain[name] for name in ("shadow_ratio_rmse", "rest_mean_change", "rest_max_change")}
     if perceptual is not None:
         for name in REGIONS:

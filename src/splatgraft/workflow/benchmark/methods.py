@@ -1,6 +1,6 @@
 """Methods of the benchmark: a light transfer, a harmoniser and a consolidation, or pictures of another program."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -10,13 +10,14 @@ from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
 from splatgraft.consolidation import (
     ConsolidateOptions,
+    DescentOptions,
     geometric_schedule,
     iterative_update,
     linear_schedule,
 )
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import l1_dssim
-from splatgraft.fitting.perceptual_losses import lpips_vgg, windowed_fourier
+from splatgraft.fitting.perceptual_losses import lpips_and_l1, lpips_vgg, windowed_fourier
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
@@ -34,10 +35,11 @@ from splatgraft.relighting.light.light import light_to_json
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.workflow.benchmark.scene import ComposedScene, perform_if_stale
+from splatgraft.workflow.benchmark.transplat import RelightByIrradianceRatio
 from splatgraft.workflow.benchmark.true_light_file import read_true_light
 
-Prior = Literal["off", "gain", "transfer", "true-light"]
-Loss = Literal["fourier", "l1-dssim", "lpips"]
+Prior = Literal["off", "gain", "transplat", "transfer", "true-light"]
+Loss = Literal["fourier", "l1-dssim", "lpips", "paper"]
 Schedule = Literal["once", "linear", "geometric"]
 _NAMES = {"copy-paste": "off", "reinhard": "off+reinhard", "flux": "off+flux"}
 _GRAMMAR = "PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], NAME=FOLDER, or " + ", ".join(_NAMES)
@@ -49,11 +51,11 @@ class Method:
 
     name: str
     prior: Prior = "off"
-    """The light transfer in 3D: none, exposure alone, the physical one, or the same with the true light given."""
+    """The light transfer in 3D: none, exposure alone, TranSplat's, the physical one, or that with the true light."""
     harmonizer: str | None = None
     """The image model; without one, the prior is the result."""
     loss: Loss = "fourier"
-    """Of the consolidation."""
+    """Of the consolidation; `paper` is the paper's: 10,000 steps of Adam on LPIPS and L1."""
     schedule: Schedule = "once"
     """Whether views are harmonised again from the consolidated scene (paper, Iterative Dataset Update)."""
     pictures: Path | None = None
@@ -156,6 +158,8 @@ class UpdateIteratively:
     """Folder of LPIPS's weights."""
     model: str | None = None
     """The harmoniser's own weights: folder, file or hub id."""
+    iterations: int = 10_000
+    """Steps of each consolidation with the paper's loss."""
     device: Device = "auto"
 
     def inputs(self) -> Inputs:
@@ -185,19 +189,36 @@ class UpdateIteratively:
                 images = [harmonizer.harmonize(view).image.to(device) for view in views]
             return LazySequence(len(images), lambda index: images[index])
 
-        loss = {"fourier": windowed_fourier, "l1-dssim": l1_dssim}.get(self.loss)
-        consolidation = ConsolidateOptions(loss=loss or lpips_vgg(self.weights))
+        consolidation = self._consolidation()
         scene = iterative_update(prior, cameras, harmonize_at, strengths, consolidation, progress=context.progress)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
+
+    def _consolidation(self) -> ConsolidateOptions:
+        if self.loss == "paper":
+            descent = DescentOptions(iterations=self.iterations)
+            return ConsolidateOptions(method="adam", loss=lpips_and_l1(self.weights), reference=descent)
+        loss = {"fourier": windowed_fourier, "l1-dssim": l1_dssim}.get(self.loss)
+        return ConsolidateOptions(loss=loss or lpips_vgg(self.weights))
+
+
+@dataclass(frozen=True)
+class MethodSettings:
+    """What all methods of a run share."""
+
+    weights: Path | None = None
+    """Folder of LPIPS's weights."""
+    model: str | None = None
+    """Weights of the harmoniser: folder, file or hub id."""
+    device: Device = "auto"
+    """Where to compute."""
+    iterations: int = 10_000
+    """Steps of the paper's consolidation."""
 
 
 def run_method(
     method: Method,
     scene: ComposedScene,
-    *,
-    weights: Path | None,
-    model: str | None,
-    device: Device,
+    settings: MethodSettings,
     console: Console,
 ) -> tuple[Path, dict[str, float]]:
     """Run the stale steps of a method on a scene.
@@ -205,9 +226,7 @@ def run_method(
     Args:
         method: The method.
         scene: The composite and its cameras.
-        weights: Folder of LPIPS's weights.
-        model: Weights of the harmoniser: folder, file or hub id.
-        device: Where to compute.
+        settings: Weights, device, length of the paper's consolidation.
         console: Takes progress and messages.
 
     Returns:
@@ -222,7 +241,7 @@ def run_method(
         prior, seconds["relight"] = _relit_scene(method.prior, scene, console)
     if method.harmonizer is None:
         return prior, seconds
-    options = harmonizer_options(method.harmonizer, weights=model)
+    options = harmonizer_options(method.harmonizer, weights=settings.model)
     result = scene.work / "methods" / method.folder_name / "result"
     if method.schedule != "once":
         update = UpdateIteratively(
@@ -233,9 +252,10 @@ def run_method(
             harmonizer=method.harmonizer,
             loss=method.loss,
             schedule=method.schedule,
-            weights=weights,
-            model=model,
-            device=device,
+            weights=settings.weights,
+            model=settings.model,
+            iterations=settings.iterations,
+            device=settings.device,
         )
         seconds["update"] = perform_if_stale(update, console)
         return result / SCENE_FILE, seconds
@@ -243,11 +263,17 @@ def run_method(
     composite = scene.composite / SCENE_FILE
     # a prior without a transfer has no light, and a failed transfer found none
     light = path if (path := prior.parent / LIGHT_FILE).is_file() else None
-    render = Render(composite, scene.cameras, views, is_object=scene.is_object, prior=prior, light=light, device=device)
+    render = Render(
+        composite, scene.cameras, views, is_object=scene.is_object, prior=prior, light=light, device=settings.device
+    )
     seconds["render"] = perform_if_stale(render, console)
     harmonized = scene.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
-    seconds["harmonize"] = perform_if_stale(Harmonize(views, harmonized, options, device=device), console)
-    consolidate = Consolidate(prior, views, harmonized, result, loss=method.loss, lpips_weights=weights, device=device)
+    seconds["harmonize"] = perform_if_stale(Harmonize(views, harmonized, options, device=settings.device), console)
+    consolidate = Consolidate(prior, views, harmonized, result, lpips_weights=settings.weights, device=settings.device)
+    if method.loss == "paper":
+        consolidate = replace(consolidate, loss="lpips-l1", method="adam", iterations=settings.iterations)
+    else:
+        consolidate = replace(consolidate, loss=method.loss)
     seconds["consolidate"] = perform_if_stale(consolidate, console)
     return result / SCENE_FILE, seconds
 
@@ -256,18 +282,25 @@ def _relit_scene(prior: Prior, scene: ComposedScene, console: Console) -> tuple[
     out = scene.work / "priors" / prior
     placement = scene.composite / PLACEMENT_FILE
     if prior == "true-light":
-        if scene.ground_truth.light is None:
-            raise ValueError(f"{scene.ground_truth.name}: expected a true light, found none")
+        if scene.light is None or scene.surroundings is None or scene.source_cameras is None:
+            raise ValueError(f"{scene.name}: expected a true light and the object's capture, found none")
         with_true_light = RelightWithTrueLight(
             scene.target,
             placement,
             scene.cameras,
-            light=scene.ground_truth.light,
+            light=scene.light,
             out=out,
             surroundings=scene.surroundings,
             object_cameras=scene.source_cameras,
         )
         return out / SCENE_FILE, perform_if_stale(with_true_light, console)
+    if prior == "transplat":
+        if scene.surroundings is None or scene.source_cameras is None:
+            raise ValueError(
+                f"{scene.name}: expected the object's capture, by which the old light is known, found none"
+            )
+        ratio = RelightByIrradianceRatio(scene.target, placement, scene.surroundings, scene.source_cameras, out)
+        return out / SCENE_FILE, perform_if_stale(ratio, console)
     kind = "gain" if prior == "gain" else "transfer"
     step = Relight(
         scene.target,

@@ -11,7 +11,7 @@ from splatgraft.project.step import Device
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.benchmark.measure_method import MeasureMethod
-from splatgraft.workflow.benchmark.methods import Method, run_method
+from splatgraft.workflow.benchmark.methods import Method, MethodSettings, run_method
 from splatgraft.workflow.benchmark.scene import GroundTruthScene, compose_scene, perform_if_stale
 
 NOT_RUN_FILE = "not_run.txt"
@@ -68,14 +68,8 @@ def measure_scene(run: BenchmarkRun, scene: GroundTruthScene, lpips: bool) -> No
         try:
             result, seconds = None, {}
             if method.pictures is None:
-                result, seconds = run_method(
-                    method,
-                    apply_output,
-                    weights=run.weights,
-                    model=run.harmonizer_weights,
-                    device=run.device,
-                    console=console,
-                )
+                settings = MethodSettings(run.weights, run.harmonizer_weights, run.device)
+                result, seconds = run_method(method, apply_output, settings, console)
             shown = None if method.pictures is None else method.pictures / scene.name
             step = MeasureMethod(
                 scene.truth, scene.target, apply_output.target, out, result, shown, run.weights, lpips, run.device

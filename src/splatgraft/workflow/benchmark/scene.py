@@ -8,7 +8,6 @@ from splatgraft.commands.steps.compose import Compose
 from splatgraft.commands.steps.reconstruct import Reconstruct
 from splatgraft.commands.steps.segment import Segment
 from splatgraft.core.posed_images import held_out
-from splatgraft.evaluation.benchmark.published_datasets import PublishedScene
 from splatgraft.formats import read_capture, write_capture
 from splatgraft.project.layout import (
     CAMERAS_FILE,
@@ -59,26 +58,19 @@ class GroundTruthScene:
         source, target, truth, placement = parts.values()
         return GroundTruthScene(folder.name, source, target, truth, placement, known)
 
-    @staticmethod
-    def from_published(scene: PublishedScene) -> "GroundTruthScene":
-        """Find the files of a scene of a published data set.
-
-        Raises:
-            ValueError: It has no ground truth or no placement.
-        """
-        folder = scene.target.parent
-        if scene.truth is None or not (folder / PLACEMENT_FILE).is_file():
-            raise ValueError(f"{folder}: expected images with the object and {PLACEMENT_FILE}, found none")
-        return GroundTruthScene(scene.name, scene.source, scene.target, scene.truth, folder / PLACEMENT_FILE)
-
 
 @dataclass(frozen=True)
 class ComposedScene:
     """The composite of a benchmark scene, on which methods are run."""
 
-    ground_truth: GroundTruthScene
+    name: str
+    """The scene's name."""
     work: Path
     """Folder of all results."""
+    light: Path | None = None
+    """light.json with the true light, where it is known."""
+    from_capture: bool = True
+    """Whether the object's own capture is known; without it, the light that the object had is not."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Of the steps that all methods share."""
 
@@ -88,9 +80,9 @@ class ComposedScene:
         return self.work / "target" / "capture" / CAMERAS_FILE
 
     @property
-    def source_cameras(self) -> Path:
+    def source_cameras(self) -> Path | None:
         """The cameras of the object's capture."""
-        return self.work / "source" / "capture" / CAMERAS_FILE
+        return self.work / "source" / "capture" / CAMERAS_FILE if self.from_capture else None
 
     @property
     def target(self) -> Path:
@@ -98,9 +90,9 @@ class ComposedScene:
         return self.work / "target" / "scene" / SCENE_FILE
 
     @property
-    def surroundings(self) -> Path:
+    def surroundings(self) -> Path | None:
         """The source without the object."""
-        return self.work / "object" / SURROUNDINGS_FILE
+        return self.work / "object" / SURROUNDINGS_FILE if self.from_capture else None
 
     @property
     def composite(self) -> Path:
@@ -150,7 +142,7 @@ def compose_scene(
     source = work / "source" / "scene" / SCENE_FILE
     segment = Segment(source, work / "source" / "capture", work / "object", device=device)
     seconds["segment"] = perform_if_stale(segment, console)
-    scene = ComposedScene(ground_truth, work, seconds)
+    scene = ComposedScene(ground_truth.name, work, light=ground_truth.light, seconds=seconds)
     compose = Compose(scene.target, work / "object" / OBJECT_FILE, scene.composite, placement=ground_truth.placement)
     seconds["compose"] = perform_if_stale(compose, console)
     return scene

@@ -1,0 +1,335 @@
+"""Everything to measure on a machine with one CUDA card and no network: `python benchmarks/gpu.py --out DIR`.
+
+Parts run one after the other, each in a process of its own that is stopped after ten minutes (`--limit`). A finished
+part is not run again: the same command continues after a stop. DIR/gpu.json and DIR/gpu.md hold all results with
+the card's name, after each part. `--toy` runs the same code at toy size on the CPU; its figures mean nothing.
+
+    cuda-tests    tests/rendering/test_cuda.py
+    renderer      gsplat against the CPU rasteriser: pictures, gradients, W and its transpose; milliseconds
+    reconstruct   data/room at draft quality: dB on held-out views, seconds
+    paper-size    benchmarks/paper_size.py: lift, relight, render, consolidate
+    harmonize-*   a random-weight harmoniser of the real size at 704x496: stock diffusers and ours, batch 1 to 8;
+                  stored in fp8; compiled
+    lora          one training step of a low-rank adaptation of that network
+"""
+
+import argparse
+import json
+import math
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+ROOT = Path(__file__).parents[1]
+LIMIT_S = 600
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a part is run with."""
+
+    device: torch.device
+    toy: bool
+
+    @property
+    def repeats(self) -> int:
+        """Timed runs of which the median counts."""
+        return 1 if self.toy else 5
+
+    def synchronize(self) -> None:
+        """Wait for the card."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+    def peak_gb(self) -> float:
+        """Memory of the card since the part's begin, GB; 0 on the CPU."""
+        return torch.cuda.max_memory_allocated(self.device) / 1e9 if self.device.type == "cuda" else 0.0
+
+
+def cuda_tests(setting: Setting) -> list[Row]:
+    """The renderer's tests that need a card, counted by their result."""
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        str(ROOT / "tests/rendering/test_cuda.py"),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    last = done.stdout.strip().splitlines()[-1] if done.stdout.strip() else done.stderr.strip()[-200:]
+    if not setting.toy and done.returncode:
+        raise RuntimeError(last)
+    return [{"tests": last}]
+
+
+def renderer(setting: Setting) -> list[Row]:
+    """Differences of the two rasterisers, and the card's milliseconds."""
+    from relight import courtyard
+
+    from splatgraft.core.cameras import look_at, pinhole
+    from splatgraft.rendering import render, view_operator
+
+    rows: list[Row] = []
+    up = torch.tensor([0.0, 0.0, 1.0])
+    pose = look_at(torch.tensor([[2.0, 0.5, 1.2]]), torch.zeros(3), up)
+    for count, width, height in [(300, 48, 32)] if setting.toy else [(30_000, 352, 248), (300_000, 704, 496)]:
+        camera = pinhole(pose, 0.85 * width, width=width, height=height)
+        pictures, gradients = [], []
+        for device in (torch.device("cpu"), setting.device):
+            scene = courtyard(count).with_sh_degree(3).to(device).map(lambda t: t.detach().requires_grad_())
+            color = render(scene, camera.to(device)).color
+            (color**2).mean().backward()
+            assert scene.means.grad is not None
+            assert scene.sh.grad is not None
+            pictures.append(color.detach().cpu())
+            gradients.append((scene.means.grad.cpu(), scene.sh.grad.cpu()))
+        operator = view_operator(courtyard(count).to(setting.device), camera.to(setting.device))
+        values = torch.randn(count, 3, device=setting.device)
+        image = torch.randn(height, width, 3, device=setting.device)
+        sides = (operator.blend(values) * image).sum(), (operator.blend_transpose(image) * values).sum()
+        scene = courtyard(count).with_sh_degree(3).to(setting.device)
+        rows.append(
+            {
+                "gaussians": count,
+                "size": f"{width}x{height}",
+                "picture_rmse": float((pictures[0] - pictures[1]).square().mean().sqrt()),
+                "gradient_error_means": _relative(gradients[0][0], gradients[1][0]),
+                "gradient_error_sh": _relative(gradients[0][1], gradients[1][1]),
+                "adjoint_error": float((sides[0] - sides[1]).abs() / (values.norm() * image.norm())),
+                "forward_ms": 1000 * _median(lambda: render(scene, camera.to(setting.device)), setting),  # noqa: B023
+            }
+        )
+    return rows
+
+
+def reconstruct_room(setting: Setting) -> list[Row]:
+    """Quality and time of a reconstruction."""
+    from splatgraft.core.image_metrics import psnr
+    from splatgraft.core.posed_images import held_out
+    from splatgraft.formats import read_capture
+    from splatgraft.reconstruction import ReconstructOptions, reconstruct
+    from splatgraft.rendering import render
+
+    capture = read_capture(ROOT / "data" / "room")
+    toy = {"iterations": 3, "budget": 500, "resolution": 0.15} if setting.toy else {}
+    options = ReconstructOptions(quality="draft", device=setting.device.type, eval_every=8, **toy)
+    begin = time.perf_counter()
+    scene = reconstruct(capture, options)
+    setting.synchronize()
+    seconds = time.perf_counter() - begin
+    served = options.served(capture)
+    chosen = [i for i in range(len(served)) if held_out(len(served))[i]][: 1 if setting.toy else None]
+    scene = scene.to(setting.device)
+    found = [psnr(render(scene, served.cameras[i].to(setting.device)).color[0].cpu(), served.image(i)) for i in chosen]
+    return [{"psnr": float(torch.stack(found).mean()), "seconds": seconds, "gaussians": scene.count}]
+
+
+def paper_size(setting: Setting) -> list[Row]:
+    """The paper's work after reconstruction; on a card at its size with 300,000 and 1,000,000 Gaussians."""
+    from paper_size import Size, measure
+
+    if setting.toy:
+        sizes = [Size(views=10, width=48, height=32, gaussians=600, passes=1)]
+    else:
+        sizes = [Size(200, 704, 496, count, setting.device.type) for count in (300_000, 1_000_000)]
+    rows: list[Row] = []
+    for size in sizes:
+        found = measure(size, say=lambda _: None)
+        parts = found.pop("parts")
+        assert isinstance(parts, list)
+        times = {f"{one['part']}_s": one["seconds"] for one in parts}
+        rows.append({"gaussians": size.gaussians, "views": size.views, **times, "peak_mb": parts[-1]["peak_mb"]})
+    return rows
+
+
+def harmonize_plain(setting: Setting) -> list[Row]:
+    """Stock diffusers one view at a time, then ours in batches."""
+    from harmonize import parts
+
+    from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
+    from splatgraft.harmonization.flux.sampling import schnell_levels
+
+    network, size = _network(setting)
+    rows: list[Row] = [{"kind": "stock, batch 1", **parts(network, 1, size, setting.repeats)}]
+    bake(network.transformer, network.prompt, schnell_levels()[:-1])
+    fuse_projections(network.transformer)
+    for batch in (1, 2) if setting.toy else (1, 2, 4, 8):
+        rows.append({"kind": f"ours, batch {batch}", **parts(network, batch, size, setting.repeats)})
+    return [{**row, "peak_gb": setting.peak_gb()} for row in rows]
+
+
+def harmonize_fp8(setting: Setting) -> list[Row]:
+    """Weights stored in 8 bits and cast layer by layer, as `--precision fp8`."""
+    from harmonize import parts
+
+    network, size = _network(setting)
+    network.transformer.enable_layerwise_casting(storage_dtype=torch.float8_e4m3fn, compute_dtype=network.dtype)
+    batch = 1 if setting.toy else 4
+    found = parts(network, batch, size, setting.repeats)
+    return [{"kind": f"fp8 stored, batch {batch}", **found, "peak_gb": setting.peak_gb()}]
+
+
+def harmonize_compiled(setting: Setting) -> list[Row]:
+    """Ours after torch.compile; the toy compiles with the backend that traces and generates no code."""
+    from harmonize import parts
+
+    from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
+    from splatgraft.harmonization.flux.sampling import schnell_levels
+
+    network, size = _network(setting)
+    bake(network.transformer, network.prompt, schnell_levels()[:-1])
+    fuse_projections(network.transformer)
+    network.transformer.compile_repeated_blocks(**({"backend": "eager"} if setting.toy else {}))
+    batch = 1 if setting.toy else 4
+    found = parts(network, batch, size, setting.repeats)
+    return [{"kind": f"compiled, batch {batch}", **found, "peak_gb": setting.peak_gb()}]
+
+
+def lora_step(setting: Setting) -> list[Row]:
+    """Seconds of forward, backward and Adam on a low-rank adaptation, frozen weights in bf16."""
+    from splatgraft.harmonization.flux.network import velocity
+    from splatgraft.harmonization.flux.weights.lora import add_lora
+
+    network, (width, height) = _network(setting)
+    layers = add_lora(network.transformer, 4 if setting.toy else 16, seed=0)
+    trained = [p for p in network.transformer.parameters() if p.requires_grad]
+    network.transformer.enable_gradient_checkpointing()
+    network.transformer.train()
+    optimizer = torch.optim.Adam(trained, lr=3e-5)
+    shape = (1, 48, math.ceil(height / 16) * 2, math.ceil(width / 16) * 2)
+    latents = torch.randn(shape, device=setting.device, dtype=network.dtype)
+    wanted = torch.randn(1, 16, *shape[2:], device=setting.device, dtype=network.dtype)
+    level = torch.full((1,), 0.5, device=setting.device, dtype=network.dtype)
+
+    def step() -> None:
+        optimizer.zero_grad()
+        found = velocity(network.transformer, latents, level, network.prompt)
+        (found - wanted).float().square().mean().backward()
+        optimizer.step()
+
+    seconds = _median(step, setting)
+    assert all(p.grad is not None for p in trained)
+    count = sum(p.numel() for p in trained)
+    return [{"layers": layers, "parameters": count, "seconds_a_step": seconds, "peak_gb": setting.peak_gb()}]
+
+
+PARTS: Mapping[str, Callable[[Setting], list[Row]]] = {
+    "cuda-tests": cuda_tests,
+    "renderer": renderer,
+    "reconstruct": reconstruct_room,
+    "paper-size": paper_size,
+    "harmonize-plain": harmonize_plain,
+    "harmonize-fp8": harmonize_fp8,
+    "harmonize-compiled": harmonize_compiled,
+    "lora": lora_step,
+}
+
+
+def _network(setting: Setting) -> tuple[Any, tuple[int, int]]:
+    """The harmoniser with random weights, of the real size or tiny, and the size of its images."""
+    from harmonize import AUTOENCODER, REAL, TINY, TINY_AUTOENCODER, TOKENS, random_network
+
+    from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
+    from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork
+    from splatgraft.harmonization.flux.weights.diffusers_library import autoencoder_class, flux_transformer_class
+
+    dtype = torch.float32 if setting.toy else torch.bfloat16
+    transformer = random_network(flux_transformer_class(), TINY if setting.toy else REAL, setting.device, dtype)
+    weights = TINY_AUTOENCODER if setting.toy else AUTOENCODER
+    autoencoder = Autoencoder(random_network(autoencoder_class(), weights, setting.device, dtype))
+    tokens = 8 if setting.toy else TOKENS
+    prompt = PromptEmbedding(torch.randn(tokens, 4096), torch.randn(768)).to(setting.device, dtype)
+    network = FluxNetwork(transformer, autoencoder, prompt, "image-mask", setting.device, dtype)
+    return network, (32, 32) if setting.toy else (704, 496)
+
+
+def _relative(wanted: torch.Tensor, found: torch.Tensor) -> float:
+    return float((wanted - found).norm() / wanted.norm())
+
+
+def _median(work: Callable[[], object], setting: Setting) -> float:
+    from harmonize import seconds
+
+    return seconds(work, setting.device, setting.repeats)
+
+
+def run_part(name: str, setting: Setting, out: Path) -> None:
+    """Run one part in this process and write OUT/NAME.json."""
+    begin = time.perf_counter()
+    rows = PARTS[name](setting)
+    record = {"part": name, "toy": setting.toy, "seconds": round(time.perf_counter() - begin, 1), "rows": rows}
+    (out / f"{name}.json").write_text(json.dumps(record, indent=1))
+
+
+def is_finished(path: Path, *, toy: bool) -> bool:
+    """Whether a part's file holds a result of the same size."""
+    return path.is_file() and json.loads(path.read_text()).get("toy") == toy
+
+
+def write_report(out: Path, names: list[str], failures: Mapping[str, str], card: str) -> None:
+    """Write gpu.json and gpu.md from the parts that are finished."""
+    found = [json.loads(path.read_text()) for name in names if (path := out / f"{name}.json").is_file()]
+    head = {"card": card, "torch": torch.__version__, "python": platform.python_version()}
+    (out / "gpu.json").write_text(json.dumps({**head, "parts": found, "failures": dict(failures)}, indent=1))
+    text = [f"# {card}", f"torch {torch.__version__}, Python {platform.python_version()}"]
+    for record in found:
+        columns = list(dict.fromkeys(key for row in record["rows"] for key in row))
+        lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
+        lines += ["| " + " | ".join(_cell(row.get(column)) for column in columns) + " |" for row in record["rows"]]
+        text += [f"## {record['part']} ({record['seconds']} s)", "\n".join(lines)]
+    text += [f"- {name} failed: {reason}" for name, reason in failures.items()]
+    (out / "gpu.md").write_text("\n\n".join(text) + "\n")
+
+
+def _cell(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("gpu"))
+    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--limit", type=float, default=LIMIT_S, help="seconds a part may take")
+    parser.add_argument("--toy", action="store_true", help="toy size on the CPU")
+    parser.add_argument("--here", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if not args.toy and not torch.cuda.is_available():
+        raise SystemExit("gpu: expected a CUDA device that torch can use, found none; --toy runs on the CPU")
+    args.out.mkdir(parents=True, exist_ok=True)
+    setting = Setting(torch.device("cpu" if args.toy else "cuda"), args.toy)
+    if args.here:
+        run_part(args.here, setting, args.out)
+        return 0
+    card = "cpu, toy size" if args.toy else torch.cuda.get_device_name()
+    failures: dict[str, str] = {}
+    for name in args.parts:
+        if is_finished(args.out / f"{name}.json", toy=args.toy):
+            print(f"{name}: finished earlier", flush=True)
+            continue
+        command = [sys.executable, __file__, "--out", str(args.out), "--here", name, *(["--toy"] if args.toy else [])]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=args.limit, check=False)
+            if done.returncode:
+                lines = done.stderr.strip().splitlines()
+                failures[name] = lines[-1] if lines else f"exit {done.returncode}"
+        except subprocess.TimeoutExpired:
+            failures[name] = f"stopped after {args.limit:.0f} s"
+        print(f"{name}: {failures.get(name, 'done')}", flush=True)
+        write_report(args.out, list(PARTS), failures, card)
+    write_report(args.out, list(PARTS), failures, card)
+    print(args.out / "gpu.md")
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,126 @@
+"""Light transfer by the ratio of two irradiances at each Gaussian's normal: TranSplat's diffuse path; no shadow.
+
+Yu et al., TranSplat (ICCP 2026, arXiv 2503.22676): the environment at the old and the new place is rendered from the
+two scenes and expanded in spherical harmonics; a radially symmetric reflection multiplies both by the same factors,
+which cancel in their ratio. Written from the published description; its code is not public, and its specular path
+(higher bands in the reflection domain) and its self-shadowing are not here.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.composite import Composite, PlacedObject
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.relighting.light.estimate import NoLight, panorama_at
+from splatgraft.relighting.light.panorama import Panorama
+from splatgraft.relighting.shading.gain import apply_gain
+from splatgraft.relighting.shading.normals import estimate_normals
+from splatgraft.relighting.transfer import SourceScene
+
+_DEGREE = 2
+"""Of the expansions: the clamped cosine has no band 3, and little above (Ramamoorthi and Hanrahan 2001)."""
+
+
+@dataclass(frozen=True)
+class IrradianceRatioOptions:
+    """Limits of the ratio, set by hand; the publication's are not stated."""
+
+    floor: float = 0.05
+    """Share of the mean irradiance below which neither irradiance counts: expansions may be near 0 or negative."""
+    largest: float = 10.0
+    """Most factor by which a channel is multiplied or divided."""
+
+
+def relight_by_irradiance_ratio(
+    composite: Composite,
+    *,
+    sources: Sequence[SourceScene | None],
+    options: IrradianceRatioOptions = IrradianceRatioOptions(),
+) -> tuple[Composite, tuple[str, ...]]:
+    """Multiply the linear colours of every object by irradiance at its new place over that at its old one.
+
+    Args:
+        composite: Target scene and placed objects.
+        sources: Per object the scene that it was taken from; None where that is not known.
+        options: Limits of a ratio.
+
+    Returns:
+        The composite and a sentence on each object. An object stays as it was captured where its source is not known
+        or there is no light at one of its places, and the sentence gives the reason.
+
+    Raises:
+        ValueError: There is not one source (or None) per object.
+    """
+    if len(sources) != len(composite.objects):
+        raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")
+    scene = composite.target.select(~composite.erased)
+    recolored, report = [], []
+    for number, (placed, source) in enumerate(zip(composite.objects, sources, strict=True), start=1):
+        found = "the scene it comes from is not known." if source is None else _relit(placed, source, scene, options)
+        recolored.append(placed.gaussians if isinstance(found, str) else found)
+        said = f"{found} It is pasted as it is." if isinstance(found, str) else "lit by the ratio of irradiances."
+        report.append(f"Object {number}: {said}")
+    return composite.with_object_colors(tuple(recolored)), tuple(report)
+
+
+def project(panorama: Panorama, degree: int = _DEGREE) -> Float[Tensor, "k 3"]:
+    """Coefficients of a panorama's linear radiance; directions that were not captured are as bright as the others.
+
+    Args:
+        panorama: Radiance from all directions.
+        degree: Of the expansion.
+    """
+    weight = panorama.alpha * panorama.solid_angles
+    mean = (panorama.radiance * weight[..., None]).sum((0, 1, 2)) / weight.sum().clamp_min(1e-12)
+    filled = panorama.radiance * panorama.alpha[..., None] + mean * (1 - panorama.alpha[..., None])
+    values = spherical_harmonics.basis(panorama.directions, degree)
+    return torch.einsum("fhwk,fhwc,fhw->kc", values, filled, panorama.solid_angles)
+
+
+def irradiance_of(coefficients: Float[Tensor, "k 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Linear rgb irradiance at unit `normals`: radiance convolved with the clamped cosine, by band."""
+    bands = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5).to(coefficients)
+    return spherical_harmonics.basis(normals, _DEGREE) @ (bands[:, None] * coefficients)
+
+
+def irradiance_ratio(
+    target: Float[Tensor, "n 3"], source: Float[Tensor, "n 3"], options: IrradianceRatioOptions
+) -> Float[Tensor, "n 3"]:
+    """Factor on linear colours, floored and limited.
+
+    Args:
+        target: Irradiance at the new place.
+        source: Irradiance at the old place.
+        options: Limits.
+    """
+    floored = [x.clamp_min(options.floor * float(x.mean().clamp_min(1e-8))) for x in (target, source)]
+    return (floored[0] / floored[1]).clamp(1 / options.largest, options.largest)
+
+
+def _relit(
+    placed: PlacedObject, source: SourceScene, scene: Gaussians, options: IrradianceRatioOptions
+) -> Gaussians | str:
+    """The object with its new colours, or the reason why it has none."""
+    if placed.gaussians.count == 0:
+        return "it is empty."
+    panoramas = {
+        "source": panorama_at(source.gaussians, bounding_sphere(placed.gaussians)),
+        "target": panorama_at(scene, bounding_sphere(placed.in_target())),
+    }
+    for where, panorama in panoramas.items():
+        if isinstance(panorama, NoLight):
+            return f"in the {where}: {panorama.reason}"
+    old, new = (project(p) for p in panoramas.values() if isinstance(p, Panorama))
+    normals = source.normals
+    if normals is None:
+        normals = estimate_normals(placed.gaussians, source.cameras).vectors
+    turned = normals @ placed.target_from_object.rotation.to(normals).T
+    ratio = irradiance_ratio(irradiance_of(new, turned), irradiance_of(old, normals), options)
+    return replace(placed.gaussians, sh=apply_gain(placed.gaussians, ratio).sh)

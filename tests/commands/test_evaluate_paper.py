@@ -1,0 +1,201 @@
+"""`evaluate paper` on a folder laid out as the card says: measured numbers, published ones, reasons, and our rows."""
+
+import json
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from paper_data import OTHER, PLAIN, REAL, STEMS, parts_of_view, put, write_data
+from random_lpips import write_random_lpips
+from shapes import ring, surfels
+
+from splatgraft.cli import main
+from splatgraft.commands.evaluate_paper import EvaluatePaper
+from splatgraft.core.gaussians import concatenate
+from splatgraft.core.image_metrics import psnr
+from splatgraft.core.images import read_rgb
+from splatgraft.formats import write_cameras, write_gaussians
+from splatgraft.rendering import render
+from splatgraft.runtime.console import Console
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """The command, run with --measure-only."""
+    root = tmp_path_factory.mktemp("published")
+    command = EvaluatePaper(write_data(root / "dot3d_data").parent, root / "out", measure_only=True)
+    assert command.execute(Console()) == 0
+    return command
+
+
+def by_scene_and_method(command):
+    found = json.loads((command.out / "paper.json").read_text())
+    return {(row["scene"], row["method"]): row for row in found["measured"]}, found
+
+
+def test_published_pictures_have_the_numbers_of_their_held_out_views(measured):
+    rows, _ = by_scene_and_method(measured)
+    row = rows[PLAIN, "Ours"]
+    wanted = []
+    for stem in STEMS[::8]:
+        truth = read_rgb(measured.data / "dot3d_data/data_3d/synthetic/insertions" / PLAIN / "gt" / f"{stem}.png")
+        mine = read_rgb(measured.data / "dot3d_data/results_3d/synthetic/ours" / PLAIN / f"{stem}.png")
+        wanted.append(float(psnr(mine, truth)))
+    assert row["values"]["psnr_whole"] == pytest.approx(sum(wanted) / 3)
+    assert row["values"]["flip_object"] > 0
+    assert row["values"]["shadow_ratio_rmse"] > 0
+    assert row["by"] == "the authors"
+    assert row["protocol"]["view_count"] == 3
+    assert row["protocol"]["resolution"] == ["224x158"]
+    assert "held out: every 8th" in row["protocol"]["views"]
+
+
+def test_numbered_pictures_of_3dgs_are_the_held_out_views_in_order(measured):
+    rows, _ = by_scene_and_method(measured)
+    row = rows["bathroom_rot_120", "Ours"]
+    assert "the held-out 3 views by order" in row["protocol"]["matched"]
+    assert row["pose"] == "P1"
+    # the truth times 0.9 in all views, rounded to 8 bits: 0.5 of 25.5 levels at most
+    truth = torch.stack([read_rgb_of(stem) for stem in STEMS[::8]])
+    assert row["values"]["psnr_whole"] == pytest.approx(float(psnr(truth * 0.9, truth)), abs=0.4)
+
+
+def read_rgb_of(stem):
+    return parts_of_view(stem)[0]
+
+
+def test_the_tables_have_published_numbers_beside_measured_ones_and_reasons_for_empty_cells(measured):
+    text = (measured.out / "paper.md").read_text()
+    assert "| Ours, as published | 22.53 | 0.840 | 0.214 | 55.86 | 0.0413 |" in text
+    line = next(row for row in text.splitlines() if row.startswith("| GS-IR, the authors' pictures, measured here"))
+    # both scenes show the same pictures, so the interval of their mean is a point
+    assert line.count("[") == 3
+    assert line.endswith("| 2 |")
+    assert "the folder has no pictures of GShader" in text
+    assert "--measure-only: nothing was run" in text
+    assert "the authors publish neither" in text
+    assert "lpips: not measured" in text.lower() or "lpips" in text.lower()
+    page = (measured.out / "index.html").read_text()
+    assert "figures/synthetic.png" in page
+    assert (measured.out / "figures" / "rotation.png").is_file()
+
+
+def test_a_scene_without_truth_has_the_numbers_that_need_none(measured):
+    rows, _ = by_scene_and_method(measured)
+    values = rows[REAL, "Ours"]["values"]
+    assert "psnr_whole" not in values
+    # halfway from 1.4 times the truth back to it: darker than the composite
+    assert 0.5 < values["object_brightness"] < 1
+    assert values["darkened_fraction"] > 0
+    assert 0 < values["detail_kept"] < 1.2
+
+
+def test_what_was_taken_for_what_can_be_corrected(measured, tmp_path):
+    found = tomllib.loads((measured.out / "layout.toml").read_text())
+    assert found["scenes"][OTHER]["masks"] == f"data_3d/synthetic/insertions/{OTHER}/ground_truth/masks"
+    assert found["scenes"][PLAIN]["composite"] == f"data_3d/synthetic/insertions/{PLAIN}/images"
+    assert found["scenes"][PLAIN]["source_capture"] == "data_3d/synthetic/scenes/objects/bathtub_57e"
+    assert found["scenes"][REAL]["results"]["Ours"] == f"results_3d/real/{REAL}/ours"
+    given = tmp_path / "layout.toml"
+    given.write_text(
+        f'[scenes."{PLAIN}"]\ntruth = "data_3d/synthetic/insertions/{PLAIN}/images"\ncomposite = ""\n'
+        f'[scenes."{PLAIN}".results]\nOurs = "results_3d/synthetic/gs_ir/{PLAIN}/renders"\n'
+    )
+    again = replace(measured, layout=given, out=tmp_path / "out", only=(PLAIN,))
+    assert again.execute(Console()) == 0
+    rows, _ = by_scene_and_method(again)
+    # GS-IR's pictures are the composite, which is now called the truth
+    assert rows[PLAIN, "Ours"]["values"]["ssim_whole"] == pytest.approx(1)
+    assert (PLAIN, "Composite") not in rows
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[scenes.nowhere]\ntruth = "x"\n', "expected a scene among"),
+        (f'[scenes."{PLAIN}"]\ntruht = "x"\n', "expected keys among"),
+        (f'[scenes."{PLAIN}"]\ntruth = "missing"\n', "expected truth at .*missing, found no such file or folder"),
+        ("held_out = 4\n", "expected the keys held_out_every and scenes, found held_out"),
+    ],
+)
+def test_a_layout_that_fits_nothing_is_one_line(measured, tmp_path, text, message):
+    given = tmp_path / "layout.toml"
+    given.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        replace(measured, layout=given, out=tmp_path / "out").execute(Console())
+
+
+def test_pictures_of_another_size_or_of_other_views_are_said_and_leave_their_cells_empty(measured, tmp_path):
+    root = tmp_path / "data"
+    for stem in STEMS:
+        truth = parts_of_view(stem)[0]
+        put(root / "data_3d/synthetic/insertions" / PLAIN / "gt" / f"{stem}.png", truth)
+        put(root / "results_3d/synthetic/ours" / PLAIN / f"{stem}.png", truth[:100])
+        put(root / "results_3d/synthetic/gs_ir" / PLAIN / f"other_{stem}.png", truth)
+    command = replace(measured, data=root, out=tmp_path / "out")
+    assert command.execute(Console()) == 0
+    _, found = by_scene_and_method(command)
+    reasons = {row["method"]: row["reason"] for row in found["missing"]}
+    assert "expected 224x100 pixels as the method's picture, found 224x158" in reasons["Ours"]
+    assert "none of 17 pictures fits 17 views" in reasons["GS-IR"]
+
+
+def test_a_folder_of_another_data_set_is_one_line(tmp_path, capsys):
+    assert main(["evaluate", "paper", "--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert "expected data_3d/synthetic/insertions or" in capsys.readouterr().err
+
+
+def test_a_second_run_measures_nothing_again(measured):
+    files = sorted(measured.out.glob("measured/*/*/metrics.json"))
+    before = {path: path.stat().st_mtime_ns for path in files}
+    assert measured.execute(Console()) == 0
+    assert {path: path.stat().st_mtime_ns for path in files} == before
+
+
+def write_placed_scene(root):
+    """A table and a ball of Gaussians that already stands on it, with cameras, and the composite as the truth."""
+    generator = torch.Generator().manual_seed(0)
+    table = torch.cat([4 * torch.rand(400, 2, generator=generator) - 2, torch.zeros(400, 1)], 1)
+    up = torch.tensor([0.0, 0.0, 1.0])
+    normals = torch.nn.functional.normalize(torch.randn(150, 3, generator=generator), dim=1)
+    ball = surfels(normals * 0.4 + torch.tensor([0, 0, 0.4]), normals, width=0.08, srgb=(0.8, 0.3, 0.2))
+    plane = surfels(table, up.expand(400, 3), width=0.15, srgb=(0.4, 0.5, 0.4))
+    scene = root / "data_3d/synthetic/insertions" / PLAIN
+    cameras = ring(10, size=(64, 48), focal=50.0)
+    for name, gaussians in (("object.ply", ball), ("background.ply", plane)):
+        (scene / "gaussians").mkdir(parents=True, exist_ok=True)
+        write_gaussians(scene / "gaussians" / name, gaussians)
+    write_cameras(scene / "transforms.json", cameras)
+    both = concatenate([plane, ball])
+    for index, name in enumerate(cameras.names):
+        image = render(both, cameras[index]).color[0].clamp(0, 1)
+        put(scene / "gt" / f"{Path(name).stem}.png", image)
+    return root
+
+
+def test_our_methods_run_on_a_composite_that_is_already_placed(tmp_path):
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    write_random_lpips(weights)
+    root = write_placed_scene(tmp_path / "data")
+    methods = ("copy-paste", "off+reinhard/paper", "off+flux/paper")
+    command = EvaluatePaper(
+        root,
+        tmp_path / "out",
+        methods=methods,
+        weights=weights,
+        iterations_of_consolidation=3,
+    )
+    assert command.execute(Console()) == 1
+    rows, found = by_scene_and_method(command)
+    assert {"copy-paste", "off+reinhard/paper"} <= {method for _, method in rows}
+    # the truth is a render of the same Gaussians, but for the table, which compose presses flat under the ball's foot
+    assert rows[PLAIN, "copy-paste"]["values"]["psnr_whole"] > 40
+    assert rows[PLAIN, "copy-paste"]["values"]["lpips_whole"] is not None
+    assert rows[PLAIN, "off+reinhard/paper"]["seconds"]["consolidate"] > 0
+    reasons = {row["method"]: row["reason"] for row in found["missing"]}
+    assert "harmonizer flux: expected --weights" in reasons["off+flux/paper"]
+    seen = json.loads((command.out / "scenes" / PLAIN / "target/capture/transforms.json").read_text())["frames"]
+    assert len(seen) == 8

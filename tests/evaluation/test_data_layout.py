@@ -1,0 +1,133 @@
+"""What names of folders say: roles, views, methods and poses, in the orders in which data sets put them."""
+
+import pytest
+import torch
+from paper_data import put
+
+from splatgraft.evaluation.benchmark.paper_numbers import PAPER_TABLES, SYNTHETIC, published_name
+from splatgraft.evaluation.benchmark.picture_metrics import KnownView, measure_picture, padded_ssim
+from splatgraft.workflow.paper.data_layout import as_toml, find_layout
+from splatgraft.workflow.paper.picture_folders import held_out_stems, match_views, pictures, role_of
+
+GREY = torch.full((12, 16, 3), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("gt", "truth"),
+        ("ground_truth", "truth"),
+        ("gt_images", "truth"),
+        ("object_masks", "masks"),
+        ("gt_mask", "masks"),
+        ("composite", "composite"),
+        ("copy_paste", "composite"),
+        ("composite_gt", "truth"),
+        ("BG", "background"),
+        ("images", None),
+        ("augmented", None),
+    ],
+)
+def test_a_folders_name_says_what_it_shows(name, role):
+    assert role_of(name) == role
+
+
+def test_views_are_in_the_order_of_their_numbers_and_every_8th_is_held_out(tmp_path):
+    for index in (0, 1, 2, 10, 9):
+        put(tmp_path / f"frame_{index}.png", GREY)
+    assert list(pictures(tmp_path)) == ["frame_0", "frame_1", "frame_2", "frame_9", "frame_10"]
+    assert held_out_stems([str(i) for i in range(17)], 8) == ["0", "8", "16"]
+
+
+def test_pictures_are_matched_by_name_then_by_number_and_never_by_chance(tmp_path):
+    views = [f"r_{i}" for i in range(16)]
+    by_name = {"r_3": tmp_path / "r_3.png", "r_8": tmp_path / "r_8.png"}
+    assert list(match_views(views, by_name, 8)[0]) == ["r_3", "r_8"]
+    all_of_them = {f"{i:05d}": tmp_path / f"{i:05d}.png" for i in range(16)}
+    assert match_views(views, all_of_them, 8)[0]["r_15"] == tmp_path / "00015.png"
+    held_out = {f"{i:05d}": tmp_path / f"{i:05d}.png" for i in range(2)}
+    assert match_views(views, held_out, 8)[0] == {"r_0": tmp_path / "00000.png", "r_8": tmp_path / "00001.png"}
+    assert match_views(views, {"00000": tmp_path / "a.png"}, 8)[0] == {}
+    assert match_views(views, {"a": tmp_path / "a.png", "b": tmp_path / "b.png"}, 8)[0] == {}
+
+
+def test_a_folder_whose_name_says_nothing_is_not_used_and_said(tmp_path):
+    scene = tmp_path / "data_3d/synthetic/insertions/sink_in_blend_92e6c7"
+    put(scene / "images" / "0.png", GREY)
+    (found,) = find_layout(tmp_path).scenes
+    assert not found.folders
+    assert any("its name does not say what it shows; name it in layout.toml" in line for line in found.taken)
+    assert any("only numbers that need no truth" in line for line in found.taken)
+
+
+def test_rotations_in_one_folder_or_in_many_are_poses_in_order(tmp_path):
+    for name in ("hall_rot120", "hall_rot0", "yard/90", "yard/0"):
+        put(tmp_path / "data_rotation" / name / "gt" / "0.png", GREY)
+    found = {scene.name: scene.pose for scene in find_layout(tmp_path).scenes}
+    assert found == {"hall_rot0": "P0", "hall_rot120": "P1", "yard_0": "P0", "yard_90": "P1"}
+
+
+def test_what_was_found_is_read_back_the_same_as_a_layout_toml(tmp_path):
+    for role in ("gt", "masks", "composite"):
+        put(tmp_path / "data_3d/real/insertions/truck_in_garden" / role / "0.png", GREY)
+    put(tmp_path / "results_3d/real/3dgs_dr/truck_in_garden/0.png", GREY)
+    first = find_layout(tmp_path)
+    (tmp_path / "layout.toml").write_text(as_toml(first))
+    again = find_layout(tmp_path)
+    assert again.scenes[0].folders == first.scenes[0].folders
+    assert list(again.scenes[0].results) == ["3DGS-DR"]
+
+
+def test_names_of_methods_are_those_of_the_paper():
+    assert [published_name(name) for name in ("ours", "gaussian_shader", "GS-IR", "3dgs-dr", "lbm")] == [
+        *("Ours", "GShader", "GS-IR", "3DGS-DR", "lbm")
+    ]
+
+
+def test_the_papers_numbers_are_whole_rows_and_its_average_is_that_of_the_sources():
+    for table in PAPER_TABLES:
+        assert all(len(row) == len(table.columns) for row in table.rows.values())
+    assert SYNTHETIC.value("Ours", "psnr") == 22.53
+    data = PAPER_TABLES[2]
+    for name in data.rows:
+        for metric, step in (("psnr", 0.01), ("ssim", 0.001), ("lpips", 0.001), ("fid", 0.01)):
+            three = [data.value(name, f"{source} {metric}") for source in ("Blender", "FLUX", "ORIDa")]
+            # all four are rounded to the same step
+            assert abs(sum(three) / 3 - data.value(name, f"average {metric}")) <= 1.01 * step
+
+
+def test_metrics_follow_what_is_known_of_a_view():
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(40, 50, 3, generator=generator)
+    mask = torch.zeros(40, 50)
+    mask[10:30, 10:30] = 1
+    image = (truth * 0.9).clamp(0, 1)
+    assert "psnr_object" not in measure_picture(image, KnownView(truth=truth))
+    with_mask = measure_picture(image, KnownView(truth=truth, mask=mask))
+    assert "psnr_object" in with_mask
+    assert "psnr_shadow" not in with_mask
+    assert "shadow_ratio_rmse" in measure_picture(image, KnownView(truth=truth, mask=mask, background=truth))
+    alone = measure_picture(image, KnownView(composite=truth, mask=mask))
+    assert set(alone) == {
+        "object_brightness",
+        "darkened_fraction",
+        "brightened_fraction",
+        "detail_kept",
+        "rest_mean_change",
+    }
+    # sRGB times 0.9 keeps 0.9 of every gradient
+    assert alone["detail_kept"] == pytest.approx(0.9, abs=1e-5)
+
+
+def test_padded_ssim_counts_border_pixels_beside_zeros():
+    a, b = torch.rand(30, 40, 3), torch.rand(30, 40, 3)
+    from skimage.metrics import structural_similarity
+
+    _, wanted = structural_similarity(
+        *(torch.nn.functional.pad(x, (0, 0, 5, 5, 5, 5)).double().numpy() for x in (a, b)),
+        **{"channel_axis": 2, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False},
+        data_range=1.0,
+        full=True,
+    )
+    # float32 against float64: 1e-6 of values up to 1, divided by the constant 0.03^2 at worst
+    assert float(padded_ssim(a, b)) == pytest.approx(float(wanted[5:-5, 5:-5].mean()), abs=1e-4)
