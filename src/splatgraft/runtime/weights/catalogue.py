@@ -1,7 +1,7 @@
 """The table of all models that the package loads: where their weights come from, their licence, size and files.
 
-Sizes are those of the files that are fetched, as the repositories or other projects state them; what is not known is
-left out. Hashes are the hub's own, read when the files are listed.
+Sizes are estimates of the files that are fetched, from the number of weights or as other projects state them; none was
+read from a hub, and what is not known is left out. Hashes are the hub's own, read when the files are listed.
 """
 
 from dataclasses import dataclass
