@@ -70,7 +70,8 @@ def test_the_lights_of_both_places_are_drawn_past_an_object_without_gaussians(tm
     write_placement(tmp_path / "placement.json", Placement(objects))
     assert relight_command(tmp_path) == 0
     drawn = {path.name: read_rgb(path) for path in (tmp_path / "relit").glob("*.png")}
-    # numbered as the placement's objects
+    # numbered as the placement's objects, as in the report
+    assert "Where object 2 comes from" in (tmp_path / "relit" / "light.txt").read_text()
     assert sorted(drawn) == ["light.png", "source_light_2.png"]
     for picture in drawn.values():
         assert picture.shape == (256, 768, 3)

@@ -110,28 +110,29 @@ def relight(
     if len(sources) not in (0, len(composite.objects)):
         raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")
     baked, is_object = composite.merged()
-    placed = [(p, s) for p, s in zip_longest(composite.objects, sources) if p.gaussians.count]
+    pairs = zip_longest(composite.objects, sources)
+    placed = [(number, p, s) for number, (p, s) in enumerate(pairs, 1) if p.gaussians.count]
     if not placed:
         return unchanged(baked, is_object, objects=(), report=("No object is placed: nothing to light.",))
     cache = cache or Memo()
     target = cache.get(
         "scene", (composite.target, composite.erased), lambda: composite.target.select(~composite.erased)
     )
-    spheres = [bounding_sphere(p.in_target()) for p, _ in placed]
+    spheres = [bounding_sphere(p.in_target()) for _, p, _ in placed]
     scene = prepare_scene(target, cameras, spheres=spheres, reach=options.reach, light=light, cache=cache)
     if isinstance(scene, NoLight):
-        in_target = tuple(p.in_target() for p, _ in placed)
+        in_target = tuple(p.in_target() for _, p, _ in placed)
         return unchanged(
             baked, is_object, objects=in_target, report=(f"{scene.reason} The object is pasted as it is.",)
         )
     report = [scene.light.describe(estimate_up(cameras)) + (", as given." if light is not None else ".")]
     objects = []
-    for i, (one, source) in enumerate(placed):
-        prepared = prepare_object(one, source, cameras, light=scene.light, index=i, cache=cache)
+    for number, one, source in placed:
+        prepared = prepare_object(one, source, cameras, light=scene.light, index=number - 1, cache=cache)
         if prepared.notes is not None:
-            report.append(f"Where object {i + 1} comes from: {prepared.notes}")
+            report.append(f"Where object {number} comes from: {prepared.notes}")
         if prepared.source_lighting is None:
-            report.append(unknown_light(i + 1))
+            report.append(unknown_light(number))
         objects.append(_lit_object(prepared, scene))
     return _assembled(scene, objects, cameras.spread(options.fitted_views), options=options, baked=baked, report=report)
 

@@ -86,7 +86,7 @@ class Relight:
             gaussians, is_object = relit.bake(self.weights)
             levels = self._level(relit)
             sentences = (*relit.report, *(line.text for line in levels))
-            doubts = (*_doubts(relit), *(line.text for line in levels if line.is_doubtful))
+            doubts = (*_doubts(relit, composite), *(line.text for line in levels if line.is_doubtful))
             _draw_lights(folder, relit, composite, sources)
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_selection(folder / IS_OBJECT_FILE, is_object)
@@ -132,11 +132,13 @@ class Relight:
         return [source if path is not None and path.resolve() == taken.resolve() else None for path in paths]
 
 
-def _doubts(relit: Relit) -> tuple[str, ...]:
+def _doubts(relit: Relit, composite: Composite) -> tuple[str, ...]:
     """What of the report tells that the light is not known, and a sentence where most of it is a guess."""
     if relit.light is None:
         return relit.report
-    doubts = [unknown_light(i) for i, one in enumerate(relit.prepared, 1) if one.source_lighting is None]
+    lit = [number for number, one in enumerate(composite.objects, 1) if one.gaussians.count]
+    pairs = zip(lit, relit.prepared, strict=True)
+    doubts = [unknown_light(number) for number, one in pairs if one.source_lighting is None]
     certain = light_confidence(relit.light)
     if certain < LEAST_CERTAIN:
         doubts.append(
@@ -152,10 +154,8 @@ def _draw_lights(folder: Path, relit: Relit, composite: Composite, sources: Sequ
         write_image(folder / LIGHT_PICTURE, draw_light(relit.estimate, composite.target, center))
     if not relit.prepared:
         return  # there was no transfer
-    # numbered as the report numbers them: objects without Gaussians are left out
-    pairs = zip(composite.objects, sources, strict=True)
-    lit = [(placed, source) for placed, source in pairs if placed.gaussians.count]
-    for i, (one, (placed, source)) in enumerate(zip(relit.prepared, lit, strict=True), 1):
+    lit = [(i, p, s) for i, (p, s) in enumerate(zip(composite.objects, sources, strict=True), 1) if p.gaussians.count]
+    for one, (i, placed, source) in zip(relit.prepared, lit, strict=True):
         lighting = one.source_lighting
         if source is not None and lighting is not None and lighting.estimate is not None:
             center = bounding_sphere(placed.gaussians).center
