@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatgraft.core.images import linear_from_srgb, read_rgb
+from splatgraft.core.images import linear_from_srgb, read_rgb, read_straight_rgb
 from splatgraft.formats import read_capture
 from splatgraft.relighting.light.true_light import light_from_probe
 from splatgraft.runtime.workers import Task, run_tasks
@@ -75,7 +75,7 @@ def test_an_interpreter_without_bpy_is_refused():
 def test_a_rendered_composite_is_equation_2_to_the_bit(pair_folder):
     for sample in pairs.samples_in(pair_folder):
         pair = pairs.load_pair(sample)
-        relit = read_rgb(sample.path("object0_light0"))
+        relit = read_straight_rgb(sample.path("object0_light0"))
         background = read_rgb(sample.path("background"))
         mask = read_rgb(sample.path("object0", "mask"))[..., :1]
         wanted = mask * pairs.match_statistics(relit, pair.target, mask[..., 0]) + (1 - mask) * background
