@@ -1,6 +1,7 @@
 """Each equation of the paper's training against numpy in float64, written from the paper and from nothing here."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -69,6 +70,8 @@ def test_a_composite_is_equation_2_at_every_pixel(tmp_path, kind):
 class Recorder:
     """In place of a network: keeps what it is given and answers with known numbers."""
 
+    config = SimpleNamespace(guidance_embeds=False)
+
     def __init__(self, answer):
         self.answer, self.given = answer, []
 
@@ -133,6 +136,7 @@ def test_the_text_is_the_empty_prompt_for_every_sample(tmp_path):
     assert np.array_equal(given["encoder_hidden_states"], np.repeat(prompt["tokens"][None], 3, 0))
     assert np.array_equal(given["pooled_projections"], np.repeat(prompt["pooled"][None], 3, 0))
     assert not given["txt_ids"].any()
+    assert given.pop("guidance") is None
     assert set(given) == {
         *("hidden_states", "timestep", "encoder_hidden_states", "pooled_projections", "txt_ids", "img_ids")
     }

@@ -74,7 +74,7 @@ def velocity(
     """
     b, _, h, w = latents.shape
     text = prompt.tokens
-    config = getattr(transformer, "module", transformer).config  # the module within DistributedDataParallel
+    config = _unwrapped(transformer).config
     guidance = torch.full((b,), GUIDANCE, device=latents.device) if config.guidance_embeds else None
     tokens = transformer(
         hidden_states=pack(latents),
@@ -87,6 +87,13 @@ def velocity(
         return_dict=False,
     )[0]
     return unpack(tokens, h, w)
+
+
+def _unwrapped(network: Any) -> Any:
+    """The network within DistributedDataParallel and other wrappers of several processes."""
+    while hasattr(network, "module"):
+        network = network.module
+    return network
 
 
 def _shift(network: Any) -> float:
