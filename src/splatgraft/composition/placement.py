@@ -79,12 +79,12 @@ def place_object(
     point, rest = found.point, RestOptions(scale=found.scale, yaw_deg=options.yaw_deg or 0.0, offset=options.offset)
     move, support = rest_on_surface(target, base, point=point, up=up, options=rest)
     if options.yaw_deg is None:
-        to_source_cameras = (source_cameras.centers - base.point) @ move.rotation.T
-        yaw = facing_yaw_deg(to_source_cameras, target_cameras.centers - support.point, up=support.normal)
+        yaw = facing_yaw_deg(
+            _towards(source_cameras, base, move), target_cameras.centers - support.point, up=support.normal
+        )
         move, support = rest_on_surface(target, base, point=point, up=up, options=replace(rest, yaw_deg=yaw))
     hidden = hidden_fraction(target, move.gaussians(object_), cameras=target_cameras)
-    to_source_cameras = (source_cameras.centers - base.point) @ move.rotation.T
-    unseen = unseen_share(to_source_cameras, target_cameras.centers - support.point)
+    unseen = unseen_share(_towards(source_cameras, base, move), target_cameras.centers - support.point)
     return Placed(
         target_from_object=move,
         base=base,
@@ -92,6 +92,11 @@ def place_object(
         hidden_fraction=hidden,
         warnings=found.reasons + _warnings(support, hidden, unseen),
     )
+
+
+def _towards(source_cameras: Cameras, base: ObjectBase, target_from_object: Similarity) -> Float[Tensor, "s 3"]:
+    """From the object to the cameras of its own capture, in the target's frame, object units."""
+    return (source_cameras.centers - base.point) @ target_from_object.rotation.T
 
 
 _CLEARLY_BETTER = 1.5

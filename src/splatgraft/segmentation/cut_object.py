@@ -97,18 +97,21 @@ def cut_object(
     feature, changes = guess.share.float().to(scene.device), []
     allowed = torch.ones_like(feature) if guess.allowed is None else guess.allowed.float().to(scene.device)
     masks: dict[int, Tensor] = {}
+
+    def cut_and_lift(chosen: Sequence[int], what: str) -> tuple[dict[int, Tensor], Tensor]:
+        made, lifted = _round(views, scene, feature, chosen, cutter, _told(progress, what))
+        return made, lifted * allowed
+
     for round_ in range(options.rounds):
         before = masks
-        masks, feature = _round(views, scene, feature, voting, cutter, _told(progress, f"round {round_ + 1}"))
-        feature = feature * allowed
+        masks, feature = cut_and_lift(voting, f"round {round_ + 1}")
         if before:
             same = torch.tensor([overlap(masks[i], before[i]) for i in voting])
             changes.append(float(same.nanmean()))
             if changes[-1] > options.settled:
                 break
     if len(voting) < count:
-        masks, feature = _round(views, scene, feature, list(range(count)), cutter, _told(progress, "every picture"))
-        feature = feature * allowed
+        masks, feature = cut_and_lift(range(count), "every picture")
     progress(count, count, "masks cut")
     if sum(bool(mask.any()) for mask in masks.values()) < 2:
         raise ValueError(
