@@ -34,7 +34,9 @@ def test_poses_and_masks_come_together_and_what_has_no_partner_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_photos(tmp_path / "mine" / "images", 10)
-    Image.new("L", (24, 16), 255).save(tmp_path / "mine" / "images" / "1_mask.png")
+    mask = Image.new("L", (24, 16), 255)
+    mask.paste(0, (0, 0, 12, 16))
+    mask.save(tmp_path / "mine" / "images" / "1_mask.png")
     posed = [0, 1, *range(3, 10)]
     poses = write_poses(tmp_path / "theirs", [*(f"{i}.png" for i in posed), "10.png"])
     for given in (poses, poses.parent):
@@ -52,6 +54,26 @@ def test_poses_and_masks_come_together_and_what_has_no_partner_is_named(
             "1 of 10 photos have masks",
         ):
             assert expected in said
+
+
+def test_masks_of_photos_without_poses_that_tell_nothing_are_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_photos(tmp_path / "mine" / "images", 10)
+    half = Image.new("L", (24, 16), 255)
+    half.paste(0, (0, 0, 12, 16))
+    masks = {"0": half, "1": Image.new("L", (24, 16)), "2": Image.new("L", (24, 16), 255), "3": half.resize((16, 16))}
+    for name, mask in masks.items():
+        mask.save(tmp_path / "mine" / "images" / f"{name}_mask.png")
+    poses = write_poses(tmp_path / "theirs", [f"{i}.png" for i in range(10)])
+    assert main(["capture", str(tmp_path / "mine"), "--poses", str(poses), "--out", str(tmp_path / "out")]) == 0
+    found = read_capture(tmp_path / "out")
+    assert [path and path.name for path in found.mask_paths] == ["0_mask.png", *[None] * 9]
+    said = capsys.readouterr().err
+    assert "the mask of 1.jpg, the mask of 2.jpg, the mask of 3.jpg" in said
+    assert "1_mask.png: expected white where the object is, found black all over" in said
+    assert "2_mask.png: expected white where the object is, found white all over" in said
+    assert "3_mask.png: expected 24x16 px" in said
 
 
 def test_poses_beside_a_video_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -34,6 +34,7 @@ class Doubtful:
         context.console.warn("This may be wrong.", picture=folder / "doubt.png")
         context.console.warn("So may this.", picture=self.photo)
         context.console.warn("Or all of it.")
+        context.console.warn("This was mended.", minor=True)
 
 
 def test_a_warning_is_recorded_with_its_picture_relative_to_the_result(
@@ -48,9 +49,10 @@ def test_a_warning_is_recorded_with_its_picture_relative_to_the_result(
         StepWarning("This may be wrong.", "doubt.png"),
         StepWarning("So may this.", "../photos/a.jpg"),
         StepWarning("Or all of it."),
+        StepWarning("This was mended.", minor=True),
     )
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
-    assert len(said) == 4
+    assert len(said) == 5
     assert all("docs/troubleshooting.md#" in line for line in said[1:])
 
 

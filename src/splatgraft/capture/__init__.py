@@ -8,7 +8,7 @@ from splatgraft.capture.plausibility import Doubt, Found, Lens, Plausible, find_
 from splatgraft.capture.pose_report import POSE_REPORT_FILE, PoseReport, Unposed, read_pose_report, write_pose_report
 from splatgraft.capture.scene_fit import misfit_of
 from splatgraft.capture.structure_from_motion import PoseOptions, pose_photos
-from splatgraft.capture.usable_views import readable_views, usable_photos, usable_views
+from splatgraft.capture.usable_views import readable_views, usable_masks, usable_photos, usable_views
 from splatgraft.capture.video import extract_frames
 from splatgraft.capture.view_coverage import CoverageRule, median_parallax_deg, require_coverage
 from splatgraft.capture.virtual_cameras import (
@@ -46,6 +46,7 @@ __all__ = [
     "scale_from_marker",
     "triangulate",
     "upright",
+    "usable_masks",
     "usable_photos",
     "usable_views",
     "write_pose_report",

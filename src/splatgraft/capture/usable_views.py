@@ -8,8 +8,9 @@ import torch
 
 from splatgraft.capture.odd_photos import find_odd_photos, find_unreadable_photos
 from splatgraft.capture.view_coverage import CoverageRule
-from splatgraft.core.images import read_mask
+from splatgraft.core.images import read_mask, stored_size
 from splatgraft.core.posed_images import LeftOut, PosedImages
+from splatgraft.formats.captures.masks import PhotoFiles, check_mask
 from splatgraft.runtime.progress import Progress, silent
 
 LEAST_PHOTOS = CoverageRule().views
@@ -41,6 +42,31 @@ def usable_photos(
             f"found {found}{first}"
         )
     return kept, odd
+
+
+def usable_masks(photos: PhotoFiles) -> tuple[PhotoFiles, tuple[LeftOut, ...]]:
+    """Photos without poses, whose masks are all of use, and the masks that were left out.
+
+    Args:
+        photos: Readable photos, with masks or without.
+
+    Returns:
+        The same photos without masks that are unreadable, of another shape than their photo, or black or white all
+        over; and these, with the reason for each.
+    """
+    masks, left_out = list(photos.masks), []
+    for index, (photo, mask) in enumerate(zip(photos.paths, photos.masks, strict=bool(photos.masks))):
+        if mask is None or mask == photo:
+            continue
+        try:
+            check_mask(mask, stored_size(photo))
+            reason = _emptiness(mask)
+        except ValueError as error:
+            reason = str(error)
+        if reason:
+            masks[index] = None
+            left_out.append(LeftOut(photo.name, reason, mask_only=True))
+    return replace(photos, masks=tuple(masks) if any(masks) else ()), tuple(left_out)
 
 
 def usable_views(posed: PosedImages, *, keep_odd: bool = False, progress: Progress = silent) -> PosedImages:
@@ -85,11 +111,17 @@ def _empty_masks(posed: PosedImages) -> Iterator[tuple[int, LeftOut]]:
             continue
         name = posed.cameras.names[index]
         try:
-            solid = read_mask(path) >= 0.5
+            reason = _emptiness(path)
         except ValueError as error:
-            yield index, LeftOut(name, str(error), mask_only=True)
-            continue
-        if not bool(solid.any()) or bool(solid.all()):
-            color = "white" if bool(solid.any()) else "black"
-            reason = f"{path}: expected white where the object is, found {color} all over"
+            reason = str(error)
+        if reason:
             yield index, LeftOut(name, reason, mask_only=True)
+
+
+def _emptiness(mask: Path) -> str:
+    """Why a mask that is black or white all over tells nothing; empty where it is neither."""
+    solid = read_mask(mask) >= 0.5
+    if bool(solid.any()) and not bool(solid.all()):
+        return ""
+    color = "white" if bool(solid.any()) else "black"
+    return f"{mask}: expected white where the object is, found {color} all over"

@@ -81,18 +81,27 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
     helps = ""
     for name, step in flow:
         record = read_record(step.out)
-        if record is None or not (doubts := [*_guesses(step), *(warning.text for warning in record.warnings)]):
+        if record is None:
             continue
-        more = f" (and {len(doubts) - 1} more)" if len(doubts) > 1 else ""
-        lines.append(f"unsure: {name}: {doubts[0]}{more}")
+        mended = [warning.text for warning in record.warnings if warning.minor]
+        doubts = [*_guesses(step), *(warning.text for warning in record.warnings if not warning.minor)]
+        if mended:
+            lines.append(f"noted: {name}: {mended[0]}{_more(mended)}")
+        if not doubts:
+            continue
+        lines.append(f"unsure: {name}: {doubts[0]}{_more(doubts)}")
         helps = helps or remedy(record.step, shown) or ""
     # later steps build on earlier ones: the first that was unsure is the one to mend
-    if not lines:
+    if not any(line.startswith("unsure: ") for line in lines):
         lines.append("no step warned of its result: look at the pictures; a cut that is off is what people mend most")
         helps = remedy("segment", shown) or ""
     lines.append(f"helps most: {helps}")
     finer = f'quality = "standard" under [reconstruct] in {shown / PROJECT_FILE}'
     return [*lines, f"finer: {finer}, then splatgraft run {shown}"]
+
+
+def _more(sentences: list[str]) -> str:
+    return f" (and {len(sentences) - 1} more)" if len(sentences) > 1 else ""
 
 
 def _guesses(step: Step) -> list[str]:

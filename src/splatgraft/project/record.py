@@ -20,6 +20,8 @@ class StepWarning:
     """One or more sentences."""
     picture: str | None = None
     """An image that shows it, relative to the result's folder."""
+    minor: bool = False
+    """Whether the step did what was needed by itself, so that its result is not in doubt."""
 
 
 @dataclass(frozen=True)

@@ -56,9 +56,9 @@ def _recorded(warning: ConsoleWarning, new: Path, folder: Path) -> StepWarning:
     """The warning with its picture relative to the result's final folder."""
     picture = warning.picture
     if picture is None:
-        return StepWarning(warning.text)
+        return StepWarning(warning.text, minor=warning.minor)
     base = new if picture.is_relative_to(new) else folder
-    return StepWarning(warning.text, os.path.relpath(picture, base))
+    return StepWarning(warning.text, os.path.relpath(picture, base), warning.minor)
 
 
 def clear_leftovers(folder: Path) -> None:

@@ -26,6 +26,8 @@ class ConsoleWarning:
     """One or more sentences without line breaks."""
     picture: Path | None
     """An image that shows it: below the step's new result folder, or anywhere else."""
+    minor: bool = False
+    """Whether the step did what was needed by itself, so that its result is not in doubt."""
 
 
 class Console:
@@ -42,20 +44,21 @@ class Console:
         """Print one line on standard error."""
         self._errors.print(sentence, markup=False, soft_wrap=True)
 
-    def warn(self, sentence: str, *, picture: Path | None = None) -> None:
+    def warn(self, sentence: str, *, picture: Path | None = None, minor: bool = False) -> None:
         """Print a warning on standard error; inside a step it also goes into step.json and to the top of the report.
 
         Args:
             sentence: What may be wrong, on one line.
             picture: An image that shows it: in the folder that the step writes, or a photo.
+            minor: Whether the step did what was needed by itself.
         """
         self.say(f"warning: {sentence}{self._help}")
-        self._warned.append(ConsoleWarning(sentence, picture))
+        self._warned.append(ConsoleWarning(sentence, picture, minor))
 
-    def warn_at_length(self, sentences: Sequence[str]) -> None:
+    def warn_at_length(self, sentences: Sequence[str], *, minor: bool = False) -> None:
         """Warn with the first sentence, where there is one, and print the others, which explain it."""
         for sentence in sentences[:1]:
-            self.warn(sentence)
+            self.warn(sentence, minor=minor)
         for sentence in sentences[1:]:
             self.say(sentence)
 

@@ -14,6 +14,7 @@ from splatgraft.capture import (
     read_pose_report,
     render_pictures,
     require_coverage,
+    usable_masks,
     usable_photos,
     usable_views,
     write_pose_report,
@@ -27,6 +28,9 @@ from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, 
 from splatgraft.formats.captures.given_poses import pose_files, read_given_poses
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.project.step import Context, Inputs, Positional
+
+_FEW = 4
+"""Photos kept per photo left out from which on the capture is not in doubt; set by hand."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,8 @@ class Capture:
         return posed
 
     def _say_left_out(self, kept: int, left_out: Sequence[LeftOut], context: Context) -> None:
-        context.console.warn_at_length(describe_left_out(self.capture, kept, left_out))
+        few = _FEW * len(left_out) <= kept
+        context.console.warn_at_length(describe_left_out(self.capture, kept, left_out), minor=few)
 
     def _with_given_poses(self, poses: Path, context: Context) -> PosedImages:
         """Photos with the poses of another program."""
@@ -144,7 +149,7 @@ class Capture:
 
     def _warn_of_exposures(self, photos: Sequence[Path], context: Context) -> None:
         for warning in exposure_warnings(self.capture, photos):
-            context.console.warn(warning)
+            context.console.warn(warning, minor=True)
 
     def _photos(self, folder: Path, context: Context) -> PhotoFiles:
         if not self.capture.is_dir():
@@ -160,7 +165,8 @@ class Capture:
         self._say_left_out(len(kept), odd, context)
         if (warning := drawn_pictures(kept)) is not None:
             context.console.warn(warning)
-        photos = found.only(kept)
+        photos, empty = usable_masks(found.only(kept))
+        self._say_left_out(len(kept), empty, context)
         masks = describe_masks(photos.paths, photos.masks)
         context.console.say(f"{self.capture}: {len(photos.paths)} photos; {masks}")
         return photos

@@ -60,7 +60,7 @@ class Reconstruct:
     def write(self, folder: Path, context: Context) -> None:
         """Make scene.ply, and metrics.json where views are held out."""
         capture = readable_views(read_capture(self.capture), progress=context.progress)
-        context.console.warn_at_length(describe_left_out(self.capture, len(capture), capture.left_out))
+        context.console.warn_at_length(describe_left_out(self.capture, len(capture), capture.left_out), minor=True)
         require_coverage(capture, str(self.capture))
         device = choose_device(self.options.device, context.console)
         options = replace(self.options, device=str(device))
@@ -74,7 +74,7 @@ class Reconstruct:
         warnings = exposure_warnings(self.capture, capture.image_paths)
         if read_record(self.capture) is None:  # of its own results the command `capture` has said it
             for warning in warnings:
-                context.console.warn(warning)
+                context.console.warn(warning, minor=True)
         if options.photo_colors is None:
             options = replace(options, photo_colors=bool(warnings))
             if warnings:
