@@ -25,6 +25,8 @@ _HEIF_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", 
 """At byte 8 of a HEIF file, after `ftyp` (ISO/IEC 23008-12)."""
 _TURNED_SIDEWAYS = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
+_FROM_RIGHT, _FROM_BELOW = (2, 3, 7, 8), (3, 4, 6, 7)
+"""EXIF orientations of which stored columns and rows are counted from the other side than when shown upright."""
 _ALWAYS_ALLOWED_PIXELS = 1 << 24
 _PIXELS_PER_BYTE = 1 << 14
 """Above every real image: a black 1-bit PNG has 8256. Above 179 million pixels Pillow itself refuses."""
@@ -117,6 +119,30 @@ def stored_size(path: Path, size: tuple[int, int] | None = None) -> tuple[int, i
         return (height, width) if size is not None and _is_sideways(image, size) else (width, height)
 
 
+def stored_points(
+    path: Path, points: Float[Tensor, "n 2"], size: tuple[int, int] | None = None
+) -> Float[Tensor, "n 2"]:
+    """Points of a picture as a viewer shows it, on the grid that `read_stored_rgb` reads.
+
+    Args:
+        path: An image file.
+        points: Pixels to the right and down, with EXIF rotation applied.
+        size: Width and height of the camera's image, as for `read_stored_rgb`.
+
+    Raises:
+        ValueError: The file is no readable image.
+    """
+    with opened(path) as image:
+        orientation = 1 if size is not None and _is_sideways(image, size) else _exif_orientation(image)
+        width, height = image.size
+    x, y = points.unbind(1)
+    if orientation in _TURNED_SIDEWAYS:
+        x, y = y, x
+    x = width - x if orientation in _FROM_RIGHT else x
+    y = height - y if orientation in _FROM_BELOW else y
+    return torch.stack([x, y], 1)
+
+
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether two sizes are those of one image scaled, with sides rounded to whole pixels."""
     # with both sides scaled by one factor and rounded, the cross products differ by at most one longer side
@@ -127,10 +153,15 @@ def _is_sideways(image: Image.Image, size: tuple[int, int]) -> bool:
     """Whether EXIF rotation, and it alone, gives the image the shape of `size`."""
     if same_shape(image.size, size) or not same_shape((image.height, image.width), size):
         return False
+    return _exif_orientation(image) in _TURNED_SIDEWAYS
+
+
+def _exif_orientation(image: Image.Image) -> int:
+    """1 to 8; 1, upright, where there is none."""
     try:
-        return image.getexif().get(Base.Orientation) in _TURNED_SIDEWAYS
+        return image.getexif().get(Base.Orientation, 1)
     except Exception:  # as in read_exif
-        return False
+        return 1
 
 
 def shrink_on_decoding(image: Image.Image, longest_px: int) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from splatgraft.capture import triangulate
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import stored_size
+from splatgraft.core.images import stored_points, stored_size
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.prompts import ViewPrompt
 from splatgraft.rendering import surface_points
@@ -20,7 +20,7 @@ def prompts_by_view(capture: PosedImages, prompts: Mapping[str, ViewPrompt], pat
 
     Args:
         capture: The pictures.
-        prompts: By name of the picture, with or without folder and suffix, pixels of its file.
+        prompts: By name of the picture, with or without folder and suffix, pixels as a viewer shows it.
         path: The file that they come from, for messages.
 
     Raises:
@@ -53,16 +53,15 @@ def picture_called(names: Sequence[str], name: str, where: str) -> int:
 
 
 def in_camera_pixels(capture: PosedImages, index: int, prompt: ViewPrompt) -> ViewPrompt:
-    """A prompt in pixels of the picture's file, in those of its undistorted camera."""
-    width, height = stored_size(capture.image_paths[index])
-    camera = capture.cameras[index]
+    """A prompt in pixels of the picture as a viewer shows it, in those of its undistorted camera."""
+    camera, path = capture.cameras[index], capture.image_paths[index]
     distortion = capture.distortions[index] if capture.distortions else None
-    if distortion is None:
-        return prompt.scaled(camera.width / width, camera.height / height)
+    size = distortion.size if distortion is not None else (camera.width, camera.height)
+    width, height = stored_size(path, size)
 
     def moved(points: Tensor) -> Tensor:
-        at_size = points * torch.tensor([distortion.size[0] / width, distortion.size[1] / height])
-        return distortion.undistort_points(at_size, camera.intrinsics[0])
+        at_size = stored_points(path, points, size) * torch.tensor([size[0] / width, size[1] / height])
+        return at_size if distortion is None else distortion.undistort_points(at_size, camera.intrinsics[0])
 
     box = prompt.box
     if box is not None:
@@ -78,7 +77,7 @@ def point_in_world(text: str, capture: PosedImages, scene: Gaussians | None, *, 
     """The point that a user names.
 
     Args:
-        text: "X,Y,Z" in the world; "IMAGE:X,Y", a pixel of a picture's file, on the surface that it shows; or the same
+        text: "X,Y,Z" in the world; "IMAGE:X,Y", a pixel of a picture, on the surface that it shows; or the same
             point in several pictures, "IMAGE:X,Y IMAGE:X,Y", where the rays meet.
         capture: The pictures.
         scene: Gives the surface of a single picture; None where there is none.
