@@ -1,7 +1,7 @@
 """Files of prompts: what a user says about the object in single pictures, as TOML or JSON.
 
     ["DSC_0423.jpg"]
-    inside = [[412, 300], [380, 351]]   # points on the object: x to the right, y down, pixels as a viewer shows the file
+    inside = [[412, 300], [380, 351]]   # on the object: x to the right, y down, pixels as a viewer shows the file
     outside = [[100, 500]]              # points beside it
     box = [300, 200, 520, 480]          # left, top, right, bottom of a rectangle that holds the whole object
 
