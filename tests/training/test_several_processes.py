@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -82,6 +83,20 @@ def folder(tmp_path_factory):
     run(folder, 3, ["changing", until(4)])
     run(folder, 1, ["changing", until(6)])
     return folder
+
+
+def test_the_variables_of_a_scheduler_start_the_processes_without_torchrun(folder):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    place = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    words = [sys.executable, str(PROGRAM), str(folder), json.dumps([["scheduled", WHOLE]])]
+    started = [
+        subprocess.Popen(words, env={**environment(), **place, "RANK": rank, "LOCAL_RANK": rank}) for rank in "01"
+    ]
+    assert [process.wait(timeout=600) for process in started] == [0, 0]
+    seen(folder, "scheduled", 2)
+    assert_near(folder, "one", "scheduled")
 
 
 def test_split_over_two_processes_the_average_that_was_measured_is_saved(folder):
