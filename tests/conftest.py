@@ -21,6 +21,7 @@ SLOW = (
     "editor/test_editor_session.py",
     "editor/test_scenes_without_photos.py",
     "editor/test_server_and_windows.py",
+    "exports/test_page_in_browser.py",
     "harmonization/test_flux_views.py",
     "reconstruction/test_training.py",
     "relighting/test_edges.py",

@@ -17,6 +17,7 @@ from splatgraft.formats.scenes.plausible import with_plausible_conventions
 from splatgraft.formats.scenes.scene_file import SceneFile
 from splatgraft.formats.scenes.sog import read_sog
 from splatgraft.formats.scenes.sog_container import files_of, is_sog_folder
+from splatgraft.formats.scenes.sog_writer import write_sog
 from splatgraft.formats.scenes.splat import read_splat, write_splat
 from splatgraft.formats.scenes.spz import read_spz, write_spz
 
@@ -47,7 +48,7 @@ _READERS = {
     ".glb": read_gaussian_glb,
     ".ksplat": read_ksplat,
 }
-_WRITERS = {".ply": write_gaussian_ply, ".splat": write_splat, ".spz": write_spz}
+_WRITERS = {".ply": write_gaussian_ply, ".splat": write_splat, ".spz": write_spz, ".sog": write_sog}
 
 SCENE_SUFFIXES = tuple(_READERS)
 """Suffixes of trained scenes that can be read; a folder of SOG pictures has none."""
@@ -112,7 +113,8 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     """Write a scene in the format of the suffix; the file appears whole or not at all.
 
     Args:
-        path: A file that ends in .ply (exact), .splat or .spz (both quantised; .splat keeps band 0 of the colour only).
+        path: A file that ends in .ply (exact), .sog, .spz or .splat (quantised; .sog changes the order, .splat keeps
+            band 0 of the colour only).
         gaussians: The scene, on the CPU.
 
     Raises:

@@ -1,0 +1,100 @@
+"""Writes a scene, a part of one, or pictures of it, in the format that the suffix of a file names."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.exports.export_source import ExportSource
+from splatgraft.exports.first_view import first_view
+from splatgraft.exports.viewer_page import write_viewer_page
+from splatgraft.formats.scenes.sog_writer import write_sog
+
+Layer = Literal["all", "object", "scene"]
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What is written, and how."""
+
+    layer: Layer = "all"
+    """all: the whole scene; object: the relit object alone; scene: the place without object and shadow."""
+
+
+def export_scene(source: ExportSource, to: Path, options: ExportOptions = ExportOptions()) -> tuple[str, ...]:
+    """Write a file; it appears whole or not at all.
+
+    Args:
+        source: What is written.
+        to: A file whose suffix is among `EXPORT_SUFFIXES`.
+        options: Which part, and how.
+
+    Returns:
+        Sentences for the user: what was assumed, left out or turned.
+
+    Raises:
+        ValueError: The suffix is another, or the source has not what is asked for.
+    """
+    write = _WRITERS.get(suffix_of(to))
+    if write is None:
+        raise ValueError(f"{to}: expected a file that ends in {', '.join(EXPORT_SUFFIXES)}, found '{to.suffix}'")
+    return write(source, to, options)
+
+
+def suffix_of(path: Path) -> str:
+    """The suffix that names the format."""
+    return path.suffix.lower()
+
+
+def layer_of(source: ExportSource, layer: Layer) -> tuple[Gaussians, tuple[str, ...]]:
+    """One layer without Gaussians that are not finite, and a sentence on those.
+
+    Raises: ValueError where the source does not know its layers.
+    """
+    if layer == "all":
+        chosen = source.scene
+    elif layer == "object" and source.is_object is not None:
+        chosen = source.scene.select(source.is_object)
+    elif layer == "scene" and source.place is not None:
+        chosen = source.place
+    else:
+        raise ValueError(
+            f"--layer {layer}: expected the folder of a project, whose parts are known, found {source.title} alone"
+        )
+    return _finite(chosen)
+
+
+def _finite(gaussians: Gaussians) -> tuple[Gaussians, tuple[str, ...]]:
+    fields = [gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh.flatten(1)]
+    finite = torch.isfinite(torch.cat(fields, 1)).all(1) & ~gaussians.opacity_logits.isnan()
+    if bool(finite.all()):
+        return gaussians, ()
+    return gaussians.select(finite), (f"{int((~finite).sum())} Gaussians that are not finite are left out",)
+
+
+def _write_html(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
+    after, said = layer_of(source, options.layer)
+    view, assumed = first_view(source)
+    scenes = {source.title: after}
+    if options.layer == "all" and source.pasted is not None:
+        scenes = {"Before": _finite(source.pasted)[0], "After": after}
+    write_viewer_page(to, scenes, view, title=source.title)
+    return (*said, *assumed)
+
+
+def _write_sog(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
+    gaussians, said = layer_of(source, options.layer)
+    write_sog(to, gaussians, source.metadata)
+    return said
+
+
+_WRITERS: dict[str, Callable[[ExportSource, Path, ExportOptions], tuple[str, ...]]] = {
+    ".html": _write_html,
+    ".sog": _write_sog,
+}
+
+EXPORT_SUFFIXES = tuple(_WRITERS)
+"""Suffixes of the formats."""
