@@ -18,7 +18,8 @@ class Export:
     scene: Positional
     """A scene file, a folder with scene.ply, or a project: its folder or project.toml."""
     to: Path
-    """The file to write; its suffix names the format: .html (one page with a viewer), .sog."""
+    """The file to write; its suffix names the format: .html (one page with a viewer), .sog, .spz, .compressed.ply,
+    .ply, .splat, .glb, .usdz."""
     cameras: Path | None = None
     """The capture that a scene was made from: says which way is up and where to look from. Found in a project."""
     options: ExportOptions = field(default_factory=ExportOptions)

@@ -10,8 +10,13 @@ import torch
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.exports.export_source import ExportSource
 from splatgraft.exports.first_view import first_view
+from splatgraft.exports.scene_frame import upright
 from splatgraft.exports.viewer_page import write_viewer_page
-from splatgraft.formats.scenes.sog_writer import write_sog
+from splatgraft.formats import WRITTEN_SCENE_SUFFIXES, scene_suffix, write_gaussians
+from splatgraft.formats.scenes.spz import write_spz
+
+_WORLD_SUFFIXES = (".glb", ".usdz")
+"""Formats whose y points up and whose unit is a metre."""
 
 Layer = Literal["all", "object", "scene"]
 
@@ -22,6 +27,11 @@ class ExportOptions:
 
     layer: Layer = "all"
     """all: the whole scene; object: the relit object alone; scene: the place without object and shadow."""
+    frame: Literal["auto", "capture", "world"] = "auto"
+    """Of a scene. capture: as in the project; world: upright and in metres, as far as they are known; auto: world for
+    .glb and .usdz, which ask for it, else capture."""
+    spz_version: int = 4
+    """Of a .spz: 4, or 3 or 2 for programs that do not read it yet."""
 
 
 def export_scene(source: ExportSource, to: Path, options: ExportOptions = ExportOptions()) -> tuple[str, ...]:
@@ -38,15 +48,10 @@ def export_scene(source: ExportSource, to: Path, options: ExportOptions = Export
     Raises:
         ValueError: The suffix is another, or the source has not what is asked for.
     """
-    write = _WRITERS.get(suffix_of(to))
+    write = _WRITERS.get(scene_suffix(to))
     if write is None:
         raise ValueError(f"{to}: expected a file that ends in {', '.join(EXPORT_SUFFIXES)}, found '{to.suffix}'")
     return write(source, to, options)
-
-
-def suffix_of(path: Path) -> str:
-    """The suffix that names the format."""
-    return path.suffix.lower()
 
 
 def layer_of(source: ExportSource, layer: Layer) -> tuple[Gaussians, tuple[str, ...]]:
@@ -85,15 +90,22 @@ def _write_html(source: ExportSource, to: Path, options: ExportOptions) -> tuple
     return (*said, *assumed)
 
 
-def _write_sog(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
+def _write_scene(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
     gaussians, said = layer_of(source, options.layer)
-    write_sog(to, gaussians, source.metadata)
+    metadata, suffix = source.metadata, scene_suffix(to)
+    if options.frame == "world" or (options.frame == "auto" and suffix in _WORLD_SUFFIXES):
+        world_from_capture, metadata, about = upright(source)
+        gaussians, said = world_from_capture.gaussians(gaussians), (*said, *about)
+    if suffix == ".spz":
+        write_spz(to, gaussians, version=options.spz_version)
+    else:
+        write_gaussians(to, gaussians, metadata=metadata)
     return said
 
 
 _WRITERS: dict[str, Callable[[ExportSource, Path, ExportOptions], tuple[str, ...]]] = {
     ".html": _write_html,
-    ".sog": _write_sog,
+    **dict.fromkeys(WRITTEN_SCENE_SUFFIXES, _write_scene),
 }
 
 EXPORT_SUFFIXES = tuple(_WRITERS)

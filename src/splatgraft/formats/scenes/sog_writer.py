@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import UInt8
 from PIL import Image
-from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.code_book import nearest_codes, palette, scalar_codes
+from splatgraft.formats.scenes.morton_order import morton_order
 from splatgraft.formats.scenes.quantized import bytes_from_unit, require_finite
 from splatgraft.formats.scenes.scene_metadata import SceneMetadata
 from splatgraft.formats.scenes.sog_container import META_FILE
@@ -29,7 +29,6 @@ _LARGEST_PALETTE = 1 << 16
 _GAUSSIANS_PER_ENTRY = 4
 """Of the palette of SH bands; by size and PSNR of the demo's scenes."""
 _SMALLEST_PALETTE = 1 << 10
-_MORTON_BITS = 10
 _SQRT2 = 2**0.5
 _FIRST_TAG = 252
 _DATE = (1980, 1, 1, 0, 0, 0)
@@ -53,7 +52,7 @@ def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = Scene
         raise ValueError(f"{path}: expected at least one Gaussian for a .sog file, found none")
     require_finite(path, gaussians)
     g = gaussians.map(lambda tensor: tensor.detach().cpu().float())
-    g = g.select(_morton_order(g.means))
+    g = g.select(morton_order(g.means))
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "splatgraft"},
@@ -154,15 +153,3 @@ def _picture(pixels: UInt8[np.ndarray, "n 4"], *, width: int | None = None) -> b
     stream = io.BytesIO()
     Image.fromarray(full.reshape(height, width, 4)).save(stream, "WEBP", lossless=True, exact=True, quality=80)
     return stream.getvalue()
-
-
-def _morton_order(means: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
-    """Indices along a Morton curve through 1024 cells per axis, whose bounds are quantiles: scenes have few outliers
-    far away."""
-    ranks = means.argsort(dim=0, stable=True).argsort(dim=0)
-    cells = ranks * (1 << _MORTON_BITS) // len(means)
-    code = torch.zeros(len(means), dtype=torch.int64)
-    for bit in range(_MORTON_BITS):
-        for axis in range(3):
-            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
-    return code.argsort(stable=True)
