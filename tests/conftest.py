@@ -22,6 +22,8 @@ SLOW = (
     "editor/test_scenes_without_photos.py",
     "editor/test_server_and_windows.py",
     "exports/test_page_in_browser.py",
+    "exports/test_parts_and_pictures.py",
+    "exports/test_playcanvas_reads.py",
     "harmonization/test_flux_views.py",
     "reconstruction/test_training.py",
     "relighting/test_edges.py",

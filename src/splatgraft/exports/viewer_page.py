@@ -24,7 +24,9 @@ _POLICY = (
 )
 
 
-def write_viewer_page(path: Path, scenes: Mapping[str, Gaussians], view: FirstView, *, title: str) -> None:
+def write_viewer_page(
+    path: Path, scenes: Mapping[str, Gaussians], view: FirstView, *, title: str, background: float = 0.0
+) -> None:
     """Write the page.
 
     Args:
@@ -32,6 +34,7 @@ def write_viewer_page(path: Path, scenes: Mapping[str, Gaussians], view: FirstVi
         scenes: Label of the button to scene, in one frame; the last one is shown first. No buttons for a single one.
         view: Where the camera starts.
         title: Of the page.
+        background: Grey behind the scene, sRGB.
 
     Raises:
         ValueError: A scene has no Gaussians, or some that are not finite.
@@ -49,7 +52,7 @@ def write_viewer_page(path: Path, scenes: Mapping[str, Gaussians], view: FirstVi
         "aspect": view.aspect,
         "near": 0.01 * distance,
         "far": 100 * distance,
-        "background": (0.0, 0.0, 0.0),
+        "background": [background] * 3,
     }
     metadata = SceneMetadata(up=view.up)
     packed = [encode_sog(path, gaussians, metadata) for gaussians in scenes.values()]
