@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from splatgraft.core.posed_images import PosedImages, held_out
     from splatgraft.core.similarity import Similarity
     from splatgraft.evaluation import Truth, evaluate, true_views
-    from splatgraft.formats import read_cameras, read_capture
+    from splatgraft.formats import SceneMetadata, read_cameras, read_capture
     from splatgraft.formats import read_gaussians as load
     from splatgraft.formats import write_gaussians as save
     from splatgraft.harmonization import (
@@ -95,6 +95,7 @@ __all__ = [
     "Relit",
     "Render",
     "RenderOptions",
+    "SceneMetadata",
     "Segmentation",
     "SelectOptions",
     "Similarity",
@@ -157,6 +158,7 @@ _SOURCES = {
     "Relit": "relighting.Relit",
     "Render": "rendering.Render",
     "RenderOptions": "rendering.RenderOptions",
+    "SceneMetadata": "formats.SceneMetadata",
     "Segmentation": "segmentation.Segmentation",
     "SelectOptions": "segmentation.SelectOptions",
     "Similarity": "core.similarity.Similarity",

@@ -25,6 +25,7 @@ _TABLE = (
     ("harmonize", "steps.harmonize", "make the light of each rendered view agree"),
     ("consolidate", "steps.consolidate", "fit the colours of the scene to the harmonised views"),
     ("evaluate", "steps.evaluate", "compare, picture and report"),
+    ("export", "export", "write a scene or a result as a page, for another program, or as pictures"),
     ("evaluate benchmark", "evaluate_benchmark", "measure methods on scenes with a known truth"),
     ("evaluate paper", "evaluate_paper", "write the paper's tables from the authors' data set"),
     ("synth pairs", "synth.pairs", "render training pairs with Blender"),

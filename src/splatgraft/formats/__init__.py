@@ -10,19 +10,26 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures import cameras_json, colmap, transforms_json
 from splatgraft.formats.captures.points_ply import read_points, write_points
 from splatgraft.formats.scenes.axes import with_axes
+from splatgraft.formats.scenes.compressed_ply_writer import COMPRESSED_PLY, write_compressed_ply
 from splatgraft.formats.scenes.gaussian_glb import read_gaussian_glb
+from splatgraft.formats.scenes.gaussian_glb_writer import write_gaussian_glb
 from splatgraft.formats.scenes.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from splatgraft.formats.scenes.gaussian_usd import write_gaussian_usdz
 from splatgraft.formats.scenes.ksplat import read_ksplat
 from splatgraft.formats.scenes.plausible import with_plausible_conventions
 from splatgraft.formats.scenes.scene_file import SceneFile
+from splatgraft.formats.scenes.scene_metadata import SceneMetadata
 from splatgraft.formats.scenes.sog import read_sog
 from splatgraft.formats.scenes.sog_container import files_of, is_sog_folder
+from splatgraft.formats.scenes.sog_writer import write_sog
 from splatgraft.formats.scenes.splat import read_splat, write_splat
 from splatgraft.formats.scenes.spz import read_spz, write_spz
 
 __all__ = [
     "SCENE_SUFFIXES",
+    "WRITTEN_SCENE_SUFFIXES",
     "SceneFile",
+    "SceneMetadata",
     "is_scene",
     "list_capture_images",
     "read_cameras",
@@ -32,6 +39,7 @@ __all__ = [
     "read_points",
     "read_scene",
     "scene_files",
+    "scene_suffix",
     "write_cameras",
     "write_capture",
     "write_gaussians",
@@ -47,10 +55,23 @@ _READERS = {
     ".glb": read_gaussian_glb,
     ".ksplat": read_ksplat,
 }
-_WRITERS = {".ply": write_gaussian_ply, ".splat": write_splat, ".spz": write_spz}
+_WRITERS = {
+    ".ply": write_gaussian_ply,
+    COMPRESSED_PLY: write_compressed_ply,
+    ".sog": write_sog,
+    ".spz": write_spz,
+    ".splat": write_splat,
+    ".glb": write_gaussian_glb,
+    ".usdz": write_gaussian_usdz,
+}
+_WITHOUT_METADATA = (".spz", ".splat")
+"""Formats that have no room for it."""
 
 SCENE_SUFFIXES = tuple(_READERS)
 """Suffixes of trained scenes that can be read; a folder of SOG pictures has none."""
+
+WRITTEN_SCENE_SUFFIXES = tuple(_WRITERS)
+"""Suffixes of scenes that can be written."""
 
 
 def is_scene(path: Path) -> bool:
@@ -108,22 +129,34 @@ def _read(path: Path) -> SceneFile:
     return read_sog(path) if is_sog_folder(path) else _by_suffix(path, _READERS)(path)
 
 
-def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
+def write_gaussians(path: Path | str, gaussians: Gaussians, *, metadata: SceneMetadata = SceneMetadata()) -> None:
     """Write a scene in the format of the suffix; the file appears whole or not at all.
 
     Args:
-        path: A file that ends in .ply (exact), .splat or .spz (both quantised; .splat keeps band 0 of the colour only).
+        path: A file that ends in .ply (exact), .glb or .usdz (float32), .sog, .spz, .compressed.ply or .splat
+            (quantised; .sog and .compressed.ply change the order, .splat keeps band 0 of the colour only).
         gaussians: The scene, on the CPU.
+        metadata: What is known of its frame; left out of .spz and .splat, which have no room for it.
 
     Raises:
         ValueError: The suffix is another, or the format cannot hold the scene.
     """
     path = Path(path)
-    _by_suffix(path, _WRITERS)(path, gaussians)
+    suffix = scene_suffix(path)
+    write = _by_suffix(path, _WRITERS)
+    if suffix in _WITHOUT_METADATA:
+        write(path, gaussians)
+    else:
+        write(path, gaussians, metadata)
+
+
+def scene_suffix(path: Path) -> str:
+    """The suffix that names the format of a scene to write: the last one, or .compressed.ply."""
+    return COMPRESSED_PLY if path.name.lower().endswith(COMPRESSED_PLY) else path.suffix.lower()
 
 
 def _by_suffix(path: Path, functions: dict[str, Callable]) -> Callable:
-    function = functions.get(path.suffix.lower())
+    function = functions.get(scene_suffix(path)) or functions.get(path.suffix.lower())
     if function is None:
         raise ValueError(f"{path}: expected a scene that ends in {', '.join(functions)}, found '{path.suffix}'")
     return function

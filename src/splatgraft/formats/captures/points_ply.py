@@ -52,5 +52,5 @@ def write_points(path: Path, points: Float[Tensor, "m 3"], colors: Float[Tensor,
     rows["color"] = (colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     with atomic_write(path) as stream:
         properties = [("float", name) for name in _POSITION] + [("uchar", name) for name in _COLOR_NAMES[0]]
-        ply.write_header(stream, len(rows), properties)
+        ply.write_header(stream, ("vertex", len(rows), properties))
         stream.write(rows.tobytes())

@@ -21,9 +21,11 @@ from splatgraft.formats.scenes.quantized import logits_from_unit
 from splatgraft.formats.scenes.scene_file import SceneFile
 from splatgraft.formats.scenes.spz import decode_spz
 
-_EXTENSION = "KHR_gaussian_splatting"
+SPLATTING = "KHR_gaussian_splatting"
+"""The extension's name, which stands before those of its attributes as well."""
 _COMPRESSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
-_AXES = "LUF"
+GLTF_AXES = "LUF"
+"""Left, up, front."""
 _SMALLEST_SCALE = 1e-30
 """World units; replaces a scale of exactly 0, since the logarithm is stored."""
 _RIGID = 1e-3
@@ -48,8 +50,9 @@ def read_gaussian_glb(path: Path) -> SceneFile:
             if sum(part.count for part in parts) > _MOST_COPIES * max(1000, len(glb.binary) // 20):
                 raise ValueError(f"{path}: expected Gaussians that are stored about once, found many copies")
     if not parts:
-        raise ValueError(f"{path}: expected Gaussians ({_EXTENSION}), found a .glb without")
-    return SceneFile(change_axes(concatenate(parts), rdf_from(_AXES)), _AXES, notes=tuple(notes))
+        raise ValueError(f"{path}: expected Gaussians ({SPLATTING}), found a .glb without")
+    gaussians = change_axes(concatenate(parts), rdf_from(GLTF_AXES))
+    return SceneFile(gaussians, GLTF_AXES, notes=tuple(notes))
 
 
 def _splats(glb: Glb, mesh: dict[str, Any]) -> list[dict[str, Any]]:
@@ -57,14 +60,14 @@ def _splats(glb: Glb, mesh: dict[str, Any]) -> list[dict[str, Any]]:
     found = []
     for primitive in primitives if isinstance(primitives, list) else []:
         extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
-        if isinstance(extensions, dict) and isinstance(extensions.get(_EXTENSION), dict):
+        if isinstance(extensions, dict) and isinstance(extensions.get(SPLATTING), dict):
             found.append(primitive)
     return found
 
 
 def _gaussians(glb: Glb, primitive: dict[str, Any]) -> tuple[Gaussians, tuple[str, ...]]:
     """One primitive in glTF's axes, and what is said of it."""
-    extension = primitive["extensions"][_EXTENSION]
+    extension = primitive["extensions"][SPLATTING]
     kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
     if kernel != "ellipse":
         raise ValueError(f"{glb.path}: expected the kernel 'ellipse', found {excerpt(kernel)}")
@@ -79,9 +82,9 @@ def _gaussians(glb: Glb, primitive: dict[str, Any]) -> tuple[Gaussians, tuple[st
     if not isinstance(attributes, dict):
         raise ValueError(f"{glb.path}: expected attributes of the Gaussians, found {excerpt(attributes)}")
     means = _attribute(glb, attributes, "POSITION", "VEC3")
-    rotations = _attribute(glb, attributes, f"{_EXTENSION}:ROTATION", "VEC4")
-    scales = _attribute(glb, attributes, f"{_EXTENSION}:SCALE", "VEC3")
-    opacities = _attribute(glb, attributes, f"{_EXTENSION}:OPACITY", "SCALAR")
+    rotations = _attribute(glb, attributes, f"{SPLATTING}:ROTATION", "VEC4")
+    scales = _attribute(glb, attributes, f"{SPLATTING}:SCALE", "VEC3")
+    opacities = _attribute(glb, attributes, f"{SPLATTING}:OPACITY", "SCALAR")
     sh = _harmonics(glb, attributes)
     if len({len(values) for values in (means, rotations, scales, opacities, sh)}) > 1:
         raise ValueError(f"{glb.path}: expected as many values of each attribute, found different numbers")
@@ -110,7 +113,7 @@ def _harmonics(glb: Glb, attributes: dict[str, Any]) -> Float[np.ndarray, "n k 3
     """All bands that are there, from 0 up."""
     coefficients = []
     for degree in range(spherical_harmonics.MAX_DEGREE + 1):
-        names = [f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for i in range(2 * degree + 1)]
+        names = [f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{i}" for i in range(2 * degree + 1)]
         if degree and not any(name in attributes for name in names):
             break
         coefficients += [_attribute(glb, attributes, name, "VEC3") for name in names]

@@ -17,7 +17,9 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes import ply
 from splatgraft.formats.scenes.compressed_ply import is_compressed, read_compressed_ply
 from splatgraft.formats.scenes.ply_variants import (
+    comments_of,
     disks_thickened,
+    header_metres,
     header_notes,
     header_up,
     smoothed,
@@ -25,6 +27,7 @@ from splatgraft.formats.scenes.ply_variants import (
     without_degree_4,
 )
 from splatgraft.formats.scenes.scene_file import SceneFile
+from splatgraft.formats.scenes.scene_metadata import SceneMetadata
 from splatgraft.runtime.atomic_file import atomic_write
 
 _MEANS = ("x", "y", "z")
@@ -46,9 +49,9 @@ def read_gaussian_ply(path: Path) -> SceneFile:
     vertex = header.element("vertex")
     if vertex is None:
         raise ValueError(f"{path}: expected an element 'vertex', found {[e.name for e in header.elements]}")
-    up, notes = header_up(header), header_notes(header)
+    up, notes, metres = header_up(header), header_notes(header), header_metres(header)
     if is_compressed(header):
-        return SceneFile(read_compressed_ply(header), up=up, notes=notes)
+        return SceneFile(read_compressed_ply(header), up=up, notes=notes, metres_per_unit=metres)
     rest = _rest_names(path, vertex)
     has_rgb = not set(_DC) & set(vertex.names) and set(_RGB) <= set(vertex.names)
     scales = _SCALES if _SCALES[2] in vertex.names or not set(_SCALES[:2]) <= set(vertex.names) else _SCALES[:2]
@@ -77,7 +80,7 @@ def read_gaussian_ply(path: Path) -> SceneFile:
         opacity_logits=torch.from_numpy(logits[:, 0]),
         sh=torch.from_numpy(sh),
     )
-    scene = SceneFile(gaussians, up=up, notes=notes)
+    scene = SceneFile(gaussians, up=up, notes=notes, metres_per_unit=metres)
     if has_rgb:
         scene = with_colors(scene, _range_of(vertex))
     if len(scales) == 2:
@@ -118,13 +121,13 @@ def _require_gaussians(path: Path, vertex: ply.Element, colors: tuple[str, ...],
     raise ValueError(f"{path}: expected the properties of 3D Gaussians, found none called {', '.join(missing)}")
 
 
-def write_gaussian_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write the layout of the original code, byte for byte, atomically."""
+def write_gaussian_ply(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
+    """Write the layout of the original code, byte for byte, atomically; what is known of the frame in comments."""
     n, k = gaussians.sh.shape[:2]
     rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
     names = [*_MEANS, "nx", "ny", "nz", *_DC, *rest, "opacity", *_SCALES, *_QUATERNION]
     with atomic_write(path) as stream:
-        ply.write_header(stream, n, [("float", name) for name in names])
+        ply.write_header(stream, ("vertex", n, [("float", name) for name in names]), comments=comments_of(metadata))
         for start in range(0, n, _ROWS_PER_WRITE):
             part = gaussians.map(lambda t, i=start: t[i : i + _ROWS_PER_WRITE].detach().cpu().float())
             columns = [

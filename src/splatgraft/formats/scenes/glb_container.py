@@ -5,7 +5,7 @@ Lengths are compared with the bytes that are there before anything is decoded.
 
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,8 @@ _MAGIC, _VERSION = 0x46546C67, 2
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_HEADER_BYTES = 28
+"""The file's header and those of the two chunks."""
 _MOST_NODES = 10_000
 _DEEPEST_NODE = 100
 
@@ -125,6 +127,28 @@ class Glb:
         if not isinstance(roots, list):
             raise ValueError(f"{self.path}: expected a list of nodes in the scene, found {excerpt(roots)}")
         return roots
+
+
+def glb_bytes(path: Path, content: dict[str, Any], parts: Sequence[bytes]) -> list[bytes]:
+    """A .glb as pieces to write one after another.
+
+    Args:
+        path: For messages.
+        content: The JSON.
+        parts: Of the buffer, whose length `content` states.
+
+    Raises:
+        ValueError: The file would be larger than the format's 4 GB.
+    """
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    length = sum(map(len, parts))
+    padding = bytes(-length % 4)
+    total = _HEADER_BYTES + len(text) + length + len(padding)
+    if total >= 1 << 32:
+        raise ValueError(f"{path}: expected at most 4 GB for a .glb file, found {total / 1e9:.1f} GB")
+    head = struct.pack("<5I", _MAGIC, _VERSION, total, len(text), _JSON)
+    return [head, text, struct.pack("<2I", length + len(padding), _BINARY), *parts, padding]
 
 
 def read_glb(path: Path) -> Glb:

@@ -4,7 +4,7 @@ Element counts of a header are checked against the size of the file before anyth
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -240,8 +240,11 @@ def _skip(stream: BinaryIO, header: PlyHeader, element: Element) -> None:
             stream.seek(length * item, 1)
 
 
-def write_header(stream: BinaryIO, count: int, properties: list[tuple[str, str]]) -> None:
-    """The header of a little-endian file of one element 'vertex' with `properties` as (PLY type, name)."""
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property {kind} {name}" for kind, name in properties]
+def write_header(
+    stream: BinaryIO, *elements: tuple[str, int, Sequence[tuple[str, str]]], comments: Sequence[str] = ()
+) -> None:
+    """The header of a little-endian file of elements (name, number of rows, properties as (PLY type, name))."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    for name, count, properties in elements:
+        lines += [f"element {name} {count}", *(f"property {kind} {prop}" for kind, prop in properties)]
     stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))

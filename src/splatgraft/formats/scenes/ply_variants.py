@@ -11,21 +11,45 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.formats.scenes import ply
 from splatgraft.formats.scenes.quantized import logits_from_unit
 from splatgraft.formats.scenes.scene_file import SceneFile
+from splatgraft.formats.scenes.scene_metadata import SceneMetadata
 
 _THICKNESS = 1e-3
 """Of a disk of 2DGS, over its smaller radius: thin enough to have no side, thick enough to have a covariance."""
 _UP = re.compile(r"vertical axis:\s*([+-]?)([xyz])", re.IGNORECASE)
+_NUMBER = r"([+-]?[0-9]{1,3}(?:\.[0-9]{1,12})?(?:e[+-]?[0-9]{1,2})?)"
+_UP_VECTOR = re.compile(rf"up: {_NUMBER} {_NUMBER} {_NUMBER}")
+_METRES = re.compile(r"metres_per_unit: ([0-9]{1,12}(?:\.[0-9]{1,12})?(?:e[+-]?[0-9]{1,2})?)")
 _LONGEST_COMMENT = 80
 
 
 def header_up(header: ply.PlyHeader) -> tuple[float, float, float] | None:
-    """The up direction that a comment states, as nerfstudio's 'Vertical Axis: z'."""
+    """The up direction that a comment states, as nerfstudio's 'Vertical Axis: z' or our own 'up: X Y Z'."""
     for comment in header.comments:
         if found := _UP.fullmatch(comment):
             sign = -1.0 if found[1] == "-" else 1.0
             x, y, z = (sign * (axis == found[2].lower()) for axis in "xyz")
             return x, y, z
+        if found := _UP_VECTOR.fullmatch(comment):
+            x, y, z = map(float, found.groups())
+            length = (x * x + y * y + z * z) ** 0.5
+            if 0 < length < float("inf"):
+                return x / length, y / length, z / length
     return None
+
+
+def header_metres(header: ply.PlyHeader) -> float | None:
+    """Metres per unit, where a comment of our own writer states them."""
+    for comment in header.comments:
+        if (found := _METRES.fullmatch(comment)) and 0 < float(found[1]) < float("inf"):
+            return float(found[1])
+    return None
+
+
+def comments_of(metadata: SceneMetadata) -> list[str]:
+    """The header's comments on what is known of the frame."""
+    up = [] if metadata.up is None else [f"up: {' '.join(f'{value:.6g}' for value in metadata.up)}"]
+    metres = metadata.metres_per_unit
+    return up + ([] if metres is None else [f"metres_per_unit: {metres:.9g}"])
 
 
 def header_notes(header: ply.PlyHeader) -> tuple[str, ...]:

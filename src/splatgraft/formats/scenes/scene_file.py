@@ -17,6 +17,8 @@ class SceneFile:
     """Directions of x, y and z in the file (right or left, up or down, back or front); what was turned to RDF."""
     up: tuple[float, float, float] | None = None
     """Up direction in the frame of `gaussians`, where the file states one."""
+    metres_per_unit: float | None = None
+    """Size of a unit, where the file states it."""
     notes: tuple[str, ...] = ()
     """For the user: conventions that differ from a .ply of the original code, and how they were found."""
 
@@ -25,8 +27,11 @@ class SceneFile:
         g = self.gaussians
         turned = "as in a .ply of structure from motion" if self.axes == "RDF" else "turned to RDF"
         words = ", ".join(f"{name} {_WORDS[letter]}" for name, letter in zip("xyz", self.axes, strict=True))
+        metres = self.metres_per_unit
+        size = () if metres is None else (f"it says that one unit is {metres:.4g} m; `splatgraft scale` takes it over",)
         return (
             f"{g.count:,} Gaussians, SH degree {g.sh_degree}",
+            *size,
             f"its axes are taken to be {self.axes} ({words}), {turned}; other ones are named by --axes",
             *self.notes,
         )

@@ -4,6 +4,7 @@ Version 2 looks scales and colours up in code books of 256 values, version 1 spr
 are rows of a palette that is a picture too. Positions are 16 bits of sign(x) log(1 + |x|). Axes are those of a .ply.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,7 +107,22 @@ def read_sog(path: Path) -> SceneFile:
         opacity_logits=logits,
         sh=torch.from_numpy(np.ascontiguousarray(sh)),
     )
-    return SceneFile(gaussians)
+    up, metres = _own_metadata(meta)
+    return SceneFile(gaussians, up=up, metres_per_unit=metres)
+
+
+def _own_metadata(meta: dict[str, Any]) -> tuple[tuple[float, float, float] | None, float | None]:
+    """Up and metres per unit where our own writer stated them; other content is not ours."""
+    own = meta.get("splatgraft")
+    up, metres = (own.get("up"), own.get("metres_per_unit")) if isinstance(own, dict) else (None, None)
+    if isinstance(up, list) and len(up) == 3 and all(isinstance(value, int | float) for value in up):
+        length = math.hypot(*up)
+        up = (up[0] / length, up[1] / length, up[2] / length) if 0 < length < math.inf else None
+    else:
+        up = None
+    if not isinstance(metres, int | float) or isinstance(metres, bool) or not 0 < metres < math.inf:
+        return up, None
+    return up, float(metres)
 
 
 def _count(path: Path, meta: dict[str, Any], version: int) -> int:

@@ -3,8 +3,6 @@
 Stored axes are right-up-back unless the file says otherwise, ours and a .ply's are right-down-front.
 """
 
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +15,11 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, require_finite
 from splatgraft.formats.scenes.scene_file import SceneFile
-from splatgraft.formats.scenes.spz_container import unpack
+from splatgraft.formats.scenes.spz_container import PackedScene, pack, unpack
 from splatgraft.runtime.atomic_file import atomic_write
 
-_MAGIC = 0x5053474E
-_HEADER = struct.Struct("<IIIBBBB")
-_GZIP = 31
+SPZ_VERSIONS = (2, 3, 4)
+"""Those that are written; 1 is read as well."""
 _COLOR_SCALE = 0.15
 _HALF_SQRT2 = 0.5**0.5
 
@@ -96,11 +93,18 @@ def _smallest_three(rotations: UInt8[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
     return xyzw[:, [3, 0, 1, 2]]
 
 
-def write_spz(path: Path, gaussians: Gaussians) -> None:
-    """Write version 3: positions in 24 bits of the scene's extent, the rest in 8 bits.
+def write_spz(path: Path, gaussians: Gaussians, *, version: int = 4) -> None:
+    """Write positions in 24 bits of the scene's extent, the rest in 8 bits.
 
-    Raises: ValueError where a Gaussian is not finite or further out than 8 million units.
+    Args:
+        path: The file.
+        gaussians: The scene.
+        version: 4 (zstd streams), 3 (one gzip stream), or 2 (rotations in 3 bytes, for the oldest readers).
+
+    Raises: ValueError where a Gaussian is not finite or further out than 8 million units, or the version is another.
     """
+    if version not in SPZ_VERSIONS:
+        raise ValueError(f"{path}: expected .spz version 2, 3 or 4 to write, found {version}")
     require_finite(path, gaussians)
     g = change_axes(gaussians.map(lambda tensor: tensor.detach().cpu().float()), rdf_from("RUB"))
     extent = float(g.means.abs().max()) if g.count else 1.0
@@ -108,20 +112,25 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
     if bits < 0:
         raise ValueError(f"{path}: expected positions within 8388607 units for a .spz file, found {extent:.4g}")
     fixed = (g.means.double() * 2.0**bits).round().to(torch.int64).numpy()
-    header = _HEADER.pack(_MAGIC, 3, g.count, g.sh_degree, bits, 0, 0)
-    parts = [
-        np.stack([fixed & 0xFF, fixed >> 8 & 0xFF, fixed >> 16 & 0xFF], -1).astype(np.uint8),
-        bytes_from_unit(g.opacities).numpy(),
+    fields = (
+        np.stack([fixed & 0xFF, fixed >> 8 & 0xFF, fixed >> 16 & 0xFF], -1).astype(np.uint8).reshape(g.count, 9),
+        bytes_from_unit(g.opacities)[:, None].numpy(),
         bytes_from_unit(g.sh[:, 0] * _COLOR_SCALE + 0.5).numpy(),
         ((g.log_scales + 10) * 16).round().clamp(0, 255).to(torch.uint8).numpy(),
-        _packed(g.quaternions),
-        (g.sh[:, 1:] * 128 + 128).round().clamp(0, 255).to(torch.uint8).numpy(),
-    ]
-    deflate = zlib.compressobj(6, zlib.DEFLATED, _GZIP)
+        _three_bytes(g.quaternions) if version == 2 else _packed(g.quaternions),
+        (g.sh[:, 1:] * 128 + 128).round().clamp(0, 255).to(torch.uint8).flatten(1).numpy(),
+    )
+    packed = PackedScene(version, g.sh_degree, bits, antialiased=False, axes="RUB", fields=fields)
+    data = pack(path, packed)
     with atomic_write(path) as stream:
-        for part in (header, *(part.tobytes() for part in parts)):
-            stream.write(deflate.compress(part))
-        stream.write(deflate.flush())
+        stream.write(data)
+
+
+def _three_bytes(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
+    """x, y, z of a unit quaternion with w >= 0."""
+    unit = torch.nn.functional.normalize(quaternions, dim=-1)
+    xyz = torch.where(unit[:, :1] < 0, -unit, unit)[:, 1:]
+    return ((xyz + 1) * 127.5).round().clamp(0, 255).to(torch.uint8).numpy()
 
 
 def _packed(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
@@ -133,4 +142,4 @@ def _packed(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
     magnitude = (three.abs() / _HALF_SQRT2 * 0x1FF).round().clamp(0, 0x1FF).to(torch.int64)
     fields = magnitude | (three < 0).to(torch.int64) << 9
     packed = largest[:, 0] << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
-    return packed.numpy().astype("<u4")
+    return packed.numpy().astype("<u4")[:, None].view(np.uint8)

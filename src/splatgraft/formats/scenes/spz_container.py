@@ -19,6 +19,8 @@ _TABLE_ENTRY = struct.Struct("<QQ")
 _EXTENSION = struct.Struct("<II")
 _COORDINATE_SYSTEM = 0xADBE0003
 _GZIP = 31
+_ZSTD_LEVEL = 12
+"""As the format's own library."""
 _LARGEST_DEGREE = 4
 _ANTIALIASED, _EXTENDED = 1, 2
 _MOST_EXPANSION = 100
@@ -74,6 +76,36 @@ def unpack(path: Path, data: bytes) -> PackedScene:
     return _packed(path, (version, degree, bits, flags), rest, _rows(n, fields, widths))
 
 
+def pack(path: Path, scene: PackedScene) -> bytes:
+    """The bytes of a .spz of the scene's version, 2 to 4, without extensions.
+
+    Raises: ValueError where version 4 needs a package that is not installed.
+    """
+    flags = _ANTIALIASED if scene.antialiased else 0
+    head = (_MAGIC, scene.version, len(scene.fields[0]), scene.degree, scene.fractional_bits, flags)
+    arrays = [field.tobytes() for field in scene.fields]
+    if scene.version < 4:
+        deflate = zlib.compressobj(9, zlib.DEFLATED, _GZIP)
+        parts = [deflate.compress(part) for part in (_GZIP_HEADER.pack(*head, 0), *arrays)]
+        return b"".join([*parts, deflate.flush()])
+    compressor = _zstandard(path).ZstdCompressor(level=_ZSTD_LEVEL, write_content_size=True)
+    streams = [(compressor.compress(array), len(array)) for array in arrays if array]
+    table = b"".join(_TABLE_ENTRY.pack(len(data), size) for data, size in streams)
+    header = _ZSTD_HEADER.pack(*head, len(streams), _ZSTD_HEADER.size)
+    return b"".join([header, table, *(data for data, _ in streams)])
+
+
+def _zstandard(path: Path) -> Any:
+    try:
+        import zstandard
+    except ImportError:
+        raise ValueError(
+            f"{path}: expected the package zstandard for .spz version 4, found none; "
+            f"install it with: pip install 'splatgraft[spz]'"
+        ) from None
+    return zstandard
+
+
 def _from_zstd(path: Path, data: bytes) -> PackedScene:
     """Version 4: plain header and extensions, table of sizes, one zstd stream per array that is not empty."""
     if len(data) < _ZSTD_HEADER.size:
@@ -106,13 +138,7 @@ def _from_zstd(path: Path, data: bytes) -> PackedScene:
 
 
 def _decompressed(path: Path, data: bytes, size: int) -> bytes:
-    try:
-        import zstandard
-    except ImportError:
-        raise ValueError(
-            f"{path}: expected the package zstandard for .spz version 4, found none; "
-            f"install it with: pip install 'splatgraft[spz]'"
-        ) from None
+    zstandard = _zstandard(path)
     try:
         if zstandard.frame_content_size(data) not in (size, -1):
             raise ValueError(f"{path}: expected a zstd stream of {size} bytes, found another size in its header")

@@ -1,0 +1,69 @@
+"""The command `export`: a scene or a result as a file for other people and other programs."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from splatgraft.exports.export import ExportOptions, export_scene
+from splatgraft.exports.report_file import write_report_file
+from splatgraft.folders.export_source import project_of, read_export_source
+from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE, Layout
+from splatgraft.project.step import Positional
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.projects import stale_steps
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a scene or a project's result as a page to look at, or in the format of another program."""
+
+    scene: Positional
+    """A scene file, a folder with scene.ply, or a project: its folder or project.toml."""
+    to: Path
+    """The file to write; its suffix names the format: .html (one page with a viewer), .sog, .spz, .compressed.ply,
+    .ply, .splat, .glb, .usdz; .png or .jpg (the page's first view); .mp4, .gif or .webp (a turntable)."""
+    page: Literal["viewer", "report"] = "viewer"
+    """What an .html holds: the scene with a viewer, or the project's report with all its pictures."""
+    cameras: Path | None = None
+    """The capture that a scene was made from: says which way is up and where to look from. Found in a project."""
+    title: str | None = None
+    """What a page calls the scene; the name of its file or folder where not given."""
+    options: ExportOptions = field(default_factory=ExportOptions)
+
+    def execute(self, console: Console) -> int:
+        """Read, write, and say what was assumed."""
+        self._say_stale(console)
+        if self.page == "report":
+            write_report_file(self.to, self._report())
+        else:
+            source = read_export_source(self.scene, cameras=self.cameras)
+            source = source if self.title is None else replace(source, title=self.title)
+            for sentence in export_scene(source, self.to, self.options):
+                console.say(f"{self.to}: {sentence}")
+        console.say(f"{self.to}: {self.to.stat().st_size / 1e6:.1f} MB")
+        console.result(self.to)
+        return 0
+
+    def _report(self) -> Path:
+        """The report's page: of the project, or of its folder report."""
+        if self.to.suffix.lower() != ".html":
+            raise ValueError(f"--page report: expected a file that ends in .html, found {self.to.name}")
+        folder = self.scene.parent if self.scene.name == PROJECT_FILE else self.scene
+        own = folder / REPORT_FILE
+        return own if own.is_file() else Layout(folder).report / REPORT_FILE
+
+    def _say_stale(self, console: Console) -> None:
+        folder = self.scene.parent if self.scene.name == PROJECT_FILE else self.scene
+        root = project_of(folder) if folder.is_dir() else None
+        if root is None or not (root / PROJECT_FILE).is_file():
+            return
+        try:
+            stale = [name for name in stale_steps(root) if self.page == "report" or name != "evaluate"]
+        except ValueError as error:  # the results are there, whatever became of the photos
+            console.warn(f"{root}: expected to know whether the result is up to date, found that {error}")
+            return
+        if stale:
+            console.warn(f"{root}: {', '.join(stale)} is out of date; `splatgraft run {root}` renews what is exported")
+
+
+COMMAND = Export

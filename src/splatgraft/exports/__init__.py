@@ -1,0 +1,1 @@
+"""Scenes, pictures and pages for other programs and other people."""

@@ -1,0 +1,158 @@
+"""Writes a scene, a part of one, or pictures of it, in the format that the suffix of a file names."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.exports.export_source import ExportSource
+from splatgraft.exports.first_view import first_view
+from splatgraft.exports.pictures import write_picture, write_turntable
+from splatgraft.exports.scene_frame import upright
+from splatgraft.exports.shadow_layer import shadow_layer
+from splatgraft.exports.viewer_page import write_viewer_page
+from splatgraft.formats import WRITTEN_SCENE_SUFFIXES, scene_suffix, write_gaussians
+from splatgraft.formats.scenes.spz import write_spz
+
+_WORLD_SUFFIXES = (".glb", ".usdz")
+"""Formats whose y points up and whose unit is a metre."""
+
+_PART_BACKGROUND = 0.8
+"""Grey on which a page shows an object or a shadow alone, sRGB."""
+
+Layer = Literal["all", "object", "scene", "shadow", "object-with-shadow"]
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What is written, and how."""
+
+    layer: Layer = "all"
+    """all: the whole scene; object: the relit object alone; scene: the place without object and shadow; shadow: black
+    Gaussians that darken what lies behind them as the shadow does; object-with-shadow: both, for a compositor."""
+    frame: Literal["auto", "capture", "world"] = "auto"
+    """Of a scene. capture: as in the project; world: upright and in metres, as far as they are known; auto: world for
+    .glb and .usdz, which ask for it, else capture."""
+    spz_version: int = 4
+    """Of a .spz: 4, or 3 or 2 for programs that do not read it yet."""
+    width: int = 1280
+    """Of pictures and videos, pixels."""
+    frames: int = 120
+    """Of a turntable; 24 are a second."""
+
+
+def export_scene(source: ExportSource, to: Path, options: ExportOptions = ExportOptions()) -> tuple[str, ...]:
+    """Write a file; it appears whole or not at all.
+
+    Args:
+        source: What is written.
+        to: A file whose suffix is among `EXPORT_SUFFIXES`.
+        options: Which part, and how.
+
+    Returns:
+        Sentences for the user: what was assumed, left out or turned.
+
+    Raises:
+        ValueError: The suffix is another, or the source has not what is asked for.
+    """
+    write = _WRITERS.get(scene_suffix(to))
+    if write is None:
+        raise ValueError(f"{to}: expected a file that ends in {', '.join(EXPORT_SUFFIXES)}, found '{to.suffix}'")
+    return write(source, to, options)
+
+
+def layer_of(source: ExportSource, layer: Layer) -> tuple[Gaussians, tuple[str, ...]]:
+    """One layer without Gaussians that are not finite, and sentences on it.
+
+    Raises: ValueError where the source does not know its layers.
+    """
+    if layer == "all":
+        return _finite(source.scene)
+    if source.is_object is None or source.place is None:
+        raise ValueError(
+            f"--layer {layer}: expected the folder of a project, whose parts are known, found {source.title} alone"
+        )
+    if layer == "scene":
+        return _finite(source.place)
+    object_ = source.scene.select(source.is_object)
+    if layer == "object":
+        return _finite(object_)
+    shadow = shadow_layer(source)
+    if shadow.psnr is None:
+        said = "the object casts no shadow that the target's cameras see"
+    else:
+        said = (
+            f"the shadow is black over what lies behind, of {shadow.gaussians.count:,} Gaussians; over the empty place "
+            f"it is {shadow.psnr:.1f} dB from the scene, in views that it was not fitted to"
+        )
+    parts = [shadow.gaussians] if layer == "shadow" else [object_, shadow.gaussians]
+    chosen, left_out = _finite(concatenate(parts))
+    return chosen, (said, *left_out)
+
+
+def _finite(gaussians: Gaussians) -> tuple[Gaussians, tuple[str, ...]]:
+    fields = [gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh.flatten(1)]
+    finite = torch.isfinite(torch.cat(fields, 1)).all(1) & ~gaussians.opacity_logits.isnan()
+    if bool(finite.all()):
+        return gaussians, ()
+    return gaussians.select(finite), (f"{int((~finite).sum())} Gaussians that are not finite are left out",)
+
+
+def _write_html(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
+    after, said = layer_of(source, options.layer)
+    view, assumed = first_view(source)
+    scenes = {source.title: after}
+    if options.layer == "all" and source.pasted is not None:
+        scenes = {"Before": _finite(source.pasted)[0], "After": after}
+    background = 0.0 if options.layer in ("all", "scene") else _PART_BACKGROUND
+    write_viewer_page(to, scenes, view, title=source.title, background=background)
+    return (*said, *assumed)
+
+
+def _write_scene(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
+    gaussians, said = layer_of(source, options.layer)
+    metadata, suffix = source.metadata, scene_suffix(to)
+    if options.frame == "world" or (options.frame == "auto" and suffix in _WORLD_SUFFIXES):
+        world_from_capture, metadata, about = upright(source)
+        gaussians, said = world_from_capture.gaussians(gaussians), (*said, *about)
+    if suffix == ".spz":
+        write_spz(to, gaussians, version=options.spz_version)
+    else:
+        write_gaussians(to, gaussians, metadata=metadata)
+    return said
+
+
+def _write_picture(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
+    gaussians, said = layer_of(source, options.layer)
+    view, assumed = first_view(source)
+    with_alpha = options.layer != "all" and to.suffix.lower() == ".png"
+    write_picture(to, gaussians, view, width=_required_width(options), with_alpha=with_alpha)
+    return (*said, *assumed)
+
+
+def _write_turntable(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
+    gaussians, said = layer_of(source, options.layer)
+    view, assumed = first_view(source)
+    width = _required_width(options)
+    about = write_turntable(to, gaussians, source, view, frames=options.frames, width=width)
+    return (*said, *assumed, about)
+
+
+def _required_width(options: ExportOptions) -> int:
+    if options.width < 16:
+        raise ValueError(f"--width: expected 16 pixels or more, found {options.width}")
+    return options.width
+
+
+_WRITERS: dict[str, Callable[[ExportSource, Path, ExportOptions], tuple[str, ...]]] = {
+    ".html": _write_html,
+    **dict.fromkeys(WRITTEN_SCENE_SUFFIXES, _write_scene),
+    **dict.fromkeys((".png", ".jpg"), _write_picture),
+    **dict.fromkeys((".mp4", ".gif", ".webp"), _write_turntable),
+}
+
+EXPORT_SUFFIXES = tuple(_WRITERS)
+"""Suffixes of the formats."""

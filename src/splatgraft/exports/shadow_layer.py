@@ -1,0 +1,131 @@
+"""The shadow of a transfer as black Gaussians, to be drawn over another picture of the place.
+
+Over-compositing black with opacity a multiplies what lies behind by 1 - a. The Gaussians of the place on which the
+shadow falls are therefore coloured black, and their opacities fitted so that the pictures of the target's cameras get
+as dark as the shadow makes them (least squares, Adam). Light that the object adds to the place is left out.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.exports.export_source import ExportSource
+from splatgraft.rendering import render, view_operator
+
+_BLACK = -0.5 / 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class ShadowLayerOptions:
+    """How the layer is fitted; numbers set by hand on the demo's scenes."""
+
+    views: int = 24
+    """Cameras of the target; every fourth one is left out of the fit and measured."""
+    longest_px: int = 320
+    """Longer side of the pictures."""
+    steps: int = 240
+    """Steps of Adam, one view each."""
+    learning_rate: float = 0.15
+    """Of opacity logits; falls to a tenth."""
+    darkest_ground: float = 0.02
+    """sRGB below which nothing is said about the share of light that is missing."""
+    least_share: float = 0.01
+    """Share of light that a Gaussian must miss to be part of the layer."""
+    least_weight_px: float = 0.5
+    """Pixels that a Gaussian must make up in all views together."""
+    faintest: float = 1 / 255
+    """Opacity below which a Gaussian is left out at the end."""
+
+
+@dataclass(frozen=True)
+class ShadowLayer:
+    """Black Gaussians, and how well they do."""
+
+    gaussians: Gaussians
+    """In the frame of the scene; none where there is no shadow."""
+    psnr: float | None
+    """The place with the layer over it against the scene with the shadow, in views outside the fit, dB."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """What the layer is fitted to."""
+
+    camera: Cameras
+    place: Float[Tensor, "h w 3"]
+    shadowed: Float[Tensor, "h w 3"]
+    darkness: Float[Tensor, "h w"]
+
+
+def shadow_layer(source: ExportSource, options: ShadowLayerOptions = ShadowLayerOptions()) -> ShadowLayer:
+    """Fit the layer to the relit scene without its object, against the place.
+
+    Raises:
+        ValueError: The source does not know its object, its place and its cameras.
+    """
+    if source.is_object is None or source.place is None or source.cameras is None:
+        raise ValueError(
+            f"--layer shadow: expected a project with its target's scene and cameras, found {source.title} without"
+        )
+    ground = source.scene.select(~source.is_object)
+    cameras = source.cameras.spread(options.views)
+    views = [_view(camera.limited(options.longest_px), ground, source.place, options) for camera in cameras]
+    fitted = [view for index, view in enumerate(views) if index % 4 != 3] or views
+    held_out = [view for index, view in enumerate(views) if index % 4 == 3] or views
+    receivers = _receivers(ground, fitted, options)
+    if receivers.count == 0:
+        return ShadowLayer(empty(), None)
+    layer = _fitted(receivers, fitted, options)
+    return ShadowLayer(layer, _psnr(layer, held_out))
+
+
+def _view(camera: Cameras, ground: Gaussians, place: Gaussians, options: ShadowLayerOptions) -> _View:
+    """A view and the share of light, in sRGB, that the shadow takes."""
+    shadowed, before = (render(scene, camera).color[0].clamp(0, 1) for scene in (ground, place))
+    level = before.mean(-1)
+    darkness = (1 - shadowed.mean(-1) / level.clamp_min(options.darkest_ground)).clamp(0, 1)
+    return _View(camera, before, shadowed, torch.where(level < options.darkest_ground, 0.0, darkness))
+
+
+def _receivers(ground: Gaussians, views: list[_View], options: ShadowLayerOptions) -> Gaussians:
+    """The Gaussians on which the shadow falls, black, with the share of light that each misses as opacity."""
+    missing, seen = torch.zeros(ground.count), torch.zeros(ground.count)
+    for view in views:
+        operator = view_operator(ground, view.camera)
+        both = torch.stack([view.darkness, torch.ones_like(view.darkness)], -1)
+        columns = operator.blend_transpose(both)
+        missing, seen = missing + columns[:, 0], seen + columns[:, 1]
+    share = missing / seen.clamp_min(1e-6)
+    kept = (share > options.least_share) & (seen > options.least_weight_px)
+    chosen = ground.select(kept)
+    opacity = (share[kept] * chosen.opacities).clamp(0.002, 0.98)
+    return replace(chosen, opacity_logits=opacity.logit(), sh=torch.full((chosen.count, 1, 3), _BLACK))
+
+
+def _fitted(layer: Gaussians, views: list[_View], options: ShadowLayerOptions) -> Gaussians:
+    logits = layer.opacity_logits.clone().requires_grad_()
+    optimizer = torch.optim.Adam([logits], lr=options.learning_rate)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / options.steps))
+    for step in range(options.steps):
+        view = views[step * 7 % len(views)]
+        alpha = render(replace(layer, opacity_logits=logits), view.camera).alpha[0]
+        # weighted by what lies behind, as that is what the layer changes
+        loss = ((alpha - view.darkness) * view.place.mean(-1)).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    done = replace(layer, opacity_logits=logits.detach())
+    return done.select(done.opacities > options.faintest)
+
+
+def _psnr(layer: Gaussians, views: list[_View]) -> float:
+    errors = []
+    for view in views:
+        alpha = render(layer, view.camera).alpha[0][..., None]
+        errors.append((view.place * (1 - alpha) - view.shadowed).square().mean())
+    return float(-10 * torch.log10(torch.stack(errors).mean().clamp_min(1e-10)))

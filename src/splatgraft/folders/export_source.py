@@ -1,0 +1,111 @@
+"""Reads what is to be exported: a scene file, the folder of a result, or a whole project."""
+
+from pathlib import Path
+
+import torch
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.exports.export_source import ExportSource
+from splatgraft.folders.selection_file import read_selection
+from splatgraft.formats import is_scene, read_cameras, read_gaussians, read_scene
+from splatgraft.formats.metric_scale import read_scale
+from splatgraft.formats.placement import read_placement
+from splatgraft.formats.scenes.scene_metadata import SceneMetadata
+from splatgraft.project.layout import (
+    CAMERAS_FILE,
+    IS_OBJECT_FILE,
+    PLACEMENT_FILE,
+    PROJECT_FILE,
+    SCENE_FILE,
+    Layout,
+)
+
+
+def read_export_source(path: Path, *, cameras: Path | None = None) -> ExportSource:
+    """What is known of a scene, a result or a project.
+
+    Args:
+        path: A scene file, a folder with scene.ply, a project's folder or its project.toml. Of a project, and of the
+            folders that `relight` and `consolidate` made in one, the scene before the transfer and its parts are known.
+        cameras: The capture that a scene was made from, in its frame; found in a project.
+
+    Raises:
+        ValueError: There is none of these, or a file is broken.
+    """
+    if path.name == PROJECT_FILE:
+        path = path.parent
+    if not path.exists():
+        raise ValueError(f"{path}: expected a scene, a folder with {SCENE_FILE} or a project, found nothing there")
+    if is_scene(path):
+        return _of_scene(path, cameras)
+    root = project_of(path)
+    if root is not None:
+        last = path if (path / SCENE_FILE).is_file() else _last_result(Layout(root))
+        return _of_project(Layout(root), last, cameras)
+    if (path / SCENE_FILE).is_file():
+        capture = path.parent / "capture"
+        found = capture if cameras is None and (capture / CAMERAS_FILE).is_file() else cameras
+        return _of_scene(path / SCENE_FILE, found)
+    raise ValueError(
+        f"{path}: expected a scene, a folder with {SCENE_FILE} or a project with relit/{SCENE_FILE}, found none of them"
+    )
+
+
+def project_of(path: Path) -> Path | None:
+    """The project whose transfer `path` shows: itself, or the folder of one of its last two results."""
+    for root, result in ((path, path / "relit"), (path.parent, path)):
+        layout = Layout(root)
+        known = result in (layout.relit, layout.result)
+        files = (result / SCENE_FILE, layout.relit / IS_OBJECT_FILE, layout.composite / SCENE_FILE)
+        if known and all(file.is_file() for file in files):
+            return root
+    return None
+
+
+def _last_result(layout: Layout) -> Path:
+    return layout.result if (layout.result / SCENE_FILE).is_file() else layout.relit
+
+
+def _of_scene(path: Path, capture: Path | None) -> ExportSource:
+    scene = read_scene(path)
+    cameras = None if capture is None else read_cameras(capture)
+    metres = None if capture is None else read_scale(capture)
+    up = scene.up if cameras is None else _up(cameras)
+    known = SceneMetadata(up, None if metres is None else metres.metres_per_unit)
+    return ExportSource(scene=scene.gaussians, title=_title(path), cameras=cameras, metadata=known)
+
+
+def _of_project(layout: Layout, last: Path, capture: Path | None) -> ExportSource:
+    """The last result beside the composite; consolidation keeps the order and the number of the relit Gaussians."""
+    scene = read_gaussians(last / SCENE_FILE)
+    is_object = read_selection(layout.relit / IS_OBJECT_FILE, scene.count, last / SCENE_FILE)
+    capture = layout.capture("target") if capture is None else capture
+    cameras = read_cameras(capture) if capture.exists() else None
+    metres = read_scale(capture) if cameras is not None else None
+    place = layout.scene("target") / SCENE_FILE
+    target = read_gaussians(place) if place.is_file() else None
+    if target is not None and (layout.composite / PLACEMENT_FILE).is_file():
+        erased = read_placement(layout.composite / PLACEMENT_FILE).erased
+        target = target if erased is None else target.select(~torch.as_tensor(erased))
+    up = None if cameras is None else _up(cameras)
+    return ExportSource(
+        scene=scene,
+        title=_title(layout.root.resolve()),
+        is_object=is_object,
+        pasted=read_gaussians(layout.composite / SCENE_FILE),
+        place=target,
+        cameras=cameras,
+        metadata=SceneMetadata(up, None if metres is None else metres.metres_per_unit),
+    )
+
+
+def _up(cameras: Cameras) -> tuple[float, float, float]:
+    x, y, z = estimate_up(cameras).tolist()
+    return x, y, z
+
+
+def _title(path: Path) -> str:
+    """The name of a file or folder as words."""
+    name = path.parent.name if path.name == SCENE_FILE and path.parent.name else path.stem
+    return name.replace("_", " ").replace("-", " ").strip().capitalize() or "Scene"

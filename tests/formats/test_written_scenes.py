@@ -1,0 +1,183 @@
+"""Scenes that we write, as the formats' own tools and other programs read them; see golden/written/README.md."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from format_files import random_gaussians
+from scene_writers import parts_of_glb
+from test_scenes_of_other_tools import (
+    BYTE,
+    COMPRESSED,
+    EXACT,
+    GLB,
+    SH_BYTE,
+    SOG,
+    SPLAT,
+    SPZ,
+    TOOLS,
+    assert_within,
+)
+
+from splatgraft import formats
+from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.formats.scenes.spz import write_spz
+
+WRITTEN = Path(__file__).parent / "golden" / "written"
+# one compressed chunk holds all 40; codes for 120 numbers are exact; bands are not rounded to 4 bits as others do
+FINE_SPZ = SPZ | {"means": 1e-6, "bands": 0.5 / 128}
+STEPS = {
+    "scene.ply": EXACT | {"means": 0.0, "dc": 0.0, "bands": 0.0},
+    "scene.compressed.ply": COMPRESSED | {"dc": SH_BYTE},
+    "scene.sog": SOG | {"log_scales": 1e-5, "dc": 1e-5, "opacities": BYTE, "bands": 0.02},
+    "scene.spz": FINE_SPZ,
+    "scene.v3.spz": FINE_SPZ,
+    "scene.v2.spz": FINE_SPZ | {"ellipsoids": 0.2},  # 8 bits of x, y, z; w near 0 is off by the root of twice a step
+    "scene.splat": SPLAT,
+    "scene.glb": GLB,
+}
+BY_SPLAT_TRANSFORM = [name for name in STEPS if name not in ("scene.ply", "scene.glb")]
+SAME = {"means": 1e-6, "log_scales": 1e-6, "ellipsoids": 1e-5, "opacities": 1e-6, "dc": 1e-6, "bands": 1e-6}
+"""The same decoding in float32 and float64."""
+DECODED = dict.fromkeys(BY_SPLAT_TRANSFORM, SAME) | {
+    "scene.v2.spz": SAME | {"ellipsoids": 1e-4},  # w as a root of what is nearly 0
+    "scene.splat": SAME | {"ellipsoids": 0.03},  # it takes a byte b for 2 b / 255 - 1, others for (b - 128) / 128
+}
+
+
+@pytest.fixture(scope="module")
+def original() -> Gaussians:
+    return formats.read_gaussians(TOOLS / "scene.ply")
+
+
+def write(path: Path, gaussians: Gaussians) -> Path:
+    version = {"scene.v2.spz": 2, "scene.v3.spz": 3}.get(path.name)
+    if version is None:
+        formats.write_gaussians(path, gaussians)
+    else:
+        write_spz(path, gaussians, version=version)
+    return path
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_our_reader_finds_the_scene_within_the_steps(original, tmp_path, name):
+    assert_within(original, formats.read_gaussians(write(tmp_path / name, original)), STEPS[name])
+
+
+@pytest.mark.parametrize("name", BY_SPLAT_TRANSFORM)
+def test_the_recorded_tool_read_what_is_written_today(original, tmp_path, name):
+    """Our file of today decodes as the tool decoded the recorded one."""
+    theirs = formats.read_gaussians(WRITTEN / f"{name}.decoded.ply")
+    assert_within(theirs, formats.read_gaussians(write(tmp_path / name, original)), DECODED[name])
+    assert_within(theirs, formats.read_gaussians(WRITTEN / name), DECODED[name])
+
+
+@pytest.mark.parametrize("name", BY_SPLAT_TRANSFORM)
+def test_the_tool_where_it_is_installed(original, tmp_path, name):
+    tool = shutil.which("splat-transform")
+    if tool is None:
+        pytest.skip("splat-transform is not installed: npm install -g @playcanvas/splat-transform")
+    file = write(tmp_path / name, original)
+    subprocess.run([tool, file, tmp_path / "decoded.ply"], check=True, capture_output=True)
+    assert_within(formats.read_gaussians(tmp_path / "decoded.ply"), formats.read_gaussians(file), DECODED[name])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog", ".spz", ".splat", ".glb"])
+def test_every_degree_and_several_chunks(tmp_path, suffix, degree):
+    g = random_gaussians(600, degree)
+    formats.write_gaussians(tmp_path / f"a{suffix}", g)
+    back = formats.read_gaussians(tmp_path / f"a{suffix}")
+    assert back.count == 600
+    assert back.sh_degree == (0 if suffix == ".splat" else degree)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog"])
+def test_up_and_size_are_read_back(tmp_path, suffix):
+    metadata = formats.SceneMetadata(up=(0.0, -0.6, 0.8), metres_per_unit=0.21)
+    formats.write_gaussians(tmp_path / f"a{suffix}", random_gaussians(20), metadata=metadata)
+    found = formats.read_scene(tmp_path / f"a{suffix}")
+    assert found.up == pytest.approx((0, -0.6, 0.8))
+    assert found.metres_per_unit == pytest.approx(0.21)
+    assert any("one unit is 0.21 m" in sentence for sentence in found.said())
+
+
+def test_a_ply_without_metadata_has_the_original_header(tmp_path):
+    formats.write_gaussians(tmp_path / "a.ply", random_gaussians(2, 0))
+    assert b"comment" not in (tmp_path / "a.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "comment", ["up: 0 0 0", "up: 1e99 0 0", "up: a b c", "metres_per_unit: 0", "metres_per_unit: -1"]
+)
+def test_comments_that_state_nothing(tmp_path, comment):
+    formats.write_gaussians(tmp_path / "a.ply", random_gaussians(2, 0))
+    data = (tmp_path / "a.ply").read_bytes().replace(b"element vertex", f"comment {comment}\nelement vertex".encode())
+    (tmp_path / "a.ply").write_bytes(data)
+    found = formats.read_scene(tmp_path / "a.ply")
+    assert found.up is None or comment == "up: 1e99 0 0"
+    assert found.metres_per_unit is None
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".glb", ".sog"])
+def test_no_gaussians_are_refused(tmp_path, suffix):
+    with pytest.raises(ValueError, match=f"a\\{suffix}: expected at least one Gaussian for a"):
+        formats.write_gaussians(tmp_path / f"a{suffix}", empty())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_versions_of_spz_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"a\.spz: expected \.spz version 2, 3 or 4 to write, found 1"):
+        write_spz(tmp_path / "a.spz", random_gaussians(3), version=1)
+
+
+def test_the_glb_is_what_the_specification_asks_for(original, tmp_path):
+    """The JSON beside that of splat-transform 3.7.0, and the values without our reader."""
+    formats.write_gaussians(tmp_path / "a.glb", original)
+    content, binary = parts_of_glb((tmp_path / "a.glb").read_bytes())
+    theirs, _ = parts_of_glb((TOOLS / "scene.glb").read_bytes())
+    ours_primitive, their_primitive = (c["meshes"][0]["primitives"][0] for c in (content, theirs))
+    assert ours_primitive["extensions"] == their_primitive["extensions"]
+    assert set(ours_primitive["attributes"]) == set(their_primitive["attributes"])
+    assert content["extensionsUsed"] == theirs["extensionsUsed"]
+
+    def values(name: str) -> np.ndarray:
+        accessor = content["accessors"][ours_primitive["attributes"][name]]
+        view = content["bufferViews"][accessor["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        if name == "COLOR_0":
+            assert (accessor["componentType"], accessor["normalized"]) == (5121, True)
+            return np.frombuffer(binary, "u1", 160, view["byteOffset"]).reshape(40, 4) / 255
+        assert (accessor["componentType"], accessor["count"], view["byteOffset"] % 4) == (5126, 40, 0)
+        return np.frombuffer(binary, "<f4", 40 * width, view["byteOffset"]).reshape(40, width)
+
+    positions = values("POSITION")
+    accessor = content["accessors"][ours_primitive["attributes"]["POSITION"]]
+    assert accessor["min"] == pytest.approx(positions.min(0))
+    assert accessor["max"] == pytest.approx(positions.max(0))
+    # x left, y up: both turned
+    assert np.allclose(positions, original.means.numpy() * [-1, -1, 1], atol=1e-6)
+    assert np.allclose(values("KHR_gaussian_splatting:SCALE"), original.scales.numpy(), rtol=1e-5)
+    assert np.allclose(values("KHR_gaussian_splatting:OPACITY")[:, 0], original.opacities.numpy(), atol=1e-6)
+    shown = (original.sh[:, 0] * 0.28209479 + 0.5).clamp(0, 1).numpy()
+    assert np.allclose(values("COLOR_0")[:, :3], shown, atol=0.51 / 255)
+    rotation = values("KHR_gaussian_splatting:ROTATION")
+    assert np.allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-5)
+    assert json.dumps(content["asset"]) == '{"version": "2.0", "generator": "splatgraft"}'
+
+
+def test_the_pictures_stay(original, tmp_path):
+    from test_scenes_of_other_tools import cameras
+
+    from splatgraft.rendering import render
+
+    expected = render(original, cameras()).color
+    for name in ("scene.glb", "scene.spz", "scene.sog", "scene.compressed.ply"):
+        found = formats.read_gaussians(write(tmp_path / name, original))
+        error = (render(found, cameras()).color - expected).abs()
+        assert float(error.mean()) < 0.005, name  # steps of a byte, and few Gaussians per pixel
+    assert torch.isfinite(expected).all()
