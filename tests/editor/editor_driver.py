@@ -20,7 +20,8 @@ from PIL import Image
 from waiting import HANG_LIMIT, act_until, wait_until
 
 from splatgraft.editor.jobs.jobs import Jobs
-from splatgraft.editor.session.edit_state import EditState, read_state
+from splatgraft.editor.session.edit_state import EditState
+from splatgraft.editor.session.state_files import read_state
 
 ARGUMENTS = (
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),

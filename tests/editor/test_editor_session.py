@@ -17,8 +17,9 @@ from splatgraft.editor.access.uploads import SCENES, save_upload
 from splatgraft.editor.jobs.exports import export_scene, export_turntable
 from splatgraft.editor.previews.preview import PICTURE_KINDS, PictureSize, wipe_comparison
 from splatgraft.editor.session import placement_operations
-from splatgraft.editor.session.edit_state import EditState, read_state, state_files, write_state
+from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.state_files import read_state, state_files, write_state
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.evaluation.pictures import write_animation
 from splatgraft.formats import read_gaussians

@@ -15,7 +15,7 @@ from splatgraft.editor.access.access_control import LOOPBACK, AccessControl
 from splatgraft.editor.access.uploads import LIMIT_BYTES
 from splatgraft.editor.page.page import Page, PageOptions
 from splatgraft.editor.page.server import GuardedServer
-from splatgraft.editor.session.edit_state import read_state
+from splatgraft.editor.session.state_files import read_state
 
 
 @pytest.fixture

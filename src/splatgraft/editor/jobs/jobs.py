@@ -4,6 +4,7 @@ A lock file shows whether the process of a job is alive.
 """
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -11,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import filelock
 
@@ -142,7 +143,12 @@ class Jobs:
         Raises:
             ValueError: If a job is running already.
         """
-        state = self.state()
+        try:
+            state = self.state()
+        except ValueError:
+            # replaced by that of the new job; a job at work still holds its lock
+            state = None
+            (self.folder / STATE_FILE).unlink(missing_ok=True)
         if state is not None and state.live:
             raise ValueError(f"{state.title}: expected no other job, found this one running; wait or cancel it")
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -188,10 +194,12 @@ class Jobs:
             fields = json.loads((self.folder / STATE_FILE).read_text())
             plan = tuple(PlannedStep(**step) for step in fields.pop("plan", ()))
             took = tuple((str(name), float(seconds)) for name, seconds in fields.pop("took", ()))
-            return JobState(**(fields | {"command": tuple(fields["command"]), "plan": plan, "took": took}))
+            state = JobState(**(fields | {"command": tuple(fields["command"]), "plan": plan, "took": took}))
+            _check_types(state)
+            return state
         except FileNotFoundError:
             return None
-        except (ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{self.folder / STATE_FILE}: expected the state of a job, found {error}") from error
 
     def _is_alive(self, pid: int) -> bool:
@@ -202,6 +210,20 @@ class Jobs:
         except OSError:
             return False
         return True
+
+
+def _check_types(state: JobState) -> None:
+    """Raises: ValueError where a number of the state is none, or the outcome is unknown."""
+    numbers = (state.started, state.done, state.total, state.step_started, state.begun, state.begun_at, state.pid)
+    numbers += (*(step.seconds for step in state.plan), *(seconds for _, seconds in state.took))
+    texts = (state.title, state.step, state.message, state.error, *(step.name for step in state.plan))
+    is_good = (
+        all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
+        and isinstance(state.pid, int)
+        and state.pid > 1
+    )
+    if not is_good or not all(isinstance(x, str) for x in texts) or state.outcome not in get_args(Outcome):
+        raise ValueError("values of another type")
 
 
 def acquire_job_lock(folder: Path) -> filelock.BaseFileLock:

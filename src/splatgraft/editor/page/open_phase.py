@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ import viser
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.editor.access.uploads import SCENES, SUFFIXES, save_upload
 from splatgraft.editor.session.project_access import Triple
-from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.session import Session, backup_of
 from splatgraft.project.layout import Side
 
 if TYPE_CHECKING:
@@ -40,6 +41,9 @@ class OpenPhase:
     def __init__(self, page: Page) -> None:
         """Build the controls."""
         self._page, gui = page, page.gui
+        self._problem = gui.add_html("", visible=False)
+        self._restore = gui.add_button("Put the last good project.toml back", icon=viser.Icon.HISTORY, visible=False)
+        self._restore.on_click(page.callback(lambda _: page.restore_project()))
         self._help = gui.add_markdown(_HELP)
         self._source = gui.add_text("Object from", "", hint="The capture or scene with the object: a path")
         self._target = gui.add_text("Place into", "", hint="The capture or scene that receives it: a path")
@@ -81,9 +85,17 @@ class OpenPhase:
 
     def refresh(self) -> None:
         """Show the fields of a new project, or the facts of the open one."""
-        session = self._page.session
+        session, problem = self._page.session, self._page.problem
+        self._problem.visible = problem is not None
+        self._restore.visible = problem is not None and backup_of(self._page.project.file).has_good()
+        if problem is not None:
+            self._problem.content = (
+                f'<div class="sg-problem" style="font-size:.85em;line-height:1.5;padding:2px 12px">'
+                f"<b>This project cannot be opened:</b><br>{html.escape(problem)}<br>"
+                f"Correct the file; the page opens it as soon as it is saved.</div>"
+            )
         for control in (self._help, self._source, self._target, self._trained, self._uploads, self._start):
-            control.visible = session is None
+            control.visible = session is None and problem is None
         self._facts.visible = self._build.visible = session is not None
         for index, (side, _) in enumerate(_SIDES):
             without_photos = session is not None and session.files.without_photos[index]

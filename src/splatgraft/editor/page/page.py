@@ -1,10 +1,11 @@
 """The editor's page: header, phases, undo buttons, job panel and preview panel, and what the phases share."""
 
+import contextlib
 import html
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -22,7 +23,7 @@ from splatgraft.editor.page.select_phase import SelectPhase
 from splatgraft.editor.page.server import GuardedServer
 from splatgraft.editor.page.windows import Windows
 from splatgraft.editor.session.project_access import Project
-from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.session import Session, backup_of
 
 PHASES = ("Open", "Select", "Place", "Light", "Run")
 _POLL_SECONDS = 0.4
@@ -65,7 +66,11 @@ class Page:
         """Build the page for a project that exists or is about to be created."""
         self.guarded, self.project, self.options = guarded, project, options
         self.server = guarded.viser
-        self.session: Session | None = None if project.files() is None else Session(project)
+        self.session: Session | None = None
+        self.problem: str | None = None
+        """Why project.toml could not be opened; None where it could, or where there is none."""
+        self._seen_project: tuple[int, int] | None = None
+        self._try_session()
         self.view = SceneView(self.server, budget=options.budget)
         self.phase = "Open"
         self._lock = threading.RLock()
@@ -109,16 +114,22 @@ class Page:
             if getattr(event, "client_id", 0) is None:
                 return
             with self._lock:
-                try:
+                with self.reported():
                     work(event)
-                except (ValueError, OSError) as error:
-                    self.say(" ".join(str(error).split()), bad=True)
-                except Exception as error:  # a programming error must be visible and must not end the page
-                    traceback.print_exc()
-                    self.say(f"{type(error).__name__}: {error} (traceback in the terminal)", bad=True)
                 self.refresh()
 
         return call
+
+    @contextlib.contextmanager
+    def reported(self) -> Iterator[None]:
+        """Show an error of the block in the status line instead of raising it."""
+        try:
+            yield
+        except (ValueError, OSError) as error:
+            self.say(" ".join(str(error).split()), bad=True)
+        except Exception as error:  # a programming error must be visible and must not end the page
+            traceback.print_exc()
+            self.say(f"{type(error).__name__}: {error} (traceback in the terminal)", bad=True)
 
     def say(self, sentence: str, *, bad: bool = False) -> None:
         """Show one sentence in the status line."""
@@ -130,18 +141,15 @@ class Page:
     def refresh(self) -> None:
         """Update the current phase, the preview, the header and the undo buttons."""
         with self._lock:
-            try:
+            with self.reported():
                 self._phases[self.phase].refresh()
                 self.preview.update()
-            except (ValueError, OSError) as error:
-                self.say(" ".join(str(error).split()), bad=True)
             self._header.content = self._header_html()
-            history = None if self.session is None else self.session.history
-            self._history_buttons.visible = history is not None and bool(history.past or history.future)
+            self._history_buttons.visible = self.session is not None and self.session.has_steps()
 
     def open_project(self) -> None:
-        """Open the project that was just created."""
-        self.session = Session(self.project)
+        """Open the project that was just created or corrected."""
+        self._try_session()
         self.preview.reset()
         self.show_phase(self._first_phase())
         self._say_notice()
@@ -160,10 +168,8 @@ class Page:
                 self.preview.scene_changed()
                 self.windows.restore_view(self._shown_scene())
             self._status.content = ""
-            try:
+            with self.reported():
                 self._phases[phase].enter()
-            except (ValueError, OSError) as error:
-                self.say(" ".join(str(error).split()), bad=True)
             self.refresh()
 
     def run(self, to: str, title: str) -> None:
@@ -217,6 +223,27 @@ class Page:
         for end in (self.preview.close, *self.on_close):
             end()
 
+    def restore_project(self) -> None:
+        """Put the last project.toml that opened back, and open it.
+
+        Raises:
+            ValueError: If none was kept.
+        """
+        backup_of(self.project.file).restore()
+        self.open_project()
+        if self.session is not None:
+            self.say("the last project.toml that opened is back; the other one is in .editor/broken")
+
+    def _try_session(self) -> None:
+        """Open the project where there is one; what prevents it is kept as `problem`."""
+        self.session, self.problem = None, None
+        self._seen_project = _stamp(self.project.file)
+        try:
+            if self.project.files() is not None:
+                self.session = Session(self.project)
+        except (ValueError, OSError) as error:
+            self.problem = " ".join(str(error).split())
+
     # construction
 
     def _build(self) -> None:
@@ -257,10 +284,16 @@ class Page:
         self.preview = PreviewPanel(self)
 
     def _undo(self) -> None:
-        self.say("undone" if self.require_session().undo() else "nothing to undo")
+        session = self.require_session()
+        session.notice = None
+        self.say("undone" if session.undo() else "nothing to undo")
+        self._say_notice()
 
     def _redo(self) -> None:
-        self.say("redone" if self.require_session().redo() else "nothing to redo")
+        session = self.require_session()
+        session.notice = None
+        self.say("redone" if session.redo() else "nothing to redo")
+        self._say_notice()
 
     def _first_phase(self) -> str:
         if self.session is None:
@@ -276,6 +309,8 @@ class Page:
     def _say_notice(self) -> None:
         if self.session is not None and self.session.notice is not None:
             self.say(self.session.notice, bad=True)
+        elif self.problem is not None:
+            self.say(self.problem, bad=True)
 
     def _header_html(self) -> str:
         where = "no project yet" if self.session is None else str(self.session.files.file.parent.name)
@@ -298,17 +333,21 @@ class Page:
     def _poll_loop(self) -> None:
         while self._open:
             time.sleep(_POLL_SECONDS)
-            with self._lock:
-                try:
-                    self._poll()
-                except (ValueError, OSError) as error:
-                    self.say(" ".join(str(error).split()), bad=True)
+            with self._lock, self.reported():
+                self._poll()
 
     def _poll(self) -> None:
         session = self.session
         if session is None:
+            if self.problem is not None and _stamp(self.project.file) != self._seen_project:
+                self.open_project()
             return
         if session.reload():
             self.say("the project's files were changed outside the editor and were loaded again")
             self.refresh()
         self.job.refresh()
+
+
+def _stamp(file: Path) -> tuple[int, int] | None:
+    """Time and size of a file; None where there is none."""
+    return (file.stat().st_mtime_ns, file.stat().st_size) if file.is_file() else None

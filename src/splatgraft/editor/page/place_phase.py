@@ -23,6 +23,7 @@ from splatgraft.editor.session.gizmo import (
     similarity_from_gizmo,
 )
 from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.state_checks import check_numbers
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.segmentation import Box
@@ -156,8 +157,9 @@ class PlacePhase:
 
     def _numbers_changed(self) -> None:
         session = self._page.require_session()
-        gizmo = Gizmo(self._position.value, quaternion_from_degrees(self._degrees.value), float(self._scale.value))
         self._shown = None  # so that the fields go back to the state where these numbers are refused
+        check_numbers((*self._position.value, *self._degrees.value, self._scale.value), "position, rotation, scale")
+        gizmo = Gizmo(self._position.value, quaternion_from_degrees(self._degrees.value), float(self._scale.value))
         self._set_placement(similarity_from_gizmo(gizmo, session.placeable_object(self._chosen).base.point))
         self._shown = self._current()
 
@@ -304,7 +306,8 @@ class PlacePhase:
             self._page.callback(lambda _: session.change(edited))(None)
         elif ended or now - self._saved > _SAVE_EVERY:
             self._saved = now
-            session.amend(edited)
+            with self._page.reported():
+                session.amend(edited)
         self._page.preview.set_dragged_state(None if ended else edited)
         if ended:
             self._dragging = False
@@ -316,6 +319,11 @@ def show_target(page: Page) -> None:
     session = page.require_session()
     state, view = session.placed_state(), page.view
     target = session.scenes.gaussians(session.files.target_scene)
+    if state.erased is not None and len(state.erased) != target.count:
+        raise ValueError(
+            f"erased.npy: expected one flag per Gaussian of the target, {target.count:,}; found {len(state.erased):,}; "
+            "restore all erased, or undo"
+        )
     shown = None if state.erased is None else session.scenes.complement("erased", state.erased)
     view.show_splats("/target/scene", target, which=shown)
     objects = state.objects or ()
