@@ -100,6 +100,16 @@ class Editor:
         self.url = self.process.stdout.readline().strip()
         assert self.url.startswith("http://"), self.log.read_text()[-2000:]
 
+    @property
+    def base(self) -> str:
+        """The address without the token."""
+        return self.url.partition("?")[0].rstrip("/")
+
+    @property
+    def token(self) -> str:
+        """The token in the address."""
+        return self.url.partition("?token=")[2]
+
     def kill(self) -> None:
         """Kill the process, as a power cut would."""
         self.process.kill()

@@ -18,7 +18,7 @@ from waiting import wait_until
 from splatgraft.cli import main
 from splatgraft.commands.edit import FlowProject
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.access.access_control import LOOPBACK, AccessControl
+from splatgraft.editor.access.access_control import AccessControl
 from splatgraft.editor.jobs.jobs import Jobs, JobState
 from splatgraft.editor.page.page import Page, PageOptions
 from splatgraft.editor.page.server import GuardedServer
@@ -54,7 +54,7 @@ def session(project: Path) -> Session:
 
 
 def page_of(project: Path) -> tuple[Page, Callable[[], None]]:
-    guarded = GuardedServer(AccessControl(hosts=LOOPBACK), host="127.0.0.1", port=0, upload_limit=1000)
+    guarded = GuardedServer(AccessControl("secret"), host="127.0.0.1", port=0, upload_limit=1000)
     page = Page(guarded, FlowProject(project), PageOptions(budget=1000, inside=None))
 
     def close() -> None:

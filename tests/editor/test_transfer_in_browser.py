@@ -197,7 +197,7 @@ def export(window: Window, project: Path, root: Path) -> None:
     digests = [hashlib.sha256(content).hexdigest() for content in (clicked, (again.parent / RESULT).read_bytes())]
     assert digests[0] == digests[1]
     assert read_gaussians(Path(shutil.copy(window.download(".spz"), root / "taken.spz"))).count > 100
-    report = window.page.request.get(window.page.url.rstrip("/") + "/files/index.html")
+    report = window.page.request.get(window.page.url.partition("?")[0].rstrip("/") + "/files/index.html")
     assert report.ok
     assert "<html" in report.text()
-    assert not window.page.request.get(window.page.url.rstrip("/") + "/files/../project.toml").ok
+    assert not window.page.request.get(window.page.url.partition("?")[0].rstrip("/") + "/files/../project.toml").ok

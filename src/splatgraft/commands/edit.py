@@ -34,6 +34,7 @@ from splatgraft.project.layout import (
 from splatgraft.project.step import Positional
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.desktop import open_page
 from splatgraft.workflow.flow import Flow, read_flow
 from splatgraft.workflow.staleness import reasons
 
@@ -146,10 +147,11 @@ class Edit:
     out: Path | None = None
     """Folder of all results; the folder of the project file where not given."""
     host: str = "127.0.0.1"
-    """Address to listen at; beyond loopback the page requires a token and accepts no paths outside the project's
-    folder."""
+    """Address to listen at; beyond loopback the page accepts no paths outside the project's folder."""
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
+    keep_closed: bool = False
+    """Only print the address, where there is a desktop to open it on."""
     budget: int = 300_000
     """Maximum number of Gaussians per scene that the browser shows; files keep all."""
 
@@ -162,16 +164,18 @@ class Edit:
         file = (self.project if is_file else self.project / PROJECT_FILE).absolute()
         file.parent.mkdir(parents=True, exist_ok=True)
         is_loopback = self.host in LOOPBACK
-        token = None if is_loopback else secrets.token_urlsafe(16)
+        token = secrets.token_urlsafe(16)
         out = None if self.out is None else self.out.absolute()
         with locked(file.parent / "edit"):
             access = AccessControl(hosts=LOOPBACK if is_loopback else (), token=token)
             guarded = GuardedServer(access, host=self.host, port=self.port, upload_limit=LIMIT_BYTES)
             project = FlowProject(file, out, console)
             page = Page(guarded, project, PageOptions(budget=self.budget, inside=None if is_loopback else file.parent))
-            query = "" if token is None else f"?token={token}"
-            console.result(f"http://{self.host}:{guarded.port}/{query}")
-            console.say("open this address in a browser; Ctrl-C ends the editor, but not jobs that it started")
+            address = f"http://{self.host}:{guarded.port}/?token={token}"
+            console.result(address)
+            is_opened = is_loopback and not self.keep_closed and open_page(address)
+            wanted = "opened in the browser" if is_opened else "open this address, all of it, in a browser"
+            console.say(f"{wanted}; Ctrl-C ends the editor, but not jobs that it started")
             stop = threading.Event()
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: stop.set())

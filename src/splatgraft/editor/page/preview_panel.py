@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -216,6 +217,9 @@ class PreviewPanel:
         notes = [note, request.session.relighting.light_mode_note() if "Light transfer" in shown else ""]
         if "Photograph" in shown and files.without_photos[1]:
             notes.append("no photograph: an image rendered of the scene, which has no photographs")
+        why = request.session.why_stale("consolidate") if "Result" in shown and files.result.is_file() else None
+        if why is not None:
+            notes.append(f"<b>the result is out of date</b> ({html.escape(why)}): see Run")
         self._say(
             " &middot; ".join(
                 [f"{request.left} | {request.right}", f"{width} x {height}", *filter(None, notes), *problems]

@@ -111,6 +111,8 @@ class GuardedServer:
         if response is not None:
             # no other site may embed this page in a frame (clickjacking)
             response.headers["X-Frame-Options"] = "DENY"
+            # the address holds the token
+            response.headers["Referrer-Policy"] = "no-referrer"
         return response
 
     async def _forward_allowed(self, inner: Callable[..., Any], window: int, message: Any) -> None:
@@ -139,7 +141,7 @@ class GuardedServer:
         reached = "127.0.0.1" if host in ("0.0.0.0", "") else "::1" if host == "::" else host
         probe = http.client.HTTPConnection(reached, self.port, timeout=_PROBE_SECONDS)
         try:
-            probe.request("GET", "/", headers={"Origin": "http://foreign.invalid"})
+            probe.request("GET", f"/?token={self._access.token}", headers={"Origin": "http://foreign.invalid"})
             status = probe.getresponse().status
         finally:
             probe.close()

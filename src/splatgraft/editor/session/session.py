@@ -30,6 +30,8 @@ from splatgraft.project.layout import Side
 from splatgraft.segmentation import Box, add_correction, apply_corrections
 
 EDITOR_FOLDER = ".editor"
+_PROBLEM_STEP = "project"
+"""Entry of `Project.reasons` where project.toml is invalid."""
 _PROJECT = "project.toml"
 """Name of a problem of the whole project file, beside those of single fields of the state."""
 
@@ -344,6 +346,16 @@ class Session:
     def reasons(self) -> Mapping[str, str | None]:
         """For each step why it is stale; None where it is up to date."""
         return self.project.reasons()
+
+    def why_stale(self, step: str) -> str | None:
+        """Why the result of a step is out of date, with the first step that is; None where it is up to date."""
+        found = self.reasons()
+        if step not in found:
+            return found.get(_PROBLEM_STEP)
+        name, reason = step, found[step]
+        while reason is not None and (before := reason.removeprefix("waits for ")) in found and before != reason:
+            name, reason = before, found[before]
+        return None if reason is None else f"{name}: {reason}"
 
 
 def backup_of(project: Path) -> ProjectBackup:
