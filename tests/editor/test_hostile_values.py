@@ -54,7 +54,7 @@ def session(project: Path) -> Session:
 
 
 def page_of(project: Path) -> tuple[Page, Callable[[], None]]:
-    guarded = GuardedServer(AccessControl("secret"), host="127.0.0.1", port=0, upload_limit=1000)
+    guarded = GuardedServer(AccessControl("secret"), host="127.0.0.1", port=0)
     page = Page(guarded, FlowProject(project), PageOptions(budget=1000, inside=None))
 
     def close() -> None:

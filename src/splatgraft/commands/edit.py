@@ -15,7 +15,7 @@ from splatgraft.commands.steps.compose import Compose
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.segment import Segment
 from splatgraft.editor.access.access_control import LOOPBACK, AccessControl
-from splatgraft.editor.access.uploads import LIMIT_BYTES
+from splatgraft.editor.access.uploads import remove_remains
 from splatgraft.editor.session.project_access import ProjectFiles, Triple
 from splatgraft.editor.session.session import EDITOR_FOLDER
 from splatgraft.editor.session.toml_edit import with_keys
@@ -167,8 +167,9 @@ class Edit:
         token = secrets.token_urlsafe(16)
         out = None if self.out is None else self.out.absolute()
         with locked(file.parent / "edit"):
+            remove_remains(file.parent)
             access = AccessControl(hosts=LOOPBACK if is_loopback else (), token=token)
-            guarded = GuardedServer(access, host=self.host, port=self.port, upload_limit=LIMIT_BYTES)
+            guarded = GuardedServer(access, host=self.host, port=self.port)
             project = FlowProject(file, out, console)
             page = Page(guarded, project, PageOptions(budget=self.budget, inside=None if is_loopback else file.parent))
             address = f"http://{self.host}:{guarded.port}/?token={token}"

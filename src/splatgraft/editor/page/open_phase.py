@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import viser
 
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.editor.access.uploads import SCENES, SUFFIXES, save_upload
+from splatgraft.editor.access.uploads import SCENES, SUFFIXES
 from splatgraft.editor.session.project_access import Triple
 from splatgraft.editor.session.session import Session, backup_of
 from splatgraft.project.layout import Side
@@ -60,14 +60,13 @@ class OpenPhase:
         # viser shows upload buttons even where `visible` is false; the folder hides it
         self._uploads = gui.add_folder("From this computer")
         with self._uploads:
-            self._upload = gui.add_upload_button("Upload a video or a scene", icon=viser.Icon.UPLOAD, color="gray")
+            page.add_upload_button("Upload a video or a scene", SUFFIXES, self._uploaded)
         self._start = gui.add_button("Start the project", icon=viser.Icon.PLUS)
         self._facts = gui.add_html("")
         self._looks = {side: gui.add_dropdown(f"Cameras: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}
         self._ups = {side: gui.add_dropdown(f"Up: {side}", tuple(_UPS), visible=False) for side, _ in _SIDES}
         self._build = gui.add_button("Reconstruct both scenes", icon=viser.Icon.PLAYER_PLAY)
         self._start.on_click(page.callback(lambda _: self._create()))
-        self._upload.on_upload(page.callback(self._uploaded))
         for side, _ in _SIDES:
             for control in (self._looks[side], self._ups[side]):
                 control.on_update(page.callback(partial(self._set_view, side)))
@@ -146,9 +145,7 @@ class OpenPhase:
             return
         self._page.say("the project was created; reconstruct both scenes next")
 
-    def _uploaded(self, event: viser.GuiEvent) -> None:
-        file = event.target.value
-        path = save_upload(self._page.project.file.parent, file.name, file.content, suffixes=SUFFIXES)
+    def _uploaded(self, path: Path) -> None:
         fields = (self._source, self._target, *(self._scenes if path.suffix.lower() in SCENES else ()))
         next((field for field in fields if not field.value), fields[-1]).value = str(path)
-        self._page.say(f"{Path(file.name).name}: stored as {path}")
+        self._page.say(f"{path.name}: stored as {path}")

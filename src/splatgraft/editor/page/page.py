@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import viser
 
+from splatgraft.editor.access.uploads import IncomingUpload, UploadRules
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.light_phase import LightPhase
 from splatgraft.editor.page.open_phase import OpenPhase
@@ -21,6 +22,7 @@ from splatgraft.editor.page.run_phase import RunPhase
 from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.select_phase import SelectPhase
 from splatgraft.editor.page.server import GuardedServer
+from splatgraft.editor.page.upload_receiver import UploadButton
 from splatgraft.editor.page.windows import Windows
 from splatgraft.editor.session.project_access import Project
 from splatgraft.editor.session.session import Session, backup_of
@@ -79,9 +81,8 @@ class Page:
         self.windows = Windows(self)
         self._build()
         self.windows.connect()
-        guarded.on_large_upload = lambda name, size: self.say(
-            f"{name}: expected a smaller file, found {size >> 20} MiB; give its path instead", bad=True
-        )
+        guarded.uploads.on_refused = lambda reason: self.say(reason, bad=True)
+        guarded.uploads.on_progress = self._show_upload
         guarded.files = self._report_file
         self.show_phase(self._first_phase())
         self._say_notice()
@@ -201,6 +202,19 @@ class Page:
         self._phases[self.phase].enter()
         self.refresh()
 
+    def add_upload_button(self, label: str, suffixes: tuple[str, ...], on_file: Callable[[Path], None]) -> None:
+        """A button for uploads of files with these suffixes; `on_file` gets the path of a stored one."""
+
+        def store(upload: IncomingUpload) -> None:
+            # a large scene is checked while the page stays usable
+            with self.reported():
+                path = upload.finish()
+                self.callback(lambda _: on_file(path))(None)
+
+        button = self.gui.add_upload_button(label, icon=viser.Icon.UPLOAD, color="gray", mime_type=",".join(suffixes))
+        uploads = UploadButton(lambda: UploadRules(self.project.file.parent, suffixes), store)
+        self.guarded.uploads.register(button, uploads)
+
     def light_ready(self) -> None:
         """Update the light phase after the preview has estimated the light."""
         with self._lock:
@@ -273,6 +287,8 @@ class Page:
             with self._folders[name]:
                 self._phases[name] = kinds[name](self)
         self._status = gui.add_html("")
+        self._cancel_upload = gui.add_button("Cancel the upload", icon=viser.Icon.X, color="red", visible=False)
+        self._cancel_upload.on_click(self.callback(lambda _: self.guarded.uploads.cancel()))
         self._history_buttons = gui.add_button_group("History", _HISTORY)
         self._history_buttons.on_click(
             self.callback(lambda e: self._undo() if e.target.value == _HISTORY[0] else self._redo())
@@ -319,6 +335,13 @@ class Page:
             f'<div class="sg-header" style="{_TEXT_STYLE}"><b style="font-size:1.1em">{html.escape(where)}</b>'
             f'<span style="opacity:.6;float:right">{saved}</span></div>'
         )
+
+    def _show_upload(self, upload: IncomingUpload | None) -> None:
+        self._cancel_upload.visible = upload is not None and not upload.is_complete
+        if upload is not None and upload.is_complete:
+            self.say(f"{upload.path.name}: uploaded, being checked")
+        elif upload is not None:
+            self._cancel_upload.label = f"Cancel the upload ({100 * upload.received // upload.size}%)"
 
     def _report_file(self, name: str) -> Path | None:
         """The file of the report under that name; None for any other path, so that nothing else is served."""

@@ -12,7 +12,7 @@ import torch
 import viser
 
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.access.uploads import SCENES, save_upload
+from splatgraft.editor.access.uploads import SCENES
 from splatgraft.editor.page.box_handles import BoxHandles
 from splatgraft.editor.session import placement_operations
 from splatgraft.editor.session.gizmo import (
@@ -60,7 +60,7 @@ class PlacePhase:
         with gui.add_folder("Another object", expand_by_default=False):
             self._path = gui.add_text("File", "", hint="A trained scene (.ply, .spz, .sog, ...) of the object alone")
             self._add = gui.add_button("Add this file", icon=viser.Icon.PLUS, color="gray")
-            self._upload = gui.add_upload_button("Upload a file", icon=viser.Icon.UPLOAD, color="gray")
+            page.add_upload_button("Upload a file", SCENES, self._add_file)
         with gui.add_folder("Erase from the target", expand_by_default=False):
             self._show_box = gui.add_checkbox("Show the box", False)
             self._erase = gui.add_button("Erase inside the box", icon=viser.Icon.ERASER, color="gray")
@@ -133,7 +133,6 @@ class PlacePhase:
             callback(lambda event: self._duplicate() if event.target.value == "Duplicate" else self._delete())
         )
         self._add.on_click(callback(lambda _: self._add_file(self._page.parse_path(self._path.value))))
-        self._upload.on_upload(callback(self._uploaded))
         self._show_box.on_update(callback(lambda _: self._toggle_box()))
         self._erase.on_click(callback(lambda _: self._erase_box()))
         self._restore.on_click(callback(lambda _: self._restore_all()))
@@ -210,10 +209,6 @@ class PlacePhase:
             rest = (*objects[: self._chosen], *objects[self._chosen + 1 :])
             session.change(replace(session.state, objects=rest))
             self._remove_gizmo()
-
-    def _uploaded(self, event: viser.GuiEvent) -> None:
-        file, root = event.target.value, self._page.require_session().files.file.parent
-        self._add_file(save_upload(root, file.name, file.content, suffixes=SCENES))
 
     def _add_file(self, path: Path) -> None:
         session = self._page.require_session()
