@@ -34,6 +34,8 @@ ARGUMENTS = (
 KNOWN_ERRORS = (
     # viser draws splats on a quad whose corners have no z, so that three.js finds no bounding sphere
     "Computed radius is NaN",
+    # the address of a picture on the canvas, which viser takes back while three.js still reads it
+    "net::ERR_FILE_NOT_FOUND",
     # the controls of three.js, on a touch or a wheel
     "Unable to preventDefault inside passive event listener",
 )

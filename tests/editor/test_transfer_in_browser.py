@@ -86,7 +86,7 @@ def select(window: Window, project: Path) -> None:
     def drag_a_rectangle() -> None:
         # over the upper left part of the image, in the middle of the canvas
         window.page.keyboard.down("Shift")
-        window.drag((640, 300), (60, 400))
+        window.drag((450, 300), (60, 400))
         window.page.keyboard.up("Shift")
 
     window.act_until(drag_a_rectangle, lambda: state_of(project).corrections is not None, what="corrections")
@@ -96,9 +96,9 @@ def select(window: Window, project: Path) -> None:
     selected = history_of(project)["present"]
     window.check("Brush")
     window.says("the brush is on")
-    # the ball is in the middle between the two panels
+    # the ball is in the middle of the canvas
     stroke = "Gaussians under the stroke"
-    window.act_until(lambda: window.page.mouse.click(648, 450), lambda: window.shows(stroke), what="a brush stroke")
+    window.act_until(lambda: window.page.mouse.click(470, 450), lambda: window.shows(stroke), what="a brush stroke")
     window.check("Brush", False)
     window.says("the brush is off")
     window.undo_until(project, lambda: history_of(project)["present"] == selected)

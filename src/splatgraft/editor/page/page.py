@@ -29,6 +29,8 @@ from splatgraft.editor.session.session import Session, backup_of
 
 PHASES = ("Open", "Select", "Place", "Light", "Run")
 _POLL_SECONDS = 0.4
+_PANEL_WIDTH = 372
+"""Pixels; the narrowest at which three numbers are legible beside their label."""
 _CURRENT_MARK = "\u25cf "
 _HISTORY = ("Undo", "Redo")
 _TEXT_STYLE = "font-size:.85em;line-height:1.45;padding:2px 12px"
@@ -265,7 +267,7 @@ class Page:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(224, 122, 46))
         gui.set_panel_label("splatgraft")
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(384)
+        gui.main_panel.set_width(_PANEL_WIDTH)
         self.server.scene.world_axes.visible = False
         self._header = gui.add_html("")
         self._phase_buttons = gui.add_button_group("Step", PHASES)
