@@ -10,7 +10,7 @@ import torch
 from tiny_project import OPTIONS, write_project
 
 from splatgraft.cli import main
-from splatgraft.commands.edit import FlowProject
+from splatgraft.commands.edit_project import FlowProject
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.jobs.exports import export_scene, export_turntable

@@ -16,7 +16,7 @@ from test_typed_numbers import arrives, is_handled
 from waiting import wait_until
 
 from splatgraft.cli import main
-from splatgraft.commands.edit import FlowProject
+from splatgraft.commands.edit_project import FlowProject
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.access.access_control import AccessControl
 from splatgraft.editor.jobs.jobs import Jobs, JobState

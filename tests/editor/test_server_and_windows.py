@@ -55,6 +55,12 @@ def websocket_status(url: str, origin: str | None, query: str = "") -> int:
         return refused.response.status_code
 
 
+def test_the_page_is_served_before_torch_is_loaded() -> None:
+    source = "import sys, splatgraft.commands.edit, splatgraft.editor.page.server; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
 def test_foreign_origins_hosts_and_paths_are_refused(editor: Editor, project: Path) -> None:
     own, query = editor.base, f"/?token={editor.token}"
     assert len(editor.token) > 20

@@ -10,7 +10,7 @@ from test_hostile_values import made, page_of, project
 from viser import GuiEvent
 
 from splatgraft.cli import main
-from splatgraft.commands.edit import FlowProject
+from splatgraft.commands.edit_project import FlowProject
 from splatgraft.editor.session.session import Session
 from splatgraft.relighting import LayerWeights
 

@@ -50,9 +50,11 @@ def test_a_transfer_from_photographs_to_the_exported_scene(browser: Any, tmp_pat
 def start_project(window: Window, root: Path) -> None:
     window.write("Object from", str(root / "photos" / "nowhere"))
     window.write("Place into", str(root / "photos" / "target"))
-    window.click("Start the project")
-    window.says("expected photos, a video, a posed capture or a scene, found nothing")
+    # it says what a path is before anything is made of it
+    window.says("expected a file or a folder, found nothing there")
+    assert window.page.get_by_role("button", name="Start the project").is_disabled()
     window.write("Object from", str(root / "photos" / "source"))
+    window.says("a capture of 8 images with poses")
     window.click("Start the project")
     window.says("the project was created")
     project = root / "project" / "project.toml"

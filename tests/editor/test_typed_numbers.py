@@ -10,7 +10,7 @@ from test_scenes_without_photos import AROUND_THE_BALL, scene_project
 from viser import GuiEvent
 
 from splatgraft.cli import main
-from splatgraft.commands.edit import FlowProject
+from splatgraft.commands.edit_project import FlowProject
 from splatgraft.editor.access.access_control import AccessControl
 from splatgraft.editor.page.page import Page, PageOptions
 from splatgraft.editor.page.server import GuardedServer

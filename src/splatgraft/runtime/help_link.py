@@ -80,6 +80,7 @@ _SECTIONS = {
     "folders.evaluated_scenes": "consolidate-and-evaluate",
     "commands.scale": "compose-and-placementjson",
     "commands.edit": "editor",
+    "commands.edit_project": "editor",
     "editor": "editor",
     "commands.evaluate_benchmark": "synthetic-scenes-and-the-benchmark",
     "commands.evaluate_paper": "synthetic-scenes-and-the-benchmark",

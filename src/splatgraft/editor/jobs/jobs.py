@@ -21,6 +21,8 @@ from splatgraft.runtime.atomic_file import atomic_write
 STATE_FILE, LOG_FILE, LOCK_FILE = "job.json", "job.log", "job.lock"
 Outcome = Literal["starting", "running", "done", "failed", "cancelled", "killed"]
 _LIVE = ("starting", "running")
+_LEAST_SPENT = 2.0
+"""Seconds after which a counter's rate is taken for measured."""
 
 
 @dataclass(frozen=True)
@@ -82,40 +84,32 @@ class JobState:
 
 
 def seconds_left(state: JobState, now: float) -> float | None:
-    """Seconds until the running step's counter is complete, extrapolated; None at its end and where it is too early."""
+    """Seconds until the running step's counter is complete, by the rate since it began; None where it is too early."""
     spent, done = now - state.begun_at, state.done - state.begun
-    if not state.live or not 0 < done < state.total - state.begun or spent < 1:
+    if not state.live or not 0 < done < state.total - state.begun or spent < _LEAST_SPENT:
         return None
     return spent * (state.total - state.done) / done
 
 
 def seconds_left_in_job(state: JobState, now: float) -> float | None:
-    """Seconds until the job ends; None where it is too early to estimate.
+    """Seconds until the job ends; None unless each part of it was measured.
 
-    Later steps count with their measured durations. Default durations are scaled by the ratio of actual to default
-    duration of this run's steps, the running one included as far as its progress allows.
+    The running step counts by its rate, or by its duration in the last run while it has no rate yet; later steps by
+    their durations in the last run.
     """
     names = [step.name for step in state.plan]
     if not state.live or state.step not in names:
         return None
     at = names.index(state.step)
     current, later = state.plan[at], state.plan[at + 1 :]
-    left, spent = seconds_left(state, now), now - state.step_started
-    if left is None and not current.is_measured and at == 0:
+    left = seconds_left(state, now)
+    if current.is_measured:
+        # the counter may be one of several of this step
+        expected = current.seconds - (now - state.step_started)
+        left = max(left or 0.0, expected) if expected > 0 else left
+    if left is None or not all(step.is_measured for step in later):
         return None
-    factor = _time_factor(state, None if left is None else spent + left)
-    expected = current.seconds * (1.0 if current.is_measured else factor) - spent
-    # the counter may be one of several of this step
-    left = max(left or 0.0, expected if left is None or current.is_measured else 0.0)
-    return left + sum(step.seconds * (1.0 if step.is_measured else factor) for step in later)
-
-
-def _time_factor(state: JobState, current: float | None) -> float:
-    """Ratio of actual to default duration of this run's steps without a measured duration; 1 where not known."""
-    took = dict(state.took) | ({} if current is None else {state.step: current})
-    defaults = {step.name: step.seconds for step in state.plan if not step.is_measured and step.name in took}
-    expected = sum(defaults.values())
-    return sum(took[name] for name in defaults) / expected if expected > 0 else 1.0
+    return left + sum(step.seconds for step in later)
 
 
 def write_state(folder: Path, state: JobState) -> None:

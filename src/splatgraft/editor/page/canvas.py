@@ -15,9 +15,9 @@ _JPEG_QUALITY = 90
 class Canvas:
     """Shows a picture with its depth in a window, or the splats again."""
 
-    def __init__(self, view: SceneView) -> None:
-        """Show the splats of `view` in all windows."""
-        self._view = view
+    def __init__(self, server: viser.ViserServer, view: SceneView) -> None:
+        """Show the splats of `view` in all windows of a server."""
+        self._server, self._view = server, view
         self._window: viser.ClientHandle | None = None
         self._lock = threading.Lock()
 
@@ -54,7 +54,7 @@ class Canvas:
 
     def _show_splats(self) -> None:
         window, self._window = self._window, None
-        if window is not None:
+        if window is not None and window.client_id in self._server.get_clients():
             with window.atomic():
                 window.scene.set_background_image(None)
                 self._set_splats_visible(window, True)

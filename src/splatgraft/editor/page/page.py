@@ -250,6 +250,25 @@ class Page:
         if self.session is not None:
             self.say("the last project.toml that opened is back; the other one is in .editor/broken")
 
+    def leave_project(self) -> None:
+        """Set the project's edits aside, so that other captures can be named; `return_to_project` puts them back.
+
+        Raises:
+            ValueError: If a job is running.
+        """
+        self.require_session().set_aside()
+        self._phases[self.phase].leave()
+        self.open_project()
+
+    def return_to_project(self) -> None:
+        """Open the project that was set aside.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        backup_of(self.project.file).bring_back()
+        self.open_project()
+
     def _try_session(self) -> None:
         """Open the project where there is one; what prevents it is kept as `problem`."""
         self.session, self.problem = None, None

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 _SOURCE_KINDS: tuple[PictureKind, PictureKind] = ("Source", "Object alone")
-_DRAFT_LIMIT = 0.8
+_DRAFT_LIMIT = 1.5
 """Seconds; where drafts of the light take longer, images without the light transfer are shown first."""
 _REST_SECONDS = 0.1
 """How long the camera stands still before its picture is drawn; browsers report a moving one more often."""
@@ -87,7 +87,7 @@ class PreviewPanel:
         self._dragged_state: EditState | None = None
         self._draft_seconds, self._relight_seconds, self._picture_seconds = float("inf"), 0.0, 0.0
         self._light_note = ""
-        self.canvas = Canvas(page.view)
+        self.canvas = Canvas(page.server, page.view)
         self._shown_pose: bytes = b""
         self._canvas_size: tuple[float, int] = (0.0, 0)
         self.on_drawn: Callable[[str, float], None] = lambda stage, seconds: None

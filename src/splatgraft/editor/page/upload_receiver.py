@@ -1,13 +1,17 @@
 """Receives the uploads of viser's upload buttons: viser itself would collect them in memory and join them there."""
 
+from __future__ import annotations
+
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import viser
 from viser import _messages
 
-from splatgraft.editor.access.uploads import IncomingUpload, UploadRules
+if TYPE_CHECKING:
+    from splatgraft.editor.access.uploads import IncomingUpload, UploadRules
 
 UPLOAD_MESSAGES = (_messages.FileTransferStartUpload, _messages.FileTransferPart)
 _HIDE_AFTER = 0.5
@@ -65,6 +69,9 @@ class UploadReceiver:
             self.cancel()
 
     def _start(self, window: int, message: _messages.FileTransferStartUpload) -> None:
+        # it loads torch, which takes seconds, and the server starts before that
+        from splatgraft.editor.access.uploads import IncomingUpload
+
         button, uploads = message.source_component_uuid, self._buttons.get(message.source_component_uuid)
         try:
             if uploads is None:

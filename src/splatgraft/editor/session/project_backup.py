@@ -6,7 +6,7 @@ from pathlib import Path
 
 from splatgraft.runtime.atomic_file import atomic_write
 
-_GOOD_FILE, _BROKEN_FOLDER = "project.toml", "broken"
+_GOOD_FILE, _BROKEN_FOLDER, _ASIDE_FOLDER = "project.toml", "broken", "aside"
 
 
 class ProjectBackup:
@@ -53,3 +53,35 @@ class ProjectBackup:
             if file.is_file():
                 shutil.copy2(file, folder / file.name)
         return folder
+
+    def move_aside(self, files: Iterable[Path]) -> None:
+        """Move the files and folders of the edits out of the project, in place of those moved earlier."""
+        aside = self._folder / _ASIDE_FOLDER
+        shutil.rmtree(aside, ignore_errors=True)
+        aside.mkdir(parents=True)
+        for file in files:
+            if file.exists():
+                # the folder of the editor is inside that of the project
+                place = aside / file.relative_to(self._project.parent)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.move(file, place)
+
+    def has_aside(self) -> bool:
+        """Whether a project was moved aside."""
+        return (self._folder / _ASIDE_FOLDER / self._project.name).is_file()
+
+    def bring_back(self) -> None:
+        """Put what was moved aside back.
+
+        Raises:
+            ValueError: If there is nothing, or another project has been made meanwhile.
+        """
+        aside = self._folder / _ASIDE_FOLDER
+        if not self.has_aside() or self._project.is_file():
+            found = "another project" if self._project.is_file() else "none"
+            raise ValueError(f"{self._project}: expected a project that was set aside, found {found}")
+        for file in sorted(path for path in aside.rglob("*") if path.is_file()):
+            place = self._project.parent / file.relative_to(aside)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(file, place)
+        shutil.rmtree(aside)

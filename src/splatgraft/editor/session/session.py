@@ -124,6 +124,17 @@ class Session:
         with self._lock:
             return self._step(History.redone)
 
+    def set_aside(self) -> None:
+        """Move project.toml, all edits and their history aside; results stay. The session must not be used again.
+
+        Raises:
+            ValueError: If a job is running.
+        """
+        job = self.job()
+        if job is not None and job.live:
+            raise ValueError(f"{job.title}: expected no job at work, found this one; wait or cancel it")
+        self._backup.move_aside((*state_files(self.files.file), *self._store.paths()))
+
     def _step(self, move: Callable[[History[str]], History[str]]) -> bool:
         """Move in the history to the next state that can be read."""
         history = self.history

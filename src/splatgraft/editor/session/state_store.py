@@ -97,6 +97,10 @@ class StateStore:
         with atomic_write(self._folder / HISTORY_FILE) as stream:
             stream.write(json.dumps(record).encode())
 
+    def paths(self) -> tuple[Path, ...]:
+        """The file of the history and the folder of the states."""
+        return self._folder / HISTORY_FILE, self._folder / STATES_FOLDER
+
     def _path(self, name: str, suffix: str) -> Path:
         return self._folder / STATES_FOLDER / f"{name}{suffix}"
 
