@@ -106,7 +106,6 @@ def _dispatch(words: list[str]) -> int:
         command, rest = "run", [rest[0], "--to", command]  # `reconstruct project.toml`: the project up to there
     import tyro
 
-    from splatgraft.project.step import perform
     from splatgraft.runtime.console import Console
 
     console, module = Console(), importlib.import_module(module_of(command))
@@ -120,6 +119,9 @@ def _dispatch(words: list[str]) -> int:
     )
     if hasattr(options, "execute"):
         return options.execute(console)
+    # steps load torch, which takes seconds
+    from splatgraft.project.step import perform
+
     console.result(perform(options, console))
     return 0
 

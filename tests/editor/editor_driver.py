@@ -20,7 +20,8 @@ from PIL import Image
 from waiting import HANG_LIMIT, act_until, wait_until
 
 from splatgraft.editor.jobs.jobs import Jobs
-from splatgraft.editor.session.edit_state import EditState, read_state
+from splatgraft.editor.session.edit_state import EditState
+from splatgraft.editor.session.state_files import read_state
 
 ARGUMENTS = (
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
@@ -33,6 +34,8 @@ ARGUMENTS = (
 KNOWN_ERRORS = (
     # viser draws splats on a quad whose corners have no z, so that three.js finds no bounding sphere
     "Computed radius is NaN",
+    # the address of a picture on the canvas, which viser takes back while three.js still reads it
+    "net::ERR_FILE_NOT_FOUND",
     # the controls of three.js, on a touch or a wheel
     "Unable to preventDefault inside passive event listener",
 )
@@ -98,6 +101,16 @@ class Editor:
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().strip()
         assert self.url.startswith("http://"), self.log.read_text()[-2000:]
+
+    @property
+    def base(self) -> str:
+        """The address without the token."""
+        return self.url.partition("?")[0].rstrip("/")
+
+    @property
+    def token(self) -> str:
+        """The token in the address."""
+        return self.url.partition("?token=")[2]
 
     def kill(self) -> None:
         """Kill the process, as a power cut would."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from splatgraft.editor.access.access_control import COOKIE, AccessControl
+from splatgraft.editor.access.access_control import AccessControl, cookie_name
 from splatgraft.editor.access.edit_lock import EditLock
 
 HERE = {"Host": "127.0.0.1:8080"}
@@ -11,7 +11,9 @@ PAGE = HERE | {"Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
 
 def test_the_page_s_own_requests_are_accepted() -> None:
     for headers in (HERE, PAGE, {"Host": "localhost:8080"}, {"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}):
-        assert AccessControl().check(headers, "/").allowed, headers
+        assert AccessControl("secret").check(headers, "/?token=secret").allowed, headers
+        # programs of other users of the machine can send the same headers
+        assert not AccessControl("secret").check(headers, "/").allowed, headers
 
 
 @pytest.mark.parametrize(
@@ -31,11 +33,11 @@ def test_the_page_s_own_requests_are_accepted() -> None:
     ],
 )
 def test_foreign_requests_are_refused(headers: dict[str, str]) -> None:
-    assert not AccessControl().check(headers, "/").allowed
+    assert not AccessControl("secret").check(headers, "/?token=secret").allowed
 
 
 def test_other_machines_need_the_token_and_keep_it_as_a_cookie() -> None:
-    access = AccessControl(hosts=(), token="secret")
+    access, cookie = AccessControl(hosts=(), token="secret"), "splatgraft_token_8080"
     remote = {"Host": "studio.lan:8080"}
     assert not access.check(remote, "/").allowed
     assert not access.check(remote, "/?token=other").allowed
@@ -43,14 +45,23 @@ def test_other_machines_need_the_token_and_keep_it_as_a_cookie() -> None:
     assert decision.allowed
     assert decision.cookie is not None
     assert "HttpOnly" in decision.cookie
-    assert access.check(remote | {"Cookie": f"a=b; {COOKIE}=secret"}, "/assets/x.js").allowed
-    assert not access.check(remote | {"Cookie": f"{COOKIE}=other"}, "/").allowed
-    assert not access.check(remote | {"Origin": "http://evil.example", "Cookie": f"{COOKIE}=secret"}, "/").allowed
+    assert access.check(remote | {"Cookie": f"a=b; {cookie}=secret"}, "/assets/x.js").allowed
+    assert not access.check(remote | {"Cookie": f"{cookie}=other"}, "/").allowed
+    assert not access.check(remote | {"Origin": "http://evil.example", "Cookie": f"{cookie}=secret"}, "/").allowed
 
 
-def test_a_server_beyond_loopback_needs_a_token() -> None:
+def test_a_server_needs_a_token() -> None:
     with pytest.raises(ValueError, match="token"):
-        AccessControl(hosts=())
+        AccessControl("", hosts=())
+
+
+def test_two_editors_on_one_host_have_a_cookie_each() -> None:
+    names = [cookie_name(host) for host in ("127.0.0.1:8080", "127.0.0.1:8081", "[::1]:8080", "studio.lan")]
+    assert names == [f"splatgraft_token_{key}" for key in (8080, 8081, 8080, "default")]
+    both = "; ".join(f"{name}={token}" for name, token in zip(names[:2], ("first", "second"), strict=True))
+    for port, token in ((8080, "first"), (8081, "second")):
+        headers = {"Host": f"127.0.0.1:{port}", "Cookie": both}
+        assert AccessControl(token).check(headers, "/").allowed
 
 
 def test_one_window_holds_the_edit_lock_until_it_closes_or_another_takes_it() -> None:

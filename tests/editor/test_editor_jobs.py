@@ -101,22 +101,26 @@ def test_units_of_an_earlier_run_do_not_count_for_the_speed() -> None:
     assert seconds_left(state, 120.0) == 80.0
 
 
-def test_the_job_s_remaining_time_uses_measured_durations_and_scales_default_ones() -> None:
-    plan = (PlannedStep("a", 10.0, True), PlannedStep("b", 4.0, False), PlannedStep("c", 6.0, False))
+def test_the_job_s_remaining_time_is_measured_or_not_said() -> None:
+    plan = (PlannedStep("a", 10.0, True), PlannedStep("b", 4.0, True), PlannedStep("c", 6.0, True))
     state = JobState("work", (), 1, "running", 0.0, step="a", step_started=100.0, plan=plan)
     assert seconds_left_in_job(state, 103.0) == 7.0 + 4.0 + 6.0
-    # progress of the running step is used; a measured step does not scale the default durations
+    # the rate of the running step counts where it is slower than in the last run
     assert seconds_left_in_job(replace(state, done=1, total=4, begun_at=100.0), 105.0) == 15.0 + 4.0 + 6.0
     # the counter may be one of several of the step
     assert seconds_left_in_job(replace(state, done=3, total=4, begun_at=100.0), 103.0) == 7.0 + 4.0 + 6.0
-    # b takes twice its default duration, so c is expected to do so as well
-    later = replace(state, step="b", step_started=110.0, begun_at=110.0, done=1, total=2, took=(("a", 10.0),))
-    assert seconds_left_in_job(later, 114.0) == 4.0 + 12.0
-    assert seconds_left_in_job(replace(later, step="c", took=(("a", 10.0), ("b", 8.0)), done=0), 111.0) == 11.0
+    # a default duration of a later step is a guess
+    guessed = (*plan[:2], PlannedStep("c", 6.0, False))
+    assert seconds_left_in_job(replace(state, plan=guessed), 103.0) is None
+    # a step without a measured duration counts by its rate alone
+    later = replace(state, plan=(PlannedStep("b", 4.0, False), plan[2]), step="b", step_started=110.0)
+    assert seconds_left_in_job(later, 114.0) is None
+    later = replace(later, begun_at=110.0, done=1, total=2)
+    assert seconds_left_in_job(later, 114.0) == 4.0 + 6.0
+    # longer than in the last run, and no rate
+    assert seconds_left_in_job(replace(state, step="c"), 120.0) is None
     # at the end of a counter the rest is not known
     assert seconds_left(replace(later, done=2), 114.0) is None
-    # unknown: a first step without measured duration, a missing plan, a finished job
-    assert seconds_left_in_job(replace(state, plan=plan[1:], step="b"), 103.0) is None
     assert seconds_left_in_job(replace(state, plan=()), 103.0) is None
     assert seconds_left_in_job(replace(state, outcome="done"), 103.0) is None
 

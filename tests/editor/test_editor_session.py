@@ -10,15 +10,15 @@ import torch
 from tiny_project import OPTIONS, write_project
 
 from splatgraft.cli import main
-from splatgraft.commands.edit import FlowProject
+from splatgraft.commands.edit_project import FlowProject
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.access.uploads import SCENES, save_upload
 from splatgraft.editor.jobs.exports import export_scene, export_turntable
 from splatgraft.editor.previews.preview import PICTURE_KINDS, PictureSize, wipe_comparison
 from splatgraft.editor.session import placement_operations
-from splatgraft.editor.session.edit_state import EditState, read_state, state_files, write_state
+from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.state_files import read_state, state_files, write_state
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.evaluation.pictures import write_animation
 from splatgraft.formats import read_gaussians
@@ -220,19 +220,6 @@ def test_the_previewed_light_equals_the_step_s_result(session: Session, light: L
 @pytest.mark.parametrize(("seconds", "wanted"), [(0.3, 480), (0.28, 480), (1.2, 240), (0.02, 800), (60.0, 192)])
 def test_the_preview_size_adapts_to_the_rendering_time(seconds: float, wanted: int) -> None:
     assert PictureSize().adapted(seconds) == wanted
-
-
-def test_uploads_are_read_before_they_are_stored(session: Session, tmp_path: Path) -> None:
-    content = session.files.object.read_bytes()
-    kept = save_upload(tmp_path, "../../my ball.ply", content, suffixes=SCENES)
-    assert kept == tmp_path / "uploads" / "my_ball.ply"
-    assert kept.read_bytes() == content
-    with pytest.raises(ValueError, match=r"my_ball\.ply"):
-        save_upload(tmp_path, "my ball.ply", b"ply\nnonsense", suffixes=SCENES)
-    assert kept.read_bytes() == content
-    with pytest.raises(ValueError, match="ends in"):
-        save_upload(tmp_path, "page.html", b"<html>", suffixes=SCENES)
-    assert sorted(p.name for p in kept.parent.iterdir()) == ["my_ball.ply"]
 
 
 @pytest.mark.parametrize("light_mode", ["gain", "off"])

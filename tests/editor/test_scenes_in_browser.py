@@ -93,11 +93,11 @@ def strokes(project: Path) -> tuple[int, int]:
 def paint(window: Window, project: Path) -> None:
     window.page.keyboard.press("b")
     window.says("the brush is on")
-    # the ball is in the middle between the two panels; a click, then a drag over it
-    click = partial(window.page.mouse.click, 648, 450)
+    # the ball is in the middle of the canvas; a click, then a drag over it
+    click = partial(window.page.mouse.click, 470, 450)
     window.act_until(click, lambda: strokes(project)[1] > 0, what="a click of the brush")
     one = strokes(project)[1]
-    drag = partial(window.drag, (600, 430), (100, 40))
+    drag = partial(window.drag, (422, 430), (100, 40))
     window.act_until(drag, lambda: strokes(project)[1] > one, what="a stroke of the brush")
     window.page.keyboard.press("b")
     window.says("the brush is off")

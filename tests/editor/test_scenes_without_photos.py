@@ -8,7 +8,7 @@ import torch
 from tiny_project import ball, plane
 
 from splatgraft.cli import main
-from splatgraft.commands.edit import FlowProject
+from splatgraft.commands.edit_project import FlowProject
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import concatenate
 from splatgraft.editor.session.session import Session

@@ -10,20 +10,19 @@ from test_scenes_without_photos import AROUND_THE_BALL, scene_project
 from viser import GuiEvent
 
 from splatgraft.cli import main
-from splatgraft.commands.edit import FlowProject
-from splatgraft.editor.access.access_control import LOOPBACK, AccessControl
-from splatgraft.editor.access.uploads import LIMIT_BYTES
+from splatgraft.commands.edit_project import FlowProject
+from splatgraft.editor.access.access_control import AccessControl
 from splatgraft.editor.page.page import Page, PageOptions
 from splatgraft.editor.page.server import GuardedServer
-from splatgraft.editor.session.edit_state import read_state
+from splatgraft.editor.session.state_files import read_state
 
 
 @pytest.fixture
 def page(tmp_path: Path) -> Iterator[Page]:
     project = scene_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, mask_source="box")
     assert main(["run", str(project), "--to", "compose"]) == 0
-    access = AccessControl(hosts=LOOPBACK, token=None)
-    guarded = GuardedServer(access, host="127.0.0.1", port=0, upload_limit=LIMIT_BYTES)
+    access = AccessControl("secret")
+    guarded = GuardedServer(access, host="127.0.0.1", port=0)
     made = Page(guarded, FlowProject(project), PageOptions(budget=1000, inside=None))
     yield made
     made.close()

@@ -9,7 +9,7 @@ from splatgraft.capture.pose_report import POSE_REPORT_FILE, PoseReport, Unposed
 from splatgraft.capture.scene_fit import misfit_of
 from splatgraft.capture.structure_from_motion import PoseOptions, pose_photos
 from splatgraft.capture.usable_views import readable_views, usable_masks, usable_photos, usable_views
-from splatgraft.capture.video import extract_frames
+from splatgraft.capture.video import VideoFacts, extract_frames, read_video_facts
 from splatgraft.capture.view_coverage import CoverageRule, median_parallax_deg, require_coverage
 from splatgraft.capture.virtual_cameras import (
     VirtualCameraOptions,
@@ -29,6 +29,7 @@ __all__ = [
     "PoseOptions",
     "PoseReport",
     "Unposed",
+    "VideoFacts",
     "VirtualCameraOptions",
     "VirtualCameras",
     "drawn_pictures",
@@ -39,6 +40,7 @@ __all__ = [
     "place_virtual_cameras",
     "pose_photos",
     "read_pose_report",
+    "read_video_facts",
     "readable_views",
     "render_pictures",
     "require_coverage",

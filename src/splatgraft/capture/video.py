@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -106,6 +107,40 @@ def _write(video: Path, folder: Path, chosen: set[int], progress: Progress) -> l
                 if not cv2.imwrite(str(paths[-1]), frame):
                     raise ValueError(f"{paths[-1]}: expected to write a frame here, found no way to")
     return paths
+
+
+@dataclass(frozen=True)
+class VideoFacts:
+    """What a video file says about itself."""
+
+    frames: int
+    """Number of frames as announced; 0 where it announces none."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    seconds: float
+    """Duration; 0 where it announces no frames."""
+
+
+def read_video_facts(video: Path) -> VideoFacts:
+    """Read the header and the first frame of a video.
+
+    Args:
+        video: The file.
+
+    Raises:
+        ValueError: There is no such file, OpenCV cannot read it, or it announces fewer than three frames.
+    """
+    with _opened(video) as capture:
+        is_read, frame = capture.read()
+        frames = _announced(capture)
+        if not is_read or 0 < frames < _LEAST_FRAMES:
+            found = f"{frames}" if is_read else "none that can be read"
+            raise ValueError(f"{video}: expected a video of at least {_LEAST_FRAMES} frames, found {found}")
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        seconds = frames / rate if math.isfinite(rate) and rate > 0 else 0.0
+        return VideoFacts(frames, frame.shape[1], frame.shape[0], seconds)
 
 
 @contextmanager

@@ -1,177 +1,66 @@
 """The command `edit`: the web editor on a project."""
 
-import os
 import secrets
 import signal
-import sys
 import threading
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from splatgraft.commands.init import Init
-from splatgraft.commands.steps.capture import Capture
-from splatgraft.commands.steps.compose import Compose
-from splatgraft.commands.steps.relight import Relight
-from splatgraft.commands.steps.segment import Segment
+import tyro
+
 from splatgraft.editor.access.access_control import LOOPBACK, AccessControl
-from splatgraft.editor.access.uploads import LIMIT_BYTES
-from splatgraft.editor.session.project_access import ProjectFiles, Triple
-from splatgraft.editor.session.session import EDITOR_FOLDER
-from splatgraft.editor.session.toml_edit import with_keys
-from splatgraft.formats import is_scene
 from splatgraft.project.folder_lock import locked
-from splatgraft.project.layout import (
-    CAMERAS_FILE,
-    LIGHT_FILE,
-    PLACEMENT_FILE,
-    PROJECT_FILE,
-    SCENE_FILE,
-    SELECTION_FILE,
-    SURROUNDINGS_FILE,
-    Side,
-)
-from splatgraft.project.step import Positional
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.flow import Flow, read_flow
-from splatgraft.workflow.staleness import reasons
-
-
-@dataclass(frozen=True)
-class FlowProject:
-    """A project as the editor needs it (`editor.session.project_access.Project`), implemented by the project's flow."""
-
-    file: Path
-    """project.toml; it need not exist yet."""
-    out: Path | None = None
-    """Folder of all results; None: the folder of project.toml."""
-    console: Console = field(default_factory=Console)
-    """For messages."""
-
-    def files(self) -> ProjectFiles | None:
-        """The project's files; None where project.toml does not exist yet.
-
-        Raises:
-            ValueError: If project.toml is invalid.
-        """
-        if not self.file.is_file():
-            return None
-        flow = read_flow(self.file, self.out)
-        layout = flow.layout
-        segment, compose, relight = (flow.steps[name] for name in ("segment", "compose", "relight"))
-        assert isinstance(segment, Segment)
-        assert isinstance(compose, Compose)
-        assert isinstance(relight, Relight)
-        return ProjectFiles(
-            file=self.file,
-            root=layout.root,
-            source_scene=segment.scene,
-            target_scene=compose.target,
-            source_cameras=layout.capture("source") / CAMERAS_FILE,
-            target_cameras=layout.capture("target") / CAMERAS_FILE,
-            target_capture=layout.capture("target"),
-            object=compose.object,
-            surroundings=layout.object / SURROUNDINGS_FILE,
-            selection=layout.object / SELECTION_FILE,
-            composite=layout.composite / SCENE_FILE,
-            placement=layout.composite / PLACEMENT_FILE,
-            relit=layout.relit / SCENE_FILE,
-            light=layout.relit / LIGHT_FILE,
-            result=layout.result / SCENE_FILE,
-            report=layout.report,
-            without_photos=(_has_no_photos(flow, "source"), _has_no_photos(flow, "target")),
-            light_mode=relight.light,
-            relight_options=relight.options,
-            place_options=compose.options,
-        )
-
-    def reasons(self) -> Mapping[str, str | None]:
-        """For each step why it is stale, as in `status`; one entry with the error where project.toml is invalid."""
-        try:
-            return reasons(read_flow(self.file, self.out))
-        except ValueError as error:
-            return {"project": str(error)}
-
-    def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
-        """Write project.toml.
-
-        Raises:
-            ValueError: If a capture or a scene is missing, or project.toml exists.
-        """
-        for scene in scenes:
-            if scene is not None and not scene.is_file():
-                raise ValueError(f"{scene}: expected a trained scene, found no such file")
-        Init(folder=self.file.parent, source=captures[0], target=captures[1]).execute(self.console)
-        text = self.file.read_text(encoding="utf-8")
-        for side, scene in zip(("source", "target"), scenes, strict=True):
-            if scene is not None:
-                text = with_keys(text, side, {"scene": os.path.relpath(scene, self.file.parent)})
-        with atomic_write(self.file) as stream:
-            stream.write(text.encode())
-
-    def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
-        """Set how images of a scene without photographs are rendered."""
-        text = with_keys(self.file.read_text(encoding="utf-8"), side, {"up": up, "look": look})
-        with atomic_write(self.file) as stream:
-            stream.write(text.encode())
-
-    def run_command(self, to: str, title: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Commands that run the stale steps up to `to`: that of the child process, and its equivalent for the user."""
-        files = self.files()
-        root = self.file.parent if files is None else files.root
-        arguments = (
-            str(root / EDITOR_FOLDER),
-            title,
-            str(self.file),
-            to,
-            *(() if self.out is None else (str(self.out),)),
-        )
-        out = () if self.out is None else ("--out", str(self.out))
-        command = (sys.executable, "-m", "splatgraft.workflow.background_job", *arguments)
-        return command, ("splatgraft", "run", str(self.file), "--to", to, *out)
-
-
-def _has_no_photos(flow: Flow, side: Side) -> bool:
-    step = flow.steps[f"{side}/capture"]
-    return isinstance(step, Capture) and is_scene(step.capture)
+from splatgraft.runtime.desktop import open_page
 
 
 @dataclass(frozen=True)
 class Edit:
     """Open a project in the browser, or create one there."""
 
-    project: Positional = Path(PROJECT_FILE)
+    project: Annotated[Path, tyro.conf.Positional] = Path(PROJECT_FILE)
     """The project file or its folder; it need not exist."""
     out: Path | None = None
     """Folder of all results; the folder of the project file where not given."""
     host: str = "127.0.0.1"
-    """Address to listen at; beyond loopback the page requires a token and accepts no paths outside the project's
-    folder."""
+    """Address to listen at; beyond loopback the page accepts no paths outside the project's folder."""
     port: int = 8080
     """Port to listen at; the next free one where it is taken."""
+    keep_closed: bool = False
+    """Only print the address, where there is a desktop to open it on."""
     budget: int = 300_000
     """Maximum number of Gaussians per scene that the browser shows; files keep all."""
 
     def execute(self, console: Console) -> int:
         """Serve until Ctrl-C."""
-        from splatgraft.editor.page.page import Page, PageOptions
         from splatgraft.editor.page.server import GuardedServer
 
         is_file = self.project.suffix == ".toml"
         file = (self.project if is_file else self.project / PROJECT_FILE).absolute()
         file.parent.mkdir(parents=True, exist_ok=True)
         is_loopback = self.host in LOOPBACK
-        token = None if is_loopback else secrets.token_urlsafe(16)
+        token = secrets.token_urlsafe(16)
         out = None if self.out is None else self.out.absolute()
         with locked(file.parent / "edit"):
             access = AccessControl(hosts=LOOPBACK if is_loopback else (), token=token)
-            guarded = GuardedServer(access, host=self.host, port=self.port, upload_limit=LIMIT_BYTES)
+            guarded = GuardedServer(access, host=self.host, port=self.port)
+            loading = guarded.viser.gui.add_markdown("Loading the project ...")
+            address = f"http://{self.host}:{guarded.port}/?token={token}"
+            console.result(address)
+            is_opened = is_loopback and not self.keep_closed and open_page(address)
+            wanted = "opened in the browser" if is_opened else "open this address, all of it, in a browser"
+            console.say(f"{wanted}; Ctrl-C ends the editor, but not jobs that it started")
+            # torch, numba and the scenes take seconds to load, and the browser shows the page meanwhile
+            from splatgraft.commands.edit_project import FlowProject
+            from splatgraft.editor.access.uploads import remove_remains
+            from splatgraft.editor.page.page import Page, PageOptions
+
+            remove_remains(file.parent)
             project = FlowProject(file, out, console)
             page = Page(guarded, project, PageOptions(budget=self.budget, inside=None if is_loopback else file.parent))
-            query = "" if token is None else f"?token={token}"
-            console.result(f"http://{self.host}:{guarded.port}/{query}")
-            console.say("open this address in a browser; Ctrl-C ends the editor, but not jobs that it started")
+            loading.remove()
             stop = threading.Event()
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: stop.set())

@@ -9,8 +9,8 @@ from pathlib import Path
 _OPENERS = {"darwin": "open", "linux": "xdg-open"}
 
 
-def open_page(page: Path) -> bool:
-    """Open a local page and return at once; False where there is no desktop, or nothing that opens pages.
+def open_page(page: Path | str) -> bool:
+    """Open a local page or an address and return at once; False where there is no desktop, or nothing that opens pages.
 
     Text browsers, which would take over the terminal, are not used.
     """

@@ -83,6 +83,7 @@ _SECTIONS = {
     "exports": "export",
     "folders.export_source": "export",
     "commands.edit": "editor",
+    "commands.edit_project": "editor",
     "editor": "editor",
     "commands.evaluate_benchmark": "synthetic-scenes-and-the-benchmark",
     "commands.evaluate_paper": "synthetic-scenes-and-the-benchmark",

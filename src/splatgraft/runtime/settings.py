@@ -1,6 +1,7 @@
 """Construction of frozen dataclasses from TOML tables, with one-line errors that name the file and the key."""
 
 import json
+import math
 import tomllib
 import types
 from collections.abc import Mapping
@@ -10,6 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
+
+MAX_TEXT_BYTES = 16 << 20
+"""Largest settings file that is read; a larger one is another file under that name."""
+_LARGEST_INT = 2**63
+"""TOML's integers have 64 bits."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +36,15 @@ def read_toml(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: There is no such file, or it is not TOML.
     """
+    if path.is_file() and path.stat().st_size > MAX_TEXT_BYTES:
+        size = path.stat().st_size >> 20
+        raise ValueError(f"{path}: expected at most {MAX_TEXT_BYTES >> 20} MiB of TOML, found {size} MiB")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ValueError(f"{path}: expected a TOML file, found none") from error
+    except RecursionError as error:
+        raise ValueError(f"{path}: expected TOML, found values nested too deeply") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"{path}: expected TOML, found {type(error).__name__}: {error}") from error
 
@@ -132,12 +143,14 @@ def _convert(value: Any, hint: Any, table: Table, key: str) -> Any:
             return tuple(_convert(v, kind, table, key) for v, kind in zip(value, kinds, strict=True))
     if hint is Path and isinstance(value, str):
         return table.folder / Path(value).expanduser()
-    if hint is float and type(value) is int:
+    if hint is float and type(value) is int and abs(value) < _LARGEST_INT:
         return float(value)
+    if hint is float and type(value) is float and math.isnan(value):
+        raise ValueError(f"{table.where} {key}: expected a number, found nan")
     if (origin is Literal and value in arguments) or (hint in (int, float, str, bool) and type(value) is hint):
         return value
     wanted = " or ".join(map(repr, arguments)) if origin is Literal else getattr(hint, "__name__", str(hint))
-    raise ValueError(f"{table.where} {key}: expected {str(hint) if origin is tuple else wanted}, found {value!r}")
+    raise ValueError(f"{table.where} {key}: expected {str(hint) if origin is tuple else wanted}, found {value!r:.60}")
 
 
 def _convert_any(value: Any, hints: list[Any], table: Table, key: str) -> Any:

@@ -1,7 +1,8 @@
-"""Access control for the editor's HTTP and websocket requests, by Host, Origin and, beyond loopback, a token.
+"""Access control for the editor's HTTP and websocket requests, by Host, Origin and a token.
 
 The Origin header identifies requests of other sites' pages, which can reach a server on loopback. The Host header
-identifies foreign names that resolve to this machine (DNS rebinding).
+identifies foreign names that resolve to this machine (DNS rebinding). Programs of other users of this machine can send
+any header; they do not know the token.
 """
 
 import hmac
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
-COOKIE = "splatgraft_token"
+_COOKIE = "splatgraft_token"
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
@@ -31,19 +32,19 @@ class AccessDecision:
 class AccessControl:
     """The access rules of one server."""
 
+    token: str
+    """Token that each request must carry: in the address, or as a cookie afterwards."""
     hosts: tuple[str, ...] = LOOPBACK
-    """Accepted names in the Host header; empty: any name, and then a token is required."""
-    token: str | None = None
-    """Token that each request must carry; None: none, for loopback only."""
+    """Accepted names in the Host header; empty: any name."""
 
     def __post_init__(self) -> None:
-        """Check that a server beyond loopback has a token.
+        """Check that there is a token.
 
         Raises:
-            ValueError: If it has none.
+            ValueError: If there is none.
         """
-        if not self.hosts and not self.token:
-            raise ValueError("access control: expected a token for a server that other machines can reach, found none")
+        if not self.token:
+            raise ValueError("access control: expected a token, found none")
 
     def check(self, headers: Mapping[str, str], path: str) -> AccessDecision:
         """Decide on a request.
@@ -53,12 +54,13 @@ class AccessControl:
             path: Request path with its query.
         """
         refusal = self._refusal(headers)
-        if refusal or self.token is None:
-            return AccessDecision(not refusal, refusal)
+        if refusal:
+            return AccessDecision(False, refusal)
+        name = cookie_name(headers.get("Host", ""))
         given = parse_qs(urlsplit(path).query).get("token", [""])[0]
         if hmac.compare_digest(given.encode(), self.token.encode()):
-            return AccessDecision(True, cookie=f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/")
-        if hmac.compare_digest(_cookie(headers).encode(), self.token.encode()):
+            return AccessDecision(True, cookie=f"{name}={self.token}; HttpOnly; SameSite=Strict; Path=/")
+        if hmac.compare_digest(_cookie(headers, name).encode(), self.token.encode()):
             return AccessDecision(True)
         return AccessDecision(False, "expected the token that `splatgraft edit` printed: open the complete address")
 
@@ -81,9 +83,15 @@ def _name(host: str) -> str:
     return found[1].strip("[]").lower() if found else ""
 
 
-def _cookie(headers: Mapping[str, str]) -> str:
+def cookie_name(host: str) -> str:
+    """Name of the cookie for a Host header: browsers send the cookies of all ports of a host to each of them."""
+    port = re.search(r":([0-9]+)$", host)
+    return f"{_COOKIE}_{port[1] if port else 'default'}"
+
+
+def _cookie(headers: Mapping[str, str], name: str) -> str:
     try:
-        found = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
+        found = SimpleCookie(headers.get("Cookie", "")).get(name)
     except CookieError:
         return ""
     return found.value if found else ""

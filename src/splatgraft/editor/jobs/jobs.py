@@ -4,6 +4,7 @@ A lock file shows whether the process of a job is alive.
 """
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -11,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import filelock
 
@@ -20,6 +21,8 @@ from splatgraft.runtime.atomic_file import atomic_write
 STATE_FILE, LOG_FILE, LOCK_FILE = "job.json", "job.log", "job.lock"
 Outcome = Literal["starting", "running", "done", "failed", "cancelled", "killed"]
 _LIVE = ("starting", "running")
+_LEAST_SPENT = 2.0
+"""Seconds after which a counter's rate is taken for measured."""
 
 
 @dataclass(frozen=True)
@@ -81,40 +84,32 @@ class JobState:
 
 
 def seconds_left(state: JobState, now: float) -> float | None:
-    """Seconds until the running step's counter is complete, extrapolated; None at its end and where it is too early."""
+    """Seconds until the running step's counter is complete, by the rate since it began; None where it is too early."""
     spent, done = now - state.begun_at, state.done - state.begun
-    if not state.live or not 0 < done < state.total - state.begun or spent < 1:
+    if not state.live or not 0 < done < state.total - state.begun or spent < _LEAST_SPENT:
         return None
     return spent * (state.total - state.done) / done
 
 
 def seconds_left_in_job(state: JobState, now: float) -> float | None:
-    """Seconds until the job ends; None where it is too early to estimate.
+    """Seconds until the job ends; None unless each part of it was measured.
 
-    Later steps count with their measured durations. Default durations are scaled by the ratio of actual to default
-    duration of this run's steps, the running one included as far as its progress allows.
+    The running step counts by its rate, or by its duration in the last run while it has no rate yet; later steps by
+    their durations in the last run.
     """
     names = [step.name for step in state.plan]
     if not state.live or state.step not in names:
         return None
     at = names.index(state.step)
     current, later = state.plan[at], state.plan[at + 1 :]
-    left, spent = seconds_left(state, now), now - state.step_started
-    if left is None and not current.is_measured and at == 0:
+    left = seconds_left(state, now)
+    if current.is_measured:
+        # the counter may be one of several of this step
+        expected = current.seconds - (now - state.step_started)
+        left = max(left or 0.0, expected) if expected > 0 else left
+    if left is None or not all(step.is_measured for step in later):
         return None
-    factor = _time_factor(state, None if left is None else spent + left)
-    expected = current.seconds * (1.0 if current.is_measured else factor) - spent
-    # the counter may be one of several of this step
-    left = max(left or 0.0, expected if left is None or current.is_measured else 0.0)
-    return left + sum(step.seconds * (1.0 if step.is_measured else factor) for step in later)
-
-
-def _time_factor(state: JobState, current: float | None) -> float:
-    """Ratio of actual to default duration of this run's steps without a measured duration; 1 where not known."""
-    took = dict(state.took) | ({} if current is None else {state.step: current})
-    defaults = {step.name: step.seconds for step in state.plan if not step.is_measured and step.name in took}
-    expected = sum(defaults.values())
-    return sum(took[name] for name in defaults) / expected if expected > 0 else 1.0
+    return left + sum(step.seconds for step in later)
 
 
 def write_state(folder: Path, state: JobState) -> None:
@@ -142,7 +137,12 @@ class Jobs:
         Raises:
             ValueError: If a job is running already.
         """
-        state = self.state()
+        try:
+            state = self.state()
+        except ValueError:
+            # replaced by that of the new job; a job at work still holds its lock
+            state = None
+            (self.folder / STATE_FILE).unlink(missing_ok=True)
         if state is not None and state.live:
             raise ValueError(f"{state.title}: expected no other job, found this one running; wait or cancel it")
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -188,10 +188,12 @@ class Jobs:
             fields = json.loads((self.folder / STATE_FILE).read_text())
             plan = tuple(PlannedStep(**step) for step in fields.pop("plan", ()))
             took = tuple((str(name), float(seconds)) for name, seconds in fields.pop("took", ()))
-            return JobState(**(fields | {"command": tuple(fields["command"]), "plan": plan, "took": took}))
+            state = JobState(**(fields | {"command": tuple(fields["command"]), "plan": plan, "took": took}))
+            _check_types(state)
+            return state
         except FileNotFoundError:
             return None
-        except (ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{self.folder / STATE_FILE}: expected the state of a job, found {error}") from error
 
     def _is_alive(self, pid: int) -> bool:
@@ -202,6 +204,20 @@ class Jobs:
         except OSError:
             return False
         return True
+
+
+def _check_types(state: JobState) -> None:
+    """Raises: ValueError where a number of the state is none, or the outcome is unknown."""
+    numbers = (state.started, state.done, state.total, state.step_started, state.begun, state.begun_at, state.pid)
+    numbers += (*(step.seconds for step in state.plan), *(seconds for _, seconds in state.took))
+    texts = (state.title, state.step, state.message, state.error, *(step.name for step in state.plan))
+    is_good = (
+        all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
+        and isinstance(state.pid, int)
+        and state.pid > 1
+    )
+    if not is_good or not all(isinstance(x, str) for x in texts) or state.outcome not in get_args(Outcome):
+        raise ValueError("values of another type")
 
 
 def acquire_job_lock(folder: Path) -> filelock.BaseFileLock:

@@ -9,6 +9,8 @@ import viser
 from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.segmentation import Box
 
+_HANDLE_PX = 60.0
+"""Length of the handles' arrows on the screen, pixels."""
 _MIN_EDGE = 1e-4
 """Shortest edge over the longest, so that a box that is dragged flat keeps a volume."""
 
@@ -32,12 +34,16 @@ class BoxHandles:
         is_new = self._box is None
         self._box = box
         self._view.show_box(f"{self._name}/edges", box, self._color)
-        size = 0.35 * float((box.upper - box.lower).max())
         for corner, at in (("lower", box.lower), ("upper", box.upper)):
             handle = self._server.scene.get_handle_by_name(f"{self._name}/{corner}")
             if is_new or handle is None:
                 handle = self._server.scene.add_transform_controls(
-                    f"{self._name}/{corner}", scale=size, disable_rotations=True, position=at.numpy()
+                    f"{self._name}/{corner}",
+                    scale=_HANDLE_PX,
+                    fixed=True,
+                    depth_test=False,
+                    disable_rotations=True,
+                    position=at.numpy(),
                 )
                 handle.on_update(self._dragged)
             else:

@@ -50,9 +50,9 @@ class JobPanel:
     def _show(self, state: JobState) -> None:
         now = time.time()
         whole, left = seconds_left_in_job(state, now), seconds_left(state, now)
-        parts = [f"about {_minutes(whole)} left in total"] if whole is not None else []
-        parts += [f"{_minutes(left)} in this step"] if left is not None else []
-        rest = ", ".join(parts) or "remaining time not known yet"
+        parts = [f"about {_minutes(left)} left in this step"] if left is not None else []
+        parts += [f"about {_minutes(whole)} in all"] if whole is not None else []
+        rest = ", ".join(parts) or "time left: not measured yet"
         names = [step.name for step in state.plan]
         if state.step in names:
             rest += f" &middot; step {names.index(state.step) + 1} of {len(names)}"

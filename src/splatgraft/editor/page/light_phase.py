@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 _LAYERS = (("shade", "Shade"), ("shadow", "Shadow"), ("bounce", "Bounce"), ("gloss", "Gloss"))
 _MAX_SOURCES = 4
+_HANDLE_PX = 70.0
+"""Length of the handle's arrows on the screen, pixels."""
 
 
 class LightPhase:
@@ -176,7 +178,12 @@ class LightPhase:
         position = arrow_points(light.sources[index], self._centre(), self._arrow_length())[0].numpy()
         if self._handle is None:
             self._handle = self._page.server.scene.add_transform_controls(
-                "/light/handle", scale=0.45 * self._arrow_length(), disable_rotations=True, position=position
+                "/light/handle",
+                scale=_HANDLE_PX,
+                fixed=True,
+                depth_test=False,
+                disable_rotations=True,
+                position=position,
             )
             self._handle.on_update(self._dragged)
         else:

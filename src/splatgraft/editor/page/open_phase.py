@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,9 +10,10 @@ from typing import TYPE_CHECKING
 import viser
 
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.editor.access.uploads import SCENES, SUFFIXES, save_upload
+from splatgraft.editor.access.uploads import SCENES, SUFFIXES
+from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
 from splatgraft.editor.session.project_access import Triple
-from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.session import Session, backup_of
 from splatgraft.project.layout import Side
 
 if TYPE_CHECKING:
@@ -21,6 +23,7 @@ _HELP = (
     "A capture is a folder of photos, a video, a COLMAP folder, or a folder with a `transforms.json`. "
     "A trained scene (`.ply`, `.spz`, `.sog`, ...) works as well: its images are rendered from cameras around it."
 )
+_NOTE_STYLE = "font-size:.8em;line-height:1.4;padding:0 12px 4px"
 _SIDES: tuple[tuple[Side, str], ...] = (("source", "Object from"), ("target", "Place into"))
 _UPS: dict[str, Triple | None] = {
     "as found": None,
@@ -40,9 +43,17 @@ class OpenPhase:
     def __init__(self, page: Page) -> None:
         """Build the controls."""
         self._page, gui = page, page.gui
+        self._problem = gui.add_html("", visible=False)
+        self._restore = gui.add_button("Put the last good project.toml back", icon=viser.Icon.HISTORY, visible=False)
+        self._restore.on_click(page.callback(lambda _: page.restore_project()))
         self._help = gui.add_markdown(_HELP)
         self._source = gui.add_text("Object from", "", hint="The capture or scene with the object: a path")
+        self._found_source = gui.add_html("")
         self._target = gui.add_text("Place into", "", hint="The capture or scene that receives it: a path")
+        self._found_target = gui.add_html("")
+        self._is_usable = [False, False]
+        self._looker = LatestOnlyWorker(self._look, lambda error: page.say(" ".join(str(error).split()), bad=True))
+        page.on_close.append(self._looker.close)
         self._trained = gui.add_folder("Scenes trained on these captures", expand_by_default=False)
         with self._trained:
             self._scenes = (
@@ -56,14 +67,23 @@ class OpenPhase:
         # viser shows upload buttons even where `visible` is false; the folder hides it
         self._uploads = gui.add_folder("From this computer")
         with self._uploads:
-            self._upload = gui.add_upload_button("Upload a video or a scene", icon=viser.Icon.UPLOAD, color="gray")
+            page.add_upload_button("Upload a video or a scene", SUFFIXES, self._uploaded)
         self._start = gui.add_button("Start the project", icon=viser.Icon.PLUS)
         self._facts = gui.add_html("")
         self._looks = {side: gui.add_dropdown(f"Cameras: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}
         self._ups = {side: gui.add_dropdown(f"Up: {side}", tuple(_UPS), visible=False) for side, _ in _SIDES}
+        self._back = gui.add_button("Back: choose other captures", icon=viser.Icon.ARROW_LEFT, color="gray")
+        self._confirm = gui.add_button("Yes, set this project aside", color="red", visible=False)
+        self._again = gui.add_button(
+            "Back to the project that was set aside", icon=viser.Icon.ARROW_LEFT, color="gray", visible=False
+        )
         self._build = gui.add_button("Reconstruct both scenes", icon=viser.Icon.PLAYER_PLAY)
+        for field in (self._source, self._target):
+            field.on_update(page.callback(lambda _: self._looker.submit((self._source.value, self._target.value))))
+        self._back.on_click(page.callback(lambda _: self._ask_back()))
+        self._confirm.on_click(page.callback(lambda _: self._leave_project()))
+        self._again.on_click(page.callback(lambda _: page.return_to_project()))
         self._start.on_click(page.callback(lambda _: self._create()))
-        self._upload.on_upload(page.callback(self._uploaded))
         for side, _ in _SIDES:
             for control in (self._looks[side], self._ups[side]):
                 control.on_update(page.callback(partial(self._set_view, side)))
@@ -81,9 +101,23 @@ class OpenPhase:
 
     def refresh(self) -> None:
         """Show the fields of a new project, or the facts of the open one."""
-        session = self._page.session
-        for control in (self._help, self._source, self._target, self._trained, self._uploads, self._start):
-            control.visible = session is None
+        session, problem = self._page.session, self._page.problem
+        self._problem.visible = problem is not None
+        self._restore.visible = problem is not None and backup_of(self._page.project.file).has_good()
+        if problem is not None:
+            self._problem.content = (
+                f'<div class="sg-problem" style="font-size:.85em;line-height:1.5;padding:2px 12px">'
+                f"<b>This project cannot be opened:</b><br>{html.escape(problem)}<br>"
+                f"Correct the file; the page opens it as soon as it is saved.</div>"
+            )
+        is_new = session is None and problem is None
+        controls = (self._help, self._source, self._target, self._trained, self._uploads, self._start)
+        for control in (*controls, self._found_source, self._found_target):
+            control.visible = is_new
+        self._start.disabled = not all(self._is_usable)
+        self._again.visible = is_new and backup_of(self._page.project.file).has_aside()
+        self._back.visible = session is not None
+        self._confirm.visible = self._confirm.visible and session is not None
         self._facts.visible = self._build.visible = session is not None
         for index, (side, _) in enumerate(_SIDES):
             without_photos = session is not None and session.files.without_photos[index]
@@ -100,6 +134,30 @@ class OpenPhase:
         have_both = session.files.source_scene.is_file() and session.files.target_scene.is_file()
         self._build.label = "Reconstruct again what is stale" if have_both else self._title(session)
         self._build.color = "gray" if have_both else None
+
+    def _look(self, paths: tuple[str, str]) -> None:
+        """Say what the paths are, before anything is made of them."""
+        for index, (path, note) in enumerate(zip(paths, (self._found_source, self._found_target), strict=True)):
+            text, usable = "", False
+            if path.strip():
+                try:
+                    text, usable = self._page.project.describe(self._page.parse_path(path))
+                except ValueError as error:
+                    text = " ".join(str(error).split())
+            self._is_usable[index] = usable
+            color = "inherit" if usable else "#e8590c"
+            note.content = f'<div class="sg-found" style="{_NOTE_STYLE};color:{color}">{html.escape(text)}</div>'
+        self._start.disabled = not all(self._is_usable)
+
+    def _ask_back(self) -> None:
+        self._confirm.visible = True
+        self._page.say(
+            "the project and its edits are set aside, and its results stay in the folder: nothing is deleted"
+        )
+
+    def _leave_project(self) -> None:
+        self._confirm.visible = False
+        self._page.leave_project()
 
     def _line(self, session: Session, index: int) -> str:
         files, name = session.files, _SIDES[index][1]
@@ -134,9 +192,8 @@ class OpenPhase:
             return
         self._page.say("the project was created; reconstruct both scenes next")
 
-    def _uploaded(self, event: viser.GuiEvent) -> None:
-        file = event.target.value
-        path = save_upload(self._page.project.file.parent, file.name, file.content, suffixes=SUFFIXES)
+    def _uploaded(self, path: Path) -> None:
         fields = (self._source, self._target, *(self._scenes if path.suffix.lower() in SCENES else ()))
         next((field for field in fields if not field.value), fields[-1]).value = str(path)
-        self._page.say(f"{Path(file.name).name}: stored as {path}")
+        self._looker.submit((self._source.value, self._target.value))
+        self._page.say(f"{path.name}: stored as {path}")

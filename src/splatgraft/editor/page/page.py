@@ -1,16 +1,18 @@
 """The editor's page: header, phases, undo buttons, job panel and preview panel, and what the phases share."""
 
+import contextlib
 import html
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import viser
 
+from splatgraft.editor.access.uploads import IncomingUpload, UploadRules
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.light_phase import LightPhase
 from splatgraft.editor.page.open_phase import OpenPhase
@@ -20,12 +22,15 @@ from splatgraft.editor.page.run_phase import RunPhase
 from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.select_phase import SelectPhase
 from splatgraft.editor.page.server import GuardedServer
+from splatgraft.editor.page.upload_receiver import UploadButton
 from splatgraft.editor.page.windows import Windows
 from splatgraft.editor.session.project_access import Project
-from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.session import Session, backup_of
 
 PHASES = ("Open", "Select", "Place", "Light", "Run")
 _POLL_SECONDS = 0.4
+_PANEL_WIDTH = 372
+"""Pixels; the narrowest at which three numbers are legible beside their label."""
 _CURRENT_MARK = "\u25cf "
 _HISTORY = ("Undo", "Redo")
 _TEXT_STYLE = "font-size:.85em;line-height:1.45;padding:2px 12px"
@@ -65,7 +70,11 @@ class Page:
         """Build the page for a project that exists or is about to be created."""
         self.guarded, self.project, self.options = guarded, project, options
         self.server = guarded.viser
-        self.session: Session | None = None if project.files() is None else Session(project)
+        self.session: Session | None = None
+        self.problem: str | None = None
+        """Why project.toml could not be opened; None where it could, or where there is none."""
+        self._seen_project: tuple[int, int] | None = None
+        self._try_session()
         self.view = SceneView(self.server, budget=options.budget)
         self.phase = "Open"
         self._lock = threading.RLock()
@@ -74,9 +83,8 @@ class Page:
         self.windows = Windows(self)
         self._build()
         self.windows.connect()
-        guarded.on_large_upload = lambda name, size: self.say(
-            f"{name}: expected a smaller file, found {size >> 20} MiB; give its path instead", bad=True
-        )
+        guarded.uploads.on_refused = lambda reason: self.say(reason, bad=True)
+        guarded.uploads.on_progress = self._show_upload
         guarded.files = self._report_file
         self.show_phase(self._first_phase())
         self._say_notice()
@@ -109,16 +117,22 @@ class Page:
             if getattr(event, "client_id", 0) is None:
                 return
             with self._lock:
-                try:
+                with self.reported():
                     work(event)
-                except (ValueError, OSError) as error:
-                    self.say(" ".join(str(error).split()), bad=True)
-                except Exception as error:  # a programming error must be visible and must not end the page
-                    traceback.print_exc()
-                    self.say(f"{type(error).__name__}: {error} (traceback in the terminal)", bad=True)
                 self.refresh()
 
         return call
+
+    @contextlib.contextmanager
+    def reported(self) -> Iterator[None]:
+        """Show an error of the block in the status line instead of raising it."""
+        try:
+            yield
+        except (ValueError, OSError) as error:
+            self.say(" ".join(str(error).split()), bad=True)
+        except Exception as error:  # a programming error must be visible and must not end the page
+            traceback.print_exc()
+            self.say(f"{type(error).__name__}: {error} (traceback in the terminal)", bad=True)
 
     def say(self, sentence: str, *, bad: bool = False) -> None:
         """Show one sentence in the status line."""
@@ -130,18 +144,15 @@ class Page:
     def refresh(self) -> None:
         """Update the current phase, the preview, the header and the undo buttons."""
         with self._lock:
-            try:
+            with self.reported():
                 self._phases[self.phase].refresh()
                 self.preview.update()
-            except (ValueError, OSError) as error:
-                self.say(" ".join(str(error).split()), bad=True)
             self._header.content = self._header_html()
-            history = None if self.session is None else self.session.history
-            self._history_buttons.visible = history is not None and bool(history.past or history.future)
+            self._history_buttons.visible = self.session is not None and self.session.has_steps()
 
     def open_project(self) -> None:
-        """Open the project that was just created."""
-        self.session = Session(self.project)
+        """Open the project that was just created or corrected."""
+        self._try_session()
         self.preview.reset()
         self.show_phase(self._first_phase())
         self._say_notice()
@@ -160,10 +171,8 @@ class Page:
                 self.preview.scene_changed()
                 self.windows.restore_view(self._shown_scene())
             self._status.content = ""
-            try:
+            with self.reported():
                 self._phases[phase].enter()
-            except (ValueError, OSError) as error:
-                self.say(" ".join(str(error).split()), bad=True)
             self.refresh()
 
     def run(self, to: str, title: str) -> None:
@@ -195,6 +204,19 @@ class Page:
         self._phases[self.phase].enter()
         self.refresh()
 
+    def add_upload_button(self, label: str, suffixes: tuple[str, ...], on_file: Callable[[Path], None]) -> None:
+        """A button for uploads of files with these suffixes; `on_file` gets the path of a stored one."""
+
+        def store(upload: IncomingUpload) -> None:
+            # a large scene is checked while the page stays usable
+            with self.reported():
+                path = upload.finish()
+                self.callback(lambda _: on_file(path))(None)
+
+        button = self.gui.add_upload_button(label, icon=viser.Icon.UPLOAD, color="gray", mime_type=",".join(suffixes))
+        uploads = UploadButton(lambda: UploadRules(self.project.file.parent, suffixes), store)
+        self.guarded.uploads.register(button, uploads)
+
     def light_ready(self) -> None:
         """Update the light phase after the preview has estimated the light."""
         with self._lock:
@@ -217,6 +239,46 @@ class Page:
         for end in (self.preview.close, *self.on_close):
             end()
 
+    def restore_project(self) -> None:
+        """Put the last project.toml that opened back, and open it.
+
+        Raises:
+            ValueError: If none was kept.
+        """
+        backup_of(self.project.file).restore()
+        self.open_project()
+        if self.session is not None:
+            self.say("the last project.toml that opened is back; the other one is in .editor/broken")
+
+    def leave_project(self) -> None:
+        """Set the project's edits aside, so that other captures can be named; `return_to_project` puts them back.
+
+        Raises:
+            ValueError: If a job is running.
+        """
+        self.require_session().set_aside()
+        self._phases[self.phase].leave()
+        self.open_project()
+
+    def return_to_project(self) -> None:
+        """Open the project that was set aside.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        backup_of(self.project.file).bring_back()
+        self.open_project()
+
+    def _try_session(self) -> None:
+        """Open the project where there is one; what prevents it is kept as `problem`."""
+        self.session, self.problem = None, None
+        self._seen_project = _stamp(self.project.file)
+        try:
+            if self.project.files() is not None:
+                self.session = Session(self.project)
+        except (ValueError, OSError) as error:
+            self.problem = " ".join(str(error).split())
+
     # construction
 
     def _build(self) -> None:
@@ -224,7 +286,7 @@ class Page:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(224, 122, 46))
         gui.set_panel_label("splatgraft")
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(384)
+        gui.main_panel.set_width(_PANEL_WIDTH)
         self.server.scene.world_axes.visible = False
         self._header = gui.add_html("")
         self._phase_buttons = gui.add_button_group("Step", PHASES)
@@ -246,6 +308,8 @@ class Page:
             with self._folders[name]:
                 self._phases[name] = kinds[name](self)
         self._status = gui.add_html("")
+        self._cancel_upload = gui.add_button("Cancel the upload", icon=viser.Icon.X, color="red", visible=False)
+        self._cancel_upload.on_click(self.callback(lambda _: self.guarded.uploads.cancel()))
         self._history_buttons = gui.add_button_group("History", _HISTORY)
         self._history_buttons.on_click(
             self.callback(lambda e: self._undo() if e.target.value == _HISTORY[0] else self._redo())
@@ -257,10 +321,16 @@ class Page:
         self.preview = PreviewPanel(self)
 
     def _undo(self) -> None:
-        self.say("undone" if self.require_session().undo() else "nothing to undo")
+        session = self.require_session()
+        session.notice = None
+        self.say("undone" if session.undo() else "nothing to undo")
+        self._say_notice()
 
     def _redo(self) -> None:
-        self.say("redone" if self.require_session().redo() else "nothing to redo")
+        session = self.require_session()
+        session.notice = None
+        self.say("redone" if session.redo() else "nothing to redo")
+        self._say_notice()
 
     def _first_phase(self) -> str:
         if self.session is None:
@@ -276,6 +346,8 @@ class Page:
     def _say_notice(self) -> None:
         if self.session is not None and self.session.notice is not None:
             self.say(self.session.notice, bad=True)
+        elif self.problem is not None:
+            self.say(self.problem, bad=True)
 
     def _header_html(self) -> str:
         where = "no project yet" if self.session is None else str(self.session.files.file.parent.name)
@@ -284,6 +356,13 @@ class Page:
             f'<div class="sg-header" style="{_TEXT_STYLE}"><b style="font-size:1.1em">{html.escape(where)}</b>'
             f'<span style="opacity:.6;float:right">{saved}</span></div>'
         )
+
+    def _show_upload(self, upload: IncomingUpload | None) -> None:
+        self._cancel_upload.visible = upload is not None and not upload.is_complete
+        if upload is not None and upload.is_complete:
+            self.say(f"{upload.path.name}: uploaded, being checked")
+        elif upload is not None:
+            self._cancel_upload.label = f"Cancel the upload ({100 * upload.received // upload.size}%)"
 
     def _report_file(self, name: str) -> Path | None:
         """The file of the report under that name; None for any other path, so that nothing else is served."""
@@ -298,17 +377,21 @@ class Page:
     def _poll_loop(self) -> None:
         while self._open:
             time.sleep(_POLL_SECONDS)
-            with self._lock:
-                try:
-                    self._poll()
-                except (ValueError, OSError) as error:
-                    self.say(" ".join(str(error).split()), bad=True)
+            with self._lock, self.reported():
+                self._poll()
 
     def _poll(self) -> None:
         session = self.session
         if session is None:
+            if self.problem is not None and _stamp(self.project.file) != self._seen_project:
+                self.open_project()
             return
         if session.reload():
             self.say("the project's files were changed outside the editor and were loaded again")
             self.refresh()
         self.job.refresh()
+
+
+def _stamp(file: Path) -> tuple[int, int] | None:
+    """Time and size of a file; None where there is none."""
+    return (file.stat().st_mtime_ns, file.stat().st_size) if file.is_file() else None

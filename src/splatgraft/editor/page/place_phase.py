@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 import viser
 
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.access.uploads import SCENES, save_upload
+from splatgraft.editor.access.uploads import SCENES
 from splatgraft.editor.page.box_handles import BoxHandles
+from splatgraft.editor.page.object_gizmo import SNAP_DEGREES, ObjectGizmo
 from splatgraft.editor.session import placement_operations
 from splatgraft.editor.session.gizmo import (
     Gizmo,
@@ -23,6 +23,7 @@ from splatgraft.editor.session.gizmo import (
     similarity_from_gizmo,
 )
 from splatgraft.editor.session.session import Session
+from splatgraft.editor.session.state_checks import check_numbers, check_state
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.segmentation import Box
@@ -34,6 +35,8 @@ NO_NAMES: tuple[str, ...] = ("1",)
 """Options of a dropdown while there is nothing to choose."""
 _SAVE_EVERY = 0.25
 """Seconds between saves during a drag."""
+_SNAP_NEAR = 0.5
+"""Distance from the surface, over the object's height, within which a drag ends on it."""
 
 
 class PlacePhase:
@@ -55,18 +58,22 @@ class PlacePhase:
         self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=0.01, hint="Degrees about x, y, z")
         self._scale = gui.add_number("Scale", 1.0, min=1e-4, step=0.001)
         self._operations = gui.add_button_group("Move", ("Drop", "Upright", "Fit size"))
+        self._snap = gui.add_checkbox(
+            "Snap",
+            False,
+            hint=f"A drag turns in steps of {SNAP_DEGREES:.0f} degrees and ends on a near surface (key S)",
+        )
         self._object_buttons = gui.add_button_group("Object ", ("Duplicate", "Delete"))
         with gui.add_folder("Another object", expand_by_default=False):
             self._path = gui.add_text("File", "", hint="A trained scene (.ply, .spz, .sog, ...) of the object alone")
             self._add = gui.add_button("Add this file", icon=viser.Icon.PLUS, color="gray")
-            self._upload = gui.add_upload_button("Upload a file", icon=viser.Icon.UPLOAD, color="gray")
+            page.add_upload_button("Upload a file", SCENES, self._add_file)
         with gui.add_folder("Erase from the target", expand_by_default=False):
             self._show_box = gui.add_checkbox("Show the box", False)
             self._erase = gui.add_button("Erase inside the box", icon=viser.Icon.ERASER, color="gray")
             self._restore = gui.add_button("Restore all erased", color="gray")
         self._handles = BoxHandles(page.server, page.view, "/target/box", color=(240, 70, 70))
-        self._gizmo: viser.TransformControlsHandle | None = None
-        self._gizmo_size = 0.0
+        self._gizmo = ObjectGizmo(page.server, self._dragged)
         self._connect()
 
     def enter(self) -> None:
@@ -79,7 +86,7 @@ class PlacePhase:
         self._is_active = False
         hide_target(self._page)
         self._handles.hide()
-        self._remove_gizmo()
+        self._gizmo.remove()
 
     def refresh(self) -> None:
         """Update the list of objects, the numbers and the gizmo."""
@@ -100,6 +107,7 @@ class PlacePhase:
             self._degrees,
             self._scale,
             self._operations,
+            self._snap,
             self._object_buttons,
         ):
             control.visible = bool(objects)
@@ -113,9 +121,11 @@ class PlacePhase:
             self._object_choice.value = names[self._chosen]
             if not self._dragging:
                 self._show_numbers(self._current())
-                self._show_gizmo(session, self._current())
+                self._gizmo.snaps = self._snap.value
+                item = session.placeable_object(self._chosen)
+                self._gizmo.show(item, objects[self._chosen].target_from_object)
         else:
-            self._remove_gizmo()
+            self._gizmo.remove()
         if not self._show_box.value:
             self._handles.hide()
         self._erase.disabled = not self._show_box.value
@@ -132,7 +142,6 @@ class PlacePhase:
             callback(lambda event: self._duplicate() if event.target.value == "Duplicate" else self._delete())
         )
         self._add.on_click(callback(lambda _: self._add_file(self._page.parse_path(self._path.value))))
-        self._upload.on_upload(callback(self._uploaded))
         self._show_box.on_update(callback(lambda _: self._toggle_box()))
         self._erase.on_click(callback(lambda _: self._erase_box()))
         self._restore.on_click(callback(lambda _: self._restore_all()))
@@ -140,9 +149,14 @@ class PlacePhase:
         drop = gui.add_command("Drop to the surface", hotkey="G")
         duplicate = gui.add_command("Duplicate the object", hotkey="D")
         delete = gui.add_command("Delete the object", hotkey="delete")
+        snap = gui.add_command("Snap on or off", hotkey="S")
+        snap.on_trigger(callback(lambda _: self._toggle_snap() if self._is_active else None))
         drop.on_trigger(callback(lambda _: self._apply_operation("Drop") if self._is_active else None))
         duplicate.on_trigger(callback(lambda _: self._duplicate() if self._is_active else None))
         delete.on_trigger(callback(lambda _: self._delete() if self._is_active else None))
+
+    def _toggle_snap(self) -> None:
+        self._snap.value = not self._snap.value
 
     # placement
 
@@ -156,8 +170,9 @@ class PlacePhase:
 
     def _numbers_changed(self) -> None:
         session = self._page.require_session()
-        gizmo = Gizmo(self._position.value, quaternion_from_degrees(self._degrees.value), float(self._scale.value))
         self._shown = None  # so that the fields go back to the state where these numbers are refused
+        check_numbers((*self._position.value, *self._degrees.value, self._scale.value), "position, rotation, scale")
+        gizmo = Gizmo(self._position.value, quaternion_from_degrees(self._degrees.value), float(self._scale.value))
         self._set_placement(similarity_from_gizmo(gizmo, session.placeable_object(self._chosen).base.point))
         self._shown = self._current()
 
@@ -188,18 +203,22 @@ class PlacePhase:
 
     def _choose(self) -> None:
         self._chosen = list(self._object_choice.options).index(self._object_choice.value)
-        self._remove_gizmo()
+        self._gizmo.remove()
 
     def _duplicate(self) -> None:
         session = self._page.require_session()
         item = session.objects()[self._chosen]
-        placed = placement_operations.place_beside(
-            session.placeable_object(self._chosen), item.target_from_object, up=session.up()
+        # objects that are placed already count as part of the scene
+        scene = session.scenes.composite(session.placed_state()).merged()[0]
+        placed, is_supported = placement_operations.place_beside(
+            scene, session.placeable_object(self._chosen), item.target_from_object, up=session.up()
         )
         objects = (*session.objects(), replace(item, target_from_object=placed))
         session.change(replace(session.state, objects=objects))
         self._chosen = len(objects) - 1
-        self._remove_gizmo()
+        self._gizmo.remove()
+        if not is_supported:
+            self._page.say("duplicated; no surface at this height was found beside it: move it, then Drop", bad=True)
 
     def _delete(self) -> None:
         session = self._page.require_session()
@@ -207,11 +226,7 @@ class PlacePhase:
         if objects:
             rest = (*objects[: self._chosen], *objects[self._chosen + 1 :])
             session.change(replace(session.state, objects=rest))
-            self._remove_gizmo()
-
-    def _uploaded(self, event: viser.GuiEvent) -> None:
-        file, root = event.target.value, self._page.require_session().files.file.parent
-        self._add_file(save_upload(root, file.name, file.content, suffixes=SCENES))
+            self._gizmo.remove()
 
     def _add_file(self, path: Path) -> None:
         session = self._page.require_session()
@@ -224,7 +239,7 @@ class PlacePhase:
         objects = (*session.objects(), ObjectPlacement(placed, path))
         session.change(replace(session.state, objects=objects))
         self._chosen = len(objects) - 1
-        self._remove_gizmo()
+        self._gizmo.remove()
 
     # erase
 
@@ -266,49 +281,42 @@ class PlacePhase:
         self._degrees.value = (x, y, z)
         self._scale.value = gizmo.scale
 
-    def _show_gizmo(self, session: Session, gizmo: Gizmo) -> None:
-        base = session.placeable_object(self._chosen).base
-        # viser draws splats over the gizmo, so it must be larger than the object
-        size = 1.6 * gizmo.scale * max(base.height, base.radius)
-        if self._gizmo is None or abs(size - self._gizmo_size) > 0.05 * size:
-            self._remove_gizmo()
-            self._gizmo_size = size
-            self._gizmo = self._page.server.scene.add_transform_controls(
-                "/gizmo", scale=size, line_width=4.0, position=gizmo.position, wxyz=gizmo.wxyz
-            )
-            self._gizmo.on_update(self._dragged)
+    def _dragged(self, placed: Similarity, ended: bool) -> None:
+        """Show and save a placement during a drag; a drag is one undo step and is saved repeatedly while it lasts."""
+        session = self._page.session
+        if session is None or self._chosen >= len(session.objects()):
             return
-        self._gizmo.position, self._gizmo.wxyz = np.array(gizmo.position), np.array(gizmo.wxyz)
-
-    def _remove_gizmo(self) -> None:
-        if self._gizmo is not None:
-            self._gizmo.remove()
-            self._gizmo = None
-
-    async def _dragged(self, event: viser.TransformControlsEvent) -> None:
-        session, handle = self._page.session, self._gizmo
-        if session is None or handle is None or self._chosen >= len(session.objects()):
-            return
-        if event.phase == "start":
-            return
-        pose, wxyz = np.asarray(handle.position).tolist(), np.asarray(handle.wxyz).tolist()
-        item = session.objects()[self._chosen]
-        gizmo = Gizmo((pose[0], pose[1], pose[2]), (wxyz[0], *wxyz[1:]), item.target_from_object.scale)
-        placed = similarity_from_gizmo(gizmo, session.placeable_object(self._chosen).base.point)
-        self._page.view.set_transform(f"/target/objects/{self._chosen}", placed)
-        edited = session.placed_state().with_object(self._chosen, replace(item, target_from_object=placed))
-        ended, now = event.phase == "end", time.monotonic()
-        # a drag is one undo step and is saved repeatedly while it lasts
-        if not self._dragging:
-            self._dragging, self._saved = True, now
-            self._page.callback(lambda _: session.change(edited))(None)
-        elif ended or now - self._saved > _SAVE_EVERY:
-            self._saved = now
-            session.amend(edited)
-        self._page.preview.set_dragged_state(None if ended else edited)
+        with self._page.reported():
+            if ended and self._snap.value:
+                placed = self._snapped_to_surface(session, placed)
+            item = session.objects()[self._chosen]
+            self._page.view.set_transform(f"/target/objects/{self._chosen}", placed)
+            edited = session.placed_state().with_object(self._chosen, replace(item, target_from_object=placed))
+            check_state(edited)
+            now = time.monotonic()
+            if not self._dragging:
+                self._dragging, self._saved = True, now
+                self._page.callback(lambda _: session.change(edited))(None)
+            elif ended or now - self._saved > _SAVE_EVERY:
+                self._saved = now
+                session.amend(edited)
+            self._page.preview.set_dragged_state(None if ended else edited)
         if ended:
             self._dragging = False
+            self._page.preview.set_dragged_state(None)
             self._page.refresh()
+
+    def _snapped_to_surface(self, session: Session, placed: Similarity) -> Similarity:
+        """The placement with its foot on the surface below or just above, where there is one near."""
+        item, up = session.placeable_object(self._chosen), session.up()
+        target = session.scenes.composite(session.placed_state()).target
+        try:
+            fallen = placement_operations.drop_to_surface(target, item, placed, up=up)
+        except ValueError:
+            return placed
+        rise = float((fallen.points(item.base.point) - placed.points(item.base.point)) @ up)
+        near = _SNAP_NEAR * placed.scale * item.base.height
+        return replace(placed, translation=placed.translation + rise * up) if abs(rise) < near else placed
 
 
 def show_target(page: Page) -> None:
@@ -316,6 +324,11 @@ def show_target(page: Page) -> None:
     session = page.require_session()
     state, view = session.placed_state(), page.view
     target = session.scenes.gaussians(session.files.target_scene)
+    if state.erased is not None and len(state.erased) != target.count:
+        raise ValueError(
+            f"erased.npy: expected one flag per Gaussian of the target, {target.count:,}; found {len(state.erased):,}; "
+            "restore all erased, or undo"
+        )
     shown = None if state.erased is None else session.scenes.complement("erased", state.erased)
     view.show_splats("/target/scene", target, which=shown)
     objects = state.objects or ()

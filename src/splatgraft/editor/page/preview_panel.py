@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import html
 import time
+import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import torch
 import viser
@@ -14,9 +18,18 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
+from splatgraft.editor.page.canvas import Canvas
 from splatgraft.editor.page.scene_view import camera_from_viser
 from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
-from splatgraft.editor.previews.preview import NEEDS_LIGHT, PICTURE_KINDS, PictureKind, PictureSize, wipe_comparison
+from splatgraft.editor.previews.preview import (
+    NEEDS_LIGHT,
+    PICTURE_KINDS,
+    Picture,
+    PictureKind,
+    PictureSize,
+    wipe_comparison,
+    with_badge,
+)
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.session import Session
 from splatgraft.runtime.memo import Memo
@@ -26,10 +39,20 @@ if TYPE_CHECKING:
 
 
 _SOURCE_KINDS: tuple[PictureKind, PictureKind] = ("Source", "Object alone")
-_DRAFT_LIMIT = 0.8
+_DRAFT_LIMIT = 1.5
 """Seconds; where drafts of the light take longer, images without the light transfer are shown first."""
+_REST_SECONDS = 0.1
+"""How long the camera stands still before its picture is drawn; browsers report a moving one more often."""
+_COARSE_ABOVE = 0.4
+"""Seconds; a picture that takes longer is preceded by a coarse one."""
+_COARSE_SHARE, _COARSE_BUDGET = 0.5, 120_000
+"""Size of a coarse picture over the canvas's, and its number of Gaussians."""
+_MAX_WIDTH = 1920
+"""Pixels; pictures of larger canvases are enlarged by the browser."""
+_DEPTH_SHARE = 0.5
+"""Resolution of the depth behind the gizmos over that of the picture."""
 _MIN_ASPECT = 1.2
-"""Minimum width over height: between two panels a window is narrow, and its image would exceed the panel."""
+"""Minimum width over height of the picture in the panel."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +65,19 @@ class _PictureRequest:
     left: PictureKind
     right: PictureKind
     split: float
-    is_dragging: bool
+    window: viser.ClientHandle | None
+    """The window whose canvas shows the picture; None: the panel shows it."""
+    is_dragging: bool = False
     """Whether something is being dragged; then a draft suffices."""
+    is_moved: bool = False
+    """Whether the camera has moved; the picture is drawn when it rests."""
     draft: bool = False
+    budget: int | None = None
+    """Maximum number of Gaussians; None: all."""
 
 
 class PreviewPanel:
-    """Renders previews in a worker thread and shows them; only the newest request is rendered."""
+    """Renders pictures in a worker thread, for the canvas or for the panel; only the newest request is rendered."""
 
     def __init__(self, page: Page) -> None:
         """Build the panel."""
@@ -56,20 +85,29 @@ class PreviewPanel:
         self._size = PictureSize()
         self._pictures = Memo()
         self._dragged_state: EditState | None = None
-        self._draft_seconds, self._relight_seconds = float("inf"), 0.0
-        self._worker = LatestOnlyWorker(self._work, lambda error: self._say(" ".join(str(error).split())))
-        self._panel = gui.add_panel()
-        with self._panel.add_tab("Preview", viser.Icon.PHOTO):
+        self._draft_seconds, self._relight_seconds, self._picture_seconds = float("inf"), 0.0, 0.0
+        self._light_note = ""
+        self.canvas = Canvas(page.server, page.view)
+        self._shown_pose: bytes = b""
+        self._canvas_size: tuple[float, int] = (0.0, 0)
+        self.on_drawn: Callable[[str, float], None] = lambda stage, seconds: None
+        """Called with `coarse`, `draft` or `final` and the seconds that the picture took; for measurements."""
+        self._worker = LatestOnlyWorker(self._work, self._say_error)
+        self._light_worker = LatestOnlyWorker(self._compute_light, self._say_error)
+        self._panel = gui.add_folder("View")
+        with self._panel:
             self._image = gui.add_image(np.full((270, 400, 3), 40, np.uint8), format="jpeg", jpeg_quality=88)
             self._caption = gui.add_html("")
             self._left = gui.add_dropdown("Left", PICTURE_KINDS, initial_value="Copy-paste")
             self._right = gui.add_dropdown("Right", PICTURE_KINDS, initial_value="Light transfer")
-            self._split = gui.add_slider("Compare", 0.0, 1.0, 0.01, 0.5)
+            self._split = gui.add_slider(
+                "Compare", 0.0, 1.0, 0.01, 0.0, hint="How far the left picture reaches over the right one"
+            )
             self._camera_slider = gui.add_slider("Camera", 0, 1, 1, 0, hint="Step through the target's cameras")
-            self._follow = gui.add_checkbox("Follow my view", True, hint="Otherwise the preview stays at the camera")
+            self._follow = gui.add_checkbox(
+                "Draw on the canvas", True, hint="Otherwise the canvas shows splats, and the panel the camera's picture"
+            )
             self._frusta = gui.add_checkbox("Show the cameras", False)
-        self._panel.dock_left()
-        self._panel.set_width(400)
         for control in (self._left, self._right, self._split, self._follow):
             control.on_update(lambda event: self.update() if event.client is not None else None)
         self._frusta.on_update(page.callback(lambda _: self._show_cameras()))
@@ -81,6 +119,7 @@ class PreviewPanel:
 
     def reset(self) -> None:
         """Discard cached images and timings for another project."""
+        self.canvas.clear()
         self._pictures, self._draft_seconds = Memo(), float("inf")
 
     def scene_changed(self) -> None:
@@ -91,8 +130,9 @@ class PreviewPanel:
         self._show_cameras()
 
     def close(self) -> None:
-        """End the worker thread."""
+        """End the worker threads."""
         self._worker.close()
+        self._light_worker.close()
 
     def first_camera(self) -> Cameras | None:
         """The first camera of the scene that the phase shows; None where there is none."""
@@ -105,21 +145,32 @@ class PreviewPanel:
         self.update()
 
     def camera_moved(self, window: int) -> None:
-        """Update the preview after a window's view changed."""
+        """Show splats while a window's view moves, and its picture when it rests."""
         if window == self._page.guarded.edit_lock.holder and self._follow.value:
-            self.update()
+            self._submit(is_moved=True)
 
     def show(self, left: PictureKind, right: PictureKind) -> None:
         """Select the two kinds of images."""
         self._left.value, self._right.value = left, right
         self.update()
 
+    def holder_changed(self) -> None:
+        """Show the picture in the window that edits now."""
+        self.canvas.clear()
+        self.update()
+
     def update(self) -> None:
         """Request a preview of the current state."""
+        self._submit(is_moved=False)
+
+    def _submit(self, *, is_moved: bool) -> None:
         request = self._request()
         self._panel.visible = request is not None
+        self._image.visible = request is not None and request.window is None
+        if request is None or request.window is None or (is_moved and _pose(request.camera) != self._shown_pose):
+            self.canvas.clear()
         if request is not None:
-            self._worker.submit(request)
+            self._worker.submit(replace(request, is_moved=is_moved))
 
     def save_picture(self, path: Path) -> None:
         """Write the right image, 1280 pixels wide.
@@ -142,16 +193,33 @@ class PreviewPanel:
             return None
         if self._camera_slider.max != max(1, len(cameras) - 1):
             self._camera_slider.max = max(1, len(cameras) - 1)
-        if self._follow.value and window is not None:
-            camera = camera_from_viser(window.camera, width=width or self._size.width, min_aspect=_MIN_ASPECT)
+        is_on_canvas = self._follow.value and window is not None and self._page.phase != "Select"
+        if window is not None and (is_on_canvas or self._follow.value):
+            size = self._canvas_width(window) if is_on_canvas else self._size.width
+            aspect = 0.0 if is_on_canvas else _MIN_ASPECT
+            camera = camera_from_viser(window.camera, width=width or size, min_aspect=aspect)
         else:
             camera = cameras[int(self._camera_slider.value)]
             camera = camera.resized((width or self._size.width) / camera.width)
         left, right = _SOURCE_KINDS if self._page.phase == "Select" else (self._left.value, self._right.value)
-        state = self._dragged_state or session.placed_state()
         return _PictureRequest(
-            session, state, camera, left, right, float(self._split.value), self._dragged_state is not None
+            session=session,
+            state=self._dragged_state or session.placed_state(),
+            camera=camera,
+            left=left,
+            right=right,
+            split=float(self._split.value),
+            window=window if is_on_canvas else None,
+            is_dragging=self._dragged_state is not None,
         )
+
+    def _canvas_width(self, window: viser.ClientHandle) -> int:
+        """Width of the canvas; a slow browser reduces its own while the view moves."""
+        aspect, width = round(window.camera.aspect, 2), window.camera.image_width
+        if aspect != self._canvas_size[0]:
+            self._canvas_size = (aspect, 0)
+        self._canvas_size = (aspect, max(width, self._canvas_size[1]))
+        return min(_MAX_WIDTH, max(64, self._canvas_size[1]))
 
     def _scene(self, session: Session) -> Path:
         return session.files.source_scene if self._page.phase == "Select" else session.files.target_scene
@@ -182,64 +250,109 @@ class PreviewPanel:
             self._to_camera()
 
     def _work(self, request: _PictureRequest) -> None:
-        relighting = request.session.relighting
-        if not {request.left, request.right} & set(NEEDS_LIGHT) or relighting.is_relit(request.state):
-            self._draw(request, note="")
+        if request.is_moved and not self._worker.wait_idle(_REST_SECONDS):
             return
-        if self._draft_seconds > _DRAFT_LIMIT:
+        relighting, state = request.session.relighting, request.state
+        if not {request.left, request.right} & set(NEEDS_LIGHT) or relighting.is_relit(state):
+            self._draw(request, note=self._light_note)
+            return
+        if self._draft_seconds > _DRAFT_LIMIT and not relighting.has_draft(state):
             # first the images that need no light transfer
             fast = replace(request, **{side: _without_light(getattr(request, side)) for side in ("left", "right")})
-            self._draw(fast, note="light: computing ...")
+            self._draw(fast, note="light: computing ...", stage="copy-paste")
             if self._worker.superseded:
                 return
         start = time.monotonic()
-        relighting.draft(request.state)
-        self._draft_seconds = time.monotonic() - start
+        if not relighting.has_draft(state):
+            relighting.draft(state)
+            self._draft_seconds = time.monotonic() - start
         self._draw(replace(request, draft=True), note=f"a draft of the light in {self._draft_seconds:.1f} s")
-        if request.is_dragging or not self._worker.wait_idle(min(1.5, 0.3 * self._relight_seconds)):
+        if not request.is_dragging:
+            self._light_worker.submit(request)
+
+    def _compute_light(self, request: _PictureRequest) -> None:
+        """The light as the step computes it, when nothing has changed for a moment."""
+        relighting = request.session.relighting
+        if relighting.is_relit(request.state) or not self._light_worker.wait_idle(
+            min(1.5, 0.3 * self._relight_seconds)
+        ):
             return
         start = time.monotonic()
         relighting.relit(request.state)
         self._relight_seconds = time.monotonic() - start
-        self._draw(request, note=f"light in {self._relight_seconds:.1f} s")
+        self._light_note = f"light in {self._relight_seconds:.1f} s"
         self._page.light_ready()
+        self.update()
 
-    def _draw(self, request: _PictureRequest, *, note: str) -> None:
+    def _draw(self, request: _PictureRequest, *, note: str, stage: str = "") -> None:
+        stage = stage or ("draft" if request.draft else "final")
+        if request.window is not None and self._picture_seconds > _COARSE_ABOVE:
+            camera = request.camera.resized(_COARSE_SHARE)
+            self._draw_once(replace(request, camera=camera, budget=_COARSE_BUDGET), note=note, stage="coarse")
+            if self._worker.superseded:
+                return
+        self._draw_once(request, note=note, stage=stage)
+
+    def _draw_once(self, request: _PictureRequest, *, note: str, stage: str) -> None:
         start = time.monotonic()
         problems: list[str] = []
-        left, right = (self._picture(kind, request, problems) for kind in (request.left, request.right))
-        seconds = (time.monotonic() - start) / 2
-        self._image.image = wipe_comparison(left, right, request.split)
-        self._size = replace(self._size, width=self._size.adapted(seconds))
-        height, width = left.shape[:2]
+        left, right = self._both(request, problems)
+        seconds = time.monotonic() - start
+        pixels = wipe_comparison(left.pixels, right.pixels, request.split)
+        if request.window is not None:
+            depth = right.depth if request.split < 0.5 else left.depth
+            self.canvas.show(request.window, with_badge(pixels, stage), _depth_behind(depth))
+            self._shown_pose = _pose(request.camera)
+            self._picture_seconds = seconds if stage != "coarse" else self._picture_seconds
+        else:
+            self._image.image = pixels
+            self._size = replace(self._size, width=self._size.adapted(seconds / 2))
+        self.on_drawn(stage, time.monotonic() - start)
+        height, width = left.pixels.shape[:2]
         files, shown = request.session.files, (request.left, request.right)
         notes = [note, request.session.relighting.light_mode_note() if "Light transfer" in shown else ""]
         if "Photograph" in shown and files.without_photos[1]:
             notes.append("no photograph: an image rendered of the scene, which has no photographs")
+        why = request.session.why_stale("consolidate") if "Result" in shown and files.result.is_file() else None
+        if why is not None:
+            notes.append(f"<b>the result is out of date</b> ({html.escape(why)}): see Run")
         self._say(
             " &middot; ".join(
                 [f"{request.left} | {request.right}", f"{width} x {height}", *filter(None, notes), *problems]
             )
         )
 
-    def _picture(self, kind: PictureKind, request: _PictureRequest, problems: list[str]) -> np.ndarray:
+    def _both(self, request: _PictureRequest, problems: list[str]) -> tuple[Picture, Picture]:
+        """Both pictures; one alone is drawn where the other one is not seen."""
+        if request.split <= 0 or request.left == request.right:
+            right = self._picture(request.right, request, problems)
+            return right, right
+        left = self._picture(request.left, request, problems)
+        return (left, left) if request.split >= 1 else (left, self._picture(request.right, request, problems))
+
+    def _picture(self, kind: PictureKind, request: _PictureRequest, problems: list[str]) -> Picture:
         camera = request.camera
-        pose = (camera.world_from_camera.numpy().tobytes(), camera.intrinsics.numpy().tobytes())
         state, result = request.state, request.session.files.result
         stamp = result.stat().st_mtime_ns if result.is_file() else 0
-        objects, selection = state.objects, request.session.selection() if self._page.phase == "Select" else None
-        key = (*pose, request.draft, stamp, objects, state.erased, state.light, state.weights, selection)
+        selection = request.session.selection() if self._page.phase == "Select" else None
+        edits = (state.objects, state.erased, state.light, state.weights, selection)
+        relit = request.draft and request.session.relighting.is_relit(state)
+        key = (_pose(camera), request.draft, relit, request.budget or 0, stamp, *edits)
         try:
-            return self._pictures.get(kind, key, lambda: self._pixels(kind, request, selection))
+            return self._pictures.get(kind, key, lambda: self._rendered(kind, request, selection))
         except ValueError as error:
             problems.append(str(error))
-            return np.full((camera.height, camera.width, 3), 48, np.uint8)
+            return Picture(np.full((camera.height, camera.width, 3), 48, np.uint8))
 
-    def _pixels(self, kind: PictureKind, request: _PictureRequest, selection: Tensor | None) -> np.ndarray:
+    def _rendered(self, kind: PictureKind, request: _PictureRequest, selection: Tensor | None) -> Picture:
         preview = request.session.preview
         if kind in _SOURCE_KINDS:
-            return preview.source_picture(selection if kind == "Object alone" else None, request.camera)
-        return preview.picture(kind, request.state, request.camera, draft=request.draft)
+            return Picture(preview.source_picture(selection if kind == "Object alone" else None, request.camera))
+        return preview.view(kind, request.state, request.camera, draft=request.draft, budget=request.budget)
+
+    def _say_error(self, error: Exception) -> None:
+        traceback.print_exception(error)
+        self._say(" ".join(str(error).split()))
 
     def _say(self, text: str) -> None:
         self._caption.content = (
@@ -249,3 +362,16 @@ class PreviewPanel:
 
 def _without_light(kind: PictureKind) -> PictureKind:
     return "Copy-paste" if kind in NEEDS_LIGHT else kind
+
+
+def _pose(camera: Cameras) -> bytes:
+    """Pose, intrinsics and size, which identify a view."""
+    return b"".join(part.numpy().tobytes() for part in (camera.world_from_camera, camera.intrinsics, camera.sizes))
+
+
+def _depth_behind(depth: np.ndarray | None) -> np.ndarray | None:
+    """The depth that hides gizmos; viser stores up to 167 units."""
+    if depth is None:
+        return None
+    size = (max(1, round(depth.shape[1] * _DEPTH_SHARE)), max(1, round(depth.shape[0] * _DEPTH_SHARE)))
+    return cv2.resize(np.minimum(depth, 167.0), size, interpolation=cv2.INTER_NEAREST)

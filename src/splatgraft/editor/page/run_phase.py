@@ -18,6 +18,8 @@ from splatgraft.harmonization import HARMONIZERS
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
 
+_NOTE_STYLE = "font-size:.85em;line-height:1.5;padding:2px 12px;color:#e8590c"
+
 
 class RunPhase:
     """The controls of the phase."""
@@ -31,6 +33,11 @@ class RunPhase:
         self._report = gui.add_button("Make the report", color="gray")
         self._steps = gui.add_html("")
         with gui.add_folder("Export"):
+            self._stale = gui.add_html("", visible=False)
+            self._renew = gui.add_button("Bring the result up to date", icon=viser.Icon.REFRESH, visible=False)
+            self._renew_report = gui.add_button(
+                "Bring the report up to date", icon=viser.Icon.REFRESH, visible=False, color="gray"
+            )
             self._scene = gui.add_button_group("Scene", (".ply", ".spz", ".splat"))
             self._picture = gui.add_button("Picture of this view", icon=viser.Icon.PHOTO, color="gray")
             self._turntable = gui.add_button_group("Turntable", (".mp4", ".webp"))
@@ -39,10 +46,14 @@ class RunPhase:
         self._method.on_update(callback(lambda _: self._set_method()))
         self._transfer.on_click(callback(lambda _: page.run("consolidate", "Harmonise and consolidate")))
         self._report.on_click(callback(lambda _: page.run("evaluate", "Make the report")))
+        self._renew.on_click(callback(lambda _: page.run("consolidate", "Bring the result up to date")))
+        self._renew_report.on_click(callback(lambda _: page.run("evaluate", "Bring the report up to date")))
         self._scene.on_click(
             callback(
                 lambda event: self._download(
-                    event, exports.export_scene(page.require_session().files, event.target.value)
+                    event,
+                    exports.export_scene(page.require_session().files, event.target.value),
+                    "consolidate",
                 )
             )
         )
@@ -84,8 +95,15 @@ class RunPhase:
         has_report = (session.files.report / "index.html").is_file()
         self._turntable.visible = has_report
         self._scene.visible = session.files.result.is_file()
+        has_result = session.files.result.is_file()
+        why_result = session.why_stale("consolidate") if has_result else None
+        why_report = session.why_stale("evaluate") if has_report else None
+        self._renew.visible, self._renew_report.visible = why_result is not None, why_report is not None
+        self._stale.visible = bool(why_result or why_report)
+        self._stale.content = _stale_note(why_result, why_report)
         link = f'<a href="{FILES_PREFIX}index.html" target="_blank">Open the report</a>' if has_report else ""
-        self._link.content = f'<div style="padding:2px 12px">{link}</div>'
+        mark = " (out of date)" if why_report else ""
+        self._link.content = f'<div style="padding:2px 12px">{link}{mark}</div>'
 
     def _set_method(self) -> None:
         session = self._page.require_session()
@@ -98,11 +116,21 @@ class RunPhase:
 
     def _send_turntable(self, event: viser.GuiEvent) -> None:
         path, remark = exports.export_turntable(self._page.require_session().files, event.target.value)
-        self._download(event, path)
+        self._download(event, path, "evaluate")
         if remark:
             self._page.say(f"written: {path}; {remark}")
 
-    def _download(self, event: viser.GuiEvent, path: Path) -> None:
+    def _download(self, event: viser.GuiEvent, path: Path, step: str | None = None) -> None:
+        """Send an exported file; `step` is the one whose result it is."""
         if event.client is not None:
             event.client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
-        self._page.say(f"written: {path}")
+        why = None if step is None else self._page.require_session().why_stale(step)
+        note = "" if why is None else f"; it is out of date ({why})"
+        self._page.say(f"written: {path}{note}", bad=why is not None)
+
+
+def _stale_note(why_result: str | None, why_report: str | None) -> str:
+    """What is out of date, and why."""
+    rows = (("The result", why_result), ("The report and its turntable", why_report))
+    lines = [f"<b>{name}</b>: out of date ({html.escape(why)})" for name, why in rows if why is not None]
+    return f'<div class="sg-stale" style="{_NOTE_STYLE}">{"<br>".join(lines)}</div>'

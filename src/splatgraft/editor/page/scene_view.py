@@ -82,6 +82,10 @@ class SceneView:
                 handle.visible = False
                 self.shown.pop(name, None)
 
+    def visible_splats(self) -> tuple[str, ...]:
+        """Names of the nodes of splats that are shown."""
+        return tuple(name for name, (_, handle, _) in self._splats.items() if handle is not None and handle.visible)
+
     def remove_splats(self, name: str) -> None:
         """Remove one node of splats."""
         _, handle, _ = self._splats.pop(name, (None, None, None))

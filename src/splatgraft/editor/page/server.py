@@ -1,4 +1,4 @@
-"""A viser server with access control, an edit lock and an upload limit."""
+"""A viser server with access control, an edit lock and uploads that go to the disk."""
 
 import contextlib
 import http
@@ -18,10 +18,10 @@ from websockets.http11 import Request, Response
 
 from splatgraft.editor.access.access_control import AccessControl
 from splatgraft.editor.access.edit_lock import EditLock
+from splatgraft.editor.page.upload_receiver import UPLOAD_MESSAGES, UploadReceiver
 
 FILES_PREFIX = "/files/"
 _CAMERA_MESSAGES = (_messages.ViewerCameraMessage, _messages.GetRenderResponseMessage)
-_UPLOAD_MESSAGES = (_messages.FileTransferStartUpload, _messages.FileTransferPart)
 # this message asks viser for a public tunnel to this machine
 _BLOCKED_MESSAGES = (_messages.ShareUrlRequest,)
 _TYPES = {".html": "text/html; charset=utf-8", ".png": "image/png", ".webp": "image/webp", ".gif": "image/gif"}
@@ -39,7 +39,7 @@ _PROBE_SECONDS = 300
 class GuardedServer:
     """A viser server with access control in front."""
 
-    def __init__(self, access: AccessControl, *, host: str, port: int, upload_limit: int) -> None:
+    def __init__(self, access: AccessControl, *, host: str, port: int) -> None:
         """Start to listen at `port` or the next free one.
 
         Raises:
@@ -47,10 +47,9 @@ class GuardedServer:
         """
         self.edit_lock = EditLock()
         self.on_edit_lock_changed: Callable[[], None] = lambda: None
-        self.on_large_upload: Callable[[str, int], None] = lambda name, size: None
         self.files: Callable[[str], Path | None] = lambda name: None
-        self._access, self._limit = access, upload_limit
-        self._uploads: dict[str, int] = {}
+        self._access = access
+        self.uploads = UploadReceiver(self._send)
         with _PATCH_LOCK:
             # viser has no hook for requests: websockets.serve is replaced while viser starts
             original = websockets.asyncio.server.serve
@@ -70,6 +69,7 @@ class GuardedServer:
         inner.on_client_disconnect(
             lambda connection: self._set_edit_lock(self.edit_lock.without_window(connection.client_id))
         )
+        inner.on_client_disconnect(lambda connection: self.uploads.window_closed(connection.client_id))
         self._check(host)
 
     @property
@@ -111,35 +111,32 @@ class GuardedServer:
         if response is not None:
             # no other site may embed this page in a frame (clickjacking)
             response.headers["X-Frame-Options"] = "DENY"
+            # the address holds the token
+            response.headers["Referrer-Policy"] = "no-referrer"
         return response
 
     async def _forward_allowed(self, inner: Callable[..., Any], window: int, message: Any) -> None:
-        """Forward messages of the editing window, camera messages of all windows, and uploads within the limit."""
+        """Forward messages of the editing window, camera messages of all windows; receive its uploads."""
         if isinstance(message, _BLOCKED_MESSAGES) or (
             window != self.edit_lock.holder and not isinstance(message, _CAMERA_MESSAGES)
         ):
             return
-        if isinstance(message, _UPLOAD_MESSAGES) and not self._upload_allowed(message):
+        if isinstance(message, UPLOAD_MESSAGES):
+            self.uploads.receive(window, message)
             return
         await inner(window, message)
 
-    def _upload_allowed(self, message: Any) -> bool:
-        if isinstance(message, _messages.FileTransferStartUpload):
-            if message.size_bytes > self._limit:
-                self.on_large_upload(message.filename, message.size_bytes)
-                return False
-            self._uploads[message.transfer_uuid] = message.size_bytes
-            return True
-        left = self._uploads.get(message.transfer_uuid, 0) - len(message.content)
-        self._uploads[message.transfer_uuid] = left
-        return left >= 0
+    def _send(self, window: int, message: Any) -> None:
+        client = self.viser.get_clients().get(window)
+        if client is not None:
+            client._websock_connection.queue_message(message)
 
     def _check(self, host: str) -> None:
         """Send a request with a foreign Origin: a viser version that bypasses the access control must be detected."""
         reached = "127.0.0.1" if host in ("0.0.0.0", "") else "::1" if host == "::" else host
         probe = http.client.HTTPConnection(reached, self.port, timeout=_PROBE_SECONDS)
         try:
-            probe.request("GET", "/", headers={"Origin": "http://foreign.invalid"})
+            probe.request("GET", f"/?token={self._access.token}", headers={"Origin": "http://foreign.invalid"})
             status = probe.getresponse().status
         finally:
             probe.close()

@@ -24,7 +24,7 @@ class Windows:
 
     def connect(self) -> None:
         """Handle windows that open and close from now on; the page must be built."""
-        self._guarded.on_edit_lock_changed = self._update_notices
+        self._guarded.on_edit_lock_changed = self._holder_changed
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(lambda client: self._notices.pop(client.client_id, None))
 
@@ -73,12 +73,17 @@ class Windows:
         client.camera.on_update(lambda _: self._page.preview.camera_moved(client.client_id))
         self._set_first_view(client)
         self._update_notices()
+        self._page.preview.update()
 
     def _set_first_view(self, client: viser.ClientHandle) -> None:
         # the reconstruction covers what the first photograph shows
         camera = self._page.preview.first_camera()
         if camera is not None and client.client_id == self._guarded.edit_lock.holder:
             self.look_through(camera)
+
+    def _holder_changed(self) -> None:
+        self._update_notices()
+        self._page.preview.holder_changed()
 
     def _update_notices(self) -> None:
         for number, client in self._server.get_clients().items():

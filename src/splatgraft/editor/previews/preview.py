@@ -1,5 +1,6 @@
 """Preview images of the edited scene by splatgraft's renderer: composite, relit scene, result and their layers."""
 
+import threading
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.previews.level_of_detail import largest_coverage_indices
 from splatgraft.editor.previews.preview_relighting import PreviewRelighting
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.scene_cache import SceneCache
@@ -41,8 +43,20 @@ PICTURE_KINDS: tuple[PictureKind, ...] = (
     "Photograph",
 )
 """Kinds of images of the target; those of the source are `Source` and `Object alone`."""
+_COLORED: tuple[PictureKind, ...] = ("Copy-paste", "Light transfer", "Result", "Target alone")
+"""Kinds that are colours of a scene."""
 NEEDS_LIGHT: tuple[PictureKind, ...] = ("Light transfer", "Shadow layer")
 """Kinds that need the light transfer."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A rendered image with the depth of what it shows."""
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    """sRGB."""
+    depth: Float[np.ndarray, "h w"] | None = None
+    """Depth along the optical axis, world units; infinite where nothing is. None for images without depth."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +86,7 @@ class Preview:
         """Start with an empty memo."""
         self._scenes, self._relighting = scenes, relighting
         self._memo = Memo()
+        self._lock = threading.RLock()
 
     def picture(
         self, kind: PictureKind, state: EditState, camera: Cameras, *, draft: bool = False
@@ -87,20 +102,44 @@ class Preview:
         Raises:
             ValueError: If a file that the image needs does not exist yet.
         """
-        with self._relighting.lock:
-            return self._picture(kind, state, camera, draft=draft)
+        return self.view(kind, state, camera, draft=draft).pixels
 
-    def _picture(
+    def view(
+        self, kind: PictureKind, state: EditState, camera: Cameras, *, draft: bool = False, budget: int | None = None
+    ) -> Picture:
+        """Render one image with its depth.
+
+        Args:
+            kind: As for `picture`.
+            state: As for `picture`.
+            camera: As for `picture`.
+            draft: As for `picture`.
+            budget: Maximum number of Gaussians that are drawn of a coloured image; None: all.
+
+        Raises:
+            ValueError: As `picture`.
+        """
+        with self._lock:
+            if kind not in _COLORED:
+                return Picture(self._layer(kind, state, camera, draft=draft))
+            scene = self._scene(kind, state, draft=draft)
+            if budget is not None and scene.count > budget:
+                scene = self._memo.get(
+                    f"coarse {kind}", (scene, budget), lambda: scene.select(largest_coverage_indices(scene, budget))
+                )
+            found = render(scene, camera, outputs=frozenset({"color", "depth"}))
+            # where little is drawn, depth is that of haze
+            depth = torch.where(found.alpha[0] > 0.5, found.depth[0], torch.inf)
+            return Picture(_bytes(found.color[0]), depth.numpy())
+
+    def _layer(
         self, kind: PictureKind, state: EditState, camera: Cameras, *, draft: bool
     ) -> UInt8[np.ndarray, "h w 3"]:
         if kind == "Photograph":
             return self._photograph(camera)
         if kind in ("Mask", "Depth"):
             return self._mask(state, camera) if kind == "Mask" else self._depth(state, camera)
-        if kind == "Shadow layer":
-            return self._shadow(state, camera, draft=draft)
-        color = render(self._scene(kind, state, draft=draft), camera).color
-        return _bytes(color[0])
+        return self._shadow(state, camera, draft=draft)
 
     def source_picture(self, which: Bool[Tensor, "n"] | None, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         """Render the source scene, or the Gaussians selected by `which`."""
@@ -172,6 +211,19 @@ def wipe_comparison(
     out = np.concatenate([left[:, :at], right[:, at:]], axis=1)
     if 0 < at < width:
         out[:, max(0, at - 1) : at + 1] = 255
+    return out
+
+
+def with_badge(pixels: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with a word in its lower left corner."""
+    out = np.ascontiguousarray(pixels.copy())
+    size = max(0.4, pixels.shape[1] / 2400)
+    (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    x, y = round(12 * size) + 4, pixels.shape[0] - round(14 * size) - 4
+    corner, end = (x - 6, y - height - 6), (x + width + 6, y + base + 2)
+    patch = out[max(0, corner[1]) : end[1], max(0, corner[0]) : end[0]]
+    patch[:] = patch // 3
+    cv2.putText(out, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (235, 235, 235), 1, cv2.LINE_AA)
     return out
 
 

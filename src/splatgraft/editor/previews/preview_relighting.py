@@ -33,8 +33,7 @@ class PreviewRelighting:
         self._scenes = scenes
         self._relight_memo, self._draft_memo = Memo(), Memo()
         self._memo = Memo()
-        self.lock = threading.RLock()
-        """Held while a memoised result is computed, so that two threads do not compute it twice."""
+        self._full_lock, self._draft_lock, self._composite_lock = threading.RLock(), threading.RLock(), threading.Lock()
 
     def composite(self, state: EditState) -> Composite:
         """The target with the placed objects; the same object for the same edits.
@@ -43,7 +42,13 @@ class PreviewRelighting:
             ValueError: If a file is missing.
         """
         inputs = (self._scenes.gaussians(self._scenes.files.target_scene), state.objects, state.erased)
-        return self._memo.get("composite", inputs, lambda: self._scenes.composite(state))
+        # memos recognise a composite by identity: two threads must get the same one
+        with self._composite_lock:
+            return self._memo.get("composite", inputs, lambda: self._scenes.composite(state))
+
+    def has_draft(self, state: EditState) -> bool:
+        """Whether a draft or the light itself of this state is memoised."""
+        return self.is_relit(state) or self._memo.peek("draft", self._inputs(state)) is not None
 
     def is_relit(self, state: EditState) -> bool:
         """Whether the light of this state is memoised, or project.toml selects no physical light transfer."""
@@ -108,10 +113,12 @@ class PreviewRelighting:
 
     def _make_once(self, name: str, state: EditState, make: Callable[[EditState], Relit]) -> Relit:
         inputs = self._inputs(state)
-        # a memoised result must not wait for a computation in another thread
+        # a memoised result must not wait for a computation in another thread, nor a draft for the light itself
         found = self._memo.peek(name, inputs)
         if found is None:
-            with self.lock:
+            # of a small scene, both share a memo of parts
+            is_apart = name == "draft" and _is_large(inputs[0])
+            with self._draft_lock if is_apart else self._full_lock:
                 found = self._memo.get(name, inputs, lambda: make(state))
         return found
 

@@ -1,7 +1,7 @@
 """Operations on an object's placement: drop to the surface, align up, rescale, suggest a place, duplicate beside."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,17 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
+
+_BESIDE = 2.2
+"""Distance of a duplicate over the object's reach to the sides: a fifth of it remains between them."""
+_INSIDE = 0.98
+"""Share of an object's Gaussians within its reach, so that floaters do not count."""
+_DIRECTIONS = 8
+"""Directions in which a place for a duplicate is looked for."""
+_LEAST_FLAT = 0.6
+"""Share of the object's base that stands on the surface."""
+_SAME_HEIGHT = 0.15
+"""Largest difference of heights over the object's own, at which two places count as one surface."""
 
 
 @dataclass(frozen=True)
@@ -100,17 +111,59 @@ def plausible_scale(
     ).target_from_object.scale
 
 
-def place_beside(item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]) -> Similarity:
-    """The same placement, shifted horizontally by three base radii."""
+def place_beside(
+    target: Gaussians, item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]
+) -> tuple[Similarity, bool]:
+    """The same object on the surface beside itself, at the same height.
+
+    Args:
+        target: The scene, with the objects that stand in it.
+        item: The object.
+        target_from_object: Its placement.
+        up: Up direction of the target.
+
+    Returns:
+        The placement, and whether a surface at that height was found; else the object stands beside itself in the air.
+    """
     up = torch.nn.functional.normalize(up, dim=0)
     axis = torch.eye(3)[int(up.abs().argmin())]
     across = torch.nn.functional.normalize(axis - (axis @ up) * up, dim=0)
-    step = 3.0 * target_from_object.scale * item.base.radius * across
-    return Similarity(
-        scale=target_from_object.scale,
-        rotation=target_from_object.rotation,
-        translation=target_from_object.translation + step,
-    )
+    along = torch.linalg.cross(up, across)
+    size = target_from_object.scale * item.base.height
+    step = _BESIDE * target_from_object.scale * _reach(item)
+    old = float(target_from_object.points(item.base.point) @ up)
+    options = RestOptions(scale=target_from_object.scale)
+    for turn in range(_DIRECTIONS):
+        angle = 2 * math.pi * turn / _DIRECTIONS
+        shift = step * (math.cos(angle) * across + math.sin(angle) * along)
+        shifted = _shifted(target_from_object, shift)
+        above = shifted.points(item.base.point) + 0.5 * size * up
+        try:
+            support = rest_on_surface(target, item.base, point=above, up=up, options=options)[1]
+        except ValueError:
+            continue  # nothing lies below there
+        drop = float(support.point @ up) - old
+        if abs(drop) <= _SAME_HEIGHT * size and support.flat_fraction >= _LEAST_FLAT:
+            # it keeps its rotation: only the height is that of the surface
+            return _shifted(shifted, drop * up), True
+    return _shifted(target_from_object, step * across), False
+
+
+def snapped_angles(degrees: tuple[float, float, float], step: float) -> tuple[float, float, float]:
+    """Angles rounded to multiples of `step` degrees."""
+    x, y, z = (round(angle / step) * step for angle in degrees)
+    return x, y, z
+
+
+def _reach(item: PlaceableObject) -> float:
+    """How far an object reaches to the sides of its foot, in its own units."""
+    offset = item.gaussians.means - item.base.point
+    sideways = (offset - (offset @ item.base.up)[:, None] * item.base.up).norm(dim=1)
+    return max(item.base.radius, float(sideways.quantile(_INSIDE)))
+
+
+def _shifted(target_from_object: Similarity, shift: Float[Tensor, "3"]) -> Similarity:
+    return replace(target_from_object, translation=target_from_object.translation + shift)
 
 
 def _about_base_point(

@@ -1,4 +1,4 @@
-"""The project as the editor needs it: its files, stale steps and commands. Implemented in `commands/edit.py`."""
+"""The project as the editor needs it: files, stale steps, commands. `commands/edit_project.py` implements it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -83,6 +83,10 @@ class Project(Protocol):
 
     def reasons(self) -> Mapping[str, str | None]:
         """For each step, in the order of the flow, why it is stale; None where it is up to date."""
+        ...
+
+    def describe(self, path: Path) -> tuple[str, bool]:
+        """What is at a path, in one line, and whether a project can be made of it; nothing is changed."""
         ...
 
     def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:

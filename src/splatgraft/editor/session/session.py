@@ -1,7 +1,8 @@
 """An open project: its edits with undo history, saved after every change, and its scenes, previews and job."""
 
+import contextlib
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,17 +16,24 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.editor.jobs.jobs import Jobs, JobState
 from splatgraft.editor.previews.preview import Preview
 from splatgraft.editor.previews.preview_relighting import PreviewRelighting
-from splatgraft.editor.session.edit_state import EditState, as_written, read_state, state_files, write_state
+from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.history import History
 from splatgraft.editor.session.placement_operations import PlaceableObject
 from splatgraft.editor.session.project_access import Project, ProjectFiles, Triple
+from splatgraft.editor.session.project_backup import ProjectBackup
 from splatgraft.editor.session.scene_cache import SceneCache
+from splatgraft.editor.session.state_checks import check_state
+from splatgraft.editor.session.state_files import as_written, find_state, state_files, write_state
 from splatgraft.editor.session.state_store import StateStore
 from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.project.layout import Side
 from splatgraft.segmentation import Box, add_correction, apply_corrections
 
 EDITOR_FOLDER = ".editor"
+_PROBLEM_STEP = "project"
+"""Entry of `Project.reasons` where project.toml is invalid."""
+_PROJECT = "project.toml"
+"""Name of a problem of the whole project file, beside those of single fields of the state."""
 
 
 class Session:
@@ -35,7 +43,7 @@ class Session:
         """Open the project with the edits and the undo history of the last session.
 
         Raises:
-            ValueError: If project.toml is missing or invalid.
+            ValueError: If project.toml is missing or invalid. Other files may be: `notice` names them then.
         """
         files = project.files()
         if files is None:
@@ -48,8 +56,14 @@ class Session:
         self.jobs = Jobs(files.root / EDITOR_FOLDER)
         self.notice: str | None = None
         self._store = StateStore(files.root / EDITOR_FOLDER, project_folder=files.file.parent)
-        self._state = read_state(files.file)
+        self._backup = backup_of(files.file)
+        self._backup.keep()
+        found = find_state(files.file)
+        self._state, self._problems = found.state, dict(found.problems)
+        self._opening_is_step = False
         self.history: History[str] = self._read_history()
+        if self._problems:
+            self.notice = self._problems_text()
         self._stamps = self._read_stamps()
         self._composed_objects: tuple[int, tuple[ObjectPlacement, ...]] = (0, ())
         self._lock = threading.RLock()
@@ -63,8 +77,10 @@ class Session:
         """Save a new state as one undo step.
 
         Raises:
-            ValueError: If the files were changed outside the editor, which loads that change, or cannot be written.
+            ValueError: If a value is out of its range, the files were changed outside the editor, which loads that
+                change, or cannot be written.
         """
+        check_state(state)
         with self._lock:
             state = as_written(state, self._state)
             name = self._store.save(state)
@@ -77,22 +93,27 @@ class Session:
         Raises:
             ValueError: As `change`.
         """
+        check_state(state)
         with self._lock:
             state = as_written(state, self._state)
             self._apply(self.history.amended(self._store.save(state)), state)
 
+    def has_steps(self) -> bool:
+        """Whether there is anything to undo or to redo."""
+        return bool(self.history.past or self.history.future or self._problems)
+
     def undo(self) -> bool:
-        """Go back by one step; False where there is none.
+        """Go back by one step; False where there is none. A file that could not be read is a step: it is written anew.
 
         Raises:
             ValueError: As `change`.
         """
         with self._lock:
-            if not self.history.past:
-                return False
-            history = self.history.undone()
-            self._apply(history, self._store.read(history.present))
-            return True
+            self._note_outside_problems()
+            if self._problems and not self._opening_is_step:
+                self._restore_files()
+                return True
+            return self._step(History.undone)
 
     def redo(self) -> bool:
         """Go forward by one step; False where there is none.
@@ -101,41 +122,100 @@ class Session:
             ValueError: As `change`.
         """
         with self._lock:
-            if not self.history.future:
-                return False
-            history = self.history.redone()
-            self._apply(history, self._store.read(history.present))
+            return self._step(History.redone)
+
+    def set_aside(self) -> None:
+        """Move project.toml, all edits and their history aside; results stay. The session must not be used again.
+
+        Raises:
+            ValueError: If a job is running.
+        """
+        job = self.job()
+        if job is not None and job.live:
+            raise ValueError(f"{job.title}: expected no job at work, found this one; wait or cancel it")
+        self._backup.move_aside((*state_files(self.files.file), *self._store.paths()))
+
+    def _step(self, move: Callable[[History[str]], History[str]]) -> bool:
+        """Move in the history to the next state that can be read."""
+        history = self.history
+        while (moved := move(history)) is not history:
+            history = moved
+            try:
+                state = self._store.read(history.present)
+            except ValueError as error:
+                self.notice = f"{error}; that step is left out"
+                continue
+            self._apply(history, state)
             return True
+        return False
 
     def reload(self) -> bool:
         """Load changes made outside the editor as one undo step; whether there were any.
 
         Raises:
-            ValueError: If a file is invalid.
+            ValueError: If a file is invalid; once for each change of the files.
         """
         with self._lock:
             stamps = self._read_stamps()
             if stamps == self._stamps:
                 return False
-            found = read_state(self.files.file)
-            self._stamps, self._state = stamps, found
-            name = self._store.save(found)
+            self._stamps, self._opening_is_step = stamps, False
+            try:
+                found = find_state(self.files.file)
+                files = self.project.files()
+            except ValueError as error:
+                self._problems = {_PROJECT: str(error)}
+                raise ValueError(self._problems_text()) from None
+            self._problems = dict(found.problems)
+            if self._problems:
+                raise ValueError(self._problems_text())
+            self._backup.keep()
+            self._state = found.state
+            name = self._store.save(found.state)
             if name != self.history.present:
                 self._save_history(self.history.pushed(name))
-            self._refresh_files()
+            self._use_files(files)
             return True
 
     def _apply(self, history: History[str], state: EditState) -> None:
-        if history.present == self.history.present:
+        if history.present == self.history.present and not self._problems:
             self._save_history(history)
             return
         if self.reload():
             raise ValueError(
                 f"{self.files.file.name}: changed outside the editor; the change was loaded, please repeat your edit"
             )
-        write_state(self.files.file, self._state, state)
-        self._state, self._stamps = state, self._read_stamps()
+        if _PROJECT in self._problems:
+            raise ValueError(self._problems_text())
+        if self._problems:
+            self._backup.set_aside(state_files(self.files.file))
+        write_state(self.files.file, None if self._problems else self._state, state)
+        self._state, self._problems, self._stamps = state, {}, self._read_stamps()
+        self._backup.keep()
         self._save_history(history)
+
+    # files that could not be read
+
+    def _note_outside_problems(self) -> None:
+        """Look for files that were made unreadable since the last look; changes that can be read are loaded."""
+        with contextlib.suppress(ValueError):
+            self.reload()
+
+    def _restore_files(self) -> None:
+        """Write the present state over files that could not be read, of which copies are kept."""
+        folder = self._backup.set_aside(state_files(self.files.file))
+        if _PROJECT in self._problems:
+            self._backup.restore()
+        write_state(self.files.file, None, self._state)
+        self.notice = (
+            f"written again as before: {', '.join(sorted(self._problems))}; the unreadable files are in {folder}"
+        )
+        self._problems, self._stamps = {}, self._read_stamps()
+        self._use_files(self.project.files())
+
+    def _problems_text(self) -> str:
+        found = "; ".join(dict.fromkeys(self._problems.values()))
+        return f"{found}. All else is open; Undo puts back what was there before"
 
     def _read_history(self) -> History[str]:
         """The saved history, with one more step where the files were changed while no editor was open."""
@@ -144,7 +224,8 @@ class Session:
         except ValueError as error:
             self.notice, saved = f"{error}; the undo history is empty now", None
         now = self._store.save(self._state)
-        history = History(now) if saved is None else saved if saved.present == now else saved.pushed(now)
+        self._opening_is_step = saved is not None and saved.present != now
+        history = History(now) if saved is None else saved.pushed(now) if self._opening_is_step else saved
         self._store.save_history(history)
         return history
 
@@ -152,8 +233,7 @@ class Session:
         self.history = history
         self._store.save_history(history)
 
-    def _refresh_files(self) -> None:
-        files = self.project.files()
+    def _use_files(self, files: ProjectFiles | None) -> None:
         if files is not None and files != self.files:
             self.files, self.scenes.files = files, files
 
@@ -172,7 +252,8 @@ class Session:
                 raise ValueError(f"{self.files.file.name}: changed outside the editor; please repeat your edit")
             self.project.set_view(side, up=up, look=look)
             self._stamps = self._read_stamps()
-            self._refresh_files()
+            self._backup.keep()
+            self._use_files(self.project.files())
 
     # the selection in the source
 
@@ -276,6 +357,21 @@ class Session:
     def reasons(self) -> Mapping[str, str | None]:
         """For each step why it is stale; None where it is up to date."""
         return self.project.reasons()
+
+    def why_stale(self, step: str) -> str | None:
+        """Why the result of a step is out of date, with the first step that is; None where it is up to date."""
+        found = self.reasons()
+        if step not in found:
+            return found.get(_PROBLEM_STEP)
+        name, reason = step, found[step]
+        while reason is not None and (before := reason.removeprefix("waits for ")) in found and before != reason:
+            name, reason = before, found[before]
+        return None if reason is None else f"{name}: {reason}"
+
+
+def backup_of(project: Path) -> ProjectBackup:
+    """The copies that the editor keeps of a project.toml."""
+    return ProjectBackup(project, project.parent / EDITOR_FOLDER)
 
 
 def _same_file(path: Path | None, other: Path) -> bool:

@@ -3,6 +3,7 @@
 Undo is therefore unbounded, needs little memory, and survives the end of the editor.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -19,11 +20,14 @@ from torch import Tensor
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.history import History
+from splatgraft.editor.session.state_checks import check_state
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
 from splatgraft.runtime.atomic_file import atomic_write
 
 HISTORY_FILE, STATES_FOLDER = "history.json", "states"
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, EOFError)
+"""What a damaged file may raise."""
 _IN_MEMORY = 20
 """Number of states held in memory; memos recognise such a state by the identity of its parts."""
 
@@ -62,8 +66,10 @@ class StateStore:
         if name not in self._recent:
             path = self._path(name, ".json")
             try:
-                self._remember(name, self._from_json(json.loads(path.read_text(encoding="utf-8"))))
-            except (OSError, ValueError, KeyError, TypeError) as error:
+                state = self._from_json(json.loads(path.read_text(encoding="utf-8")))
+                check_state(state)
+                self._remember(name, state)
+            except _UNREADABLE as error:
                 raise ValueError(f"{path}: expected an earlier state, found {type(error).__name__}: {error}") from error
         self._recent.move_to_end(name)
         return self._recent[name]
@@ -80,7 +86,7 @@ class StateStore:
             history = History(str(found["present"]), _names(found["past"]), _names(found["future"]))
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except _UNREADABLE as error:
             raise ValueError(f"{path}: expected a history, found {type(error).__name__}: {error}") from error
         self._remove_unused({history.present, *history.past, *history.future})
         return history
@@ -90,6 +96,10 @@ class StateStore:
         record = {"past": history.past, "present": history.present, "future": history.future}
         with atomic_write(self._folder / HISTORY_FILE) as stream:
             stream.write(json.dumps(record).encode())
+
+    def paths(self) -> tuple[Path, ...]:
+        """The file of the history and the folder of the states."""
+        return self._folder / HISTORY_FILE, self._folder / STATES_FOLDER
 
     def _path(self, name: str, suffix: str) -> Path:
         return self._folder / STATES_FOLDER / f"{name}{suffix}"
@@ -103,8 +113,12 @@ class StateStore:
 
     def _remove_unused(self, used: set[str]) -> None:
         """Delete all states but those in `used`, and all arrays that these do not refer to."""
-        texts = [path.read_text() for name in used if (path := self._path(name, ".json")).is_file()]
-        arrays = {found[key] for text in texts for found in [json.loads(text)] for key in ("erased", "corrections")}
+        arrays: set[str] = set()
+        for path in (self._path(name, ".json") for name in used):
+            # a state that cannot be read is passed over by undo
+            with contextlib.suppress(*_UNREADABLE):
+                found = json.loads(path.read_text(encoding="utf-8"))
+                arrays |= {str(found["erased"]), str(found["corrections"])}
         for path in (self._folder / STATES_FOLDER).glob("*"):
             if path.stem not in used and path.stem not in arrays:
                 path.unlink()

@@ -1,0 +1,206 @@
+"""Times of the editor as a browser sees them: start, first picture, a moved view, a moved object.
+
+`python benchmarks/editor.py [COUNT ...]`. For targets of 200,000 Gaussians (or COUNT) it starts `splatgraft edit` on a
+project of two synthetic scenes and speaks the page's own protocol through a websocket, at a canvas of 1280x720. No
+browser takes part, so what a browser needs for drawing comes on top. Times are seconds from the message that causes a
+picture to its arrival, medians of REPEATS; `final` is the light as the step computes it.
+"""
+
+import contextlib
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+import zstandard
+from relight import courtyard, surfels
+from websockets.sync.client import ClientConnection, connect
+
+from splatgraft.cli import main as command
+from splatgraft.core.cameras import look_at
+from splatgraft.core.directions import even_directions
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.rotations import quaternion_from_rotation
+from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.formats import write_gaussians
+
+WIDTH, HEIGHT, REPEATS, HANG_LIMIT = 1280, 720, 5, 600.0
+BALL_BOX = [-0.35, -0.35, 0.02, 0.35, 0.35, 0.75]
+
+
+def ball(count: int) -> Gaussians:
+    directions = even_directions(count)
+    return surfels(0.3 * directions + torch.tensor([0, 0, 0.33]), directions, 0.02, 0.4)
+
+
+def write_project(root: Path, count: int) -> Path:
+    """Two scenes without photographs, and all steps up to the pasted object."""
+    write_gaussians(root / "source.ply", concatenate([courtyard(20_000), ball(5_000)]))
+    write_gaussians(root / "target.ply", courtyard(count))
+    project = root / "project" / "project.toml"
+    words = ["--source", str(root / "source.ply"), "--target", str(root / "target.ply")]
+    with contextlib.redirect_stdout(sys.stderr):
+        assert command(["init", str(project.parent), *words]) == 0
+        text = with_keys(project.read_text(), "segment", {"keep": "all", "mask_source": "box", "box": BALL_BOX})
+        for side in ("source", "target"):
+            text = with_keys(text, side, {"views": 8, "picture_width": 320, "up": [0.0, 0.0, 1.0]})
+        project.write_text(with_keys(text, "compose", {"point": [0.0, 0.0, 0.5], "scale": 1.0}))
+        assert command(["run", str(project), "--to", "compose"]) == 0
+    return project
+
+
+class Client:
+    """What a browser sends and receives."""
+
+    def __init__(self, address: str) -> None:
+        """Connect; nothing is sent yet."""
+        base, _, query = address.partition("/?")
+        self._socket: ClientConnection = connect(
+            base.replace("http", "ws") + "/?" + query,
+            origin=base,  # pyright: ignore[reportArgumentType]
+            subprotocols=["viser-v1.1.1"],  # pyright: ignore[reportArgumentType]
+            max_size=None,
+            open_timeout=HANG_LIMIT,
+        )
+        self._gui: dict[str, dict[str, Any]] = {}
+        self.has_splats = False
+
+    def send(self, kind: str, **fields: Any) -> None:
+        """Send a message as viser's page would."""
+        self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def look(self, angle: float, *, distance: float = 2.5) -> None:
+        """Report a view from a direction."""
+        eye = torch.tensor([[distance * np.cos(angle), distance * np.sin(angle), 1.2]]).float()
+        pose = look_at(eye, torch.tensor([0.0, 0.0, 0.3]), torch.tensor([0.0, 0.0, 1.0]))[0]
+        rotation = quaternion_from_rotation(pose[None, :3, :3])[0]
+        self.send(
+            "ViewerCameraMessage",
+            wxyz=rotation.tolist(),
+            position=eye[0].tolist(),
+            fov=0.9,
+            near=0.01,
+            far=1000.0,
+            image_height=HEIGHT,
+            image_width=WIDTH,
+            look_at=[0.0, 0.0, 0.3],
+            up_direction=[0.0, 0.0, 1.0],
+        )
+
+    def set_value(self, label: str, value: Any) -> None:
+        """Change a control, as a user would."""
+        uuid = next(key for key, props in self._gui.items() if props.get("label") == label)
+        self.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
+
+    def value(self, label: str) -> Any:
+        """The value of a control."""
+        return next(props for props in self._gui.values() if props.get("label") == label)["value"]
+
+    def messages(self, seconds: float) -> Iterator[dict[str, Any]]:
+        """What arrives within a time."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            try:
+                data = self._socket.recv(timeout=left)
+            except TimeoutError:
+                return
+            assert isinstance(data, bytes)
+            packed = int.from_bytes(data[8:16], "little")
+            size = int.from_bytes(data[:8], "little")
+            inner = zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed], max_output_size=size)
+            for message in msgspec.msgpack.decode(inner)["messages"]:
+                self._note(message)
+                yield message
+
+    def _note(self, message: dict[str, Any]) -> None:
+        if "uuid" in message and isinstance(message.get("props"), dict):
+            self._gui[message["uuid"]] = {**message["props"], "value": message.get("value")}
+        elif message["type"] == "GuiUpdateMessage" and message["uuid"] in self._gui:
+            self._gui[message["uuid"]].update(message["updates"])
+        self.has_splats |= message["type"] == "GaussianSplatsMessage"
+
+    def caption(self) -> str:
+        """What the page says about the picture."""
+        return " ".join(str(p.get("content")) for p in self._gui.values() if "sg-caption" in str(p.get("content")))
+
+    def until(self, condition: Callable[[], bool]) -> float:
+        """Seconds until a condition holds."""
+        start = time.monotonic()
+        while not condition():
+            assert time.monotonic() - start < HANG_LIMIT
+            for _ in self.messages(0.02):
+                if condition():
+                    break
+        return time.monotonic() - start
+
+    def picture(self) -> float:
+        """Seconds until the next picture on the canvas."""
+        start = time.monotonic()
+        while time.monotonic() - start < HANG_LIMIT:
+            for message in self.messages(1.0):
+                if message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None:
+                    return time.monotonic() - start
+        raise AssertionError("no picture")
+
+
+def is_final(client: Client) -> bool:
+    caption = client.caption()
+    return "Light transfer" in caption and "draft" not in caption and "computing" not in caption
+
+
+def measure(project: Path) -> dict[str, float]:
+    start, found = time.monotonic(), {}
+    words = [sys.executable, "-m", "splatgraft", "edit", str(project), "--port", "18400", "--keep-closed"]
+    server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"})
+    try:
+        assert server.stdout is not None
+        client = Client(server.stdout.readline().strip())
+        found["page"] = time.monotonic() - start
+        client.look(0.0)
+        client.until(lambda: client.has_splats)
+        found["splats"] = time.monotonic() - start
+        client.picture()
+        found["first picture"] = time.monotonic() - start
+        client.until(lambda: is_final(client))
+        found["final light"] = time.monotonic() - start
+        found |= {"moved view": statistics.median([_turn(client, 0.3 * (k + 1)) for k in range(REPEATS)])}
+        found |= {"moved object": statistics.median([_move(client, k) for k in range(REPEATS)])}
+        found["final after a move"] = client.until(lambda: is_final(client))
+    finally:
+        server.terminate()
+        server.wait(60)
+    return found
+
+
+def _turn(client: Client, angle: float) -> float:
+    for step in range(6):
+        client.look(angle - 0.05 * (6 - step))
+        time.sleep(0.03)
+    client.look(angle)
+    return client.picture()
+
+
+def _move(client: Client, k: int) -> float:
+    client.until(lambda: is_final(client))
+    x, y, z = client.value("Position")
+    start = time.monotonic()
+    client.set_value("Position", [x + 0.02 * (1 if k % 2 else -1), y, z])
+    # the picture before is of the pasted object or of the old light
+    client.until(lambda: "a draft of the light" in client.caption())
+    return time.monotonic() - start
+
+
+if __name__ == "__main__":
+    counts = [int(word) for word in sys.argv[1:]] or [200_000]
+    for count in counts:
+        with tempfile.TemporaryDirectory() as folder:
+            times = measure(write_project(Path(folder), count))
+        print(f"{count:,} Gaussians: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in times.items()))

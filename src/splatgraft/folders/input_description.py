@@ -1,0 +1,77 @@
+"""What a path is, in one line, before a project is made of it: photos, a video, a posed capture or a trained scene."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from splatgraft.capture import read_video_facts
+from splatgraft.folders.capture_files import has_poses
+from splatgraft.formats import is_scene, read_capture, read_gaussians
+from splatgraft.formats.captures.masks import describe_masks, find_photos
+
+InputKind = Literal["photos", "video", "posed capture", "scene", "project", "nothing"]
+_LARGE = 1 << 30
+"""Bytes above which a scene is not read to count its Gaussians."""
+_LEAST_PHOTOS = 3
+"""Photos from which poses can be found at all."""
+_FOLDERS = ("target/scene/scene.ply", "result/scene.ply", "scene.ply")
+"""Scenes in folders that splatgraft writes."""
+
+
+@dataclass(frozen=True)
+class InputDescription:
+    """What is at a path."""
+
+    kind: InputKind
+    """`nothing`: it is none of the others."""
+    text: str
+    """One line for the user: what it is, and what can be done with it."""
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether a project can be made of it."""
+        return self.kind not in ("project", "nothing")
+
+
+def describe_input(path: Path) -> InputDescription:
+    """Look at a path without changing anything.
+
+    Args:
+        path: A file or a folder, which need not exist.
+    """
+    try:
+        return _described(path)
+    except (ValueError, OSError) as error:
+        return InputDescription("nothing", " ".join(str(error).split()))
+
+
+def _described(path: Path) -> InputDescription:
+    if not path.exists():
+        raise ValueError(f"{path}: expected a file or a folder, found nothing there")
+    if path.name == "project.toml" or (path / "project.toml").is_file():
+        folder = path.parent if path.is_file() else path
+        return InputDescription("project", f"a project of its own: splatgraft edit {folder}")
+    if is_scene(path):
+        size = sum(p.stat().st_size for p in ([path] if path.is_file() else path.iterdir()) if p.is_file())
+        count = "" if size > _LARGE else f" of {read_gaussians(path).count:,} Gaussians"
+        return InputDescription("scene", f"a trained scene{count}: images are rendered of it, nothing is trained")
+    if has_poses(path):
+        posed = read_capture(path)
+        masks = describe_masks(posed.image_paths, posed.mask_paths)
+        return InputDescription("posed capture", f"a capture of {len(posed)} images with poses, {masks}: it is trained")
+    if path.is_file():
+        facts = read_video_facts(path)
+        found = f"a video of {facts.seconds:.0f} s, {facts.width} x {facts.height}"
+        return InputDescription("video", f"{found}: frames are taken, poses are found, and it is trained")
+    return _folder_of_photos(path)
+
+
+def _folder_of_photos(path: Path) -> InputDescription:
+    result = next((path / name for name in _FOLDERS if (path / name).is_file()), None)
+    if result is not None:
+        return InputDescription("nothing", f"a folder of results; name the scene in it: {result}")
+    photos = find_photos(path)
+    if len(photos.paths) < _LEAST_PHOTOS:
+        raise ValueError(f"{path}: expected at least {_LEAST_PHOTOS} photos, found {len(photos.paths)}")
+    masks = describe_masks(photos.paths, photos.masks)
+    return InputDescription("photos", f"{len(photos.paths)} photos, {masks}: poses are found, and it is trained")

@@ -1,0 +1,111 @@
+"""The phase Open: what a path is, before anything is made of it, and the way back from a project."""
+
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import pytest
+from test_hostile_values import made, page_of, project
+from tiny_project import ball, photograph, plane
+from waiting import wait_until
+
+from splatgraft.editor.session.state_files import read_state
+from splatgraft.folders.input_description import describe_input
+from splatgraft.formats import write_gaussians
+
+__all__ = ["made", "project"]
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("inputs")
+    photograph(root / "posed", plane((0.3, 0.5, 0.3)), ball())
+    write_gaussians(root / "ball.ply", ball())
+    (root / "photos").mkdir()
+    (root / "one").mkdir()
+    (root / "empty").mkdir()
+    for index in range(4):
+        cv2.imwrite(str(root / "photos" / f"{index}.png"), np.full((20, 30, 3), 50 * index, np.uint8))
+    cv2.imwrite(str(root / "one" / "0.png"), np.zeros((20, 30, 3), np.uint8))
+    writer = cv2.VideoWriter(str(root / "walk.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for level in range(20):
+        writer.write(np.full((48, 64, 3), 10 * level, np.uint8))
+    writer.release()
+    (root / "letter.pdf").write_bytes(b"%PDF-1.4 no capture")
+    (root / "broken.ply").write_bytes(b"ply\nnonsense")
+    (root / "results").mkdir()
+    write_gaussians(root / "results" / "scene.ply", ball())
+    return root
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "text"),
+    [
+        ("ball.ply", "scene", "a trained scene of 80 Gaussians"),
+        ("posed", "posed capture", "a capture of 8 images with poses, 8 of 8 photos have masks"),
+        ("photos", "photos", "4 photos, no masks"),
+        ("walk.avi", "video", "a video of 2 s, 64 x 48"),
+        ("one", "nothing", "expected at least 3 photos, found 1"),
+        ("empty", "nothing", "expected photos"),
+        ("letter.pdf", "nothing", "expected a video that OpenCV can read"),
+        ("broken.ply", "nothing", "broken.ply"),
+        ("nowhere", "nothing", "found nothing there"),
+        ("results", "nothing", "name the scene in it"),
+    ],
+)
+def test_what_a_path_is(inputs: Path, name: str, kind: str, text: str) -> None:
+    before = sorted(inputs.rglob("*"))
+    found = describe_input(inputs / name)
+    assert found.kind == kind, found.text
+    assert text in found.text
+    assert "\n" not in found.text
+    assert found.is_usable == (kind != "nothing")
+    assert sorted(inputs.rglob("*")) == before
+
+
+def test_a_project_is_named_with_the_command_that_opens_it(project: Path) -> None:
+    for path in (project, project.parent):
+        found = describe_input(path)
+        assert found.kind == "project"
+        assert f"splatgraft edit {project.parent}" in found.text
+        assert not found.is_usable
+
+
+def test_a_project_is_started_only_of_two_usable_paths(inputs: Path, tmp_path: Path) -> None:
+    page, close = page_of(tmp_path / "new" / "project.toml")
+    try:
+        phase = cast("Any", page._phases["Open"])
+        assert phase._start.disabled
+        for second, usable in (("letter.pdf", False), ("ball.ply", True)):
+            phase._look((str(inputs / "ball.ply"), str(inputs / second)))
+            assert phase._start.disabled != usable
+        assert "80 Gaussians" in phase._found_source.content
+    finally:
+        close()
+
+
+def test_there_is_a_way_back_from_a_project_and_back_to_it(project: Path) -> None:
+    page, close = page_of(project)
+    try:
+        session = page.require_session()
+        session.change(session.placed_state())
+        kept = {name: (project.parent / name).read_bytes() for name in ("project.toml", "placement.json")}
+        page.show_phase("Open")
+        phase = cast("Any", page._phases["Open"])
+        phase._ask_back()
+        assert phase._confirm.visible
+        phase._leave_project()
+        assert page.session is None
+        assert page.problem is None
+        # nothing of the old project is left for the next one, but its results
+        assert not (project.parent / "placement.json").is_file()
+        assert (project.parent / "target" / "scene" / "scene.ply").is_file()
+        assert phase._again.visible
+        page.return_to_project()
+        assert {name: (project.parent / name).read_bytes() for name in kept} == kept
+        assert read_state(project).objects is not None
+        assert page.require_session().undo()
+        wait_until(lambda: page.session is not None, what="the project")
+    finally:
+        close()
