@@ -1,8 +1,8 @@
 """Size, seconds and PSNR of every format that `splatgraft export` writes, against the .ply.
 
 `python benchmarks/export.py PROJECT [--chromium] [--copies]`. PROJECT is a project's folder, e.g. of `splatgraft demo`.
-PSNR is the mean over eight of the target's views, drawn by our renderer from what our reader finds; of the .html
-it is the picture in Chromium (playwright) against ours, without a network. Its size counts both scenes and the viewer.
+PSNR is the mean over eight of the target's views, drawn by our renderer from what our reader finds; of the .html it is
+the picture in Chromium (playwright) against ours, without a network. Sizes of an .html count both scenes and viewer.
 The last line is the scene with band 0 alone. With --copies, 18 jittered copies of the scene are written instead.
 """
 

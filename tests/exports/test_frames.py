@@ -62,6 +62,17 @@ def test_an_unknown_size_is_said(tmp_path, capsys):
     assert "its size is not known: a unit of the capture is written as a metre" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".sog", ".spz", ".glb"])
+def test_a_lower_degree(project, tmp_path, suffix):
+    assert main(["export", str(project), "--to", str(tmp_path / f"a{suffix}"), "--sh-degree", "0"]) == 0
+    assert read_gaussians(tmp_path / f"a{suffix}").sh_degree == 0
+
+
+def test_no_such_degree(project, tmp_path, capsys):
+    assert main(["export", str(project), "--to", str(tmp_path / "a.sog"), "--sh-degree", "4"]) == 2
+    assert "--sh-degree: expected 0 to 3, found 4" in capsys.readouterr().err
+
+
 def test_older_versions_of_spz(project, tmp_path):
     for version in ("2", "3", "4"):
         out = tmp_path / f"v{version}.spz"

@@ -161,6 +161,28 @@ def test_fingers_turn_and_pinch(browser, page_file):
     page.context.close()
 
 
+def test_without_webgl_the_page_says_so(browser, page_file):
+    page = browser.new_context(offline=True).new_page()
+    page.set_default_timeout(1000 * HANG_LIMIT)
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
+    page.goto(page_file.as_uri())
+    page.wait_for_selector("body[data-state=failed]")
+    assert page.inner_text("#message") == "This browser cannot draw the scene: it has no WebGL 2."
+    page.context.close()
+
+
+def test_a_title_is_text_and_nothing_else(browser, project, tmp_path):
+    title = '</title></script><script>document.body.dataset.taken="1"</script>"{}'
+    out = tmp_path / "title.html"
+    words = ["export", str(project), "--to", str(out), "--layer", "object", "--title", title]
+    assert main(words) == 0
+    page = Page(browser, out)
+    assert page.page.title() == title
+    assert page.page.text_content("h1") == title
+    assert page.page.get_attribute("body", "data-taken") is None
+    page.context.close()
+
+
 def test_a_scene_alone_has_no_buttons_to_compare(browser, project, tmp_path):
     out = tmp_path / "one.html"
     assert main(["export", str(project), "--to", str(out), "--layer", "object"]) == 0

@@ -7,6 +7,7 @@ from typing import Literal
 
 import torch
 
+from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.exports.export_source import ExportSource
 from splatgraft.exports.first_view import first_view
@@ -38,6 +39,8 @@ class ExportOptions:
     .glb and .usdz, which ask for it, else capture."""
     spz_version: int = 4
     """Of a .spz: 4, or 3 or 2 for programs that do not read it yet."""
+    sh_degree: int = 3
+    """Highest SH degree that is written, 0 to 3: files of lower ones are smaller, and highlights move less."""
     width: int = 1280
     """Of pictures and videos, pixels."""
     frames: int = 120
@@ -93,6 +96,18 @@ def layer_of(source: ExportSource, layer: Layer) -> tuple[Gaussians, tuple[str, 
     return chosen, (said, *left_out)
 
 
+def _layer(source: ExportSource, options: ExportOptions) -> tuple[Gaussians, tuple[str, ...]]:
+    gaussians, said = layer_of(source, options.layer)
+    return _limited(gaussians, options), said
+
+
+def _limited(gaussians: Gaussians, options: ExportOptions) -> Gaussians:
+    """Without bands above the wanted degree."""
+    if not 0 <= options.sh_degree <= spherical_harmonics.MAX_DEGREE:
+        raise ValueError(f"--sh-degree: expected 0 to {spherical_harmonics.MAX_DEGREE}, found {options.sh_degree}")
+    return gaussians.with_sh_degree(min(options.sh_degree, gaussians.sh_degree))
+
+
 def _finite(gaussians: Gaussians) -> tuple[Gaussians, tuple[str, ...]]:
     fields = [gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh.flatten(1)]
     finite = torch.isfinite(torch.cat(fields, 1)).all(1) & ~gaussians.opacity_logits.isnan()
@@ -102,18 +117,18 @@ def _finite(gaussians: Gaussians) -> tuple[Gaussians, tuple[str, ...]]:
 
 
 def _write_html(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
-    after, said = layer_of(source, options.layer)
+    after, said = _layer(source, options)
     view, assumed = first_view(source)
     scenes = {source.title: after}
     if options.layer == "all" and source.pasted is not None:
-        scenes = {"Before": _finite(source.pasted)[0], "After": after}
+        scenes = {"Before": _limited(_finite(source.pasted)[0], options), "After": after}
     background = 0.0 if options.layer in ("all", "scene") else _PART_BACKGROUND
     write_viewer_page(to, scenes, view, title=source.title, background=background)
     return (*said, *assumed)
 
 
 def _write_scene(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
-    gaussians, said = layer_of(source, options.layer)
+    gaussians, said = _layer(source, options)
     metadata, suffix = source.metadata, scene_suffix(to)
     if options.frame == "world" or (options.frame == "auto" and suffix in _WORLD_SUFFIXES):
         world_from_capture, metadata, about = upright(source)
@@ -126,7 +141,7 @@ def _write_scene(source: ExportSource, to: Path, options: ExportOptions) -> tupl
 
 
 def _write_picture(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
-    gaussians, said = layer_of(source, options.layer)
+    gaussians, said = _layer(source, options)
     view, assumed = first_view(source)
     with_alpha = options.layer != "all" and to.suffix.lower() == ".png"
     write_picture(to, gaussians, view, width=_required_width(options), with_alpha=with_alpha)
@@ -134,7 +149,7 @@ def _write_picture(source: ExportSource, to: Path, options: ExportOptions) -> tu
 
 
 def _write_turntable(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
-    gaussians, said = layer_of(source, options.layer)
+    gaussians, said = _layer(source, options)
     view, assumed = first_view(source)
     width = _required_width(options)
     about = write_turntable(to, gaussians, source, view, frames=options.frames, width=width)

@@ -130,7 +130,7 @@
     const does = {
       ArrowLeft: () => rotate(-20, 0), ArrowRight: () => rotate(20, 0), ArrowUp: () => rotate(0, 20),
       ArrowDown: () => rotate(0, -20), "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
-      Home: reset, b: () => show((shown + 1) % entities.length),
+      Home: reset, b: () => entities.length === view.scenes.length && show((shown + 1) % entities.length),
     }[event.key];
     if (does) { event.preventDefault(); does(); }
   });
