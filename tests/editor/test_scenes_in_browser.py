@@ -101,17 +101,17 @@ def paint(window: Window, project: Path) -> None:
     window.act_until(drag, lambda: strokes(project)[1] > one, what="a stroke of the brush")
     window.page.keyboard.press("b")
     window.says("the brush is off")
-    window.check("Box for strokes")
+    window.check("Second box")
     window.click("Add")
     # the box begins a tenth larger than the object's, and adds what was removed in it
     window.until(lambda: strokes(project)[0] >= 80, what="corrections by the box")
     window.undo_until(project, lambda: strokes(project) == (0, 0))
-    window.check("Box for strokes", False)
+    window.check("Second box", False)
 
 
 def fill_the_target(window: Window, project: Path, root: Path) -> None:
     window.show_phase("Place")
-    window.click("Find a place for it")
+    window.click("Find a place")
     window.until(lambda: len(state_of(project).objects or ()) == 1, what="a placed object")
     window.unfold("Another object")
     window.upload("Upload a file", root / "another.spz")

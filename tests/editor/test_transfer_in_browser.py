@@ -83,7 +83,7 @@ def select(window: Window, project: Path) -> None:
     window.says("Cut out the object: done")
     window.says("are the object")
     before = len(read_gaussians(project.parent / "object" / "object.ply").means)
-    window.choose("A stroke", "removes")
+    window.choose("Strokes", "remove")
 
     def drag_a_rectangle() -> None:
         # over the upper left part of the image, in the middle of the canvas
@@ -112,7 +112,7 @@ def select(window: Window, project: Path) -> None:
 
 def place(window: Window, project: Path) -> None:
     window.show_phase("Place")
-    window.click("Find a place for it")
+    window.click("Find a place")
     window.until((project.parent / "placement.json").is_file, what="a placement")
     found = object_at(project)
 

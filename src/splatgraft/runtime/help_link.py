@@ -29,6 +29,7 @@ _SECTIONS = {
     "commands.steps.capture": "capture-photos-and-videos",
     "core.images": "capture-photos-and-videos",
     "folders.capture_files": "capture-photos-and-videos",
+    "folders.input_description": "capture-photos-and-videos",
     "formats": "capture-photos-and-videos",
     "workflow.run_steps": "capture-photos-and-videos",
     "capture.metric_scale": "compose-and-placementjson",

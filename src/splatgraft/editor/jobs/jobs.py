@@ -207,7 +207,7 @@ class Jobs:
 
 
 def _check_types(state: JobState) -> None:
-    """Raises: ValueError where a number of the state is none, or the outcome is unknown."""
+    """Raises: TypeError where a number of the state is none, or the outcome is unknown."""
     numbers = (state.started, state.done, state.total, state.step_started, state.begun, state.begun_at, state.pid)
     numbers += (*(step.seconds for step in state.plan), *(seconds for _, seconds in state.took))
     texts = (state.title, state.step, state.message, state.error, *(step.name for step in state.plan))
@@ -217,7 +217,7 @@ def _check_types(state: JobState) -> None:
         and state.pid > 1
     )
     if not is_good or not all(isinstance(x, str) for x in texts) or state.outcome not in get_args(Outcome):
-        raise ValueError("values of another type")
+        raise TypeError("values of another type")
 
 
 def acquire_job_lock(folder: Path) -> filelock.BaseFileLock:

@@ -58,10 +58,10 @@ class OpenPhase:
         with self._trained:
             self._scenes = (
                 gui.add_text(
-                    "Of the first", "", hint="A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
+                    "Of the object", "", hint="A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
                 ),
                 gui.add_text(
-                    "Of the second", "", hint="A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
+                    "Of the place", "", hint="A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
                 ),
             )
         # viser shows upload buttons even where `visible` is false; the folder hides it
@@ -132,7 +132,7 @@ class OpenPhase:
             f'<div style="font-size:.85em;line-height:1.6;padding:2px 12px">{"<br>".join(lines)}</div>'
         )
         have_both = session.files.source_scene.is_file() and session.files.target_scene.is_file()
-        self._build.label = "Reconstruct again what is stale" if have_both else self._title(session)
+        self._build.label = "Bring both scenes up to date" if have_both else self._title(session)
         self._build.color = "gray" if have_both else None
 
     def _look(self, paths: tuple[str, str]) -> None:

@@ -14,6 +14,7 @@ import viser
 
 from splatgraft.editor.access.uploads import IncomingUpload, UploadRules
 from splatgraft.editor.page.job_panel import JobPanel
+from splatgraft.editor.page.keys import Keys
 from splatgraft.editor.page.light_phase import LightPhase
 from splatgraft.editor.page.open_phase import OpenPhase
 from splatgraft.editor.page.place_phase import PlacePhase
@@ -314,6 +315,7 @@ class Page:
         self._history_buttons.on_click(
             self.callback(lambda e: self._undo() if e.target.value == _HISTORY[0] else self._redo())
         )
+        self._keys = Keys(self, PHASES)
         undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
         redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
         undo.on_trigger(self.callback(lambda _: self._undo()))

@@ -52,7 +52,7 @@ class PlacePhase:
         self._saved = 0.0
         self._is_active = False
         self._note = gui.add_html("", visible=False)
-        self._suggest = gui.add_button("Find a place for it", icon=viser.Icon.WAND)
+        self._suggest = gui.add_button("Find a place", icon=viser.Icon.WAND)
         self._object_choice = gui.add_dropdown("Object", NO_NAMES, initial_value=NO_NAMES[0])
         self._position = gui.add_vector3("Position", (0.0, 0.0, 0.0), step=0.001)
         self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=0.01, hint="Degrees about x, y, z")

@@ -98,10 +98,10 @@ class PreviewPanel:
         with self._panel:
             self._image = gui.add_image(np.full((270, 400, 3), 40, np.uint8), format="jpeg", jpeg_quality=88)
             self._caption = gui.add_html("")
-            self._left = gui.add_dropdown("Left", PICTURE_KINDS, initial_value="Copy-paste")
-            self._right = gui.add_dropdown("Right", PICTURE_KINDS, initial_value="Light transfer")
+            self._right = gui.add_dropdown("Picture", PICTURE_KINDS, initial_value="Light transfer")
+            self._left = gui.add_dropdown("Compare with", PICTURE_KINDS, initial_value="Copy-paste")
             self._split = gui.add_slider(
-                "Compare", 0.0, 1.0, 0.01, 0.0, hint="How far the left picture reaches over the right one"
+                "Compare", 0.0, 1.0, 0.01, 0.0, hint="How much of the width shows what it is compared with"
             )
             self._camera_slider = gui.add_slider("Camera", 0, 1, 1, 0, hint="Step through the target's cameras")
             self._follow = gui.add_checkbox(

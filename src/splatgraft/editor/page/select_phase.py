@@ -47,14 +47,14 @@ class SelectPhase:
         self._keep = gui.add_dropdown("Keep pieces", _KEEP, initial_value=_KEEP[0])
         self._cut = gui.add_button("Cut out the object", icon=viser.Icon.WAND)
         with gui.add_folder("Correct by hand"):
-            self._mode = gui.add_dropdown("A stroke", ("adds", "removes"), initial_value="removes")
+            self._mode = gui.add_dropdown("Strokes", ("remove", "add"), initial_value="remove")
             self._use_brush = gui.add_checkbox("Brush", False, hint="Drag or click on the picture (key B)")
             self._size = gui.add_slider(
                 "Brush size", 0.01, 0.5, 0.01, 0.1, hint="Diameter over the distance to the surface"
             )
             gui.add_markdown("Shift and drag: a rectangle.")
-            self._show_correction_box = gui.add_checkbox("Box for strokes", False, hint="Another box than the object's")
-            self._box_group = gui.add_button_group("All inside that box", ("Add", "Remove"), visible=False)
+            self._show_correction_box = gui.add_checkbox("Second box", False, hint="Adds or removes everything in it")
+            self._box_group = gui.add_button_group("All in it", ("Add", "Remove"), visible=False)
             self._clear = gui.add_button("Clear all strokes", icon=viser.Icon.ERASER, color="gray")
         self._isolate = gui.add_checkbox("Show the object alone", False)
         self._handles = BoxHandles(page.server, page.view, "/source/box", color=(255, 150, 40))
@@ -218,7 +218,7 @@ class SelectPhase:
         self._correct(box.contains(session.scenes.gaussians(session.files.source_scene).means), add=add)
 
     def _adds(self) -> bool:
-        return self._mode.value == "adds"
+        return self._mode.value == "add"
 
     def _apply_stroke(self, touched: torch.Tensor) -> None:
         self._correct(touched, add=self._adds())
