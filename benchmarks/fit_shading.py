@@ -3,8 +3,8 @@
 `python benchmarks/fit_shading.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `python
 benchmarks/exam` renders them. The objective is the mean gain of the object's PSNR over pasting on the held-out views.
 Every combination of a grid is tried; the numbers are chosen with each scene left out in turn, too, and the gain of the
-scene left out is reported. Gloss stays as today's numbers give it. The level's share has to be chosen on scenes that
-benchmarks/fit_light.py did not see: on its own scenes the light is better than elsewhere.
+scene left out is reported. Gloss stays as today's numbers give it. The shares of level and tint have to be chosen on
+scenes that benchmarks/fit_light.py did not see: on its own scenes the light is better than elsewhere.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from splatgraft.runtime.console import Console
 
 FLOORS = (0.02, 0.08, 0.2)
 LEVEL_SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-TINT_SHARES = (0.5, 0.75, 1.0)
+TINT_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 SPANS = (3.0, 5.0, 12.0)
 
 

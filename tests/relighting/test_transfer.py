@@ -216,7 +216,7 @@ def test_a_cached_transfer_equals_a_fresh_one():
     assert (run(0.2, cache) - run(0.2, None)).abs().mean() < 5e-3
 
 
-def test_even_lights_change_the_tint_and_a_share_of_the_level():
+def test_even_lights_change_a_share_of_the_tint_and_of_the_level():
     # the ball is as bright as one of the expected albedo, 0.3, in the dim light
     shell = even_directions(4000)
     bright = surfels(20 * shell, -shell, width=0.7, srgb=(0.8, 0.7, 0.6))
@@ -225,17 +225,20 @@ def test_even_lights_change_the_tint_and_a_share_of_the_level():
     relit = relight(composite, cameras(), sources=(SourceScene(dim, cameras()),), options=WHOLE)
     shade = relit.shade[relit.is_object].log()
     light = (linear_from_srgb(torch.tensor([0.8, 0.7, 0.6])) / linear_from_srgb(torch.tensor([0.6] * 3))).log()
-    expected = light - light.mean() + ShadeSettings().level_share * light.mean()
+    shares = ShadeSettings()
+    expected = shares.tint_share * (light - light.mean()) + shares.level_share * light.mean()
+    assert not torch.allclose(expected, torch.zeros(3), atol=0.15)
     # the shells' splats overlap to an alpha below 1 in places, the same in both; 10% for their blending in sRGB
     assert torch.allclose(shade.mean(0), expected, atol=0.1)
 
 
-def test_shade_takes_the_stated_share_of_the_level():
+def test_shade_takes_the_stated_shares_of_level_and_tint():
     target, source, opacities = torch.tensor([[8.0, 4.0, 2.0]]), torch.ones(1, 3), torch.ones(1)
-    for share in (0.0, 0.5, 1.0):
-        shade = shade_ratio(target, source, opacities, settings=ShadeSettings(level_share=share))
+    for level, tint in ((0.0, 1.0), (0.5, 0.5), (1.0, 0.0)):
+        shares = ShadeSettings(level_share=level, tint_share=tint)
+        shade = shade_ratio(target, source, opacities, settings=shares)
         # the mean over channels of log 8, 4 and 2 is log 4; the tint is 2, 1 and 1/2
-        assert torch.allclose(shade, 4**share * torch.tensor([[2.0, 1.0, 0.5]]))
+        assert torch.allclose(shade, 4**level * torch.tensor([[2.0, 1.0, 0.5]]) ** tint)
 
 
 def test_shading_is_full_where_no_surface_is_sure():
