@@ -43,6 +43,10 @@ class Edit:
         is_loopback = self.host in LOOPBACK
         token = secrets.token_urlsafe(16)
         out = None if self.out is None else self.out.absolute()
+        # before the page is served: an interruption while torch is loaded ends the editor as one later does
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
         with locked(file.parent / "edit"):
             access = AccessControl(hosts=LOOPBACK if is_loopback else (), token=token)
             guarded = GuardedServer(access, host=self.host, port=self.port)
@@ -61,9 +65,6 @@ class Edit:
             project = FlowProject(file, out, console)
             page = Page(guarded, project, PageOptions(budget=self.budget, inside=None if is_loopback else file.parent))
             loading.remove()
-            stop = threading.Event()
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, lambda *_: stop.set())
             stop.wait()
             page.close()
             guarded.close()
