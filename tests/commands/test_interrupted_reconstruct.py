@@ -12,7 +12,8 @@ import pytest
 import torch
 from tiny_project import ball, photograph, plane
 
-ITERATIONS = 700
+ITERATIONS = 3000
+"""Lines of progress come once a second at most: with fewer steps a run could end before its first line."""
 
 
 def start(capture: Path, out: Path) -> subprocess.Popen[str]:
