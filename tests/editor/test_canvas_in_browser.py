@@ -19,9 +19,11 @@ PANEL_PX = 372
 @pytest.fixture
 def window(browser: Any, project: Path) -> Iterator[Window]:
     editor = Editor(project)
+    opened = Window.opened(browser, editor)
     try:
-        yield Window.opened(browser, editor)
+        yield opened
     finally:
+        opened.page.close()
         editor.kill()
 
 
