@@ -25,8 +25,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "photos").mkdir()
     (root / "one").mkdir()
     (root / "empty").mkdir()
-    for index in range(4):
-        cv2.imwrite(str(root / "photos" / f"{index}.png"), np.full((20, 30, 3), 50 * index, np.uint8))
+    for index in range(8):
+        cv2.imwrite(str(root / "photos" / f"{index}.png"), np.full((20, 30, 3), 30 * index, np.uint8))
     cv2.imwrite(str(root / "one" / "0.png"), np.zeros((20, 30, 3), np.uint8))
     writer = cv2.VideoWriter(str(root / "walk.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
     for level in range(20):
@@ -44,9 +44,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("ball.ply", "scene", "a trained scene of 80 Gaussians"),
         ("posed", "posed capture", "a capture of 8 images with poses, 8 of 8 photos have masks"),
-        ("photos", "photos", "4 photos, no masks"),
+        ("photos", "photos", "8 photos, no masks"),
         ("walk.avi", "video", "a video of 2 s, 64 x 48"),
-        ("one", "nothing", "expected at least 3 photos, found 1"),
+        ("one", "nothing", "expected at least 8 photos, found 1"),
         ("empty", "nothing", "expected photos"),
         ("letter.pdf", "nothing", "expected a video that OpenCV can read"),
         ("broken.ply", "nothing", "broken.ply"),

@@ -1,6 +1,6 @@
 """Leaves out photos and masks of a capture that would harm what is made of it, with the reason for each."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,19 +54,13 @@ def usable_masks(photos: PhotoFiles) -> tuple[PhotoFiles, tuple[LeftOut, ...]]:
         The same photos without masks that are unreadable, of another shape than their photo, or black or white all
         over; and these, with the reason for each.
     """
-    masks, left_out = list(photos.masks), []
-    for index, (photo, mask) in enumerate(zip(photos.paths, photos.masks, strict=bool(photos.masks))):
-        if mask is None or mask == photo:
-            continue
-        try:
-            check_mask(mask, stored_size(photo))
-            reason = _emptiness(mask)
-        except ValueError as error:
-            reason = str(error)
-        if reason:
-            masks[index] = None
-            left_out.append(LeftOut(photo.name, reason, mask_only=True))
-    return replace(photos, masks=tuple(masks) if any(masks) else ()), tuple(left_out)
+
+    def reason_against(photo: Path, mask: Path) -> str:
+        check_mask(mask, stored_size(photo))
+        return _emptiness(mask)
+
+    masks, left_out = _without_useless(photos.paths, photos.masks, [p.name for p in photos.paths], reason_against)
+    return replace(photos, masks=masks), left_out
 
 
 def usable_views(posed: PosedImages, *, keep_odd: bool = False, progress: Progress = silent) -> PosedImages:
@@ -83,13 +77,9 @@ def usable_views(posed: PosedImages, *, keep_odd: bool = False, progress: Progre
     odd = _odd(posed.image_paths, keep_odd, progress)
     out = {one.name for one in odd}
     kept = posed.select(torch.tensor([str(path) not in out for path in posed.image_paths], dtype=torch.bool))
-    empty = dict(_empty_masks(kept))
-    masks = tuple(None if index in empty else path for index, path in enumerate(kept.mask_paths))
-    return replace(
-        kept,
-        mask_paths=masks if any(masks) else (),
-        left_out=(*posed.left_out, *odd, *empty.values()),
-    )
+    names = kept.cameras.names
+    masks, empty = _without_useless(kept.image_paths, kept.mask_paths, names, lambda _, mask: _emptiness(mask))
+    return replace(kept, mask_paths=masks, left_out=(*posed.left_out, *odd, *empty))
 
 
 def readable_views(posed: PosedImages, *, progress: Progress = silent) -> PosedImages:
@@ -105,17 +95,32 @@ def _odd(photos: Sequence[Path], keep_odd: bool, progress: Progress) -> tuple[Le
     return find(photos, progress=progress)
 
 
-def _empty_masks(posed: PosedImages) -> Iterator[tuple[int, LeftOut]]:
-    for index, path in enumerate(posed.mask_paths):
-        if path is None or path == posed.image_paths[index]:
+def _without_useless(
+    photos: Sequence[Path],
+    masks: Sequence[Path | None],
+    names: Sequence[str],
+    reason_against: Callable[[Path, Path], str],
+) -> tuple[tuple[Path | None, ...], tuple[LeftOut, ...]]:
+    """The masks that are of use, none where there are none, and the others with their reasons.
+
+    Args:
+        photos: Image files.
+        masks: One each or None, or empty; the photo itself where its alpha channel is the mask.
+        names: What the photos are called.
+        reason_against: Why a photo's mask is not used, empty where it is; a ValueError's message is a reason too.
+    """
+    kept, left_out = list(masks), []
+    for index, (photo, mask) in enumerate(zip(photos, masks, strict=bool(masks))):
+        if mask is None or mask == photo:
             continue
-        name = posed.cameras.names[index]
         try:
-            reason = _emptiness(path)
+            reason = reason_against(photo, mask)
         except ValueError as error:
             reason = str(error)
         if reason:
-            yield index, LeftOut(name, reason, mask_only=True)
+            kept[index] = None
+            left_out.append(LeftOut(names[index], reason, mask_only=True))
+    return tuple(kept) if any(kept) else (), tuple(left_out)
 
 
 def _emptiness(mask: Path) -> str:

@@ -30,6 +30,11 @@ class Export:
     """What a page calls the scene; the name of its file or folder where not given."""
     options: ExportOptions = field(default_factory=ExportOptions)
 
+    @property
+    def folder(self) -> Path:
+        """The scene's folder or file; the project's folder where its project.toml was named."""
+        return self.scene.parent if self.scene.name == PROJECT_FILE else self.scene
+
     def execute(self, console: Console) -> int:
         """Read, write, and say what was assumed."""
         self._say_stale(console)
@@ -48,13 +53,11 @@ class Export:
         """The report's page: of the project, or of its folder report."""
         if self.to.suffix.lower() != ".html":
             raise ValueError(f"--page report: expected a file that ends in .html, found {self.to.name}")
-        folder = self.scene.parent if self.scene.name == PROJECT_FILE else self.scene
-        own = folder / REPORT_FILE
-        return own if own.is_file() else Layout(folder).report / REPORT_FILE
+        own = self.folder / REPORT_FILE
+        return own if own.is_file() else Layout(self.folder).report / REPORT_FILE
 
     def _say_stale(self, console: Console) -> None:
-        folder = self.scene.parent if self.scene.name == PROJECT_FILE else self.scene
-        root = project_of(folder) if folder.is_dir() else None
+        root = project_of(self.folder) if self.folder.is_dir() else None
         if root is None or not (root / PROJECT_FILE).is_file():
             return
         try:

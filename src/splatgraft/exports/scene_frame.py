@@ -1,9 +1,8 @@
 """The frame of an exported scene: that of its capture, or upright and in metres, as some formats ask for."""
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from splatgraft.core.rotations import rotation_between
 from splatgraft.core.similarity import Similarity
 from splatgraft.exports.export_source import ExportSource
 from splatgraft.exports.first_view import up_of
@@ -20,7 +19,7 @@ def upright(source: ExportSource) -> tuple[Similarity, SceneMetadata, tuple[str,
     """
     up, said = up_of(source)
     metres = source.metadata.metres_per_unit
-    rotation = _least_rotation(up, torch.tensor(_UP))
+    rotation = rotation_between(up, torch.tensor(_UP))
     moved = Similarity(scale=metres or 1.0, rotation=rotation, translation=torch.zeros(3))
     size = (
         "its size is not known: a unit of the capture is written as a metre; `splatgraft scale` says how large it is"
@@ -28,15 +27,3 @@ def upright(source: ExportSource) -> tuple[Similarity, SceneMetadata, tuple[str,
         else f"one unit is a metre; one of the capture was {metres:.4g} m"
     )
     return moved, SceneMetadata(_UP, None if metres is None else 1.0), (*said, "turned upright", size)
-
-
-def _least_rotation(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The rotation by the least angle that takes the unit vector a to b."""
-    axis, cosine = torch.linalg.cross(a, b), float(a @ b)
-    if cosine < -1 + 1e-6:  # half a turn about any axis across
-        across = torch.linalg.cross(a, torch.eye(3)[int(a.abs().argmin())])
-        across = torch.nn.functional.normalize(across, dim=0)
-        return 2 * across[:, None] * across[None] - torch.eye(3)
-    x, y, z = axis.tolist()
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return torch.eye(3) + cross + cross @ cross / (1 + cosine)

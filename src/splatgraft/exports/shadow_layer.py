@@ -13,10 +13,9 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.exports.export_source import ExportSource
 from splatgraft.rendering import render, view_operator
-
-_BLACK = -0.5 / 0.28209479177387814
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def _receivers(ground: Gaussians, views: list[_View], options: ShadowLayerOption
     kept = (share > options.least_share) & (seen > options.least_weight_px)
     chosen = ground.select(kept)
     opacity = (share[kept] * chosen.opacities).clamp(0.002, 0.98)
-    return replace(chosen, opacity_logits=opacity.logit(), sh=torch.full((chosen.count, 1, 3), _BLACK))
+    return replace(chosen, opacity_logits=opacity.logit(), sh=dc_from_rgb(torch.zeros(chosen.count, 1, 3)))
 
 
 def _fitted(layer: Gaussians, views: list[_View], options: ShadowLayerOptions) -> Gaussians:

@@ -5,16 +5,16 @@ from pathlib import Path
 from typing import Literal
 
 from splatgraft.capture import read_video_facts
+from splatgraft.capture.usable_views import LEAST_PHOTOS
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture, read_gaussians
 from splatgraft.formats.captures.masks import describe_masks, find_photos
+from splatgraft.project.layout import PROJECT_FILE, SCENE_FILE
 
 InputKind = Literal["photos", "video", "posed capture", "scene", "project", "nothing"]
 _LARGE = 1 << 30
 """Bytes above which a scene is not read to count its Gaussians."""
-_LEAST_PHOTOS = 3
-"""Photos from which poses can be found at all."""
-_FOLDERS = ("target/scene/scene.ply", "result/scene.ply", "scene.ply")
+_FOLDERS = (f"target/scene/{SCENE_FILE}", f"result/{SCENE_FILE}", SCENE_FILE)
 """Scenes in folders that splatgraft writes."""
 
 
@@ -48,7 +48,7 @@ def describe_input(path: Path) -> InputDescription:
 def _described(path: Path) -> InputDescription:
     if not path.exists():
         raise ValueError(f"{path}: expected a file or a folder, found nothing there")
-    if path.name == "project.toml" or (path / "project.toml").is_file():
+    if path.name == PROJECT_FILE or (path / PROJECT_FILE).is_file():
         folder = path.parent if path.is_file() else path
         return InputDescription("project", f"a project of its own: splatgraft edit {folder}")
     if is_scene(path):
@@ -71,7 +71,7 @@ def _folder_of_photos(path: Path) -> InputDescription:
     if result is not None:
         return InputDescription("nothing", f"a folder of results; name the scene in it: {result}")
     photos = find_photos(path)
-    if len(photos.paths) < _LEAST_PHOTOS:
-        raise ValueError(f"{path}: expected at least {_LEAST_PHOTOS} photos, found {len(photos.paths)}")
+    if len(photos.paths) < LEAST_PHOTOS:
+        raise ValueError(f"{path}: expected at least {LEAST_PHOTOS} photos, found {len(photos.paths)}")
     masks = describe_masks(photos.paths, photos.masks)
     return InputDescription("photos", f"{len(photos.paths)} photos, {masks}: poses are found, and it is trained")

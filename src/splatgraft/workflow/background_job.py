@@ -50,7 +50,6 @@ class JobConsole(Console):
                     self.write(self.state)
 
             yield move
-        self.state = replace(self.state, took=(*self.state.took, (name, time.time() - now)))
 
     def write(self, state: JobState) -> None:
         """Replace the state file."""

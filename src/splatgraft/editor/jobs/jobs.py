@@ -69,8 +69,6 @@ class JobState:
     """Error message, one line; empty unless the outcome is `failed`."""
     plan: tuple[PlannedStep, ...] = ()
     """All steps of the job in order; empty where they are not known."""
-    took: tuple[tuple[str, float], ...] = ()
-    """Finished steps of this run with their durations in seconds."""
 
     @property
     def live(self) -> bool:
@@ -187,8 +185,8 @@ class Jobs:
         try:
             fields = json.loads((self.folder / STATE_FILE).read_text())
             plan = tuple(PlannedStep(**step) for step in fields.pop("plan", ()))
-            took = tuple((str(name), float(seconds)) for name, seconds in fields.pop("took", ()))
-            state = JobState(**(fields | {"command": tuple(fields["command"]), "plan": plan, "took": took}))
+            fields.pop("took", None)  # of older versions
+            state = JobState(**(fields | {"command": tuple(fields["command"]), "plan": plan}))
             _check_types(state)
             return state
         except FileNotFoundError:
@@ -209,7 +207,7 @@ class Jobs:
 def _check_types(state: JobState) -> None:
     """Raises: TypeError where a number of the state is none, or the outcome is unknown."""
     numbers = (state.started, state.done, state.total, state.step_started, state.begun, state.begun_at, state.pid)
-    numbers += (*(step.seconds for step in state.plan), *(seconds for _, seconds in state.took))
+    numbers += tuple(step.seconds for step in state.plan)
     texts = (state.title, state.step, state.message, state.error, *(step.name for step in state.plan))
     is_good = (
         all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)

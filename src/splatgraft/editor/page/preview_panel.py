@@ -194,7 +194,7 @@ class PreviewPanel:
         if self._camera_slider.max != max(1, len(cameras) - 1):
             self._camera_slider.max = max(1, len(cameras) - 1)
         is_on_canvas = self._follow.value and window is not None and self._page.phase != "Select"
-        if window is not None and (is_on_canvas or self._follow.value):
+        if window is not None and self._follow.value:
             size = self._canvas_width(window) if is_on_canvas else self._size.width
             aspect = 0.0 if is_on_canvas else _MIN_ASPECT
             camera = camera_from_viser(window.camera, width=width or size, min_aspect=aspect)

@@ -94,8 +94,8 @@ class RunPhase:
         )
         has_report = (session.files.report / "index.html").is_file()
         self._turntable.visible = has_report
-        self._scene.visible = session.files.result.is_file()
         has_result = session.files.result.is_file()
+        self._scene.visible = has_result
         why_result = session.why_stale("consolidate") if has_result else None
         why_report = session.why_stale("evaluate") if has_report else None
         self._renew.visible, self._renew_report.visible = why_result is not None, why_report is not None

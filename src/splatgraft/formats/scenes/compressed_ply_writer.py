@@ -15,7 +15,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes import ply
 from splatgraft.formats.scenes.morton_order import morton_order
 from splatgraft.formats.scenes.ply_variants import comments_of
-from splatgraft.formats.scenes.quantized import require_finite
+from splatgraft.formats.scenes.quantized import smallest_three, writable
 from splatgraft.formats.scenes.scene_metadata import SceneMetadata
 from splatgraft.runtime.atomic_file import atomic_write
 
@@ -32,10 +32,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians, metadata: SceneMetada
 
     Raises: ValueError where there are no Gaussians, or some are not finite.
     """
-    if gaussians.count == 0:
-        raise ValueError(f"{path}: expected at least one Gaussian for a compressed .ply file, found none")
-    require_finite(path, gaussians)
-    g = gaussians.map(lambda tensor: tensor.detach().cpu().float())
+    g = writable(path, gaussians, "compressed .ply")
     g = g.select(morton_order(g.means))
     log_scales = g.log_scales.clamp(-_LARGEST_LOG_SCALE, _LARGEST_LOG_SCALE)
     values = torch.cat([g.means, log_scales, spherical_harmonics.rgb_from_dc(g.sh[:, 0])], 1)
@@ -82,8 +79,5 @@ def _packed(unit: Float[Tensor, "n c"], bits: tuple[int, ...]) -> Int64[Tensor, 
 
 def _packed_rotations(quaternions: Float[Tensor, "n 4"]) -> Int64[Tensor, "n"]:
     """Index of the largest of w, x, y, z in two bits, then the others in 10 bits each."""
-    unit = torch.nn.functional.normalize(quaternions, dim=1)
-    largest = unit.abs().argmax(1, keepdim=True)
-    unit = torch.where(unit.gather(1, largest) < 0, -unit, unit)
-    axes = torch.arange(3) + (torch.arange(3) >= largest)
-    return largest[:, 0] << 30 | _packed(unit.gather(1, axes) * _HALF_SQRT2 + 0.5, (10, 10, 10))
+    largest, three = smallest_three(quaternions)
+    return largest << 30 | _packed(three * _HALF_SQRT2 + 0.5, (10, 10, 10))

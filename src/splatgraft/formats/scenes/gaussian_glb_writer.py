@@ -15,7 +15,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.formats.scenes.gaussian_glb import GLTF_AXES, SPLATTING
 from splatgraft.formats.scenes.glb_container import glb_bytes
-from splatgraft.formats.scenes.quantized import bytes_from_unit, require_finite
+from splatgraft.formats.scenes.quantized import bytes_from_unit, writable
 from splatgraft.formats.scenes.scene_metadata import SceneMetadata
 from splatgraft.runtime.atomic_file import atomic_write
 
@@ -34,11 +34,7 @@ def write_gaussian_glb(path: Path, gaussians: Gaussians, metadata: SceneMetadata
     Raises:
         ValueError: There are no Gaussians, some are not finite, or the file would be larger than 4 GB.
     """
-    if gaussians.count == 0:
-        raise ValueError(f"{path}: expected at least one Gaussian for a .glb file, found none")
-    require_finite(path, gaussians)
-    moved = gaussians.map(lambda tensor: tensor.detach().cpu().float())
-    g = change_axes(moved, rdf_from(GLTF_AXES).T)
+    g = change_axes(writable(path, gaussians, ".glb"), rdf_from(GLTF_AXES).T)
     arrays = _attributes(g)
     views, accessors, at = [], [], 0
     for values in arrays.values():
@@ -61,8 +57,7 @@ def write_gaussian_glb(path: Path, gaussians: Gaussians, metadata: SceneMetadata
         "mode": _POINTS,
         "extensions": {SPLATTING: splats | {"sortingMethod": "cameraDistance"}},
     }
-    known = {"up": metadata.up, "metres_per_unit": metadata.metres_per_unit}
-    extras = {key: value for key, value in known.items() if value is not None}
+    extras = metadata.known
     content: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "splatgraft"} | ({"extras": extras} if extras else {}),
         "extensionsUsed": [SPLATTING],

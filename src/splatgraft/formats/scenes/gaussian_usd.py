@@ -15,7 +15,7 @@ import torch
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
-from splatgraft.formats.scenes.quantized import require_finite
+from splatgraft.formats.scenes.quantized import writable
 from splatgraft.formats.scenes.scene_metadata import SceneMetadata
 
 _AXES = "RUB"
@@ -40,9 +40,7 @@ def write_gaussian_usdz(path: Path, gaussians: Gaussians, metadata: SceneMetadat
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         found = ".".join(map(str, Usd.GetVersion()[1:]))
         raise ValueError(f"{path}: expected OpenUSD 26.3 or later, which has Gaussians, found {found}")
-    if gaussians.count == 0:
-        raise ValueError(f"{path}: expected at least one Gaussian for a .usdz file, found none")
-    require_finite(path, gaussians)
+    g = writable(path, gaussians, ".usdz")
     if not path.parent.is_dir():
         raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")
     with tempfile.TemporaryDirectory(prefix=".splatgraft_usd_", dir=path.parent) as folder:
@@ -52,7 +50,7 @@ def write_gaussian_usdz(path: Path, gaussians: Gaussians, metadata: SceneMetadat
         UsdGeom.SetStageMetersPerUnit(stage, metadata.metres_per_unit or 1.0)
         scene = UsdGeom.Xform.Define(stage, "/Scene")
         stage.SetDefaultPrim(scene.GetPrim())
-        _define(UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Scene/Gaussians"), gaussians)
+        _define(UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Scene/Gaussians"), g)
         stage.GetRootLayer().Save()
         if not UsdUtils.CreateNewUsdzPackage(str(layer), str(package)):
             raise ValueError(f"{path}: expected OpenUSD to make a package, found that it could not")
@@ -63,8 +61,7 @@ def _define(prim: Any, gaussians: Gaussians) -> None:
     """Set the attributes of a ParticleField3DGaussianSplat."""
     from pxr import UsdGeom, Vt
 
-    moved = gaussians.map(lambda tensor: tensor.detach().cpu().float())
-    g = change_axes(moved, rdf_from(_AXES).T)
+    g = change_axes(gaussians, rdf_from(_AXES).T)
     reach = _SIGMAS * g.scales.amax(1, keepdim=True)
     extent = torch.stack([(g.means - reach).amin(0), (g.means + reach).amax(0)])
     unit = torch.nn.functional.normalize(g.quaternions, dim=1)

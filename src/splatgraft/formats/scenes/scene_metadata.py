@@ -11,3 +11,9 @@ class SceneMetadata:
     """Unit vector, in the frame of the Gaussians."""
     metres_per_unit: float | None = None
     """Above 0."""
+
+    @property
+    def known(self) -> dict[str, tuple[float, float, float] | float]:
+        """The fields that are known, by their names."""
+        fields = {"up": self.up, "metres_per_unit": self.metres_per_unit}
+        return {name: value for name, value in fields.items() if value is not None}

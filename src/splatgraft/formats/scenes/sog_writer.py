@@ -19,7 +19,7 @@ from PIL import Image
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.code_book import nearest_codes, palette, scalar_codes
 from splatgraft.formats.scenes.morton_order import morton_order
-from splatgraft.formats.scenes.quantized import bytes_from_unit, require_finite
+from splatgraft.formats.scenes.quantized import bytes_from_unit, smallest_three, writable
 from splatgraft.formats.scenes.scene_metadata import SceneMetadata
 from splatgraft.formats.scenes.sog_container import META_FILE
 from splatgraft.runtime.atomic_file import atomic_write
@@ -48,10 +48,7 @@ def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = Scene
 
     Raises: ValueError where there are no Gaussians, or some are not finite.
     """
-    if gaussians.count == 0:
-        raise ValueError(f"{path}: expected at least one Gaussian for a .sog file, found none")
-    require_finite(path, gaussians)
-    g = gaussians.map(lambda tensor: tensor.detach().cpu().float())
+    g = writable(path, gaussians, ".sog")
     g = g.select(morton_order(g.means))
     meta: dict[str, Any] = {
         "version": 2,
@@ -63,9 +60,8 @@ def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = Scene
     for part in (_means(g), _scales(g), _quaternions(g), _colors(g), _bands(g)):
         meta |= part[0]
         pictures |= part[1]
-    known = {"up": metadata.up, "metres_per_unit": metadata.metres_per_unit}
-    if any(value is not None for value in known.values()):
-        meta["splatgraft"] = {key: value for key, value in known.items() if value is not None}
+    if metadata.known:
+        meta["splatgraft"] = metadata.known
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, data in {META_FILE: json.dumps(meta, separators=(",", ":")).encode(), **pictures}.items():
@@ -97,12 +93,9 @@ def _scales(g: Gaussians) -> _Part:
 
 def _quaternions(g: Gaussians) -> _Part:
     """The largest of w, x, y, z is left out and named by alpha."""
-    unit = torch.nn.functional.normalize(g.quaternions, dim=1)
-    largest = unit.abs().argmax(1, keepdim=True)
-    unit = torch.where(unit.gather(1, largest) < 0, -unit, unit)
-    axes = torch.arange(3) + (torch.arange(3) >= largest)
-    three = bytes_from_unit(unit.gather(1, axes) * _SQRT2 / 2 + 0.5)
-    pixels = torch.cat([three, (largest + _FIRST_TAG).to(torch.uint8)], 1).numpy()
+    largest, three = smallest_three(g.quaternions)
+    tags = (largest + _FIRST_TAG).to(torch.uint8)[:, None]
+    pixels = torch.cat([bytes_from_unit(three * _SQRT2 / 2 + 0.5), tags], 1).numpy()
     files = {"quats.webp": _picture(pixels)}
     return {"quats": {"files": list(files)}}, files
 

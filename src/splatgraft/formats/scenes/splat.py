@@ -11,7 +11,7 @@ import torch
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, require_finite
+from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, writable
 from splatgraft.formats.scenes.scene_file import SceneFile
 from splatgraft.runtime.atomic_file import atomic_write
 
@@ -49,10 +49,7 @@ def write_splat(path: Path, gaussians: Gaussians) -> None:
 
     Raises: ValueError where there are no Gaussians, or some are not finite.
     """
-    if gaussians.count == 0:
-        raise ValueError(f"{path}: expected at least one Gaussian for a .splat file, found none")
-    require_finite(path, gaussians)
-    g = gaussians.map(lambda tensor: tensor.detach().cpu().float())
+    g = writable(path, gaussians, ".splat")
     rows = np.empty(g.count, _ROW)
     rows["position"] = g.means.numpy()
     rows["scale"] = g.scales.numpy()

@@ -13,7 +13,7 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
-from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, require_finite
+from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, require_finite, smallest_three
 from splatgraft.formats.scenes.scene_file import SceneFile
 from splatgraft.formats.scenes.spz_container import PackedScene, pack, unpack
 from splatgraft.runtime.atomic_file import atomic_write
@@ -134,12 +134,8 @@ def _three_bytes(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
 
 
 def _packed(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
-    xyzw = torch.nn.functional.normalize(quaternions, dim=-1)[:, [1, 2, 3, 0]]
-    largest = xyzw.abs().argmax(1, keepdim=True)
-    xyzw = torch.where(xyzw.gather(1, largest) < 0, -xyzw, xyzw)
-    axes = torch.arange(3) + (torch.arange(3) >= largest)
-    three = xyzw.gather(1, axes)
+    largest, three = smallest_three(quaternions[:, [1, 2, 3, 0]])
     magnitude = (three.abs() / _HALF_SQRT2 * 0x1FF).round().clamp(0, 0x1FF).to(torch.int64)
     fields = magnitude | (three < 0).to(torch.int64) << 9
-    packed = largest[:, 0] << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
+    packed = largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
     return packed.numpy().astype("<u4")[:, None].view(np.uint8)
