@@ -1,18 +1,19 @@
-"""The command `evaluate paper`: the paper's tables on the authors' data set, published numbers beside measured ones."""
+"""The command `evaluate paper`: tables on the authors' data set or on SynCom, published numbers beside measured."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
-from splatgraft.evaluation.benchmark.published_datasets import DOT3D, download
+from splatgraft.evaluation.benchmark.published_datasets import PUBLISHED, download
 from splatgraft.project.folder_lock import locked
 from splatgraft.project.step import Device
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.benchmark.methods import Method, MethodSettings
 from splatgraft.workflow.benchmark.run import unmeasurable_metrics
-from splatgraft.workflow.paper.data_layout import DataLayout, find_layout
+from splatgraft.workflow.paper.data_layout import find_layout
 from splatgraft.workflow.paper.our_pictures import OurRun
+from splatgraft.workflow.paper.paper_scene import DataLayout, Dataset
 from splatgraft.workflow.paper.report import write_paper_report
 from splatgraft.workflow.paper.run import PaperRun, perform_paper_run
 
@@ -25,9 +26,11 @@ class EvaluatePaper:
     """Measure the authors' published pictures, run ours on their scenes, and write the paper's tables."""
 
     data: Path
-    """Folder of the published data set (the one that holds data_3d/, or dot3d_data/ with it)."""
+    """Folder of the published data set (the one that holds data_3d/, or dot3d_data/ with it; composition/)."""
     out: Path = Path("paper")
     """Folder for index.html, paper.md, paper.json, figures/, layout.toml and all results."""
+    dataset: Dataset = "dot3d"
+    """Whose data set it is: the authors' (dot3d), or that of ComGS (syncom)."""
     measure_only: bool = False
     """Measure the pictures that are there, and run nothing: needs no GPU and no weights."""
     methods: tuple[str, ...] = (
@@ -53,8 +56,8 @@ class EvaluatePaper:
     def execute(self, console: Console) -> int:
         """Measure and run what is missing and write the tables; 1 where a method that was asked for could not run."""
         if self.download:
-            download(DOT3D, self.data)
-        layout = self._chosen(find_layout(self.data, self.layout))
+            download(PUBLISHED[self.dataset], self.data)
+        layout = self._chosen(find_layout(self.data, self.layout, dataset=self.dataset))
         missing_metrics = unmeasurable_metrics(self.weights)
         for name, reason in missing_metrics.items():
             console.say(f"{name}: not measured: {reason}")

@@ -1,4 +1,4 @@
-"""Published data sets with ground truth: the authors' and SynCom, downloaded on request."""
+"""Published data sets with ground truth: the authors' and SynCom (CC-BY 4.0), downloaded on request."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,11 @@ DOT3D = PublishedDataset(
     repository="nviolante/dot3d",
     parts=("data_3d/**", "data_rotation/**", "results_3d/**", "results_rotation/**", "README.md"),
 )
-SYNCOM = PublishedDataset(repository="yGaoJiany/SynCom", parts=("**",))
+SYNCOM = PublishedDataset(
+    repository="yGaoJiany/SynCom",
+    parts=("composition/**", "scene/*/train/**", "object/*/train/**", "README.md"),
+)
+PUBLISHED = {"dot3d": DOT3D, "syncom": SYNCOM}
 
 
 def download(dataset: PublishedDataset, folder: Path) -> Path:

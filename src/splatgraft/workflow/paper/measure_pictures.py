@@ -90,8 +90,10 @@ class MeasurePictures:
 
     def _protocol(self, chosen: "ChosenViews", sizes: set[Size]) -> dict[str, object]:
         """What a reader needs to know to compare the numbers."""
+        every = self.held_out_every
+        views = "all" if self.all_views or every == 1 else f"held out: every {every}th from the first"
         return {
-            "views": "all" if self.all_views else f"held out: every {self.held_out_every}th from the first",
+            "views": views,
             "view_count": len(chosen.matched),
             "views_of_the_scene": chosen.of_scene,
             "held_out_views_of_the_scene": chosen.held_out,

@@ -23,8 +23,9 @@ from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.benchmark.methods import Method, MethodSettings, run_method
 from splatgraft.workflow.benchmark.scene import ComposedScene, GroundTruthScene, compose_scene, perform_if_stale
-from splatgraft.workflow.paper.data_layout import LAYOUT_FILE, PaperScene
+from splatgraft.workflow.paper.paper_scene import LAYOUT_FILE, PaperScene
 from splatgraft.workflow.paper.picture_folders import held_out_stems
+from splatgraft.workflow.paper.syncom_scene import convert_syncom
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,13 @@ def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Consol
         ValueError: The scene lacks what is needed, or the method cannot run here, with the reason.
     """
     work = run.out / "scenes" / scene.name
-    cameras_from = _cameras_path(scene)
-    composed = _composed(scene, work, run, console)
+    if scene.kind == "syncom":
+        converted = convert_syncom(scene, work / "given")
+        cameras_from = converted.cameras
+        composed = compose_scene(converted.truth, work, run.options, device=run.device, console=console)
+    else:
+        cameras_from = _cameras_path(scene)
+        composed = _composed(scene, work, run, console)
     result, seconds = run_method(method, composed, run.methods, console)
     names = [Path(name).stem for name in read_cameras(cameras_from).names]
     stems = tuple(held_out_stems(names, run.held_out_every))

@@ -18,8 +18,8 @@ from splatgraft.evaluation.benchmark.image_features import (
 )
 from splatgraft.fitting.perceptual_losses import HEADS_FILE, VGG_FILE
 from splatgraft.project.layout import METRICS_FILE
-from splatgraft.workflow.paper.data_layout import DataLayout, Kind, PaperScene
 from splatgraft.workflow.paper.measure_pictures import MeasurePictures
+from splatgraft.workflow.paper.paper_scene import DataLayout, Kind, PaperScene
 
 METRIC_VERSIONS = {
     "psnr": "whole images, peak 1, mean over views, then over scenes",

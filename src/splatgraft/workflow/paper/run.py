@@ -8,9 +8,9 @@ from splatgraft.evaluation.benchmark.image_features import inception_features
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.benchmark.methods import Method
 from splatgraft.workflow.benchmark.scene import perform_if_stale
-from splatgraft.workflow.paper.data_layout import DataLayout, Kind, PaperScene
 from splatgraft.workflow.paper.measure_pictures import MeasurePictures
 from splatgraft.workflow.paper.our_pictures import OurRun, our_pictures
+from splatgraft.workflow.paper.paper_scene import DataLayout, Kind, PaperScene
 from splatgraft.workflow.paper.results import Measured, PaperResults, pooled_distances, read_measured
 
 COMPOSITE = "Composite"

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from splatgraft.evaluation.benchmark.paper_numbers import (
     DATA_ABLATION,
     ROTATION,
+    SYNCOM,
     SYNTHETIC,
     UPDATES,
     PublishedTable,
 )
 from splatgraft.evaluation.benchmark.table import Summary, Table, summarize
-from splatgraft.workflow.paper.data_layout import Kind
+from splatgraft.workflow.paper.paper_scene import Kind
 from splatgraft.workflow.paper.results import PaperResults
 
 _FORMATS = {"psnr": "{:.2f}", "fid": "{:.2f}", "minutes": "{:.1f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
@@ -20,6 +21,8 @@ _COLUMNS = ("psnr", "ssim", "lpips", "fid", "kid", "flip")
 _NO_TRUTH = ("object_brightness", "darkened_fraction", "brightened_fraction", "detail_kept", "rest_mean_change")
 _NOT_REPEATED = "needs the paper's test splits and models trained without one source; the authors publish neither"
 _NOT_PUBLISHED = "the paper's table has no such row"
+_NOT_IN = {False: "not in the paper", True: "published, but not at hand when this was written"}
+"""By whether it is ComGS' table."""
 
 
 @dataclass
@@ -51,7 +54,9 @@ class ExplainedTable:
 
 
 def paper_tables(results: PaperResults) -> list[ExplainedTable]:
-    """The paper's four tables, the real scenes without truth, and PSNR by scene."""
+    """The paper's four tables, the real scenes without truth, and PSNR by scene; of SynCom, its own table."""
+    if results.layout.dataset == "syncom":
+        return [_syncom(results), *_by_scene(results)]
     return [
         _synthetic(results),
         _rotation(results),
@@ -84,6 +89,17 @@ def _rotation(results: PaperResults) -> ExplainedTable:
             what = "run here" if name in results.ours else "the authors' pictures, measured here"
             rows.append((f"{pose}, {name}, {what}", *_measured(results, "rotation", name, notes, pose=pose)))
     return ExplainedTable(Table(ROTATION.title, _head("pose"), tuple(rows)), tuple(notes.reasons))
+
+
+def _syncom(results: PaperResults) -> ExplainedTable:
+    notes = _Notes([])
+    rows: list[tuple[str, ...]] = []
+    for name in SYNCOM.rows:
+        rows.append((f"{name} number as published", *_published(SYNCOM, name, notes)))
+    for name in dict.fromkeys(["ComGS", *results.methods("syncom")]):
+        what = "run here" if name in results.ours else "its pictures, measured here"
+        rows.append((f"{name}, {what}", *_measured(results, "syncom", name, notes)))
+    return ExplainedTable(Table(SYNCOM.title, _head("method"), tuple(rows)), tuple(notes.reasons))
 
 
 def _data() -> ExplainedTable:
@@ -135,7 +151,7 @@ def _without_truth(results: PaperResults) -> ExplainedTable:
 
 def _by_scene(results: PaperResults) -> list[ExplainedTable]:
     out: list[ExplainedTable] = []
-    for kind in ("synthetic", "rotation"):
+    for kind in ("synthetic", "rotation", "syncom"):
         scenes = [scene.name for scene in results.layout.scenes if scene.kind == kind]
         notes = _Notes([])
         rows: list[tuple[str, ...]] = []
@@ -147,7 +163,7 @@ def _by_scene(results: PaperResults) -> list[ExplainedTable]:
                 reason = results.missing.get((scene, name)) or f"no pictures of {name}, no truth, or equal to it"
                 cells.append(notes.mark(reason) if value is None else _plain("psnr", value))
             rows.append((name, *cells))
-        if rows:
+        if rows and scenes:
             table = Table(f"PSNR by scene: {kind}", ("method", *scenes), tuple(rows))
             out.append(ExplainedTable(table, tuple(notes.reasons)))
     return out
@@ -165,9 +181,9 @@ def _published(table: PublishedTable, row: str, notes: _Notes, *, minutes: bool 
     cells: list[str] = []
     for column in (*(("minutes",) if minutes else ()), *_COLUMNS):
         value = table.value(row, column)
-        reason = _NOT_PUBLISHED if row not in table.rows else "not in the paper"
+        reason = _NOT_PUBLISHED if row not in table.rows else _NOT_IN[table is SYNCOM]
         cells.append(notes.mark(reason) if value is None else _plain(column, value))
-    return [*cells, "3" if table is ROTATION else "9"]
+    return [*cells, {ROTATION.key: "3", SYNCOM.key: "16"}.get(table.key, "9")]
 
 
 def _measured(results: PaperResults, kind: Kind, method: str, notes: _Notes, *, pose: str = "") -> list[str]:
