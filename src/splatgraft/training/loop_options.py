@@ -40,6 +40,8 @@ class LoopOptions:
     """Of the order of pairs, the noise and initial values."""
     tensorboard: bool = False
     """Also write for TensorBoard; needs the package tensorboard."""
+    readers: int = 4
+    """Threads of each process that read pictures and latents ahead; 0 reads them when they are needed."""
     cpu: bool = False
     """Train on the CPU even if a GPU is available."""
 
@@ -62,6 +64,8 @@ class LoopOptions:
         for name in ("steps", "batch", "accumulate", "save_every", "validate_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')}: expected at least 1, found {getattr(self, name)}")
+        if self.readers < 0:
+            raise ValueError(f"--readers: expected a number of threads from 0, found {self.readers}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"--ema: expected a decay from 0 to below 1, found {self.ema}")
         if self.parallel == "shards":

@@ -5,9 +5,7 @@ optimiser and moving average, and the number of processes may change between run
 """
 
 import time
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from splatgraft.training.checkpoints import list_states, load_state, read_job, s
 from splatgraft.training.latent_cache import LatentCache, LoadedPair
 from splatgraft.training.loop_options import LoopOptions
 from splatgraft.training.objective import Objective
+from splatgraft.training.pair_loader import PairLoader
 from splatgraft.training.processes import Processes
 from splatgraft.training.sources.pair_source import Mixture, sample_seed
 from splatgraft.training.trained_network import TrainedNetwork
@@ -28,9 +27,6 @@ from splatgraft.training.training_log import LOG_FILE, TrainingLog, truncate_log
 from splatgraft.training.validation import ValidationRun, validate
 
 MODEL_FOLDER = "model"
-_READERS = 4
-_STEPS_AHEAD = 4
-"""Steps whose pairs are read while the network computes."""
 _STOP, _UNREADABLE = 1, 2
 
 
@@ -68,31 +64,32 @@ def train(run: TrainingRun) -> Path:
             another training. The last state is kept.
         KeyboardInterrupt: Ctrl-C, or SIGTERM as cluster schedulers send it; the state of the finished steps is saved.
     """
-    with ThreadPoolExecutor(_READERS) as readers, interruption_held(terminate=True) as interrupted:
-        loop = _RunningLoop(run, readers, interrupted)
+    with interruption_held(terminate=True) as interrupted:
+        loop = _RunningLoop(run, interrupted)
         try:
             return loop.run()
         except torch.OutOfMemoryError as error:
             raise ValueError(
-                f"training: expected memory for {loop.pairs_per_pass} pairs a pass, found too little at step "
+                f"training: expected memory for {loop.loader.pairs_per_pass} pairs a pass, found too little at step "
                 f"{loop.step}; the last state is kept: try --accumulate, --optimizer adam8bit or --lora"
             ) from error
         finally:
-            readers.shutdown(wait=False, cancel_futures=True)
+            loop.loader.close()
 
 
 class _RunningLoop:
     """The state of a running training."""
 
-    def __init__(self, run: TrainingRun, readers: ThreadPoolExecutor, interrupted: Callable[[], bool]) -> None:
-        self._run, self._readers, self._interrupted = run, readers, interrupted
+    def __init__(self, run: TrainingRun, interrupted: Callable[[], bool]) -> None:
+        self._run, self._interrupted = run, interrupted
         self._processes = Processes.join(cpu=run.loop.cpu)
-        self.pairs_per_pass = run.loop.check(self._processes.count)
+        run.loop.check(self._processes.count)
         self.step = 0
         run.objective.to(self._processes.device)
         self._network = TrainedNetwork(run.objective.network, run.loop, self._processes)
-        self._reading: deque[list[list[Future[LoadedPair]]]] = deque()
-        self._waited = 0.0
+        rank, count = self._processes.rank, self._processes.count
+        roles = run.objective.roles
+        self.loader = PairLoader(run.mixture, run.cache, roles, loop=run.loop, rank=rank, count=count)
 
     def run(self) -> Path:
         """Run all remaining steps and write the model."""
@@ -107,7 +104,7 @@ class _RunningLoop:
             if log:
                 log.add(self.step, loss, loop.rate_at(self.step - 1))
                 spent = max(time.monotonic() - began, 1e-9)
-                speed, waiting = (self.step - first) * loop.batch / spent, self._waited / spent
+                speed, waiting = (self.step - first) * loop.batch / spent, self.loader.waited / spent
                 words = f"loss {log.smooth:.4f}, {speed:.2f} pairs/s, {waiting:.0%} of it waiting for pictures"
                 run.progress(self.step, loop.steps, words)
             if self.step % loop.save_every == 0 or self.step == loop.steps:
@@ -118,21 +115,17 @@ class _RunningLoop:
             log.close()
             if self.step > first:
                 spent = max(time.monotonic() - began, 1e-9)
-                speed = (self.step - first) * loop.batch / spent
-                run.say(f"throughput: {speed:.2f} pairs/s; {self._waited / spent:.0%} of the time waited for pictures")
+                speed, waiting = (self.step - first) * loop.batch / spent, self.loader.waited / spent
+                run.say(f"throughput: {speed:.2f} pairs/s; {waiting:.0%} of the time waited for pictures")
         return self._finish()
 
     def _next_batches(self) -> list[list[LoadedPair]]:
         """The pairs of this process in this step, pass by pass; the following steps are read meanwhile."""
-        last = min(self.step + _STEPS_AHEAD, self._run.loop.steps)
-        for step in range(self.step + len(self._reading), last):
-            self._reading.append(self._begin_reading(step))
-        began, problem, batches = time.monotonic(), "", []
+        problem, batches = "", []
         try:
-            batches = [[future.result() for future in batch] for batch in self._reading.popleft()]
+            batches = self.loader.batches(self.step)
         except ValueError as error:
             problem = str(error)
-        self._waited += time.monotonic() - began
         signal = self._processes.largest(_UNREADABLE if problem else _STOP if self._interrupted() else 0)
         if signal == _UNREADABLE:
             # all processes stop together: one alone would leave the others waiting for it
@@ -151,7 +144,7 @@ class _RunningLoop:
         for number, loaded in enumerate(batches):
             latents = run.cache.encode_missing(loaded, run.objective.roles)
             latents = {role: tensor.to(self._processes.device) for role, tensor in latents.items()}
-            seeds = [sample_seed(loop.seed, position) for position in self._positions(self.step, number)]
+            seeds = [sample_seed(loop.seed, position) for position in self.loader.positions(self.step, number)]
             passes.append((latents, seeds))
             loss = run.objective.loss(self._network, latents, seeds)
             self._network.backward(loss, last=number == len(batches) - 1)
@@ -168,7 +161,7 @@ class _RunningLoop:
         """Name the pairs at fault, and save the weights where they are whole: they are those of the step before."""
         broken = []
         for number, (latents, seeds) in enumerate(passes):
-            for i, position in enumerate(self._positions(self.step, number)):
+            for i, position in enumerate(self.loader.positions(self.step, number)):
                 one = {role: tensor[i : i + 1] for role, tensor in latents.items()}
                 loss = float(self._run.objective.loss(self._network, one, seeds[i : i + 1]))
                 if not abs(loss) < float("inf"):
@@ -186,21 +179,6 @@ class _RunningLoop:
     def _kept_state(self) -> str:
         states = list_states(self._run.folder)
         return f"the state of step {int(states[-1].name)} is kept" if states else "no state was saved before"
-
-    def _positions(self, step: int, number: int) -> range:
-        """Positions in the order of the mixture that this process takes in pass `number` of a step."""
-        begin = step * self._run.loop.batch
-        begin += (number * self._processes.count + self._processes.rank) * self.pairs_per_pass
-        return range(begin, begin + self.pairs_per_pass)
-
-    def _begin_reading(self, step: int) -> list[list[Future[LoadedPair]]]:
-        run = self._run
-
-        def read(position: int) -> LoadedPair:
-            return run.cache.load(run.mixture.draw(position), run.objective.roles)
-
-        passes = range(run.loop.accumulate)
-        return [[self._readers.submit(read, at) for at in self._positions(step, number)] for number in passes]
 
     def _save(self) -> None:
         if self.step == 0:
