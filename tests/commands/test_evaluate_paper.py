@@ -5,6 +5,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from paper_data import OTHER, PLAIN, REAL, STEMS, parts_of_view, put, write_data
@@ -175,11 +176,21 @@ def write_placed_scene(root):
     return root
 
 
-def test_our_methods_run_on_a_composite_that_is_already_placed(tmp_path):
+def add_property(path, name, value):
+    """A float property after the others of a .ply."""
+    head, rows = path.read_bytes().split(b"end_header\n", 1)
+    count = int(next(line.split()[-1] for line in head.splitlines() if line.startswith(b"element vertex")))
+    table = np.frombuffer(rows, "<f4").reshape(count, -1)
+    table = np.concatenate([table, np.full((count, 1), value, "<f4")], 1)
+    path.write_bytes(head + f"property float {name}\nend_header\n".encode() + table.tobytes())
+
+
+def test_our_methods_run_on_a_composite_that_is_already_placed(tmp_path, capsys):
     weights = tmp_path / "weights"
     weights.mkdir()
     write_random_lpips(weights)
     root = write_placed_scene(tmp_path / "data")
+    add_property(root / "data_3d/synthetic/insertions" / PLAIN / "gaussians/object.ply", "refl", 2.0)
     methods = ("copy-paste", "off+reinhard/paper", "off+flux/paper")
     command = EvaluatePaper(
         root,
@@ -197,5 +208,6 @@ def test_our_methods_run_on_a_composite_that_is_already_placed(tmp_path):
     assert rows[PLAIN, "off+reinhard/paper"]["seconds"]["consolidate"] > 0
     reasons = {row["method"]: row["reason"] for row in found["missing"]}
     assert "harmonizer flux: expected --weights" in reasons["off+flux/paper"]
+    assert "object.ply: 3DGS-DR: colours are its base colour" in capsys.readouterr().err
     seen = json.loads((command.out / "scenes" / PLAIN / "target/capture/transforms.json").read_text())["frames"]
     assert len(seen) == 8

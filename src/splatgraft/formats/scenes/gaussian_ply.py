@@ -3,7 +3,8 @@
 Layout of the original code (Kerbl et al. 2023): x y z, nx ny nz (zeros), f_dc_0..2, f_rest (channel-major), opacity,
 scale_0..2, rot_0..3 (wxyz), all float32. Read in any order, with extra properties or without normals and f_rest.
 Values that are not finite are kept, so that reading and writing copies a file exactly; renderers cull them.
-Variants: red, green, blue in place of f_dc (nerfstudio), filter_3D (Mip-Splatting), two scales (2DGS), degree 4.
+Variants: red, green, blue in place of f_dc (nerfstudio), filter_3D (Mip-Splatting), two scales (2DGS), degree 4, files
+of inverse-rendering programs (`ply_peers.py`). What is not used is said in the notes.
 """
 
 import re
@@ -16,6 +17,7 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes import ply
 from splatgraft.formats.scenes.compressed_ply import is_compressed, read_compressed_ply
+from splatgraft.formats.scenes.ply_peers import REFLECTION, is_gaussian_shader, left_out_notes, shader_sh
 from splatgraft.formats.scenes.ply_variants import (
     comments_of,
     disks_thickened,
@@ -38,6 +40,8 @@ _QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _FILTER = "filter_3D"
 _ROWS_PER_WRITE = 1 << 14
 _REST_COUNTS = tuple(3 * (spherical_harmonics.coefficient_count(d) - 1) for d in range(5))
+_SHADER_REST_COUNTS = (0, *(3 * spherical_harmonics.coefficient_count(d) for d in range(1, 5)))
+"""Of GaussianShader, whose f_rest has a band 0 of its own."""
 
 
 def read_gaussian_ply(path: Path) -> SceneFile:
@@ -52,7 +56,8 @@ def read_gaussian_ply(path: Path) -> SceneFile:
     up, notes, metres = header_up(header), header_notes(header), header_metres(header)
     if is_compressed(header):
         return SceneFile(read_compressed_ply(header), up=up, notes=notes, metres_per_unit=metres)
-    rest = _rest_names(path, vertex)
+    shader = is_gaussian_shader(vertex)
+    rest = _rest_names(path, vertex, _SHADER_REST_COUNTS if shader else _REST_COUNTS)
     has_rgb = not set(_DC) & set(vertex.names) and set(_RGB) <= set(vertex.names)
     scales = _SCALES if _SCALES[2] in vertex.names or not set(_SCALES[:2]) <= set(vertex.names) else _SCALES[:2]
     _require_gaussians(path, vertex, _RGB if has_rgb else _DC, scales)
@@ -60,14 +65,19 @@ def read_gaussian_ply(path: Path) -> SceneFile:
     means, log_scales = np.empty((n, 3), np.float32), np.full((n, 3), -np.inf, np.float32)
     quaternions, logits = np.empty((n, 4), np.float32), np.empty((n, 1), np.float32)
     sh, filters = np.empty((n, k, 3), np.float32), np.empty(n if _FILTER in vertex.names else 0, np.float32)
+    reflection = np.empty(n, np.float32) if REFLECTION in vertex.names else None
     columns = [
         *((name, means[:, i]) for i, name in enumerate(_MEANS)),
         *((name, log_scales[:, i]) for i, name in enumerate(scales)),
         *((name, quaternions[:, i]) for i, name in enumerate(_QUATERNION)),
         ("opacity", logits[:, 0]),
         *((name, sh[:, 0, i]) for i, name in enumerate(_RGB if has_rgb else _DC)),
-        *((name, sh[:, 1 + i % (k - 1), i // (k - 1)]) for i, name in enumerate(rest)),
+        *(
+            (name, sh[:, 1 + i // 3, i % 3] if shader else sh[:, 1 + i % (k - 1), i // (k - 1)])
+            for i, name in enumerate(rest)
+        ),
         *([(_FILTER, filters)] if len(filters) else []),
+        *([] if reflection is None else [(REFLECTION, reflection)]),
     ]
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is culled as such
         for start, rows in ply.read_chunks(header, vertex):
@@ -78,8 +88,9 @@ def read_gaussian_ply(path: Path) -> SceneFile:
         log_scales=torch.from_numpy(log_scales),
         quaternions=torch.from_numpy(quaternions),
         opacity_logits=torch.from_numpy(logits[:, 0]),
-        sh=torch.from_numpy(sh),
+        sh=shader_sh(torch.from_numpy(sh[:, 0]), torch.from_numpy(sh[:, 1:])) if shader else torch.from_numpy(sh),
     )
+    notes = (*notes, *left_out_notes(vertex, None if reflection is None else torch.from_numpy(reflection)))
     scene = SceneFile(gaussians, up=up, notes=notes, metres_per_unit=metres)
     if has_rgb:
         scene = with_colors(scene, _range_of(vertex))
@@ -96,15 +107,15 @@ def _range_of(vertex: ply.Element) -> float:
     return 1.0 if kind.startswith("f") else 255.0
 
 
-def _rest_names(path: Path, vertex: ply.Element) -> tuple[str, ...]:
+def _rest_names(path: Path, vertex: ply.Element, counts: tuple[int, ...]) -> tuple[str, ...]:
     """f_rest_0 .. in the order of their numbers, whatever their order in the row."""
     count = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in vertex.names)
     names = tuple(f"f_rest_{i}" for i in range(count))
     missing = [name for name in names if name not in vertex.names]
-    if count not in _REST_COUNTS or missing:
+    if count not in counts or missing:
         detail = f"{count}, without {missing[0]}" if missing else str(count)
-        counts = "0, 9, 24, 45 or 72"
-        raise ValueError(f"{path}: expected {counts} properties f_rest_0 .. (SH degree 0 to 4), found {detail}")
+        wanted = f"{', '.join(map(str, counts[:-1]))} or {counts[-1]}"
+        raise ValueError(f"{path}: expected {wanted} properties f_rest_0 .. (SH degree 0 to 4), found {detail}")
     return names
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import read_rgb, write_image
+from splatgraft.core.images import list_images, read_rgb, write_image
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.evaluation import Truth
 from splatgraft.evaluation.benchmark.view_metrics import disagreement, measure_view
@@ -23,6 +23,7 @@ from splatgraft.project.layout import METRICS_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.rendering import render
 from splatgraft.workflow.benchmark.scene import HELD_OUT_EVERY
+from splatgraft.workflow.paper.picture_folders import match_views, pictures
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class MeasureMethod:
     result: Path | None = None
     """The method's scene, a .ply."""
     pictures: Path | None = None
-    """Or its pictures, NAME.png for every held-out view."""
+    """Or its pictures, named as the views, or numbered as 3DGS's render.py does: all views, or the held-out ones."""
     weights: Path | None = None
     """Folder of LPIPS's weights."""
     lpips: bool = False
@@ -53,7 +54,7 @@ class MeasureMethod:
         for role, folder in (("truth", self.truth), ("photographs", self.photographs)):
             files[role] = read_capture(folder).image_paths
         files["scenes"] = tuple(path for path in (self.target, self.result) if path is not None)
-        found = sorted(self.pictures.glob("*.png")) if self.pictures is not None else []
+        found = list_images(self.pictures) if self.pictures is not None and self.pictures.is_dir() else []
         return {**files, "pictures": tuple(found)}
 
     def write(self, folder: Path, context: Context) -> None:
@@ -88,9 +89,11 @@ class MeasureMethod:
             return {index: _picture(scene, truth, index) for index in range(len(truth))}
         assert self.pictures is not None
         found: dict[int, Tensor] = {}
-        for index, name in enumerate(truth.cameras.names):
-            path = self.pictures / f"{Path(name).stem}.png"
-            if path.is_file():
+        stems = [Path(name).stem for name in truth.cameras.names]
+        matched, _ = match_views(stems, pictures(self.pictures), HELD_OUT_EVERY)
+        for index, stem in enumerate(stems):
+            path = matched.get(stem, self.pictures / f"{stem}.png")
+            if stem in matched:
                 found[index] = read_rgb(path)
                 wanted = (truth.cameras.sizes[index][1], truth.cameras.sizes[index][0])
                 if found[index].shape[:2] != torch.Size([int(wanted[0]), int(wanted[1])]):

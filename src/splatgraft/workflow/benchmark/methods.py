@@ -59,7 +59,7 @@ class Method:
     schedule: Schedule = "once"
     """Whether views are harmonised again from the consolidated scene (paper, Iterative Dataset Update)."""
     pictures: Path | None = None
-    """Folder of another program's results: SCENE/VIEW.png, named as the views of the ground truth."""
+    """Folder of another program's results: SCENE/VIEW.png, named as the views of the ground truth, or numbered."""
 
     @staticmethod
     def parse(text: str) -> "Method":

@@ -14,7 +14,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
 from splatgraft.core.similarity import Similarity
 from splatgraft.folders.capture_files import camera_files
-from splatgraft.formats import read_cameras, read_gaussians, write_cameras, write_gaussians
+from splatgraft.formats import read_cameras, read_gaussians, read_scene, write_cameras, write_gaussians
 from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.layout import OBJECT_FILE, PLACEMENT_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
@@ -130,8 +130,11 @@ def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> Com
     for path in (composed.cameras, composed.target, object_file, placement):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_cameras(composed.cameras, _without(cameras, run.held_out_every))
-    write_gaussians(composed.target, read_gaussians(scene.files["target_scene"]))
-    write_gaussians(object_file, read_gaussians(scene.files["object_scene"]))
+    for key, path in (("target_scene", composed.target), ("object_scene", object_file)):
+        given = read_scene(scene.files[key])
+        for note in given.notes:
+            console.say(f"{scene.files[key]}: {note}")
+        write_gaussians(path, given.gaussians)
     write_placement(placement, Placement((ObjectPlacement(Similarity.identity()),)))
     perform_if_stale(Compose(composed.target, object_file, composed.composite, placement=placement), console)
     return composed
