@@ -148,7 +148,8 @@ def paper_size(setting: Setting) -> list[Row]:
         parts = found.pop("parts")
         assert isinstance(parts, list)
         times = {f"{one['part']}_s": one["seconds"] for one in parts}
-        rows.append({"gaussians": size.gaussians, "views": size.views, **times, "peak_mb": parts[-1]["peak_mb"]})
+        counts = {"gaussians": size.gaussians, "gaussians_relit": found["gaussians_relit"], "views": size.views}
+        rows.append({**counts, **times, "peak_mb": parts[-1]["peak_mb"]})
     return rows
 
 
