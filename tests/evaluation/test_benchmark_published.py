@@ -3,7 +3,7 @@
 import huggingface_hub
 import pytest
 
-from splatgraft.evaluation.benchmark.published_datasets import DOT3D, download
+from splatgraft.evaluation.benchmark.published_datasets import DOT3D, SYNCOM, download
 
 
 def test_a_hub_that_cannot_be_reached_is_one_line(tmp_path, monkeypatch):
@@ -31,3 +31,20 @@ def test_scenes_and_the_authors_results_are_fetched_wherever_the_card_puts_them(
         allow_patterns=asked["allow_patterns"],
     )
     assert len(list(files)) == 3
+
+
+def test_of_syncom_the_linear_pictures_and_the_test_views_are_not_fetched(tmp_path, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda repo, **how: asked.update(repo=repo, **how))
+    download(SYNCOM, tmp_path)
+    assert asked["repo"] == "yGaoJiany/SynCom"
+    wanted = [
+        "composition/room_with_toy/transform.json",
+        "composition/room_with_toy/images/0000.png",
+        "scene/room/train/cameras.json",
+        "object/toy/train/cameras.json",
+        "object/toy/train/images/0000.png",
+    ]
+    others = ["object/toy/train/images/0000.exr", "object/toy/test/images/0000.png", "demo/room_with_toy/cameras.json"]
+    found = huggingface_hub.utils.filter_repo_objects([*wanted, *others], allow_patterns=asked["allow_patterns"])
+    assert list(found) == wanted

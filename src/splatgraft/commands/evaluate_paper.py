@@ -26,7 +26,7 @@ class EvaluatePaper:
     """Measure the authors' published pictures, run ours on their scenes, and write the paper's tables."""
 
     data: Path
-    """Folder of the published data set (the one that holds data_3d/, or dot3d_data/ with it; composition/)."""
+    """Folder of the published data set (the one that holds data_3d/ or dot3d_data/; of SynCom composition/)."""
     out: Path = Path("paper")
     """Folder for index.html, paper.md, paper.json, figures/, layout.toml and all results."""
     dataset: Dataset = "dot3d"

@@ -20,9 +20,13 @@ DOT3D = PublishedDataset(
 )
 SYNCOM = PublishedDataset(
     repository="yGaoJiany/SynCom",
-    parts=("composition/**", "scene/*/train/**", "object/*/train/**", "README.md"),
-)
+    # of the objects not the linear .exr pictures, which are not read
+    parts=(
+        "composition/**", "scene/*/train/**", "object/*/train/cameras.json", "object/*/train/*.png", "README.md",
+    ),
+)  # fmt: skip
 PUBLISHED = {"dot3d": DOT3D, "syncom": SYNCOM}
+"""By the name that `evaluate paper --dataset` has for it."""
 
 
 def download(dataset: PublishedDataset, folder: Path) -> Path:
