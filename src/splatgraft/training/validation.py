@@ -29,20 +29,21 @@ class ValidationResult:
     """Means over the pairs."""
 
     metrics: dict[str, float]
-    """psnr, ssim, psnr_object and psnr_input (the PSNR of the network's input, for comparison); dB but for ssim."""
+    """psnr, ssim, psnr_object, and psnr_input and psnr_object_input (those of the network's input, for comparison); dB
+    but for ssim."""
 
     @property
     def sentence(self) -> str:
         """The metrics in one line of text."""
         m = self.metrics
         whole = f"PSNR {m['psnr']:.2f} dB (input {m['psnr_input']:.2f})"
-        return f"{whole}, object {m['psnr_object']:.2f}, SSIM {m['ssim']:.3f}"
+        return f"{whole}, object {m['psnr_object']:.2f} (input {m['psnr_object_input']:.2f}), SSIM {m['ssim']:.3f}"
 
 
 @torch.no_grad()
 def validate(run: ValidationRun, network: Network) -> tuple[ValidationResult, Float[Tensor, "h w 3"]]:
     """Compute the metrics, and a contact sheet with one row per pair: input, prediction, target."""
-    rows, totals = [], {"psnr": 0.0, "ssim": 0.0, "psnr_object": 0.0, "psnr_input": 0.0}
+    rows, totals = [], dict.fromkeys(("psnr", "ssim", "psnr_object", "psnr_input", "psnr_object_input"), 0.0)
     objective = run.objective
     for reference in run.pairs:
         loaded = run.cache.load(reference, objective.roles)
@@ -52,12 +53,12 @@ def validate(run: ValidationRun, network: Network) -> tuple[ValidationResult, Fl
         pair = crop_pair_to_size(reference.source.read(reference.index), predicted.shape[1], predicted.shape[0])
         target, source = pair.picture(objective.output_role), _input(pair, objective)
         inside = pair.mask > 0.5
+        inside = inside if bool(inside.any()) else torch.ones_like(inside)
         totals["psnr"] += float(psnr(predicted, target))
         totals["ssim"] += float(ssim(predicted, target))
-        totals["psnr_object"] += (
-            float(psnr(predicted, target, inside)) if bool(inside.any()) else float(psnr(predicted, target))
-        )
+        totals["psnr_object"] += float(psnr(predicted, target, inside))
         totals["psnr_input"] += float(psnr(source, target))
+        totals["psnr_object_input"] += float(psnr(source, target, inside))
         rows.append(torch.cat([source, predicted, target], 1))
     metrics = {name: round(total / len(run.pairs), 4) for name, total in totals.items()}
     return ValidationResult(metrics), torch.cat(rows, 0)
