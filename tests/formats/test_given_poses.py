@@ -1,4 +1,4 @@
-"""Poses of another program beside photos: joined by name; Metashape's lens is that of its manual."""
+"""Poses of another program beside photos: joined by name; the lens is that of the program's manual."""
 
 from pathlib import Path
 
@@ -107,3 +107,70 @@ def test_other_files_are_no_poses(tmp_path: Path, text: str) -> None:
         read_given_poses(tmp_path / "cameras.xml", found)
     with pytest.raises(ValueError, match=r"photos: expected .*found"):
         read_given_poses(tmp_path / "photos", found)
+
+
+def realityscan(path: Path, rows: list[dict[str, object]], *, without: str = "") -> Path:
+    names = ["#name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"]
+    given: list[dict[str, object]] = [
+        {**dict.fromkeys(names, 0.0), "#name": f"000{i}.jpg", "x": i, "f": 36.0, **row} for i, row in enumerate(rows)
+    ]
+    columns = [name for name in names if name != without]
+    lines = [",".join(columns), *(",".join(str(row[name]) for name in columns) for row in given)]
+    path.write_text("\ufeff" + "\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("angles", "ahead", "top"),
+    [
+        # looks down, its top to the north (y)
+        ({}, (0, 0, -1), (0, 1, 0)),
+        # heading is clockwise from above: its top to the east (x)
+        ({"heading": 90}, (0, 0, -1), (1, 0, 0)),
+        # pitched up to the horizon: looks north, its top up
+        ({"pitch": 90}, (0, 1, 0), (0, 0, 1)),
+        ({"heading": 90, "pitch": 90}, (1, 0, 0), (0, 0, 1)),
+        # roll about its own y, which is its top: looks west
+        ({"roll": 90}, (-1, 0, 0), (0, 1, 0)),
+    ],
+)
+def test_realityscan_angles_are_those_of_an_aeroplane(
+    tmp_path: Path, angles: dict[str, object], ahead: tuple[int, ...], top: tuple[int, ...]
+) -> None:
+    path = realityscan(tmp_path / "cameras.csv", [angles, {}, {}, {}])
+    posed = read_given_poses(path, find_photos(photos(tmp_path / "photos"))).posed
+    pose = posed.cameras.world_from_camera[0]
+    assert pose[:3, 2].tolist() == pytest.approx(ahead, abs=1e-6)
+    assert (-pose[:3, 1]).tolist() == pytest.approx(top, abs=1e-6)
+    assert posed.cameras.world_from_camera[2, :3, 3].tolist() == [2, 0, 0]
+
+
+def test_realityscan_lens_is_in_shares_of_the_longer_side(tmp_path: Path) -> None:
+    row: dict[str, object] = {"f": 27.0, "px": 0.05, "py": -0.02, "k1": 0.05, "k2": 0.01, "k3": -0.02}
+    row |= {"t1": 0.003, "t2": -0.002}
+    path = realityscan(tmp_path / "cameras.csv", [row, row, row, row])
+    lens = read_given_poses(path, find_photos(photos(tmp_path / "photos"))).posed.distortions[0]
+    assert lens is not None
+    width, height = lens.size
+    longer = max(width, height)
+    focal = 27 / 36 * longer
+    expected = [[focal, 0, width / 2 + 0.05 * longer], [0, focal, height / 2 - 0.02 * longer], [0, 0, 1]]
+    assert lens.intrinsics.tolist() == pytest.approx(np.array(expected))
+    assert lens.coefficients.tolist() == [0.05, 0.01, 0.003, -0.002, -0.02]
+
+
+@pytest.mark.parametrize(
+    ("row", "without", "message"),
+    [
+        ({}, "heading", "expected RealityScan's CSV with columns #name, x, y, .*found no heading"),
+        ({"pitch": "nan"}, "", "expected a finite number as pitch of 0000.jpg, found 'nan'"),
+        ({"k4": 0.1}, "", "expected f above 0 and k4 of 0 for 0000.jpg, found f = 36, k4 = 0.1"),
+        ({"f": 0}, "", "expected f above 0 and k4 of 0"),
+    ],
+)
+def test_realityscan_files_that_cannot_be_used(
+    tmp_path: Path, row: dict[str, object], without: str, message: str
+) -> None:
+    path = realityscan(tmp_path / "cameras.csv", [row, {}, {}, {}], without=without)
+    with pytest.raises(ValueError, match=message):
+        read_given_poses(path, find_photos(photos(tmp_path / "photos")))

@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.core.images import stored_size
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures import colmap, metashape_xml, transforms_json
+from splatgraft.formats.captures import colmap, metashape_xml, realityscan_csv, transforms_json
 from splatgraft.formats.captures.assembly import fitted_to_file, posed_images_of
 from splatgraft.formats.captures.masks import PhotoFiles
 from splatgraft.formats.captures.view_record import ViewRecord
@@ -39,7 +40,7 @@ def pose_files(source: Path) -> tuple[Path, ...]:
         return (source,)
     if not source.is_dir():
         raise ValueError(f"{source}: expected a file or folder with poses, found nothing")
-    suffixes = {".json", ".ply", ".bin", ".txt", ".xml"}
+    suffixes = {".json", ".ply", ".bin", ".txt", ".xml", ".csv"}
     return tuple(sorted(p for p in source.rglob("*") if p.is_file() and p.suffix in suffixes and p.name != "step.json"))
 
 
@@ -47,13 +48,14 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
     """The `photos` with the poses in `source`; a pose belongs to the photo with its name, whatever its suffix.
 
     Args:
-        source: A folder with a COLMAP model or a transforms.json, that file itself, or Metashape's XML file.
+        source: A folder with a COLMAP model or a transforms.json, that file itself, Metashape's XML file, or
+            RealityScan's CSV file.
         photos: With their masks.
 
     Raises:
         ValueError: There is no such thing at `source`, it is broken, or fewer than three photos have a pose.
     """
-    views, points, colors = _read(source)
+    views, points, colors = _read(source, photos.paths)
     masks = photos.masks or (None,) * len(photos.paths)
     by_stem = {path.stem: (path, mask) for path, mask in zip(photos.paths, masks, strict=True)}
     known = {path.name: path.stem for path in photos.paths}
@@ -78,16 +80,22 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
     )
 
 
-def _read(source: Path) -> tuple[Sequence[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+def _read(
+    source: Path, photos: Sequence[Path]
+) -> tuple[Sequence[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     if source.suffix.lower() == ".xml":
         return metashape_xml.read_views(source), torch.zeros(0, 3), torch.zeros(0, 3)
+    if source.suffix.lower() == ".csv":
+        sizes = {photo.stem: stored_size(photo) for photo in photos}
+        return realityscan_csv.read_views(source, sizes), torch.zeros(0, 3), torch.zeros(0, 3)
     transforms = next((f for f in (source, source / "transforms.json") if f.suffix == ".json" and f.is_file()), None)
     if transforms is not None:
         return transforms_json.read_views(transforms)
     folder = source.parent if source.is_file() else source
     if not colmap.is_colmap(folder):
         raise ValueError(
-            f"{source}: expected poses (a COLMAP model, transforms.json or Metashape's XML), found none of these"
+            f"{source}: expected poses (a COLMAP model, transforms.json, Metashape's XML or RealityScan's CSV), "
+            "found none of these"
         )
     return colmap.read_views(folder)
 
