@@ -8,6 +8,7 @@ from typing import Any, cast
 import pytest
 from test_hostile_values import made, page_of, project
 from viser import GuiEvent
+from waiting import wait_until
 
 from splatgraft.cli import main
 from splatgraft.commands.edit_project import FlowProject
@@ -46,17 +47,20 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
     try:
         page.show_phase("Run")
         run, session = cast("Any", page._phases["Run"]), page.require_session()
-        event = GuiEvent(client=None, client_id=0, target=run._scene)
+        share = run._share
         assert not run._stale.visible
         assert not run._renew.visible
         session.change(replace(session.state, weights=LayerWeights(shadow=0.5)))
         page.refresh()
         assert "relight: " in run._stale.content
         assert run._renew.visible
-        run._scene.value = ".ply"
-        for callback in run._scene._impl.update_cb:
-            callback(event)
-        assert "it is out of date (relight: " in page._status.content
+        share._kind.value = "Scene, exact (.ply)"
+        page.refresh()
+        for callback in share._write._impl.update_cb:
+            callback(GuiEvent(client=None, client_id=0, target=share._write))
+        wait_until(lambda: "it is out of date (relight: " in page._status.content, what="the end of the export")
+        assert " MB in " in page._status.content
+        assert (session.files.root / "export" / "project.ply").is_file()
         page.preview.show("Copy-paste", "Result")
         camera = session.scenes.cameras(session.files.target_cameras)[0].resized(0.2)
         request = page.preview._request()
