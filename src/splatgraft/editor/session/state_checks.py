@@ -18,6 +18,8 @@ MIN_SCALE, MAX_SCALE = 1e-6, 1e6
 """Smallest and largest scale of an object: beyond, covariances leave the range of float32."""
 MAX_COORDINATE = 1e6
 """Largest absolute coordinate, world units: beyond, float32 resolves less than a tenth of a unit."""
+MIN_HEIGHT_CM, MAX_HEIGHT_CM = 1e-3, 1e7
+"""Smallest and largest height that can be typed: a hundredth of a millimetre, and a hundred kilometres."""
 MASK_SOURCES = ("auto", "files", "grabcut", "sam2", "birefnet", "box")
 """Values of `mask_source` of [segment]."""
 MAX_WEIGHT = 100.0
@@ -78,6 +80,15 @@ def check_numbers(values: Iterable[object], where: str) -> None:
     """
     for value in values:
         _check_number(value, where, (-MAX_COORDINATE, MAX_COORDINATE))
+
+
+def check_height_cm(value: object) -> None:
+    """Check a typed height in centimetres.
+
+    Raises:
+        ValueError: As `check_state`.
+    """
+    _check_number(value, "height in cm", (MIN_HEIGHT_CM, MAX_HEIGHT_CM))
 
 
 def _check_box(box: Sequence[float]) -> None:
