@@ -66,7 +66,7 @@ def test_every_edit_is_saved_and_undone(session: Session) -> None:
         lambda s: replace(s, erased=torch.arange(count) % 7 == 0),
         lambda s: replace(s, corrections=(torch.arange(source) % 3 - 1).to(torch.int8)),
         lambda s: replace(s, light=LIGHT),
-        lambda s: replace(s, weights=LayerWeights(shadow=0.5, gloss=0.0)),
+        lambda s: replace(s, weights=LayerWeights(shadow=0.5, gloss=0.0, exposure=-0.5)),
         lambda s: replace(s, box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), mask_source="grabcut", keep="largest"),
         lambda s: replace(s, harmonizer="reinhard"),
     ]
@@ -81,7 +81,7 @@ def test_every_edit_is_saved_and_undone(session: Session) -> None:
     assert torch.equal(again.erased, torch.arange(count) % 7 == 0)
     assert torch.equal(again.corrections, (torch.arange(source) % 3 - 1).to(torch.int8))
     assert light_to_json(again.light) == light_to_json(LIGHT)
-    assert again.weights == LayerWeights(shadow=0.5, gloss=0.0)
+    assert again.weights == LayerWeights(shadow=0.5, gloss=0.0, exposure=-0.5)
     assert (again.box, again.mask_source, again.keep) == ((0, 0, 0, 1, 1, 1), "grabcut", "largest")
     after = contents(session)
     while session.undo():

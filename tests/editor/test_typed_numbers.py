@@ -1,11 +1,12 @@
 """Numbers typed in the page: the real server and page, with the messages that a browser would send."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
+import torch
 from test_scenes_without_photos import AROUND_THE_BALL, scene_project
 from viser import GuiEvent
 
@@ -17,6 +18,7 @@ from splatgraft.editor.page.server import GuardedServer
 from splatgraft.editor.session.object_size import true_scale
 from splatgraft.editor.session.state_files import read_state
 from splatgraft.formats.metric_scale import MetricScale, read_scale, write_scale
+from splatgraft.relighting import LayerWeights
 
 
 @pytest.fixture
@@ -146,3 +148,27 @@ def test_a_height_that_cannot_be_is_refused(page: Page, height: float) -> None:
     page.refresh()
     assert str(path) in size._note.content
     assert not size._height.visible
+
+
+def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(page: Page) -> None:
+    page.show_phase("Light")
+    sliders, session = cast("Any", page._phases["Light"])._sliders, page.require_session()
+    assert {key: slider.value for key, slider in sliders.items()} == asdict(LayerWeights())
+    relit = session.relighting.relit(session.placed_state())
+    before = session.relighting.scene(session.placed_state())
+    for key, value in (("exposure", 1.0), ("tint", 0.5), ("shadow", 0.25)):
+        arrives(sliders[key], value)
+        is_handled(sliders[key])
+    assert read_state(session.files.file).weights == LayerWeights(exposure=1.0, tint=0.5, shadow=0.25)
+    # the same layers, by identity
+    assert session.relighting.relit(session.placed_state()) is relit
+    after = session.relighting.scene(session.placed_state())
+    objects = relit.bake()[1]
+    assert after.count == before.count
+    assert float((after.sh - before.sh)[objects, 0].mean()) > 0.1
+    # what is as computed needs no key in project.toml
+    for key, value in asdict(LayerWeights()).items():
+        arrives(sliders[key], value)
+        is_handled(sliders[key])
+    assert "exposure" not in session.files.file.read_text()
+    assert torch.equal(session.relighting.scene(session.placed_state()).sh, before.sh)

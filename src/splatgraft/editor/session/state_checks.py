@@ -24,6 +24,8 @@ MASK_SOURCES = ("auto", "files", "grabcut", "sam2", "birefnet", "box")
 """Values of `mask_source` of [segment]."""
 MAX_WEIGHT = 100.0
 """Largest weight of a layer of the light transfer."""
+MAX_STOPS = 16.0
+"""Largest exposure of the objects, up or down, stops."""
 _ORTHONORMAL = 1e-3
 """Largest deviation of a rotation from orthonormality: typed angles and float32 stay below 1e-6."""
 
@@ -103,7 +105,7 @@ def _check_box(box: Sequence[float]) -> None:
 
 def _check_weights(weights: LayerWeights) -> None:
     for name, value in asdict(weights).items():
-        _check_number(value, name, (0.0, MAX_WEIGHT))
+        _check_number(value, name, (-MAX_STOPS, MAX_STOPS) if name == "exposure" else (0.0, MAX_WEIGHT))
 
 
 def _check_light(light: Light | None) -> None:

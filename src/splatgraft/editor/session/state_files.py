@@ -149,8 +149,9 @@ def _segment_keys(state: EditState) -> dict[str, Any]:
 
 
 def _relight_keys(state: EditState) -> dict[str, Any]:
-    # the physical weight, 1, is the default and needs no key
-    weights = {key: None if value == 1.0 else value for key, value in asdict(state.weights).items()}
+    # what is physically right is the default and needs no key
+    usual = asdict(LayerWeights())
+    weights = {key: None if value == usual[key] else value for key, value in asdict(state.weights).items()}
     return weights | {"given_light": None if state.light is None else LIGHT_FILE}
 
 
