@@ -44,6 +44,8 @@ def check_state(state: EditState) -> None:
         _check_array(state.corrections, torch.int8, "corrections")
     if state.box is not None:
         _check_box(state.box)
+    for name, prompt in (state.prompts or {}).items():
+        check_numbers((*prompt.inside.flatten().tolist(), *prompt.outside.flatten().tolist()), f"points in {name}")
     _check_choice(state.mask_source, MASK_SOURCES, "mask_source")
     _check_choice(state.keep, get_args(Keep), "keep")
     _check_choice(state.harmonizer, tuple(HARMONIZERS), "image model")
