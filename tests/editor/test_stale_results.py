@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import MagicMock
 
 import pytest
 from test_hostile_values import made, page_of, project
-from viser import GuiEvent
+from viser import ClientHandle, GuiEvent
 from waiting import wait_until
 
 from splatgraft.cli import main
@@ -70,5 +71,25 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         assert session.undo()
         page.refresh()
         assert not run._stale.visible
+    finally:
+        close()
+
+
+def test_a_picture_that_was_begun_before_select_is_not_shown_there(project: Path) -> None:
+    page, close = page_of(project)
+    try:
+        page.show_phase("Place")
+        request = page.preview._request()
+        assert request is not None
+        window = MagicMock(spec=ClientHandle, client_id=1, scene=MagicMock(), _websock_connection=MagicMock())
+        late = replace(
+            request, window=window, camera=request.camera.resized(0.2), left="Target alone", right="Target alone"
+        )
+        page.preview._is_on_canvas = True
+        page.preview._draw_once(late, note="", stage="final")
+        assert page.preview.canvas.is_shown
+        page.show_phase("Select")
+        page.preview._draw_once(late, note="", stage="final")
+        assert not page.preview.canvas.is_shown
     finally:
         close()
