@@ -59,8 +59,10 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         page.refresh()
         for callback in share._write._impl.update_cb:
             callback(GuiEvent(client=None, client_id=0, target=share._write))
+        wait_until(lambda: share._bar.visible, what="the progress of the export")
         wait_until(lambda: "it is out of date (relight: " in page._status.content, what="the end of the export")
         assert " MB in " in page._status.content
+        assert not share._bar.visible
         assert (session.files.root / "export" / "project.ply").is_file()
         page.preview.show("Copy-paste", "Result")
         camera = session.scenes.cameras(session.files.target_cameras)[0].resized(0.2)

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -65,10 +66,15 @@ def prompts_to_json(prompts: Mapping[str, ViewPrompt]) -> dict[str, Any]:
     """Tables, lists and numbers from which `prompts_from_json` gives the same back."""
     content = {}
     for name, prompt in prompts.items():
-        points = {"inside": prompt.inside.tolist(), "outside": prompt.outside.tolist()}
+        points = {"inside": _decimal(prompt.inside), "outside": _decimal(prompt.outside)}
         box = {} if prompt.box is None else {"box": list(prompt.box)}
         content[name] = {key: value for key, value in points.items() if value} | box
     return content
+
+
+def _decimal(points: Float[Tensor, "k 2"]) -> list[list[float]]:
+    """The shortest decimal numbers that are read back as the same float32."""
+    return [[float(str(number)) for number in point] for point in points.numpy().astype(np.float32)]
 
 
 def _prompt(file: str, name: str, entry: Any) -> ViewPrompt:

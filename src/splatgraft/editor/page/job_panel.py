@@ -22,6 +22,8 @@ class JobPanel:
         """Build the controls."""
         self._page, gui = page, page.gui
         self._last_seen = ""
+        self.on_progress: Callable[[JobState], None] = lambda state: None
+        """Called with the state of the running job, a few times a second."""
         self.on_end: Callable[[JobState], None] = lambda state: None
         """Called with the state of a job that has ended, after the page has been redrawn."""
         self._text = gui.add_html("", visible=False)
@@ -42,6 +44,7 @@ class JobPanel:
             return
         if live:
             self._show(state)
+            self.on_progress(state)
         current = f"{state.pid} {state.outcome} {state.step}"
         if current == self._last_seen:
             return

@@ -99,7 +99,8 @@ class PhotoClicks:
         inside, outside = (sum(len(getattr(p, kind)) for p in prompts.values()) for kind in ("inside", "outside"))
         if not prompts:
             return "No points yet; some in two or three photos are usually enough."
-        return f"<b>{inside}</b> on the object, <b>{outside}</b> beside it, in {len(prompts)} photos"
+        where = "1 photo" if len(prompts) == 1 else f"{len(prompts)} photos"
+        return f"<b>{inside}</b> on the object, <b>{outside}</b> beside it, in {where}"
 
     def _say(self) -> None:
         if self._show.value:

@@ -39,13 +39,14 @@ class SharePanel:
         )
         self._note = gui.add_html("", visible=False)
         self._write = gui.add_button("Write and download", icon=viser.Icon.SHARE)
+        self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._picture = gui.add_button("Picture of this view", icon=viser.Icon.PHOTO, color="gray")
         self._written = gui.add_html("")
         self._kind.on_update(page.callback(lambda _: None))
         self._part.on_update(page.callback(lambda _: None))
         self._write.on_click(page.callback(self._start))
         self._picture.on_click(page.callback(self._send_picture))
-        page.job.on_end = self._job_ended
+        page.job.on_progress, page.job.on_end = self._show_progress, self._job_ended
 
     def refresh(self) -> None:
         """Update what can be written, the command and the list of files."""
@@ -83,9 +84,15 @@ class SharePanel:
         self._page.say(f"{to.name}: being written; you can go on meanwhile")
         self._page.job.refresh()
 
+    def _show_progress(self, job: JobState) -> None:
+        """Show the progress here too: the panel of the job is out of view."""
+        self._bar.visible = _is_export(job)
+        self._bar.value = 100 * job.fraction
+
     def _job_ended(self, job: JobState) -> None:
         """Send the file that a job has written to the window that asked for it, and say what the job said."""
-        if job.command[:1] != ("export",):
+        self._bar.visible = False
+        if not _is_export(job):
             return
         asked, self._asked = self._asked, None
         if job.outcome == "cancelled":
@@ -122,3 +129,7 @@ class SharePanel:
             older = " (older than the result)" if stat.st_mtime_ns < newest else ""
             rows.append(f'{name}, {stat.st_size / 1e6:.1f} MB {link}<a href="{address}" download>download</a>{older}')
         return "<br>".join(rows)
+
+
+def _is_export(job: JobState) -> bool:
+    return job.command[:1] == ("export",)
