@@ -21,6 +21,7 @@ SLOW = (
     "editor/test_editor_session.py",
     "editor/test_scenes_without_photos.py",
     "editor/test_server_and_windows.py",
+    "editor/test_sharing.py",
     "exports/test_page_in_browser.py",
     "exports/test_parts_and_pictures.py",
     "exports/test_playcanvas_reads.py",

@@ -1,4 +1,4 @@
-"""Puts tests/commands on the path, whose tiny project the editor's tests use, and provides a browser."""
+"""Puts the folders on the path whose tiny projects the editor's tests use, and provides a browser."""
 
 import sys
 from collections.abc import Iterator
@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-sys.path.append(str(Path(__file__).parents[1] / "commands"))
+for name in ("commands", "exports"):
+    sys.path.append(str(Path(__file__).parents[1] / name))
 
 
 @pytest.fixture(scope="module")

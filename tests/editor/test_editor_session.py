@@ -4,7 +4,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import pytest
 import torch
 from tiny_project import OPTIONS, write_project
@@ -13,14 +12,12 @@ from splatgraft.cli import main
 from splatgraft.commands.edit_project import FlowProject
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.jobs.exports import export_scene, export_turntable
 from splatgraft.editor.previews.preview import PICTURE_KINDS, PictureSize, wipe_comparison
 from splatgraft.editor.session import placement_operations
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.session import Session
 from splatgraft.editor.session.state_files import read_state, state_files, write_state
 from splatgraft.editor.session.toml_edit import with_keys
-from splatgraft.evaluation.pictures import write_animation
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.project.record import read_record
@@ -69,7 +66,7 @@ def test_every_edit_is_saved_and_undone(session: Session) -> None:
         lambda s: replace(s, erased=torch.arange(count) % 7 == 0),
         lambda s: replace(s, corrections=(torch.arange(source) % 3 - 1).to(torch.int8)),
         lambda s: replace(s, light=LIGHT),
-        lambda s: replace(s, weights=LayerWeights(shadow=0.5, gloss=0.0)),
+        lambda s: replace(s, weights=LayerWeights(shadow=0.5, gloss=0.0, exposure=-0.5)),
         lambda s: replace(s, box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), mask_source="grabcut", keep="largest"),
         lambda s: replace(s, harmonizer="reinhard"),
     ]
@@ -84,7 +81,7 @@ def test_every_edit_is_saved_and_undone(session: Session) -> None:
     assert torch.equal(again.erased, torch.arange(count) % 7 == 0)
     assert torch.equal(again.corrections, (torch.arange(source) % 3 - 1).to(torch.int8))
     assert light_to_json(again.light) == light_to_json(LIGHT)
-    assert again.weights == LayerWeights(shadow=0.5, gloss=0.0)
+    assert again.weights == LayerWeights(shadow=0.5, gloss=0.0, exposure=-0.5)
     assert (again.box, again.mask_source, again.keep) == ((0, 0, 0, 1, 1, 1), "grabcut", "largest")
     after = contents(session)
     while session.undo():
@@ -238,33 +235,6 @@ def test_the_shown_light_equals_what_the_step_writes(session: Session, light_mod
     camera = session.scenes.cameras(session.files.target_cameras)[0]
     with pytest.raises(ValueError, match="physical transfer"):
         session.preview.picture("Shadow layer", state, camera)
-
-
-def test_exports_of_missing_results_are_refused(session: Session) -> None:
-    with pytest.raises(ValueError, match="finished scene"):
-        export_scene(session.files, ".ply")
-    with pytest.raises(ValueError, match="a turntable"):
-        export_turntable(session.files, ".mp4")
-
-
-def test_the_orbit_video_has_the_frames_of_the_turntable(session: Session) -> None:
-    session.files.report.mkdir()
-    frames = [torch.full((25, 41, 3), level) for level in (0.1, 0.5, 0.9)]
-    write_animation(session.files.report / "turntable.webp", frames, fps=10.0)
-    path, remark = export_turntable(session.files, ".mp4")
-    # OpenCV may have either codec or none, and then the remark says so
-    assert path.suffix == ".mp4" or "instead" in remark
-    if path.suffix == ".mp4":
-        video = cv2.VideoCapture(str(path))
-        shown = [video.read()[1] for _ in frames]
-        assert not video.read()[0]
-        assert video.get(cv2.CAP_PROP_FPS) == 10.0
-        # a flat picture survives any codec to within its steps of quantisation
-        assert all(abs(float(x.mean()) / 255 - float(y.mean())) < 0.03 for x, y in zip(shown, frames, strict=True))
-        assert shown[0].shape == (24, 40, 3)
-    webp, remark = export_turntable(session.files, ".webp")
-    assert webp.read_bytes() == (session.files.report / "turntable.webp").read_bytes()
-    assert remark == ""
 
 
 def test_a_project_with_trained_scenes_uses_them(session: Session, tmp_path: Path) -> None:

@@ -87,6 +87,7 @@ BAD_STATES = [
     EditState(keep="bogus"),
     EditState(harmonizer="bogus"),
     *(EditState(weights=LayerWeights(shadow=value)) for value in (math.nan, math.inf, -1.0, 1e9)),
+    *(EditState(weights=LayerWeights(exposure=value)) for value in (math.nan, -math.inf, -17.0)),
     EditState(light=lit(math.nan)),
     EditState(light=lit(-1.0)),
 ]

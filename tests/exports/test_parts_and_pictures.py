@@ -135,6 +135,15 @@ def test_a_scene_without_cameras_is_circled(tmp_path):
         assert animation.n_frames == 4
 
 
+def test_the_pictures_of_a_turntable_and_a_shadow_s_steps_are_counted(source, tmp_path):
+    told = []
+    options = ExportOptions(layer="shadow", frames=3, width=32)
+    export_scene(source, tmp_path / "a.gif", options, progress=lambda *counted: told.append(counted))
+    assert [done for done, _, text in told if text == "pictures"] == [0, 1, 2, 3]
+    fitted = [(done, total) for done, total, text in told if text == "fitting the shadow"]
+    assert fitted[-1] == (len(fitted), len(fitted))
+
+
 @pytest.mark.parametrize(("option", "value"), [("--frames", "1"), ("--width", "8")])
 def test_numbers_out_of_range(project, tmp_path, capsys, option, value):
     assert main(["export", str(project), "--to", str(tmp_path / "a.mp4"), option, value]) == 2

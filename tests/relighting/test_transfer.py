@@ -10,7 +10,7 @@ from shapes import ring, surfels
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
-from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.images import LUMINANCE, linear_from_srgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting import (
@@ -191,6 +191,31 @@ def test_layers_can_be_taken_out():
     nothing = LayerWeights(shade=0.0, shadow=0.0, bounce=0.0, gloss=0.0)
     assert torch.equal(relit.shaded(nothing).sh, composite.merged()[0].sh)
     assert not torch.equal(relit.shaded().sh, composite.merged()[0].sh)
+
+
+def test_tint_and_exposure_change_the_object_alone():
+    factors = torch.tensor([[1.0, 1.0, 1.0], [0.5, 0.4, 0.2], [1.5, 1.2, 2.0], [0.7, 0.7, 0.7]])
+    composite = placed((ball(), at(0.0, 0.0, 0.35)))
+    relit = relight(composite, cameras(), light=sun_from(-1, 0, 1), options=WHOLE)
+    given = factors[torch.arange(relit.gaussians.count) % len(factors)]
+    relit = replace(relit, shade=torch.where(relit.is_object[:, None], given, 1))
+    usual, objects = relit.ratio(), relit.is_object
+    grey = relit.ratio(LayerWeights(tint=0.0))
+    assert torch.equal(grey[~objects], usual[~objects])
+    luminance = (grey @ LUMINANCE, usual @ LUMINANCE)
+    # sums of three products in float32
+    assert torch.allclose(*luminance, rtol=1e-5)
+    plain = replace(relit, shadow=torch.ones_like(relit.shadow), bounce=torch.zeros_like(relit.bounce))
+    spread = plain.ratio(LayerWeights(tint=0.0))[objects]
+    assert float((spread.amax(1) / spread.amin(1) - 1).abs().max()) < 1e-5
+    # twice the tint: ratios of channels are squared
+    once, twice = plain.ratio()[objects], plain.ratio(LayerWeights(tint=2.0))[objects]
+    assert torch.allclose(twice[:, 0] / twice[:, 2], (once[:, 0] / once[:, 2]) ** 2, rtol=1e-4)
+    brighter = relit.ratio(LayerWeights(exposure=1.0))
+    assert torch.equal(brighter[objects], 2 * usual[objects])
+    assert torch.equal(brighter[~objects], usual[~objects])
+    # the transfer has not been done again: the layers are the same, only their weights are not
+    assert torch.equal(relit.shaded(LayerWeights(tint=1.0, exposure=0.0)).sh, relit.shaded().sh)
 
 
 def test_splitting_sharpens_and_keeps_count_bounded():

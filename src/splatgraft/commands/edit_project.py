@@ -6,14 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from splatgraft.commands.export_job import export_words
 from splatgraft.commands.init import Init
 from splatgraft.commands.steps.capture import Capture
 from splatgraft.commands.steps.compose import Compose
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.segment import Segment
-from splatgraft.editor.session.project_access import ProjectFiles, Triple
+from splatgraft.editor.session.project_access import Commands, ExportPage, ProjectFiles, Triple
 from splatgraft.editor.session.session import EDITOR_FOLDER
 from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.exports.export import Layer
 from splatgraft.folders.input_description import describe_input
 from splatgraft.formats import is_scene
 from splatgraft.project.layout import (
@@ -114,10 +116,9 @@ class FlowProject:
         with atomic_write(self.file) as stream:
             stream.write(text.encode())
 
-    def run_command(self, to: str, title: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Commands that run the stale steps up to `to`: that of the child process, and its equivalent for the user."""
-        files = self.files()
-        root = self.file.parent if files is None else files.root
+    def run_command(self, to: str, title: str) -> Commands:
+        """Commands that run the stale steps up to `to`."""
+        root = self._root()
         arguments = (
             str(root / EDITOR_FOLDER),
             title,
@@ -128,6 +129,17 @@ class FlowProject:
         out = () if self.out is None else ("--out", str(self.out))
         command = (sys.executable, "-m", "splatgraft.workflow.background_job", *arguments)
         return command, ("splatgraft", "run", str(self.file), "--to", to, *out)
+
+    def export_command(self, to: Path, *, page: ExportPage, layer: Layer, title: str) -> Commands:
+        """Commands that write the result, or a part of it, as a file whose suffix names the format."""
+        root = self._root()
+        arguments = (str(root / EDITOR_FOLDER), title, str(root), str(to), page, layer)
+        command = (sys.executable, "-m", "splatgraft.commands.export_job", *arguments)
+        return command, ("splatgraft", *export_words(root, to, page=page, layer=layer))
+
+    def _root(self) -> Path:
+        files = self.files()
+        return self.file.parent if files is None else files.root
 
 
 def _has_no_photos(flow: Flow, side: Side) -> bool:

@@ -1,5 +1,6 @@
 """The command `export`: a scene or a result as a file for other people and other programs."""
 
+import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -36,18 +37,32 @@ class Export:
         return self.scene.parent if self.scene.name == PROJECT_FILE else self.scene
 
     def execute(self, console: Console) -> int:
-        """Read, write, and say what was assumed."""
+        """Read, write, and say what was assumed, how large the file is and how long it took."""
         self._say_stale(console)
+        for sentence in self.write(console):
+            console.say(sentence)
+        console.result(self.to)
+        return 0
+
+    def write(self, console: Console) -> tuple[str, ...]:
+        """Read and write, with a progress bar.
+
+        Returns:
+            Sentences for the user: what was assumed; size and seconds.
+
+        Raises:
+            ValueError: There is nothing to export, or the format cannot hold it.
+        """
+        began, said = time.monotonic(), ()
         if self.page == "report":
             write_report_file(self.to, self._report())
         else:
             source = read_export_source(self.scene, cameras=self.cameras)
             source = source if self.title is None else replace(source, title=self.title)
-            for sentence in export_scene(source, self.to, self.options):
-                console.say(f"{self.to}: {sentence}")
-        console.say(f"{self.to}: {self.to.stat().st_size / 1e6:.1f} MB")
-        console.result(self.to)
-        return 0
+            with console.bar("export") as progress:
+                said = export_scene(source, self.to, self.options, progress=progress)
+        size, seconds = self.to.stat().st_size / 1e6, time.monotonic() - began
+        return (*(f"{self.to}: {sentence}" for sentence in said), f"{self.to}: {size:.1f} MB in {seconds:.1f} s")
 
     def _report(self) -> Path:
         """The report's page: of the project, or of its folder report."""

@@ -199,6 +199,23 @@ def read_grey(path: Path, longest_px: int) -> UInt8[np.ndarray, "h w"]:
         return np.array(grey)
 
 
+def read_upright(path: Path, longest_px: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
+    """A picture as a viewer shows it, at most `longest_px` long, and its full width and height upright.
+
+    Raises: ValueError where the file is no readable image.
+    """
+    with opened(path) as image:
+        width, height = image.size
+        size = (height, width) if _exif_orientation(image) in _TURNED_SIDEWAYS else (width, height)
+        shrink_on_decoding(image, longest_px)
+        image.load()
+        upright = ImageOps.exif_transpose(image)
+    pixels = (_rgb(upright) * 255).round().to(torch.uint8).numpy()
+    small = Image.fromarray(pixels)
+    small.thumbnail((longest_px, longest_px), Image.Resampling.LANCZOS)
+    return np.array(small), size
+
+
 def read_exif(path: Path) -> dict[int, Any]:
     """The camera's EXIF tags of an image file, with Pillow's values; empty where there are none or they are damaged.
 

@@ -14,9 +14,11 @@ from splatgraft.exports.first_view import first_view
 from splatgraft.exports.pictures import write_picture, write_turntable
 from splatgraft.exports.scene_frame import upright
 from splatgraft.exports.shadow_layer import shadow_layer
+from splatgraft.exports.turntable_video import path_around
 from splatgraft.exports.viewer_page import write_viewer_page
 from splatgraft.formats import WRITTEN_SCENE_SUFFIXES, scene_suffix, write_gaussians
 from splatgraft.formats.scenes.spz import write_spz
+from splatgraft.runtime.progress import Progress, silent
 
 _WORLD_SUFFIXES = (".glb", ".usdz")
 """Formats whose y points up and whose unit is a metre."""
@@ -47,13 +49,16 @@ class ExportOptions:
     """Of a turntable; 24 are a second."""
 
 
-def export_scene(source: ExportSource, to: Path, options: ExportOptions = ExportOptions()) -> tuple[str, ...]:
+def export_scene(
+    source: ExportSource, to: Path, options: ExportOptions = ExportOptions(), *, progress: Progress = silent
+) -> tuple[str, ...]:
     """Write a file; it appears whole or not at all.
 
     Args:
         source: What is written.
         to: A file whose suffix is among `EXPORT_SUFFIXES`.
         options: Which part, and how.
+        progress: Told of the steps of a shadow's fit and of the pictures of a turntable.
 
     Returns:
         Sentences for the user: what was assumed, left out or turned.
@@ -64,10 +69,18 @@ def export_scene(source: ExportSource, to: Path, options: ExportOptions = Export
     write = _WRITERS.get(scene_suffix(to))
     if write is None:
         raise ValueError(f"{to}: expected a file that ends in {', '.join(EXPORT_SUFFIXES)}, found '{to.suffix}'")
-    return write(source, to, options)
+    return write(source, to, _Wanted(options, progress))
 
 
-def layer_of(source: ExportSource, layer: Layer) -> tuple[Gaussians, tuple[str, ...]]:
+@dataclass(frozen=True)
+class _Wanted:
+    """What a writer is told."""
+
+    options: ExportOptions
+    progress: Progress
+
+
+def layer_of(source: ExportSource, layer: Layer, *, progress: Progress = silent) -> tuple[Gaussians, tuple[str, ...]]:
     """One layer without Gaussians that are not finite, and sentences on it.
 
     Raises: ValueError where the source does not know its layers.
@@ -83,7 +96,7 @@ def layer_of(source: ExportSource, layer: Layer) -> tuple[Gaussians, tuple[str, 
     object_ = source.scene.select(source.is_object)
     if layer == "object":
         return _finite(object_)
-    shadow = shadow_layer(source)
+    shadow = shadow_layer(source, progress=progress)
     if shadow.psnr is None:
         said = "the object casts no shadow that the target's cameras see"
     else:
@@ -96,9 +109,9 @@ def layer_of(source: ExportSource, layer: Layer) -> tuple[Gaussians, tuple[str, 
     return chosen, (said, *left_out)
 
 
-def _layer(source: ExportSource, options: ExportOptions) -> tuple[Gaussians, tuple[str, ...]]:
-    gaussians, said = layer_of(source, options.layer)
-    return _limited(gaussians, options), said
+def _layer(source: ExportSource, wanted: _Wanted) -> tuple[Gaussians, tuple[str, ...]]:
+    gaussians, said = layer_of(source, wanted.options.layer, progress=wanted.progress)
+    return _limited(gaussians, wanted.options), said
 
 
 def _limited(gaussians: Gaussians, options: ExportOptions) -> Gaussians:
@@ -116,8 +129,9 @@ def _finite(gaussians: Gaussians) -> tuple[Gaussians, tuple[str, ...]]:
     return gaussians.select(finite), (f"{int((~finite).sum())} Gaussians that are not finite are left out",)
 
 
-def _write_html(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
-    after, said = _layer(source, options)
+def _write_html(source: ExportSource, to: Path, wanted: _Wanted) -> tuple[str, ...]:
+    options = wanted.options
+    after, said = _layer(source, wanted)
     view, assumed = first_view(source)
     scenes = {source.title: after}
     if options.layer == "all" and source.pasted is not None:
@@ -127,8 +141,9 @@ def _write_html(source: ExportSource, to: Path, options: ExportOptions) -> tuple
     return (*said, *assumed)
 
 
-def _write_scene(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
-    gaussians, said = _layer(source, options)
+def _write_scene(source: ExportSource, to: Path, wanted: _Wanted) -> tuple[str, ...]:
+    options = wanted.options
+    gaussians, said = _layer(source, wanted)
     metadata, suffix = source.metadata, scene_suffix(to)
     if options.frame == "world" or (options.frame == "auto" and suffix in _WORLD_SUFFIXES):
         world_from_capture, metadata, about = upright(source)
@@ -140,19 +155,22 @@ def _write_scene(source: ExportSource, to: Path, options: ExportOptions) -> tupl
     return said
 
 
-def _write_picture(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
-    gaussians, said = _layer(source, options)
+def _write_picture(source: ExportSource, to: Path, wanted: _Wanted) -> tuple[str, ...]:
+    options = wanted.options
+    gaussians, said = _layer(source, wanted)
     view, assumed = first_view(source)
     with_alpha = options.layer != "all" and to.suffix.lower() == ".png"
     write_picture(to, gaussians, view, width=_required_width(options), with_alpha=with_alpha)
     return (*said, *assumed)
 
 
-def _write_turntable(source: ExportSource, to: Path, options: ExportOptions) -> tuple[str, ...]:
-    gaussians, said = _layer(source, options)
+def _write_turntable(source: ExportSource, to: Path, wanted: _Wanted) -> tuple[str, ...]:
+    options = wanted.options
+    gaussians, said = _layer(source, wanted)
     view, assumed = first_view(source)
     width = _required_width(options)
-    about = write_turntable(to, gaussians, source, view, frames=options.frames, width=width)
+    cameras = path_around(source, view, frames=options.frames, width=width)
+    about = write_turntable(to, gaussians, cameras, progress=wanted.progress)
     return (*said, *assumed, about)
 
 
@@ -162,7 +180,7 @@ def _required_width(options: ExportOptions) -> int:
     return options.width
 
 
-_WRITERS: dict[str, Callable[[ExportSource, Path, ExportOptions], tuple[str, ...]]] = {
+_WRITERS: dict[str, Callable[[ExportSource, Path, _Wanted], tuple[str, ...]]] = {
     ".html": _write_html,
     **dict.fromkeys(WRITTEN_SCENE_SUFFIXES, _write_scene),
     **dict.fromkeys((".png", ".jpg"), _write_picture),

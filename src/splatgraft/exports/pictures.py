@@ -13,11 +13,11 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_image
 from splatgraft.evaluation import write_animation
-from splatgraft.exports.export_source import ExportSource
 from splatgraft.exports.first_view import FirstView
-from splatgraft.exports.turntable_video import FPS, path_around, write_video
+from splatgraft.exports.turntable_video import FPS, write_video
 from splatgraft.rendering import render
 from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.progress import Progress, silent
 
 
 def write_picture(path: Path, gaussians: Gaussians, view: FirstView, *, width: int, with_alpha: bool) -> None:
@@ -42,24 +42,22 @@ def write_picture(path: Path, gaussians: Gaussians, view: FirstView, *, width: i
         Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "PNG")
 
 
-def write_turntable(
-    path: Path, gaussians: Gaussians, source: ExportSource, view: FirstView, *, frames: int, width: int
-) -> str:
-    """Write a path around the view's centre as .mp4, .gif or .webp; gives a sentence on it.
+def write_turntable(path: Path, gaussians: Gaussians, cameras: Cameras, *, progress: Progress = silent) -> str:
+    """Write what the cameras of a path see as .mp4, .gif or .webp; gives a sentence on it.
 
     Raises:
-        ValueError: Fewer than two frames, or the encoder does not start.
+        ValueError: The encoder does not start.
     """
-    if frames < 2:
-        raise ValueError(f"--frames: expected 2 or more, found {frames}")
-    cameras = path_around(source, view, frames=frames, width=width)
+    frames = len(cameras)
     if path.suffix.lower() == ".mp4":
-        codec = write_video(path, _drawn(gaussians, cameras))
+        codec = write_video(path, _drawn(gaussians, cameras, progress))
         return f"{frames / FPS:.1f} s of {cameras.width} x {cameras.height} in {codec}"
-    write_animation(path, list(_drawn(gaussians, cameras)), fps=float(FPS))
+    write_animation(path, list(_drawn(gaussians, cameras, progress)), fps=float(FPS))
     return f"{frames / FPS:.1f} s, scaled down where it would be larger than 6 MB"
 
 
-def _drawn(gaussians: Gaussians, cameras: Cameras) -> Iterator[Float[Tensor, "h w 3"]]:
-    for camera in cameras:
+def _drawn(gaussians: Gaussians, cameras: Cameras, progress: Progress) -> Iterator[Float[Tensor, "h w 3"]]:
+    for index, camera in enumerate(cameras):
+        progress(index, len(cameras), "pictures")
         yield render(gaussians, camera).color[0].clamp(0, 1)
+    progress(len(cameras), len(cameras), "pictures")

@@ -16,6 +16,7 @@ from splatgraft.core.gaussians import Gaussians, empty
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.exports.export_source import ExportSource
 from splatgraft.rendering import render, view_operator
+from splatgraft.runtime.progress import Progress, silent
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,15 @@ class _View:
     darkness: Float[Tensor, "h w"]
 
 
-def shadow_layer(source: ExportSource, options: ShadowLayerOptions = ShadowLayerOptions()) -> ShadowLayer:
+def shadow_layer(
+    source: ExportSource, options: ShadowLayerOptions = ShadowLayerOptions(), *, progress: Progress = silent
+) -> ShadowLayer:
     """Fit the layer to the relit scene without its object, against the place.
+
+    Args:
+        source: The transfer.
+        options: How it is fitted.
+        progress: Told of the steps.
 
     Raises:
         ValueError: The source does not know its object, its place and its cameras.
@@ -78,7 +86,7 @@ def shadow_layer(source: ExportSource, options: ShadowLayerOptions = ShadowLayer
     receivers = _receivers(ground, fitted, options)
     if receivers.count == 0:
         return ShadowLayer(empty(), None)
-    layer = _fitted(receivers, fitted, options)
+    layer = _fitted(receivers, fitted, options, progress)
     return ShadowLayer(layer, _psnr(layer, held_out))
 
 
@@ -105,7 +113,7 @@ def _receivers(ground: Gaussians, views: list[_View], options: ShadowLayerOption
     return replace(chosen, opacity_logits=opacity.logit(), sh=dc_from_rgb(torch.zeros(chosen.count, 1, 3)))
 
 
-def _fitted(layer: Gaussians, views: list[_View], options: ShadowLayerOptions) -> Gaussians:
+def _fitted(layer: Gaussians, views: list[_View], options: ShadowLayerOptions, progress: Progress) -> Gaussians:
     logits = layer.opacity_logits.clone().requires_grad_()
     optimizer = torch.optim.Adam([logits], lr=options.learning_rate)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / options.steps))
@@ -118,6 +126,7 @@ def _fitted(layer: Gaussians, views: list[_View], options: ShadowLayerOptions) -
         loss.backward()
         optimizer.step()
         schedule.step()
+        progress(step + 1, options.steps, "fitting the shadow")
     done = replace(layer, opacity_logits=logits.detach())
     return done.select(done.opacities > options.faintest)
 

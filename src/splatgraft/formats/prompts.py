@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -31,10 +32,22 @@ def read_prompts(path: Path) -> dict[str, ViewPrompt]:
     Raises:
         ValueError: The file is missing or broken, or says nothing.
     """
-    content = load(path) if path.suffix.lower() == ".json" else read_toml(path)
+    return prompts_from_json(load(path) if path.suffix.lower() == ".json" else read_toml(path), str(path))
+
+
+def prompts_from_json(content: Any, where: str) -> dict[str, ViewPrompt]:
+    """The prompts of a file's content, by the name of the picture.
+
+    Args:
+        content: Tables, lists and numbers, as JSON and TOML have them.
+        where: The file, for messages.
+
+    Raises:
+        ValueError: It is broken, or says nothing.
+    """
     if not isinstance(content, dict) or not content:
-        raise ValueError(f"{path}: expected a table of points per picture, found {excerpt(content)}")
-    return {name: _prompt(path, name, entry) for name, entry in content.items()}
+        raise ValueError(f"{where}: expected a table of points per picture, found {excerpt(content)}")
+    return {name: _prompt(where, name, entry) for name, entry in content.items()}
 
 
 def write_prompts(path: Path, prompts: Mapping[str, ViewPrompt]) -> None:
@@ -45,17 +58,27 @@ def write_prompts(path: Path, prompts: Mapping[str, ViewPrompt]) -> None:
         prompts: By the name of the picture, pixels as a viewer shows it.
     """
     assert path.suffix.lower() == ".json", path
+    with atomic_write(path) as stream:
+        stream.write((json.dumps(prompts_to_json(prompts), indent=1) + "\n").encode())
+
+
+def prompts_to_json(prompts: Mapping[str, ViewPrompt]) -> dict[str, Any]:
+    """Tables, lists and numbers from which `prompts_from_json` gives the same back."""
     content = {}
     for name, prompt in prompts.items():
-        points = {"inside": prompt.inside.tolist(), "outside": prompt.outside.tolist()}
+        points = {"inside": _decimal(prompt.inside), "outside": _decimal(prompt.outside)}
         box = {} if prompt.box is None else {"box": list(prompt.box)}
         content[name] = {key: value for key, value in points.items() if value} | box
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(content, indent=1) + "\n").encode())
+    return content
 
 
-def _prompt(path: Path, name: str, entry: Any) -> ViewPrompt:
-    where = f"{path}: {name}"
+def _decimal(points: Float[Tensor, "k 2"]) -> list[list[float]]:
+    """The shortest decimal numbers that are read back as the same float32."""
+    return [[float(str(number)) for number in point] for point in points.numpy().astype(np.float32)]
+
+
+def _prompt(file: str, name: str, entry: Any) -> ViewPrompt:
+    where = f"{file}: {name}"
     if not isinstance(entry, dict) or not entry or not set(entry) <= set(_KEYS):
         raise ValueError(f"{where}: expected a table with {', '.join(_KEYS)}, found {excerpt(entry)}")
     box = entry.get("box")

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
 from splatgraft.core.splitting import split_wide_around
 from splatgraft.relighting.light.confidence import light_confidence
 from splatgraft.relighting.light.estimate import EstimatedLight
@@ -22,7 +22,7 @@ _MOST_VIEW_CHANGE = 0.9
 
 @dataclass(frozen=True)
 class LayerWeights:
-    """How much of each layer is baked: 0 leaves it out, 1 is physically right, more exaggerates."""
+    """How much of each layer is baked: 0 leaves it out, 1 is physically right, more exaggerates; and an exposure."""
 
     shade: float = 1.0
     """The object's own light and dark sides."""
@@ -32,6 +32,10 @@ class LayerWeights:
     """What the object's lit sides give to its surroundings."""
     gloss: float = 1.0
     """Reflections on the object."""
+    tint: float = 1.0
+    """The change of colour within the object's shade; its brightness stays."""
+    exposure: float = 0.0
+    """Stops by which the object is brighter than computed, its reflections excepted; 0 is physically right."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +110,22 @@ class Relit:
         return replace(self.gaussians, sh=sh)
 
     def ratio(self, weights: LayerWeights = LayerWeights()) -> Float[Tensor, "m 3"]:
-        """Factor on linear rgb that shade, shadow and bounce make together."""
-        return self.shade**weights.shade * (self.shadow**weights.shadow + weights.bounce * self.bounce)
+        """Factor on linear rgb that shade, tint, exposure, shadow and bounce make together."""
+        shade = self.shade**weights.shade
+        if weights.tint != 1:
+            shade = _tinted(shade, weights.tint)
+        if weights.exposure:
+            shade = torch.where(self.is_object[:, None], 2**weights.exposure * shade, shade)
+        return shade * (self.shadow**weights.shadow + weights.bounce * self.bounce)
+
+
+def _tinted(factor: Float[Tensor, "m 3"], weight: float) -> Float[Tensor, "m 3"]:
+    """A factor on linear rgb with its chromaticity to the power of `weight`, of the same luminance."""
+    luminance = (factor @ LUMINANCE)[:, None].clamp_min(1e-6)
+    chroma = (factor / luminance).clamp_min(1e-6) ** weight
+    changed = luminance * chroma / (chroma @ LUMINANCE)[:, None]
+    # what is grey keeps every bit
+    return torch.where((factor == factor[:, :1]).all(1, keepdim=True), factor, changed)
 
 
 def _srgb_slope(

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -57,24 +57,32 @@ class JobConsole(Console):
         write_state(self._folder, state)
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Run the steps; the outcome is in the state file and the exit status."""
-    from splatgraft.workflow.run_steps import run_steps
+def run_as_job(folder: Path, title: str, shown: Sequence[str], work: Callable[[JobConsole], Sequence[str]]) -> int:
+    """Do the work of a job's process; progress, outcome and error go into the state file.
 
+    Args:
+        folder: Of the state file; another job there is refused.
+        title: Title for the user.
+        shown: Arguments of the equivalent `splatgraft` command.
+        work: Called once; gives sentences for the user on what was done. It imports what it needs, so that an
+            interruption while torch is loaded is an outcome too.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        ValueError: If another job holds the folder's lock.
+    """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # a shell starts background processes with SIGINT ignored
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    folder, title, project, to = Path(arguments[0]), arguments[1], Path(arguments[2]), arguments[3]
-    out = Path(arguments[4]) if len(arguments) > 4 else None
-    shown = ("run", str(project), "--to", to)
     lock = acquire_job_lock(folder)
-    console = JobConsole(folder, JobState(title, shown, os.getpid(), "running", time.time()))
+    console = JobConsole(folder, JobState(title, tuple(shown), os.getpid(), "running", time.time()))
     try:
         console.write(console.state)
-        console.write(replace(console.state, plan=_plan(project, out, to)))
-        run_steps(project, console, out=out, to=to)
-        console.write(replace(console.state, outcome="done"))
+        said = tuple(work(console))
+        console.write(replace(console.state, outcome="done", said=said))
         return 0
     except KeyboardInterrupt:
         console.write(replace(console.state, outcome="cancelled"))
@@ -84,6 +92,21 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     finally:
         lock.release()
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the steps; the outcome is in the state file and the exit status."""
+    folder, title, project, to = Path(arguments[0]), arguments[1], Path(arguments[2]), arguments[3]
+    out = Path(arguments[4]) if len(arguments) > 4 else None
+
+    def work(console: JobConsole) -> Sequence[str]:
+        from splatgraft.workflow.run_steps import run_steps
+
+        console.write(replace(console.state, plan=_plan(project, out, to)))
+        run_steps(project, console, out=out, to=to)
+        return ()
+
+    return run_as_job(folder, title, ("run", str(project), "--to", to), work)
 
 
 def _plan(project: Path, out: Path | None, to: str) -> tuple[PlannedStep, ...]:

@@ -1,79 +1,121 @@
-"""Exports of results: the scene in any supported format, images, the orbit video and the report."""
+"""What of a project can be shared: kinds of files, their names and parts, and the files that were written."""
 
-import shutil
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
-from splatgraft.editor.jobs.orbit_video import write_orbit_video
-from splatgraft.editor.session.project_access import ProjectFiles
-from splatgraft.formats import read_gaussians, write_gaussians
+from splatgraft.editor.session.project_access import ExportPage, ProjectFiles
+from splatgraft.exports.export import Layer
 from splatgraft.project.layout import REPORT_FILE
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.optional_dependencies import extra_providing
 
 EXPORTS_FOLDER = "export"
+"""Folder of shared files, below the project's results."""
+_EXPORTS_PREFIX = f"{EXPORTS_FOLDER}/"
+_REPORT_NAME = "report"
 
 
-def export_scene(files: ProjectFiles, suffix: str) -> Path:
-    """Write the result as export/scene.SUFFIX; in the result's own format byte for byte.
+@dataclass(frozen=True)
+class ShareKind:
+    """One kind of file."""
+
+    suffix: str
+    """Of the file, with the dot; it names the format."""
+    page: ExportPage = "viewer"
+    """What an .html holds."""
+    module: str | None = None
+    """An optional module that the format needs."""
+
+    @property
+    def has_parts(self) -> bool:
+        """Whether a part of the scene can be written alone."""
+        return self.page == "viewer"
+
+
+SHARE_KINDS: dict[str, ShareKind] = {
+    "Page to look at (.html)": ShareKind(".html"),
+    "Report as one page (.html)": ShareKind(".html", page="report"),
+    "Picture (.png)": ShareKind(".png"),
+    "Picture (.jpg)": ShareKind(".jpg"),
+    "Turntable, video (.mp4)": ShareKind(".mp4"),
+    "Turntable, animation (.webp)": ShareKind(".webp"),
+    "Turntable, animation (.gif)": ShareKind(".gif"),
+    "Scene, small (.sog)": ShareKind(".sog"),
+    "Scene, small (.spz)": ShareKind(".spz", module="zstandard"),
+    "Scene, SuperSplat (.compressed.ply)": ShareKind(".compressed.ply"),
+    "Scene, exact (.ply)": ShareKind(".ply"),
+    "Scene, old viewers (.splat)": ShareKind(".splat"),
+    "Scene, glTF (.glb)": ShareKind(".glb"),
+    "Scene, OpenUSD (.usdz)": ShareKind(".usdz", module="pxr"),
+}
+"""By the name that a user chooses."""
+
+PARTS: dict[str, Layer] = {
+    "all": "all",
+    "object alone": "object",
+    "scene alone": "scene",
+    "object with shadow": "object-with-shadow",
+    "shadow alone": "shadow",
+}
+"""Parts of the scene, by the name that a user chooses."""
+
+
+def missing_package(kind: ShareKind) -> str | None:
+    """What must be installed before this kind can be written; None where nothing is missing."""
+    if kind.module is None or find_spec(kind.module) is not None:
+        return None
+    extra = extra_providing(kind.module)
+    return f"{kind.suffix}: needs a package that is not installed: pip install 'splatgraft[{extra}]'"
+
+
+def export_path(files: ProjectFiles, kind: ShareKind, layer: Layer) -> Path:
+    """Where a shared file is written; its name says the project and the part.
 
     Raises:
-        ValueError: If there is no result yet.
+        ValueError: If there is no result or no report yet.
     """
-    if not files.result.is_file():
+    if kind.page == "report":
+        page = files.report / REPORT_FILE
+        if not page.is_file():
+            raise ValueError(f"{page}: expected a report, found none yet; run it first")
+        part = f"_{_REPORT_NAME}"
+    elif not has_scene(files):
         raise ValueError(f"{files.result}: expected a finished scene, found none yet; run the transfer first")
-    path = _folder(files) / f"scene{suffix}"
-    if suffix == files.result.suffix:
-        with files.result.open("rb") as source, atomic_write(path) as stream:
-            shutil.copyfileobj(source, stream)
     else:
-        write_gaussians(path, read_gaussians(files.result))
-    return path
+        part = "" if layer == "all" else f"_{layer.replace('-', '_')}"
+    name = files.root.resolve().name or "scene"
+    return files.root / EXPORTS_FOLDER / f"{name}{part}{kind.suffix}"
 
 
-def export_turntable(files: ProjectFiles, suffix: str) -> tuple[Path, str]:
-    """Write the report's turntable as export/turntable.SUFFIX.
-
-    Returns:
-        The file, and a remark where it is not in the requested format or browsers do not play it; else an empty string.
-
-    Raises:
-        ValueError: If there is none yet.
-    """
-    found = next((p for p in (files.report / "turntable.webp", files.report / "turntable.gif") if p.is_file()), None)
-    if found is None:
-        raise ValueError(f"{files.report}: expected a turntable, found none yet; run the report first")
-    path = _folder(files) / f"turntable{suffix}"
-    if suffix != ".mp4":
-        return Path(shutil.copy2(found, path.with_suffix(found.suffix))), ""
-    try:
-        codec = write_orbit_video(path, found)
-    except ValueError as error:
-        return Path(shutil.copy2(found, _folder(files) / found.name)), f"{error}; exported {found.name} instead"
-    return (
-        path,
-        ""
-        if codec == "H.264"
-        else f"in {codec}, which video players support but browsers do not; .webp plays in browsers",
-    )
+def has_scene(files: ProjectFiles) -> bool:
+    """Whether there is a scene with transferred light to share."""
+    return files.result.is_file() or files.relit.is_file()
 
 
-def report_page(files: ProjectFiles) -> Path:
-    """The report's page.
-
-    Raises:
-        ValueError: If there is none yet.
-    """
-    page = files.report / REPORT_FILE
-    if not page.is_file():
-        raise ValueError(f"{page}: expected a report, found none yet; run it first")
-    return page
+def step_shown(files: ProjectFiles, *, is_report: bool) -> str:
+    """The step whose result a shared file shows."""
+    if is_report:
+        return "evaluate"
+    return "consolidate" if files.result.is_file() else "relight"
 
 
 def picture_path(files: ProjectFiles, name: str) -> Path:
     """Path of an exported image."""
-    return _folder(files) / f"{name}.png"
+    return files.root / EXPORTS_FOLDER / f"{name}.png"
 
 
-def _folder(files: ProjectFiles) -> Path:
+def written_exports(files: ProjectFiles) -> tuple[Path, ...]:
+    """The shared files, the newest first."""
     folder = files.root / EXPORTS_FOLDER
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    if not folder.is_dir():
+        return ()
+    found = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    return tuple(sorted(found, key=lambda path: (-path.stat().st_mtime_ns, path.name)))
+
+
+def served_file(files: ProjectFiles, name: str) -> Path | None:
+    """The file of the report, or the shared file, that the page's server gives for a name; None for any other name."""
+    is_export = name.startswith(_EXPORTS_PREFIX)
+    folder = (files.root / EXPORTS_FOLDER if is_export else files.report).resolve()
+    path = (folder / name.removeprefix(_EXPORTS_PREFIX if is_export else "")).resolve()
+    return path if path.is_relative_to(folder) and path.is_file() and not path.name.startswith(".") else None

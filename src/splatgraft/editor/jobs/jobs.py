@@ -69,6 +69,8 @@ class JobState:
     """Error message, one line; empty unless the outcome is `failed`."""
     plan: tuple[PlannedStep, ...] = ()
     """All steps of the job in order; empty where they are not known."""
+    said: tuple[str, ...] = ()
+    """Sentences for the user on what was done; empty before the outcome `done`."""
 
     @property
     def live(self) -> bool:
@@ -186,7 +188,8 @@ class Jobs:
             fields = json.loads((self.folder / STATE_FILE).read_text())
             plan = tuple(PlannedStep(**step) for step in fields.pop("plan", ()))
             fields.pop("took", None)  # of older versions
-            state = JobState(**(fields | {"command": tuple(fields["command"]), "plan": plan}))
+            said = tuple(fields.pop("said", ()))
+            state = JobState(**(fields | {"command": tuple(fields["command"]), "plan": plan, "said": said}))
             _check_types(state)
             return state
         except FileNotFoundError:
@@ -208,7 +211,7 @@ def _check_types(state: JobState) -> None:
     """Raises: TypeError where a number of the state is none, or the outcome is unknown."""
     numbers = (state.started, state.done, state.total, state.step_started, state.begun, state.begun_at, state.pid)
     numbers += tuple(step.seconds for step in state.plan)
-    texts = (state.title, state.step, state.message, state.error, *(step.name for step in state.plan))
+    texts = (state.title, state.step, state.message, state.error, *(step.name for step in state.plan), *state.said)
     is_good = (
         all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
         and isinstance(state.pid, int)

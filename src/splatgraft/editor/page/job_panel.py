@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import viser
@@ -21,6 +22,10 @@ class JobPanel:
         """Build the controls."""
         self._page, gui = page, page.gui
         self._last_seen = ""
+        self.on_progress: Callable[[JobState], None] = lambda state: None
+        """Called with the state of the running job, a few times a second."""
+        self.on_end: Callable[[JobState], None] = lambda state: None
+        """Called with the state of a job that has ended, after the page has been redrawn."""
         self._text = gui.add_html("", visible=False)
         self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="red", visible=False)
@@ -39,6 +44,7 @@ class JobPanel:
             return
         if live:
             self._show(state)
+            self.on_progress(state)
         current = f"{state.pid} {state.outcome} {state.step}"
         if current == self._last_seen:
             return
@@ -46,6 +52,8 @@ class JobPanel:
         if ended or state.outcome == "killed":
             self._say_end(state)
         self._page.redraw()
+        if ended:
+            self.on_end(state)
 
     def _show(self, state: JobState) -> None:
         now = time.time()

@@ -19,11 +19,14 @@ if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
 
 _LAYERS = (
-    ("shade", "Shade", "Light and dark sides of the object; 1 is as computed"),
-    ("shadow", "Shadow", "Light that the object takes from its surroundings; 1 is as computed"),
-    ("bounce", "Bounce", "Light that the object reflects onto its surroundings; 1 is as computed"),
-    ("gloss", "Gloss", "Reflections on the object; 1 is as computed"),
+    ("shade", "Shade", (0.0, 2.0), "Light and dark sides of the object; 1 is as computed"),
+    ("tint", "Tint", (0.0, 4.0), "Change of the object's colour by the new light; 1 is as computed"),
+    ("exposure", "Exposure", (-2.0, 2.0), "Stops by which the object is brighter; 0 is as computed"),
+    ("shadow", "Shadow", (0.0, 2.0), "Light that the object takes from its surroundings; 1 is as computed"),
+    ("bounce", "Bounce", (0.0, 2.0), "Light that the object reflects onto its surroundings; 1 is as computed"),
+    ("gloss", "Gloss", (0.0, 2.0), "Reflections on the object; 1 is as computed"),
 )
+"""Field of `LayerWeights`, label, range of the slider and hint."""
 _MAX_SOURCES = 4
 _HANDLE_PX = 70.0
 """Length of the handle's arrows on the screen, pixels."""
@@ -40,7 +43,11 @@ class LightPhase:
         self._estimate_button = gui.add_button("Estimate the light", icon=viser.Icon.SUN)
         self._source_choice = gui.add_dropdown("Source", NO_NAMES, initial_value=NO_NAMES[0], visible=False)
         self._strength = gui.add_slider("Strength", 0.0, 3.0, 0.05, 1.0, visible=False)
-        self._sliders = {key: gui.add_slider(label, 0.0, 2.0, 0.05, 1.0, hint=hint) for key, label, hint in _LAYERS}
+        usual = LayerWeights()
+        self._sliders = {
+            key: gui.add_slider(label, *ends, 0.05, float(getattr(usual, key)), hint=hint)
+            for key, label, ends, hint in _LAYERS
+        }
         self._reset = gui.add_button("Back to the estimate", color="gray")
         self._handle: viser.TransformControlsHandle | None = None
         self._dragged_light: Light | None = None

@@ -13,6 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import viser
 
 from splatgraft.editor.access.uploads import IncomingUpload, UploadRules
+from splatgraft.editor.jobs.exports import served_file
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.keys import Keys
 from splatgraft.editor.page.light_phase import LightPhase
@@ -86,7 +87,7 @@ class Page:
         self.windows.connect()
         guarded.uploads.on_refused = lambda reason: self.say(reason, bad=True)
         guarded.uploads.on_progress = self._show_upload
-        guarded.files = self._report_file
+        guarded.files = lambda name: None if self.session is None else served_file(self.session.files, name)
         self.show_phase(self._first_phase())
         self._say_notice()
         threading.Thread(target=self._poll_loop, daemon=True).start()
@@ -365,14 +366,6 @@ class Page:
             self.say(f"{upload.path.name}: uploaded, being checked")
         elif upload is not None:
             self._cancel_upload.label = f"Cancel the upload ({100 * upload.received // upload.size}%)"
-
-    def _report_file(self, name: str) -> Path | None:
-        """The file of the report under that name; None for any other path, so that nothing else is served."""
-        if self.session is None:
-            return None
-        report = self.session.files.report.resolve()
-        path = (report / name).resolve()
-        return path if path.is_relative_to(report) and path.is_file() and not path.name.startswith(".") else None
 
     # polling of files and jobs
 

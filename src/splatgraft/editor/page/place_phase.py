@@ -14,6 +14,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.editor.access.uploads import SCENES
 from splatgraft.editor.page.box_handles import BoxHandles
 from splatgraft.editor.page.object_gizmo import SNAP_DEGREES, ObjectGizmo
+from splatgraft.editor.page.size_controls import SizeControls
 from splatgraft.editor.session import placement_operations
 from splatgraft.editor.session.gizmo import (
     Gizmo,
@@ -22,6 +23,7 @@ from splatgraft.editor.session.gizmo import (
     quaternion_from_degrees,
     similarity_from_gizmo,
 )
+from splatgraft.editor.session.object_size import true_scale
 from splatgraft.editor.session.session import Session
 from splatgraft.editor.session.state_checks import check_numbers, check_state
 from splatgraft.formats import read_gaussians
@@ -57,6 +59,7 @@ class PlacePhase:
         self._position = gui.add_vector3("Position", (0.0, 0.0, 0.0), step=0.001)
         self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=0.01, hint="Degrees about x, y, z")
         self._scale = gui.add_number("Scale", 1.0, min=1e-4, step=0.001)
+        self._size = SizeControls(page)
         self._operations = gui.add_button_group("Move", ("Drop", "Upright", "Fit size"))
         self._snap = gui.add_checkbox(
             "Snap",
@@ -124,7 +127,9 @@ class PlacePhase:
                 self._gizmo.snaps = self._snap.value
                 item = session.placeable_object(self._chosen)
                 self._gizmo.show(item, objects[self._chosen].target_from_object)
+                self._size.show(self._chosen)
         else:
+            self._size.hide()
             self._gizmo.remove()
         if not self._show_box.value:
             self._handles.hide()
@@ -189,14 +194,17 @@ class PlacePhase:
         else:
             scale = placement_operations.plausible_scale(target, item, placed, cameras)
             self._set_placement(placement_operations.rescale(item, placed, scale))
-            self._page.say("scaled to about a third of the views' height; captures have no common unit")
+            self._page.say("scaled to about a third of the views' height, which is a guess")
 
     def _find_place(self) -> None:
         session = self._page.require_session()
         item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity()))
         cameras = session.scenes.cameras(session.files.target_cameras)
+        options = session.files.place_options
+        # as `compose` does
+        options = replace(options, scale=true_scale(session)) if options.scale is None else options
         placed = placement_operations.suggest_placement(
-            session.scenes.gaussians(session.files.target_scene), item, cameras, session.files.place_options
+            session.scenes.gaussians(session.files.target_scene), item, cameras, options
         )
         session.change(replace(session.state, objects=(ObjectPlacement(placed),)))
         self._page.say("placed on a level, visible surface; drag it, or type numbers")

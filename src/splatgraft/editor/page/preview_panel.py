@@ -90,6 +90,8 @@ class PreviewPanel:
         self.canvas = Canvas(page.server, page.view)
         self._shown_pose: bytes = b""
         self._canvas_size: tuple[float, int] = (0.0, 0)
+        self._is_on_canvas = False
+        """Whether the newest request is for the canvas."""
         self.on_drawn: Callable[[str, float], None] = lambda stage, seconds: None
         """Called with `coarse`, `draft` or `final` and the seconds that the picture took; for measurements."""
         self._worker = LatestOnlyWorker(self._work, self._say_error)
@@ -167,6 +169,7 @@ class PreviewPanel:
         request = self._request()
         self._panel.visible = request is not None
         self._image.visible = request is not None and request.window is None
+        self._is_on_canvas = request is not None and request.window is not None
         if request is None or request.window is None or (is_moved and _pose(request.camera) != self._shown_pose):
             self.canvas.clear()
         if request is not None:
@@ -299,6 +302,8 @@ class PreviewPanel:
         left, right = self._both(request, problems)
         seconds = time.monotonic() - start
         pixels = wipe_comparison(left.pixels, right.pixels, request.split)
+        if request.window is not None and not self._is_on_canvas:
+            return  # the canvas was given to splats while this picture was drawn
         if request.window is not None:
             depth = right.depth if request.split < 0.5 else left.depth
             self.canvas.show(request.window, with_badge(pixels, stage), _depth_behind(depth))

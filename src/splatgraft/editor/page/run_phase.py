@@ -1,18 +1,17 @@
-"""The phase `Run`: run the remaining steps, show which steps are stale, and export the results."""
+"""The phase `Run`: run the remaining steps, show which steps are stale, and share the results."""
 
 from __future__ import annotations
 
 import html
 import shlex
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import viser
 
-from splatgraft.editor.jobs import exports
 from splatgraft.editor.page.place_phase import hide_target, show_target
 from splatgraft.editor.page.server import FILES_PREFIX
+from splatgraft.editor.page.share_panel import SharePanel
 from splatgraft.harmonization import HARMONIZERS
 
 if TYPE_CHECKING:
@@ -32,15 +31,13 @@ class RunPhase:
         self._transfer = gui.add_button("Harmonise and consolidate", icon=viser.Icon.PLAYER_PLAY)
         self._report = gui.add_button("Make the report", color="gray")
         self._steps = gui.add_html("")
-        with gui.add_folder("Export"):
+        with gui.add_folder("Share"):
             self._stale = gui.add_html("", visible=False)
             self._renew = gui.add_button("Bring the result up to date", icon=viser.Icon.REFRESH, visible=False)
             self._renew_report = gui.add_button(
                 "Bring the report up to date", icon=viser.Icon.REFRESH, visible=False, color="gray"
             )
-            self._scene = gui.add_button_group("Scene", (".ply", ".spz", ".splat"))
-            self._picture = gui.add_button("Picture of this view", icon=viser.Icon.PHOTO, color="gray")
-            self._turntable = gui.add_button_group("Turntable", (".mp4", ".webp"))
+            self._share = SharePanel(page)
             self._link = gui.add_html("")
         callback = page.callback
         self._method.on_update(callback(lambda _: self._set_method()))
@@ -48,17 +45,6 @@ class RunPhase:
         self._report.on_click(callback(lambda _: page.run("evaluate", "Make the report")))
         self._renew.on_click(callback(lambda _: page.run("consolidate", "Bring the result up to date")))
         self._renew_report.on_click(callback(lambda _: page.run("evaluate", "Bring the report up to date")))
-        self._scene.on_click(
-            callback(
-                lambda event: self._download(
-                    event,
-                    exports.export_scene(page.require_session().files, event.target.value),
-                    "consolidate",
-                )
-            )
-        )
-        self._turntable.on_click(callback(self._send_turntable))
-        self._picture.on_click(callback(self._send_picture))
 
     def enter(self) -> None:
         """Show the target, and compare with the result in the preview."""
@@ -76,7 +62,7 @@ class RunPhase:
         hide_target(self._page)
 
     def refresh(self) -> None:
-        """Update the table of steps and the exports."""
+        """Update the table of steps and what can be shared."""
         session = self._page.session
         if session is None or not self._is_active:
             return
@@ -93,9 +79,7 @@ class RunPhase:
             f"<code>{html.escape(shown)}</code></div>"
         )
         has_report = (session.files.report / "index.html").is_file()
-        self._turntable.visible = has_report
         has_result = session.files.result.is_file()
-        self._scene.visible = has_result
         why_result = session.why_stale("consolidate") if has_result else None
         why_report = session.why_stale("evaluate") if has_report else None
         self._renew.visible, self._renew_report.visible = why_result is not None, why_report is not None
@@ -103,34 +87,16 @@ class RunPhase:
         self._stale.content = _stale_note(why_result, why_report)
         link = f'<a href="{FILES_PREFIX}index.html" target="_blank">Open the report</a>' if has_report else ""
         mark = " (out of date)" if why_report else ""
+        self._share.refresh()
         self._link.content = f'<div style="padding:2px 12px">{link}{mark}</div>'
 
     def _set_method(self) -> None:
         session = self._page.require_session()
         session.change(replace(session.state, harmonizer=self._method.value))
 
-    def _send_picture(self, event: viser.GuiEvent) -> None:
-        path = exports.picture_path(self._page.require_session().files, "view")
-        self._page.preview.save_picture(path)
-        self._download(event, path)
-
-    def _send_turntable(self, event: viser.GuiEvent) -> None:
-        path, remark = exports.export_turntable(self._page.require_session().files, event.target.value)
-        self._download(event, path, "evaluate")
-        if remark:
-            self._page.say(f"written: {path}; {remark}")
-
-    def _download(self, event: viser.GuiEvent, path: Path, step: str | None = None) -> None:
-        """Send an exported file; `step` is the one whose result it is."""
-        if event.client is not None:
-            event.client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
-        why = None if step is None else self._page.require_session().why_stale(step)
-        note = "" if why is None else f"; it is out of date ({why})"
-        self._page.say(f"written: {path}{note}", bad=why is not None)
-
 
 def _stale_note(why_result: str | None, why_report: str | None) -> str:
     """What is out of date, and why."""
-    rows = (("The result", why_result), ("The report and its turntable", why_report))
+    rows = (("The result", why_result), ("The report", why_report))
     lines = [f"<b>{name}</b>: out of date ({html.escape(why)})" for name, why in rows if why is not None]
     return f'<div class="sg-stale" style="{_NOTE_STYLE}">{"<br>".join(lines)}</div>'

@@ -10,6 +10,7 @@ import viser
 
 from splatgraft.editor.page.box_handles import BoxHandles
 from splatgraft.editor.page.brush import Brush
+from splatgraft.editor.page.photo_clicks import PhotoClicks
 from splatgraft.editor.page.scene_view import TINT, Color, camera_from_viser
 from splatgraft.editor.session.edit_state import BoxNumbers
 from splatgraft.editor.session.picking import Rectangle, in_rectangle
@@ -46,6 +47,7 @@ class SelectPhase:
         self._upper = gui.add_vector3("Box to", (0.0, 0.0, 0.0), step=0.001, visible=False)
         self._keep = gui.add_dropdown("Keep pieces", _KEEP, initial_value=_KEEP[0])
         self._cut = gui.add_button("Cut out the object", icon=viser.Icon.WAND)
+        self._photos = PhotoClicks(page)
         with gui.add_folder("Correct by hand"):
             self._mode = gui.add_dropdown("Strokes", ("remove", "add"), initial_value="remove")
             self._use_brush = gui.add_checkbox("Brush", False, hint="Drag or click on the picture (key B)")
@@ -80,6 +82,7 @@ class SelectPhase:
             self._page.server.scene.remove_rect_select_callback(self._rectangle_drawn)
         self._is_active = False
         self._brush.deactivate()
+        self._photos.leave()
         self._page.view.hide_splats("/source")
         self._handles.hide()
         self._correction_handles.hide()
@@ -114,6 +117,13 @@ class SelectPhase:
             self._brush.deactivate()
         self._clear.disabled = state.corrections is None
         self._draw()
+        # last, as it hides the splats
+        self._photos.refresh()
+        if self._photos.is_shown:
+            self._show_correction_box.value = self._box_group.visible = False
+            self._handles.hide()
+            self._correction_handles.hide()
+            self._brush.deactivate()
 
     def _connect(self) -> None:
         callback = self._page.callback
@@ -203,6 +213,8 @@ class SelectPhase:
             self._correction_handles.show(box.grown(1.1))
 
     def _rectangle_drawn(self, event: viser.SceneRectSelectEvent) -> None:
+        if self._photos.is_shown:
+            return
         self._page.callback(self._apply_rectangle)(event)
 
     def _apply_rectangle(self, event: viser.SceneRectSelectEvent) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import viser
 import websockets.asyncio.server
@@ -30,6 +31,7 @@ _TYPES |= {
     ".js": "text/javascript",
     ".json": "application/json",
     ".jpg": "image/jpeg",
+    ".mp4": "video/mp4",
 }
 _PATCH_LOCK = threading.Lock()
 _PROBE_SECONDS = 300
@@ -100,7 +102,7 @@ class GuardedServer:
             return _response(http.HTTPStatus.FORBIDDEN, f"splatgraft: {decision.reason}\n".encode(), "text/plain")
         path = request.path.partition("?")[0]
         if path.startswith(FILES_PREFIX):
-            found = self.files(path.removeprefix(FILES_PREFIX))
+            found = self.files(unquote(path.removeprefix(FILES_PREFIX)))
             if found is None:
                 return _response(http.HTTPStatus.NOT_FOUND, b"splatgraft: no such file\n", "text/plain")
             kind = _TYPES.get(found.suffix, "application/octet-stream")

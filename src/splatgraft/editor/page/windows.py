@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import viser
@@ -21,6 +22,8 @@ class Windows:
         self._page, self._guarded, self._server = page, page.guarded, page.server
         self._notices: dict[int, Any] = {}
         self._views: dict[str, tuple[Any, ...]] = {}
+        self.on_moved: list[Callable[[int], None]] = []
+        """Called with the number of a window whose view or shape has changed."""
 
     def connect(self) -> None:
         """Handle windows that open and close from now on; the page must be built."""
@@ -70,10 +73,15 @@ class Windows:
             window.camera.position, window.camera.look_at, window.camera.fov = view[0], view[1], view[3]
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda _: self._page.preview.camera_moved(client.client_id))
+        client.camera.on_update(lambda _: self._moved(client.client_id))
         self._set_first_view(client)
         self._update_notices()
         self._page.preview.update()
+
+    def _moved(self, window: int) -> None:
+        self._page.preview.camera_moved(window)
+        for call in self.on_moved:
+            call(window)
 
     def _set_first_view(self, client: viser.ClientHandle) -> None:
         # the reconstruction covers what the first photograph shows

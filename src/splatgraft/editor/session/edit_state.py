@@ -1,10 +1,12 @@
 """The edits of a project as one immutable value."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from jaxtyping import Bool, Int8
 from torch import Tensor
 
+from splatgraft.core.prompts import ViewPrompt
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.relighting import LayerWeights, Light
 
@@ -27,6 +29,8 @@ class EditState:
     """Box around the object in the source's world: minimum x, y, z, then maximum."""
     keep: str | None = None
     """Which connected pieces of the selection are kept: `keep` of [segment]."""
+    prompts: Mapping[str, ViewPrompt] | None = None
+    """Points and rectangles in photos of the source, by the photo's name: `prompts` of [segment]."""
     light: Light | None = None
     """The light set by hand; None: it is estimated."""
     weights: LayerWeights = field(default_factory=LayerWeights)

@@ -6,10 +6,15 @@ from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 from splatgraft.composition import PlaceOptions
+from splatgraft.exports.export import Layer
 from splatgraft.project.layout import Side
 from splatgraft.relighting import RelightOptions
 
 LightMode = Literal["transfer", "gain", "off"]
+ExportPage = Literal["viewer", "report"]
+"""What an exported .html holds."""
+Commands = tuple[tuple[str, ...], tuple[str, ...]]
+"""The command line of a child process, and its equivalent for the user."""
 Triple = tuple[float, float, float]
 
 
@@ -111,6 +116,10 @@ class Project(Protocol):
         """
         ...
 
-    def run_command(self, to: str, title: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Commands that run the stale steps up to `to`: that of the child process, and its equivalent for the user."""
+    def run_command(self, to: str, title: str) -> Commands:
+        """Commands that run the stale steps up to `to`."""
+        ...
+
+    def export_command(self, to: Path, *, page: ExportPage, layer: Layer, title: str) -> Commands:
+        """Commands that write the result, or a part of it, as a file whose suffix names the format."""
         ...

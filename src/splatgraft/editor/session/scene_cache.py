@@ -13,10 +13,11 @@ from splatgraft.composition import compose
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.posed_images import PosedImages
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.placement_operations import PlaceableObject, placeable_object
 from splatgraft.editor.session.project_access import ProjectFiles
-from splatgraft.formats import read_cameras, read_gaussians
+from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.formats.placement import ObjectPlacement, read_erased
 from splatgraft.relighting import SourceScene
 from splatgraft.runtime.memo import Memo
@@ -47,6 +48,14 @@ class SceneCache:
             ValueError: If the file is missing or invalid.
         """
         return self._read("cameras", path, read_cameras)
+
+    def capture(self, path: Path) -> PosedImages:
+        """The posed images whose cameras are in a file.
+
+        Raises:
+            ValueError: If the file or one that it names is missing or invalid.
+        """
+        return self._read("capture", path, lambda path: read_capture(path.parent))
 
     def segmented(self) -> Bool[Tensor, "n"] | None:
         """Flags of the source's Gaussians in the last result of `segment`; None where there is none."""

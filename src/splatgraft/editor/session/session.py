@@ -19,12 +19,13 @@ from splatgraft.editor.previews.preview_relighting import PreviewRelighting
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.history import History
 from splatgraft.editor.session.placement_operations import PlaceableObject
-from splatgraft.editor.session.project_access import Project, ProjectFiles, Triple
+from splatgraft.editor.session.project_access import Commands, ExportPage, Project, ProjectFiles, Triple
 from splatgraft.editor.session.project_backup import ProjectBackup
 from splatgraft.editor.session.scene_cache import SceneCache
 from splatgraft.editor.session.state_checks import check_state
 from splatgraft.editor.session.state_files import as_written, find_state, state_files, write_state
 from splatgraft.editor.session.state_store import StateStore
+from splatgraft.exports.export import Layer
 from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.project.layout import Side
 from splatgraft.segmentation import Box, add_correction, apply_corrections
@@ -347,8 +348,21 @@ class Session:
         Raises:
             ValueError: If a job is running.
         """
-        command, shown = self.project.run_command(to, title)
-        self.jobs.start(command, title=title, shown=shown)
+        self._start(self.project.run_command(to, title), title)
+
+    def export(self, to: Path, *, page: ExportPage, layer: Layer, title: str) -> JobState | None:
+        """Start a child process that writes the result as a file whose suffix names the format; gives its job.
+
+        Raises:
+            ValueError: If a job is running.
+        """
+        to.parent.mkdir(parents=True, exist_ok=True)
+        self._start(self.project.export_command(to, page=page, layer=layer, title=title), title)
+        return self.job()
+
+    def _start(self, commands: Commands, title: str) -> None:
+        command, shown = commands
+        self.jobs.start(command, title=title, shown=shown[1:])
 
     def job(self) -> JobState | None:
         """The running job, else the last one; None where there was none."""

@@ -18,10 +18,14 @@ MIN_SCALE, MAX_SCALE = 1e-6, 1e6
 """Smallest and largest scale of an object: beyond, covariances leave the range of float32."""
 MAX_COORDINATE = 1e6
 """Largest absolute coordinate, world units: beyond, float32 resolves less than a tenth of a unit."""
+MIN_HEIGHT_CM, MAX_HEIGHT_CM = 1e-3, 1e7
+"""Smallest and largest height that can be typed: a hundredth of a millimetre, and a hundred kilometres."""
 MASK_SOURCES = ("auto", "files", "grabcut", "sam2", "birefnet", "box")
 """Values of `mask_source` of [segment]."""
 MAX_WEIGHT = 100.0
 """Largest weight of a layer of the light transfer."""
+MAX_STOPS = 16.0
+"""Largest exposure of the objects, up or down, stops."""
 _ORTHONORMAL = 1e-3
 """Largest deviation of a rotation from orthonormality: typed angles and float32 stay below 1e-6."""
 
@@ -40,6 +44,8 @@ def check_state(state: EditState) -> None:
         _check_array(state.corrections, torch.int8, "corrections")
     if state.box is not None:
         _check_box(state.box)
+    for name, prompt in (state.prompts or {}).items():
+        check_numbers((*prompt.inside.flatten().tolist(), *prompt.outside.flatten().tolist()), f"points in {name}")
     _check_choice(state.mask_source, MASK_SOURCES, "mask_source")
     _check_choice(state.keep, get_args(Keep), "keep")
     _check_choice(state.harmonizer, tuple(HARMONIZERS), "image model")
@@ -80,6 +86,15 @@ def check_numbers(values: Iterable[object], where: str) -> None:
         _check_number(value, where, (-MAX_COORDINATE, MAX_COORDINATE))
 
 
+def check_height_cm(value: object) -> None:
+    """Check a typed height in centimetres.
+
+    Raises:
+        ValueError: As `check_state`.
+    """
+    _check_number(value, "height in cm", (MIN_HEIGHT_CM, MAX_HEIGHT_CM))
+
+
 def _check_box(box: Sequence[float]) -> None:
     if not isinstance(box, tuple) or len(box) != 6:
         raise ValueError(f"box: expected six numbers, found {_short(box)}")
@@ -92,7 +107,7 @@ def _check_box(box: Sequence[float]) -> None:
 
 def _check_weights(weights: LayerWeights) -> None:
     for name, value in asdict(weights).items():
-        _check_number(value, name, (0.0, MAX_WEIGHT))
+        _check_number(value, name, (-MAX_STOPS, MAX_STOPS) if name == "exposure" else (0.0, MAX_WEIGHT))
 
 
 def _check_light(light: Light | None) -> None:

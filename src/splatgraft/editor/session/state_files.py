@@ -1,4 +1,5 @@
-"""The edits of a project in its files: project.toml, placement.json, erased.npy, corrections.npy and light.json."""
+"""The edits of a project in its files: project.toml, placement.json, erased.npy, corrections.npy, prompts.json and
+light.json."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -11,6 +12,7 @@ from splatgraft.editor.session.state_checks import check_state
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.formats.corrections import read_corrections, write_corrections
 from splatgraft.formats.placement import Placement, read_placement, write_placement
+from splatgraft.formats.prompts import read_prompts, write_prompts
 from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE
 from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
 from splatgraft.runtime.atomic_file import atomic_write
@@ -18,8 +20,13 @@ from splatgraft.runtime.settings import MAX_TEXT_BYTES, read_toml
 
 _PARTS = {"objects": ("objects", "erased")}
 """Fields of the state that are read together: placement.json names erased.npy."""
-CORRECTIONS_FILE, ERASED_FILE = "corrections.npy", "erased.npy"
-_FILES = {"objects": PLACEMENT_FILE, "corrections": CORRECTIONS_FILE, "light": LIGHT_FILE}
+CORRECTIONS_FILE, ERASED_FILE, PROMPTS_FILE = "corrections.npy", "erased.npy", "prompts.json"
+_FILES = {
+    "objects": PLACEMENT_FILE,
+    "corrections": CORRECTIONS_FILE,
+    "prompts": PROMPTS_FILE,
+    "light": LIGHT_FILE,
+}
 """Usual file of a field of the state; project.toml holds the others."""
 
 
@@ -54,7 +61,7 @@ def find_state(project: Path) -> FoundState:
     content, folder = read_toml(project), project.parent
     segment, relight, harmonize = (_table(content, name, project) for name in ("segment", "relight", "harmonize"))
     placement = folder / PLACEMENT_FILE
-    given, corrections = relight.get("given_light"), segment.get("corrections")
+    given, corrections, prompts = relight.get("given_light"), segment.get("corrections"), segment.get("prompts")
     readers: dict[str, Callable[[], EditState]] = {
         "objects": lambda: _placed(placement) if placement.is_file() else EditState(),
         "corrections": lambda: EditState(
@@ -63,6 +70,7 @@ def find_state(project: Path) -> FoundState:
         "mask_source": lambda: EditState(mask_source=segment.get("mask_source")),
         "box": lambda: EditState(box=None if "box" not in segment else _six(segment["box"], project)),
         "keep": lambda: EditState(keep=segment.get("keep")),
+        "prompts": lambda: EditState(prompts=None if prompts is None else read_prompts(folder / prompts)),
         "light": lambda: EditState(light=None if given is None else _light(folder / given)),
         "weights": lambda: EditState(weights=_weights(relight, project)),
         "harmonizer": lambda: EditState(harmonizer=harmonize.get("method")),
@@ -101,6 +109,8 @@ def write_state(project: Path, before: EditState | None, after: EditState) -> No
         text = with_keys(text, table, keys)
     if after.corrections is not None and (before is None or after.corrections is not before.corrections):
         write_corrections(folder / CORRECTIONS_FILE, after.corrections)
+    if after.prompts is not None and (before is None or after.prompts is not before.prompts):
+        write_prompts(folder / PROMPTS_FILE, after.prompts)
     if after.light is not None and (before is None or after.light is not before.light):
         with atomic_write(folder / LIGHT_FILE) as stream:
             stream.write(light_to_json(after.light).encode())
@@ -120,7 +130,7 @@ def as_written(state: EditState, before: EditState) -> EditState:
 
 def state_files(project: Path) -> tuple[Path, ...]:
     """All files that hold the state."""
-    names = (PLACEMENT_FILE, ERASED_FILE, CORRECTIONS_FILE, LIGHT_FILE)
+    names = (PLACEMENT_FILE, ERASED_FILE, CORRECTIONS_FILE, PROMPTS_FILE, LIGHT_FILE)
     return (project, *(project.parent / name for name in names))
 
 
@@ -135,22 +145,35 @@ def _write_placement(path: Path, state: EditState) -> None:
 
 def _changed_keys(before: EditState | None, after: EditState) -> dict[str, Mapping[str, Any]]:
     tables = ((_segment_keys, "segment"), (_relight_keys, "relight"), (_harmonize_keys, "harmonize"))
+    # the file of what was changed may have another name, given by hand
+    renewed = {
+        key
+        for key, field in (("corrections", "corrections"), ("prompts", "prompts"), ("given_light", "light"))
+        if before is not None and getattr(after, field) is not getattr(before, field)
+    }
     changes: dict[str, Mapping[str, Any]] = {}
     for keys_of, table in tables:
         new, old = keys_of(after), {} if before is None else keys_of(before)
-        changed = {key: new[key] for key in new if key not in old or json.dumps(new[key]) != json.dumps(old[key])}
+        changed = {
+            key: new[key]
+            for key in new
+            if key not in old or key in renewed or json.dumps(new[key]) != json.dumps(old[key])
+        }
         changes |= {table: changed} if changed else {}
     return changes
 
 
 def _segment_keys(state: EditState) -> dict[str, Any]:
     corrections = None if state.corrections is None else CORRECTIONS_FILE
-    return {"mask_source": state.mask_source, "box": state.box, "keep": state.keep, "corrections": corrections}
+    prompts = None if state.prompts is None else PROMPTS_FILE
+    keys = {"mask_source": state.mask_source, "box": state.box, "keep": state.keep}
+    return keys | {"corrections": corrections, "prompts": prompts}
 
 
 def _relight_keys(state: EditState) -> dict[str, Any]:
-    # the physical weight, 1, is the default and needs no key
-    weights = {key: None if value == 1.0 else value for key, value in asdict(state.weights).items()}
+    # what is physically right is the default and needs no key
+    usual = asdict(LayerWeights())
+    weights = {key: None if value == usual[key] else value for key, value in asdict(state.weights).items()}
     return weights | {"given_light": None if state.light is None else LIGHT_FILE}
 
 

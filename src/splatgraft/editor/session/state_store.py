@@ -22,6 +22,7 @@ from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.history import History
 from splatgraft.editor.session.state_checks import check_state
 from splatgraft.formats.placement import ObjectPlacement
+from splatgraft.formats.prompts import prompts_from_json, prompts_to_json
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
 from splatgraft.runtime.atomic_file import atomic_write
 
@@ -134,6 +135,7 @@ class StateStore:
             "mask_source": state.mask_source,
             "box": state.box,
             "keep": state.keep,
+            "prompts": None if state.prompts is None else prompts_to_json(state.prompts),
             "light": None if state.light is None else light_to_json(state.light),
             "weights": asdict(state.weights),
             "harmonizer": state.harmonizer,
@@ -149,6 +151,7 @@ class StateStore:
             mask_source=fields["mask_source"],
             box=None if box is None else (a, b, c, d, e, f),
             keep=fields["keep"],
+            prompts=None if (found := fields.get("prompts")) is None else prompts_from_json(found, "prompts"),
             light=None if light is None else light_from_json(light),
             weights=LayerWeights(**fields["weights"]),
             harmonizer=fields["harmonizer"],
