@@ -18,6 +18,8 @@ from splatgraft.relighting.shading.gain import apply_gain
 
 _MOST_VIEW_CHANGE = 0.9
 """Most share of the light in a shadow that a view direction takes away; set by hand."""
+_LEAST_SLOPE = 1e-6
+"""Of a ratio over view directions; below it nothing is seen, and divisions would overflow."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +137,10 @@ def _srgb_slope(
 
     By the secant between both ends, limited so that neither is black nor brighter than without a shadow.
     """
-    length = slope.norm(dim=1, keepdim=True)
+    # the squares of slopes below 1e-20 are 0 in float32
+    length = slope.norm(dim=1, keepdim=True).clamp_min(_LEAST_SLOPE)
     most = torch.minimum(_MOST_VIEW_CHANGE * ratio, (1 - ratio).clamp_min(0))
-    change = torch.minimum(length, most).clamp_min(1e-6)
+    change = torch.minimum(length, most).clamp_min(_LEAST_SLOPE)
     linear = linear_from_srgb(srgb.clamp(0, 1))
     high, low = (srgb_from_linear(linear * (ratio + sign * change)) for sign in (1, -1))
     return (slope / length)[:, :, None] * (0.5 * (high - low))[:, None]
