@@ -119,3 +119,10 @@ def test_init_full_writes_a_project_with_every_key(tmp_path: Path, capsys: pytes
     assert "#sampling_steps = 4" in text
     assert max(map(len, text.splitlines())) <= 120
     assert set(tomllib.loads(text)) == {table.name for table in project_keys()}
+
+
+@pytest.mark.parametrize("folder", ["target/capture", "target/scene/photos", "report"])
+def test_a_step_that_would_read_its_own_or_a_later_result_is_refused(tmp_path, folder):
+    (tmp_path / "project.toml").write_text(f'[source]\ncapture = "photos"\n[target]\ncapture = "{folder}"\n')
+    with pytest.raises(ValueError, match=r"project.toml: expected inputs of target/capture elsewhere than in the res"):
+        read_flow(tmp_path)

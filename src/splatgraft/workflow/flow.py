@@ -107,7 +107,21 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
         kind, given = (Reconstruct, given) if trained is None else (Adopt, given | {"scene": trained})
         steps[f"{side}/reconstruct"] = file.step(kind, given, out=layout.scene(side), side=side)
         steps[f"{side}/reconstruct"] = _with_axes_of(steps[f"{side}/capture"], steps[f"{side}/reconstruct"])
-    return Flow(layout, steps | _joint_steps(file, layout), file.renamed)
+    flow = Flow(layout, steps | _joint_steps(file, layout), file.renamed)
+    _require_order(path, flow)
+    return flow
+
+
+def _require_order(project: Path, flow: Flow) -> None:
+    """Raises: ValueError where a step reads what it, or a later step, writes."""
+    names = list(flow.steps)
+    for at, name in enumerate(names):
+        for other in flow.before(name):
+            if names.index(other) >= at:
+                folder = flow.steps[other].out
+                raise ValueError(
+                    f"{project}: expected inputs of {name} elsewhere than in the results of {other}, found {folder}"
+                )
 
 
 def _with_axes_of(capture: Step, scene: Step) -> Step:
