@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from splatgraft.project.job import Job
 from splatgraft.project.layout import Layout
 from splatgraft.project.record import read_record, why_stale
 from splatgraft.project.replacement import replacing
+from splatgraft.project.step import job_of
 from splatgraft.runtime.atomic_folder import atomic_folder
 
 
@@ -59,6 +61,45 @@ def test_only_content_and_options_make_stale(tmp_path: Path, image: Path) -> Non
     assert why_stale(job(folder, (image,), iterations=7)) == "images: a.png changed"
     (folder / "scene.ply").unlink()
     assert why_stale(job(folder, (image,), iterations=7)) == "scene.ply was removed"
+
+
+def test_an_option_that_a_later_version_brought_is_fresh_at_its_default(tmp_path: Path) -> None:
+    done = job(tmp_path / "scene", iterations=7)
+    finish(done)
+    newer = replace(done, options={"iterations": 7, "tint": 1.0}, defaults={"iterations": 5, "tint": 1.0})
+    assert why_stale(newer) is None
+    assert why_stale(replace(newer, options={"iterations": 7, "tint": 0.5})) == "tint is now 0.5, was 1.0"
+    assert why_stale(replace(newer, options={"iterations": 5, "tint": 1.0})) == "iterations is now 5, was 7"
+
+
+@dataclass(frozen=True)
+class Weights:
+    shadow: float = 1.0
+    sizes: tuple[int, ...] = (1, 2)
+
+
+@dataclass(frozen=True)
+class Tint:
+    scene: Path
+    out: Path = Path("tinted")
+    strength: float = 0.5
+    weights: Weights = field(default_factory=Weights)
+
+    def inputs(self) -> dict[str, tuple[Path, ...]]:
+        return {}
+
+    def write(self, folder: Path, context: object) -> None:
+        (folder / "scene.ply").write_text("result")
+
+
+def test_a_step_knows_the_defaults_of_its_options(tmp_path: Path) -> None:
+    done = Tint(tmp_path / "scene.ply", tmp_path / "tinted")
+    older = replace(job_of(done), options={"strength": 0.5})
+    finish(older)
+    assert why_stale(older) is None
+    assert why_stale(job_of(done)) is None
+    assert why_stale(job_of(replace(done, weights=Weights(shadow=0.3)))) == "shadow is now 0.3, was 1.0"
+    assert why_stale(job_of(replace(done, weights=Weights(sizes=(3,))))) == "sizes is now [3], was [1, 2]"
 
 
 def test_fingerprint_moves_with_inputs_and_options(tmp_path: Path, image: Path) -> None:
@@ -116,6 +157,7 @@ import os, signal, sys
 from pathlib import Path
 from splatgraft.project.job import Job
 from splatgraft.project.replacement import replacing
+from splatgraft.project.step import job_of
 
 fatal, seen = int(sys.argv[2]), 0
 def count(event, arguments):

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,8 @@ class Job:
     """Files whose content the result depends on, by role."""
     options: Mapping[str, Any]
     """Plain JSON values that the result depends on."""
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    """Of the options that have one: what an earlier version did, which did not have the option yet."""
 
     @cached_property
     def entries(self) -> Mapping[str, tuple[Entry, ...]]:

@@ -76,9 +76,11 @@ def why_stale(job: Job) -> str | None:
     if missing := [name for name in record.outputs if not (job.folder / name).is_file()]:
         return f"{missing[0]} was removed"
     options = json.loads(json.dumps(job.options))
+    # an option that came with a later version than the record's was at its default
+    before = {**json.loads(json.dumps(job.defaults)), **record.options}
     for key in sorted({*options, *record.options}):
-        if options.get(key) != record.options.get(key):
-            return f"{key} is now {options.get(key)}, was {record.options.get(key)}"
+        if options.get(key) != before.get(key):
+            return f"{key} is now {options.get(key)}, was {before.get(key)}"
     for role in sorted({*job.inputs, *record.inputs}):
         before = record.inputs.get(role, ())
         now = input_entries(job.inputs.get(role, ()), before)

@@ -1,7 +1,7 @@
 """The interface of a step, and its execution: locked, timed, resumable, with the result replaced atomically."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, get_args, runtime_checkable
 
@@ -71,7 +71,13 @@ class RecordsOptions(Protocol):
 def job_of(step: Step) -> Job:
     """The job of `step`: what its result depends on."""
     options = step.recorded_options() if isinstance(step, RecordsOptions) else plain_options(vars(step))
-    return Job(step=type(step).__name__.lower(), folder=step.out, inputs=step.inputs(), options=options)
+    return Job(
+        step=type(step).__name__.lower(),
+        folder=step.out,
+        inputs=step.inputs(),
+        options=options,
+        defaults=plain_options(_defaults(type(step))),
+    )
 
 
 def path_fields(step: Step) -> list[Path]:
@@ -109,6 +115,12 @@ def choose_device(wanted: str, console: Console) -> torch.device:
     reason = "no CUDA device found" if wanted == "auto" and not has_cuda else f"--device {wanted}"
     console.say(f"device: {device} ({reason})")
     return torch.device(device)
+
+
+def _defaults(kind: type) -> dict[str, Any]:
+    """The fields of a step that have a default."""
+    found = {one.name: one.default for one in fields(kind) if one.default is not MISSING}
+    return found | {one.name: one.default_factory() for one in fields(kind) if one.default_factory is not MISSING}
 
 
 def plain_options(values: Mapping[str, Any]) -> dict[str, Any]:
