@@ -18,3 +18,17 @@ def browser() -> Iterator[Any]:
 
     with with_browser() as found:
         yield found
+
+
+@pytest.fixture
+def window(browser: Any, project: Path) -> Iterator[Any]:
+    """The editor's page on a project of the test's module."""
+    from editor_driver import Editor, Window
+
+    editor = Editor(project)
+    opened = Window.opened(browser, editor)
+    try:
+        yield opened
+    finally:
+        opened.page.close()
+        editor.kill()

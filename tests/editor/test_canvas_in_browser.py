@@ -1,30 +1,16 @@
 """The canvas shows the renderer's picture when the view rests, splats while it moves, and gizmos over both."""
 
 import io
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pytest
 import torch
-from editor_driver import Editor, Window, state_of
+from editor_driver import Window, state_of
 from PIL import Image
 from test_hostile_values import made, project
 
 __all__ = ["made", "project"]
 PANEL_PX = 372
-
-
-@pytest.fixture
-def window(browser: Any, project: Path) -> Iterator[Window]:
-    editor = Editor(project)
-    opened = Window.opened(browser, editor)
-    try:
-        yield opened
-    finally:
-        opened.page.close()
-        editor.kill()
 
 
 def canvas_of(window: Window) -> np.ndarray:

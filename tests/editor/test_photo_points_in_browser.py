@@ -1,12 +1,10 @@
 """A photo on the canvas, and clicks in it that become points of `segment`."""
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from editor_driver import Editor, Window, state_of
+from editor_driver import Window, state_of
 from PIL import Image
 from test_canvas_in_browser import canvas_of
 from test_hostile_values import made, project
@@ -15,17 +13,6 @@ from splatgraft.editor.session.photo_points import PhotoView
 from splatgraft.formats import read_capture
 
 __all__ = ["made", "project"]
-
-
-@pytest.fixture
-def window(browser: Any, project: Path) -> Iterator[Window]:
-    editor = Editor(project)
-    opened = Window.opened(browser, editor)
-    try:
-        yield opened
-    finally:
-        opened.page.close()
-        editor.kill()
 
 
 def test_clicks_in_a_photo_become_points(window: Window, project: Path) -> None:

@@ -75,9 +75,8 @@ def export_path(files: ProjectFiles, kind: ShareKind, layer: Layer) -> Path:
         ValueError: If there is no result or no report yet.
     """
     if kind.page == "report":
-        page = files.report / REPORT_FILE
-        if not page.is_file():
-            raise ValueError(f"{page}: expected a report, found none yet; run it first")
+        if not has_report(files):
+            raise ValueError(f"{files.report / REPORT_FILE}: expected a report, found none yet; run it first")
         part = f"_{_REPORT_NAME}"
     elif not has_scene(files):
         raise ValueError(f"{files.result}: expected a finished scene, found none yet; run the transfer first")
@@ -90,6 +89,11 @@ def export_path(files: ProjectFiles, kind: ShareKind, layer: Layer) -> Path:
 def has_scene(files: ProjectFiles) -> bool:
     """Whether there is a scene with transferred light to share."""
     return files.result.is_file() or files.relit.is_file()
+
+
+def has_report(files: ProjectFiles) -> bool:
+    """Whether the report's page was written."""
+    return (files.report / REPORT_FILE).is_file()
 
 
 def step_shown(files: ProjectFiles, *, is_report: bool) -> str:

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 
 import viser
 
+from splatgraft.editor.jobs import exports
 from splatgraft.editor.page.place_phase import hide_target, show_target
 from splatgraft.editor.page.server import FILES_PREFIX
 from splatgraft.editor.page.share_panel import SharePanel
 from splatgraft.harmonization import HARMONIZERS
+from splatgraft.project.layout import REPORT_FILE
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
@@ -78,14 +80,14 @@ class RunPhase:
             f'<div style="opacity:.6;margin-top:6px">the same on the command line:</div>'
             f"<code>{html.escape(shown)}</code></div>"
         )
-        has_report = (session.files.report / "index.html").is_file()
+        has_report = exports.has_report(session.files)
         has_result = session.files.result.is_file()
         why_result = session.why_stale("consolidate") if has_result else None
         why_report = session.why_stale("evaluate") if has_report else None
         self._renew.visible, self._renew_report.visible = why_result is not None, why_report is not None
         self._stale.visible = bool(why_result or why_report)
         self._stale.content = _stale_note(why_result, why_report)
-        link = f'<a href="{FILES_PREFIX}index.html" target="_blank">Open the report</a>' if has_report else ""
+        link = f'<a href="{FILES_PREFIX}{REPORT_FILE}" target="_blank">Open the report</a>' if has_report else ""
         mark = " (out of date)" if why_report else ""
         self._share.refresh()
         self._link.content = f'<div style="padding:2px 12px">{link}{mark}</div>'

@@ -56,7 +56,7 @@ class SharePanel:
         files, kind = session.files, exports.SHARE_KINDS[self._kind.value]
         self._part.visible = kind.has_parts
         missing = exports.missing_package(kind)
-        exists = (files.report / "index.html").is_file() if kind.page == "report" else exports.has_scene(files)
+        exists = exports.has_report(files) if kind.page == "report" else exports.has_scene(files)
         if missing is None and not exists:
             missing = "There is no report yet." if kind.page == "report" else "There is no result yet."
         self._write.disabled = missing is not None

@@ -16,7 +16,7 @@ from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from splatgraft.formats.captures.view_record import ViewRecord, rigid
+from splatgraft.formats.captures.view_record import ViewRecord, rigid, turn_about
 
 _POSE = ("x", "y", "alt", "heading", "pitch", "roll")
 _LENS = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
@@ -57,7 +57,8 @@ def _view(path: Path, row: Mapping[str, str], sizes: Mapping[str, tuple[int, int
     width, height = sizes.get(PureWindowsPath(name).stem, (36, 36))
     longer = max(width, height)
     pose = np.eye(4)
-    pose[:3, :3] = _turn(2, -heading) @ _turn(0, pitch) @ _turn(1, roll)
+    heading, pitch, roll = np.radians((heading, pitch, roll))
+    pose[:3, :3] = turn_about(2, -heading) @ turn_about(0, pitch) @ turn_about(1, roll)
     pose[:3, 3] = (x, y, alt)
     return ViewRecord(
         name=name,
@@ -82,13 +83,3 @@ def _number(path: Path, name: str, row: Mapping[str, str], key: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{path}: expected a finite number as {key} of {name}, found {(text or '')[:40]!r}")
     return value
-
-
-def _turn(axis: int, degrees: float) -> np.ndarray:
-    """Counterclockwise about a positive axis."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    out = np.eye(3)
-    out[i, i] = out[j, j] = math.cos(math.radians(degrees))
-    out[j, i] = math.sin(math.radians(degrees))
-    out[i, j] = -out[j, i]
-    return out

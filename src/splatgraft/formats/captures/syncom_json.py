@@ -20,7 +20,7 @@ from splatgraft.core.images import IMAGE_SUFFIXES
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats.captures.assembly import cameras_of, posed_images_of, view_or_reason
-from splatgraft.formats.captures.view_record import ViewRecord, existing_file, rigid
+from splatgraft.formats.captures.view_record import ViewRecord, existing_file, rigid, turn_about
 from splatgraft.formats.json_file import array, excerpt, load, text, whole_side
 
 CAMERAS_FILE = "cameras.json"
@@ -92,11 +92,7 @@ def _euler(path: Path, entry: dict[str, Any]) -> np.ndarray:
     angles, scale = array(path, given, "rotation", ((3,),)), array(path, given, "scale", ((3,),))
     rotation = np.eye(3)
     for axis, angle in enumerate(angles):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        turn = np.eye(3)
-        turn[i, i] = turn[j, j] = np.cos(angle)
-        turn[j, i], turn[i, j] = np.sin(angle), -np.sin(angle)
-        rotation = turn @ rotation
+        rotation = turn_about(axis, angle) @ rotation
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * scale
     matrix[:3, 3] = array(path, given, "location", ((3,),))

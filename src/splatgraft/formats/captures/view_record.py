@@ -58,6 +58,15 @@ def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
     return out
 
 
+def turn_about(axis: int, radians: float) -> np.ndarray:
+    """The rotation (3, 3) by an angle, counterclockwise about a positive axis, x, y or z."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    turn = np.eye(3)
+    turn[i, i] = turn[j, j] = np.cos(radians)
+    turn[j, i], turn[i, j] = np.sin(radians), -np.sin(radians)
+    return turn
+
+
 def existing_file(path: Path) -> Path | None:
     """`path` where it is a file, otherwise None, also for invalid file names."""
     try:
