@@ -20,8 +20,6 @@ from splatgraft.runtime.atomic_folder import atomic_folder
 from splatgraft.runtime.progress import Progress
 
 _LATENTS, _TEXT, _POOLED = 16, 32, 32
-_FACTOR = 4
-"""Pixels per latent, along each side."""
 _MEAN_STEPS = 50
 """Steps over which the autoencoder's error is averaged."""
 _SHOWN = 64
@@ -36,12 +34,19 @@ class TinyBaseOptions:
     head_width: int = 40
     double_blocks: int = 2
     single_blocks: int = 4
+    autoencoder_widths: tuple[int, ...] = (24, 48, 64)
+    """Channels of its levels, multiples of 8; each but the first halves the picture."""
     autoencoder_steps: int = 4000
     """Of parts of pictures, half as wide and half as high."""
     batch: int = 8
     rate: float = 5e-4
     """Of Adam, falling to zero along a cosine. With 2e-3 the autoencoder never learns colours."""
     seed: int = 0
+
+    @property
+    def pixels_per_latent(self) -> int:
+        """Along each side."""
+        return 2 ** (len(self.autoencoder_widths) - 1)
 
 
 def write_tiny_base(
@@ -62,7 +67,7 @@ def write_tiny_base(
         progress: called after every step.
     """
     torch.manual_seed(options.seed)
-    autoencoder = _autoencoder()
+    autoencoder = _autoencoder(options.autoencoder_widths)
     stacked = torch.stack(list(pictures)) * 2 - 1
     error = _train(autoencoder, stacked, options, progress)
     _normalise(autoencoder, stacked)
@@ -78,11 +83,11 @@ def write_tiny_base(
         write_prompt(new / PROMPT_FILE, prompt, "random: the recipe has no text")
 
 
-def _autoencoder() -> Any:
+def _autoencoder(widths: tuple[int, ...]) -> Any:
     return autoencoder_class()(
-        block_out_channels=(24, 48, 64),
-        down_block_types=("DownEncoderBlock2D",) * 3,
-        up_block_types=("UpDecoderBlock2D",) * 3,
+        block_out_channels=widths,
+        down_block_types=("DownEncoderBlock2D",) * len(widths),
+        up_block_types=("UpDecoderBlock2D",) * len(widths),
         latent_channels=_LATENTS,
         norm_num_groups=8,
         layers_per_block=1,
@@ -114,7 +119,8 @@ def _train(autoencoder: Any, pictures: Float[Tensor, "n 3 h w"], options: TinyBa
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.autoencoder_steps)
     generator, errors = torch.Generator().manual_seed(options.seed), []
     draw = partial(torch.randint, size=(1,), generator=generator)
-    height, width = (side // 2 // _FACTOR * _FACTOR for side in pictures.shape[2:])
+    multiple = options.pixels_per_latent
+    height, width = (side // 2 // multiple * multiple for side in pictures.shape[2:])
     for step in range(options.autoencoder_steps):
         batch = pictures[torch.randint(len(pictures), (options.batch,), generator=generator)]
         top, left = int(draw(pictures.shape[2] - height + 1)), int(draw(pictures.shape[3] - width + 1))
