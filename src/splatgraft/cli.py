@@ -35,6 +35,7 @@ _TABLE = (
     ("synth generated", "synth.generated", "make training pairs of pictures that FLUX paints"),
     ("synth orida", "synth.orida", "make training pairs of ORIDa's photographs"),
     ("synth spheres", "synth.spheres", "make training pairs of balls in a second each, to learn training"),
+    ("synth lights", "synth.lights", "make examples for learning the light from captures"),
     ("synth pack", "synth.pack", "pack training pairs into tar files, also for object storage"),
     ("train flux", "train.flux", "train the paper's harmoniser on pairs"),
     ("train compact", "train.compact", "train the compact harmoniser on rendered pairs"),

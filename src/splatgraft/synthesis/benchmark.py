@@ -228,8 +228,16 @@ def sparse_points(
     return torch.from_numpy(np.concatenate(points)).float(), torch.from_numpy(np.concatenate(colors)).float()
 
 
-def _gather(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
-    """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply."""
+def gather_capture(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
+    """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply.
+
+    Args:
+        rendered: Folder of the job.
+        take: Its name, with color, and depth where `points` is set.
+        out: Receives the capture.
+        passes: Names of folders: images, masks, depth.
+        points: Whether sparse points are made of the depths.
+    """
     count = len(json.loads((rendered / "cameras.json").read_text())["poses"])
     stems = tuple(f"{i:04d}" for i in range(count))
     for folder, suffix, ending in _PASS_FILES:
@@ -255,9 +263,11 @@ _PASS_FILES = (("images", ".png", ".png"), ("masks", "_mask.png", ".png"), ("dep
 
 def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out: Path) -> None:
     """Write one rendered scene as captures, with its placement, its true lights and the object's true surface."""
-    _gather(source_render, "source", out / "source", passes=("images", "masks"), points=True)
-    _gather(target_render, "target", out / "target", passes=("images",), points=True)
-    _gather(target_render, "ground_truth", out / "ground_truth", passes=("images", "masks", "depth"), points=False)
+    gather_capture(source_render, "source", out / "source", passes=("images", "masks"), points=True)
+    gather_capture(target_render, "target", out / "target", passes=("images",), points=True)
+    gather_capture(
+        target_render, "ground_truth", out / "ground_truth", passes=("images", "masks", "depth"), points=False
+    )
     scene = make_scene(which.kind, which.seed)
     angle = math.radians(which.pose_deg)
     c, s = math.cos(angle), math.sin(angle)

@@ -71,7 +71,7 @@ def _without_peaks(
     panorama: Float[Tensor, "h w 3"], settings: PeakSettings
 ) -> tuple[Float[Tensor, "h w 3"], list[LightSource]]:
     """The panorama with its peaks replaced by the median of what is near them, and the peaks as sources."""
-    directions, solid_angles = _pixels(panorama)
+    directions, solid_angles = panorama_pixels(panorama)
     mean = float((panorama.mean(-1) * solid_angles).sum()) / (4 * math.pi)
     rest, peaks = panorama.clone(), []
     while len(peaks) < settings.most:
@@ -102,8 +102,8 @@ def _source(
     )
 
 
-def _pixels(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Unit directions and solid angles of the pixels of an equirectangular panorama."""
+def panorama_pixels(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+    """Unit directions and solid angles of the pixels of an equirectangular panorama, laid out as of `light_from_probe`."""
     h, w = panorama.shape[:2]
     down = (torch.arange(h) + 0.5) / h * math.pi
     turn = (2 * math.pi * (0.5 - (torch.arange(w) + 0.5) / w)).expand(h, w)
