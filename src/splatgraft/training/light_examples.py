@@ -1,10 +1,12 @@
 """Examples for learning the light at a place: what is known of it, and what is true."""
 
 import math
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -87,12 +89,12 @@ def read_examples(path: Path) -> list[LightExample]:
         ValueError: The file is no such file, or of another version.
     """
     try:
-        with np.load(path, allow_pickle=False) as found:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as found:
             arrays = {name: found[name] for name in found.files}
         version = int(arrays["version"])
         parts = [torch.from_numpy(arrays[name]).float() for name in ("maps", "numbers", "log2_truth")]
         names = [str(name) for name in arrays["names"]]
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
         raise ValueError(f"{path}: expected examples of light as `synth lights` writes them, found {error}") from error
     if version != VERSION:
         raise ValueError(f"{path}: expected examples of version {VERSION}, found version {version}")

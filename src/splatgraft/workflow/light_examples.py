@@ -18,12 +18,10 @@ from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.relighting.light.estimate import NoLight, fit_light
 from splatgraft.segmentation import segment
 from splatgraft.synthesis.benchmark import BenchmarkScene, BenchmarkSize, gather_capture, plan
-from splatgraft.synthesis.jobs import Job, RenderSize, render_job
+from splatgraft.synthesis.jobs import Job, render_job
 from splatgraft.synthesis.pairs import KINDS
 from splatgraft.training.light_examples import LightExample, light_example, write_examples
 
-SIZE = BenchmarkSize(RenderSize(width=288, height=204, samples=8), views=18)
-"""As small as the light's estimate was fitted with."""
 _SEEDS = (2**33, 2**34)
 """Range of the seeds of scenes and objects: neither the benchmark's, nor an exam's, nor those of training pairs."""
 _NEW, _OLD = "new", "old"
@@ -36,21 +34,21 @@ class LightScene:
     """A drawn scene and how it is made an example of."""
 
     which: BenchmarkScene
-    size: BenchmarkSize = SIZE
-    reconstruction: ReconstructOptions = ReconstructOptions(iterations=1000, budget=20_000)
+    size: BenchmarkSize
+    reconstruction: ReconstructOptions
 
 
-def draw_light_scene(seed: int, number: int) -> LightScene:
+def draw_scene(seed: int, number: int, size: BenchmarkSize) -> BenchmarkScene:
     """Draw a scene; the kinds follow each other, and a scene without room for the cameras is drawn again."""
     rng = random.Random(f"lights-{seed}-{number}")
     while True:
         kind = KINDS[number % len(KINDS)]
         which = BenchmarkScene(f"{seed}_{number:05d}_{kind}", kind, rng.randrange(*_SEEDS), rng.randrange(*_SEEDS))
         try:
-            plan(which, SIZE)
+            plan(which, size)
         except ValueError:
             continue
-        return LightScene(which)
+        return which
 
 
 def make_light_examples(scene: LightScene, work: Path, out: Path, blender_python: Path) -> None:

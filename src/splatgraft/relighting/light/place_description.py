@@ -1,8 +1,8 @@
 """A place's light evidence and estimate as maps of fixed size, upright: what a network learns the light from.
 
 A map has a row per height and a column per azimuth, so that a turn about the up axis only shifts its columns. What is
-known per direction is averaged over the directions near a cell; what is known per surface over the surfaces whose normal
-is near it.
+known per direction is averaged over the directions near a cell; what is known per surface over the surfaces whose
+normal is near it.
 """
 
 import math

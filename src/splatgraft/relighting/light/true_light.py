@@ -103,7 +103,7 @@ def _source(
 
 
 def panorama_pixels(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Unit directions and solid angles of the pixels of an equirectangular panorama, laid out as of `light_from_probe`."""
+    """Unit directions and solid angles of the pixels of an equirectangular panorama, as `light_from_probe` takes it."""
     h, w = panorama.shape[:2]
     down = (torch.arange(h) + 0.5) / h * math.pi
     turn = (2 * math.pi * (0.5 - (torch.arange(w) + 0.5) / w)).expand(h, w)
