@@ -119,7 +119,7 @@ def test_bad_files_are_one_line(found, tmp_path):
     with np.load(path) as arrays:
         kept = dict(arrays)
     np.savez(path, **{**kept, "version": np.array(99)})
-    with pytest.raises(ValueError, match=r"bad.npz: expected examples of version 1, found version 99"):
+    with pytest.raises(ValueError, match=r"bad.npz: expected examples of version 2, found version 99"):
         read_examples(path)
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(ValueError, match=r"bad.npz: expected examples of light"):

@@ -25,7 +25,7 @@ from splatgraft.relighting.light.place_description import (
 from splatgraft.relighting.light.true_light import panorama_pixels
 from splatgraft.runtime.atomic_file import atomic_write
 
-VERSION = 1
+VERSION = 2
 """Of the description; examples of another version are refused."""
 
 

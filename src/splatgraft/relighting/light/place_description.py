@@ -34,8 +34,7 @@ MAPS = (
     "surfaces' brightness",
     "surfaces' residual",
     "open sky of surfaces",
-    "highlight explained alone",
-    "highlight covariance",
+    "highlights explained alone",
 )
 """What the maps of a description are."""
 NUMBERS = (
@@ -119,7 +118,6 @@ def _direction_values(found: EstimatedLight) -> Float[Tensor, "k c"]:
     around, far = evidence.around, evidence.far
     estimated = hidden.radiance(evidence, found.tint).mean(1)
     nearness = evidence.surfaces.region.radius / around.distance.clamp_min(1e-3)
-    alone, covariance = _highlight_values(evidence)
     columns = [
         around.seen,
         far.seen,
@@ -129,20 +127,17 @@ def _direction_values(found: EstimatedLight) -> Float[Tensor, "k c"]:
         _log(estimated),
         _log(hidden.unseen * (1 - around.seen).clamp_min(0)),
         _log(hidden.clipped * evidence.visible_sources),
-        alone,
-        covariance,
+        _explained_by_each(evidence),
     ]
     return torch.stack([column.float() for column in columns], 1)
 
 
-def _highlight_values(evidence: LightEvidence) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
-    """Share of the view-dependent change that light from one direction alone explains, and its correlation."""
-    found = evidence.highlights
+def _explained_by_each(evidence: LightEvidence) -> Float[Tensor, "k"]:
+    """Share of the view-dependent change that light from one direction alone explains."""
+    found, k = evidence.highlights, len(DIRECTIONS)
     if found is None:
-        return torch.zeros(len(DIRECTIONS)), torch.zeros(len(DIRECTIONS))
-    scale = (found.squares.diag() * found.variance).clamp_min(1e-12).sqrt()
-    correlation = found.products / scale
-    return correlation.clamp_min(0) ** 2, correlation
+        return torch.zeros(k)
+    return found.explained_with_more(torch.zeros(k), torch.arange(k), torch.ones(k))
 
 
 def _surface_maps(found: EstimatedLight) -> Float[Tensor, "12 24 4"]:
