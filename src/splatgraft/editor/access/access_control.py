@@ -10,7 +10,7 @@ import hmac
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 from urllib.parse import parse_qs, parse_qsl, urlencode, urlsplit
 
 _COOKIE = "splatgraft_token"
@@ -71,6 +71,7 @@ def parse_public_address(address: str) -> PublicAddress:
     return PublicAddress(f"{scheme}://{name}{port}", found[4])
 
 
+@runtime_checkable
 class HasHeaders(Protocol):
     """Headers of a request, of which one name may occur several times."""
 
@@ -156,7 +157,9 @@ class AccessControl:
         """Whether an Origin is that of the editor's own page."""
         if self.public is not None and origin.lower() == self.public.origin:
             return True
-        return _netloc(origin) == host.lower()
+        # a page that came unencrypted under the public name is not the editor's
+        is_public = self.public is not None and host.lower() == _netloc(self.public.origin)
+        return not is_public and _netloc(origin) == host.lower()
 
     def _cookie_attributes(self) -> str:
         path = "/" if self.public is None else self.public.path or "/"

@@ -21,9 +21,9 @@ from splatgraft.project.layout import EDITOR_FOLDER, PLACEMENT_FILE, PROJECT_FIL
 StateKind = Literal["unknown", "running", "fresh", "stale", "part", "new", "bad"]
 _NOT_MADE = "not made yet"
 _REST_SHARE = 20
-"""Seconds between two looks at the steps over the seconds that a look took: they take at most a twentieth of a core."""
-_REST_SECONDS = 2.0
-"""Least time between two looks."""
+"""Seconds between two looks at the steps over the seconds that a look took."""
+_REST_SECONDS = (2.0, 10.0)
+"""Least and longest time between two looks."""
 _CHANGED = (
     *(PROJECT_FILE, PLACEMENT_FILE, "light.json", "erased.npy", "corrections.npy", "prompts.json"),
     *(f"{EDITOR_FOLDER}/{name}" for name in ("history.json", STATE_FILE)),
@@ -108,7 +108,8 @@ class ProjectStates:
                 if self._open and project.file.is_file():
                     self._reasons[project.file] = self._ask(project.file)
             spent = time.monotonic() - start
-            self._rest(max(_REST_SECONDS, _REST_SHARE * spent))
+            least, longest = _REST_SECONDS
+            self._rest(min(longest, max(least, _REST_SHARE * spent)))
         self._end()
 
     def _rest(self, seconds: float) -> None:

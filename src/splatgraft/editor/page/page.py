@@ -357,11 +357,8 @@ class Page:
     def _header_html(self) -> str:
         where = "no project yet" if self.session is None else str(self.session.files.file.parent.name)
         saved = "all changes are saved" if self.session else ""
-        link = (
-            f'<a style="color:#ffa94d" href="{self.options.start_page}">All projects</a><br>'
-            if self.options.start_page
-            else ""
-        )
+        home = self.options.start_page
+        link = f'<a style="color:#ffa94d" href="{home}">All projects</a><br>' if home else ""
         return (
             f'<div class="sg-header" style="{_TEXT_STYLE}">{link}<b style="font-size:1.1em">{html.escape(where)}</b>'
             f'<span style="opacity:.6;float:right">{saved}</span></div>'
