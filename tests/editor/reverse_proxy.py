@@ -51,39 +51,55 @@ def reverse_proxy(rules: ProxyRules, upstream: list[str], port: int) -> Iterator
         upstream: Name and port of the other server, once it is known.
         port: Where to listen.
     """
-    loop, ready = asyncio.new_event_loop(), threading.Event()
+    ready, stops = threading.Event(), []
+    tasks: set[asyncio.Task[None]] = set()
 
     async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        head = _passed_on(await reader.readuntil(b"\r\n\r\n"), rules, upstream[0])
-        if head is None:
-            writer.write(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
-            writer.close()
-            return
-        name, _, number = upstream[0].partition(":")
-        inner_reader, inner_writer = await asyncio.open_connection(name, int(number))
-        inner_writer.write(head)
-        await asyncio.gather(_copy(reader, inner_writer), _copy(inner_reader, writer))
+        task = asyncio.current_task()
+        assert task is not None
+        tasks.add(task)
+        try:
+            await _pass_on((reader, writer), rules, upstream[0])
+        finally:
+            tasks.discard(task)
+            await _close(writer)
 
     async def serve() -> None:
+        stop, loop = asyncio.Event(), asyncio.get_running_loop()
+        stops.append(lambda: loop.call_soon_threadsafe(stop.set))
         server = await asyncio.start_server(accept, "127.0.0.1", port)
         ready.set()
-        with contextlib.suppress(asyncio.CancelledError):
-            await server.serve_forever()
+        await stop.wait()
+        server.close()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
-    def run() -> None:
-        asyncio.set_event_loop(loop)
-        task = loop.create_task(serve())
-        loop.run_forever()
-        for left in asyncio.all_tasks(loop):
-            left.cancel()
-        loop.run_until_complete(asyncio.gather(task, *asyncio.all_tasks(loop), return_exceptions=True))
-        loop.close()
-
-    thread = threading.Thread(target=run, daemon=True)
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
     thread.start()
     ready.wait()
     try:
         yield
     finally:
-        loop.call_soon_threadsafe(loop.stop)
+        stops[0]()
         thread.join()
+
+
+async def _pass_on(outer: tuple[asyncio.StreamReader, asyncio.StreamWriter], rules: ProxyRules, upstream: str) -> None:
+    head = _passed_on(await outer[0].readuntil(b"\r\n\r\n"), rules, upstream)
+    if head is None:
+        outer[1].write(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
+        return
+    name, _, number = upstream.partition(":")
+    reader, writer = await asyncio.open_connection(name, int(number))
+    try:
+        writer.write(head)
+        await asyncio.gather(_copy(outer[0], writer), _copy(reader, outer[1]))
+    finally:
+        await _close(writer)
+
+
+async def _close(writer: asyncio.StreamWriter) -> None:
+    writer.close()
+    with contextlib.suppress(OSError):
+        await writer.wait_closed()

@@ -3,7 +3,6 @@
 import shutil
 import ssl
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -52,7 +51,7 @@ def test_all_pages_are_reached_under_a_path(folder: Path, rules: ProxyRules) -> 
                 assert websocket(f"{base}/splat/p/one", origin, cookie)[0] == 403
                 assert answer(f"{base}/splat/list", Cookie=cookie, Origin=origin)[0] == 403
     finally:
-        editor.kill()
+        editor.end()
 
 
 def test_one_project_is_reached_under_a_path(folder: Path) -> None:
@@ -67,15 +66,15 @@ def test_one_project_is_reached_under_a_path(folder: Path) -> None:
             # viser's page takes its own address without the last slash
             assert websocket(f"{base}/splat/p/one", base, cookie)[0] == 101
     finally:
-        editor.kill()
+        editor.end()
 
 
 @pytest.fixture(scope="module")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Path]]:
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     if shutil.which("openssl") is None:
         pytest.skip("no openssl, which makes a certificate")
     folder = tmp_path_factory.mktemp("tls")
-    yield make_certificate(folder, "a")
+    return make_certificate(folder, "a")
 
 
 def make_certificate(folder: Path, name: str, *options: str) -> tuple[Path, Path]:
@@ -106,7 +105,7 @@ def test_https_and_encrypted_websockets(folder: Path, certificate: tuple[Path, P
             answer(editor.base, ssl.create_default_context())
         assert answer(f"{editor.base}/list", context, Cookie=cookie)[0] == 200
     finally:
-        editor.kill()
+        editor.end()
 
 
 def test_bad_certificates_are_one_line_each(
@@ -125,7 +124,7 @@ def test_bad_certificates_are_one_line_each(
         (own, own, f"{own}: expected a PEM file with a private key, found none in it"),
         (own, other, f"{other}: expected the private key of {own}, found another key"),
         (own, locked, "--tls-key: expected a key without a password, found an encrypted one"),
-        (tmp_path / "cut.pem", key, f"{tmp_path}/cut.pem: expected a certificate and its key that can be read, found"),
+        (tmp_path / "cut.pem", key, f"{tmp_path}/cut.pem: expected a certificate that can be read, found"),
     ]
     for given, given_key, line in cases:
         words = ["edit", str(tmp_path), "--tls-certificate", str(given), "--tls-key", str(given_key)]

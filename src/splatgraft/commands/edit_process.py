@@ -5,9 +5,11 @@ ended it, and ends with its input. Not a command.
 """
 
 import json
+import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,6 +17,9 @@ from pathlib import Path
 from splatgraft.editor.access.access_control import LOOPBACK, AccessControl
 from splatgraft.project.folder_lock import locked
 from splatgraft.runtime.console import Console
+
+_END_SECONDS = 3.0
+"""How long the child may take to end by itself."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +104,9 @@ def main(arguments: Sequence[str]) -> int:
     def wait_for_the_end() -> None:
         sys.stdin.read()
         stop.set()
+        # torch or a scene may be loading; whatever was decided is in the project's files
+        time.sleep(_END_SECONDS)
+        os._exit(0)
 
     threading.Thread(target=wait_for_the_end, daemon=True).start()
     answer = sys.stdout

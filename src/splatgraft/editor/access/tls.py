@@ -27,6 +27,10 @@ def read_certificate(certificate: Path | None, key: Path | None) -> ssl.SSLConte
         text = _text(path)
         if f"{what}-----" not in text:
             raise ValueError(f"{path}: expected a PEM file with a {what.lower()}, found none in it")
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_verify_locations(certificate)
+    except ssl.SSLError as error:
+        raise ValueError(f"{certificate}: expected a certificate that can be read, found {error}") from None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
@@ -35,7 +39,7 @@ def read_certificate(certificate: Path | None, key: Path | None) -> ssl.SSLConte
     except ssl.SSLError as error:
         if error.reason == _OTHER_KEY:
             raise ValueError(f"{key}: expected the private key of {certificate}, found another key") from None
-        raise ValueError(f"{key}: expected a certificate and its key that can be read, found {error}") from None
+        raise ValueError(f"{key}: expected a private key that can be read, found {error}") from None
     return context
 
 
