@@ -124,7 +124,7 @@ def _card(card: ProjectCard, now: float) -> str:
     return (
         f'<li data-key="{project.key}" class="{state.kind}"><a href="{PROJECTS_PATH}/{project.key}/">{picture}'
         f'<span class="name">{html.escape(project.name)}</span>'
-        f'<span class="state"><b>{label}</b>{more}</span>'
+        f'<span class="state"><b>{label}</b> {more}</span>'
         f'<span class="changed">{age(state.changed, now)}{windows}</span></a></li>'
     )
 
