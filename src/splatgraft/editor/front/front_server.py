@@ -118,7 +118,7 @@ class FrontServer:
             except OSError as error:
                 if error.errno != errno.EADDRINUSE or options.port == 0:
                     raise
-        raise OSError(f"--port: expected a free one from {options.port} on, found none")
+        raise _no_port(options.port)
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -272,6 +272,10 @@ class FrontServer:
             await asyncio.sleep(_IDLE_LOOK_SECONDS)
             for process in tuple(self._processes.values()):
                 await process.end_if_idle()
+
+
+def _no_port(first: int) -> OSError:
+    return OSError(f"--port: expected a free one from {first} on, found none")
 
 
 async def _send(writer: asyncio.StreamWriter, answer: Answer, cookie: str | None) -> None:

@@ -29,7 +29,7 @@ def parse_request(head: bytes) -> Request:
         yield from ()
         line = next(lines) + b"\n"
         if len(line) > limit:
-            raise ValueError("line too long")
+            raise ValueError
         return line
 
     parser = Request.parse(read_line)

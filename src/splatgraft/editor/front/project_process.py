@@ -124,4 +124,8 @@ class ProjectProcess:
             self._answered.set()
         status = await process.wait()
         if error or status:
-            self.problem = error or f"{self.project.name}: expected its editor to go on, found that it ended ({status})"
+            self.problem = error or _ended(self.project.name, status)
+
+
+def _ended(name: str, status: int) -> str:
+    return f"{name}: expected its editor to go on, found that it ended ({status})"

@@ -41,7 +41,7 @@ def thumbnail(picture: Path) -> bytes | None:
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError):
         return None
     # parts of a scene have alpha
-    behind = Image.new("RGBA", small.size, (37, 38, 43, 255))
+    behind = Image.new("RGBA", small.size, (104, 106, 112, 255))
     stream = io.BytesIO()
     Image.alpha_composite(behind, small).convert("RGB").save(stream, "JPEG", quality=_QUALITY)
     return stream.getvalue()
