@@ -103,6 +103,7 @@ def test_a_crash_of_one_project_is_not_one_of_the_others(browser: Any, editor: E
     open_project(page, "project ")
     (first,) = child_pids(editor)
     other.goto(editor.base)
+    other.get_by_text("open in 1 window").wait_for()
     window = open_project(other, NAMED)
     kill(first)
     wait_until(lambda: not is_alive(first), what="the end of one project")

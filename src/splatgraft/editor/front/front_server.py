@@ -10,17 +10,17 @@ import errno
 import http
 import ssl
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from urllib.parse import unquote, urlsplit
 
 from websockets.http11 import Request
 
 from splatgraft.editor.access.access_control import AccessControl, allowed_query, plain_headers
 from splatgraft.editor.front import start_page
-from splatgraft.editor.front.http_messages import MAX_HEAD_BYTES, Answer, moved, parse_request, refusal
+from splatgraft.editor.front.http_messages import MAX_HEAD_BYTES, Answer, moved, parse_request, refusal, with_cookie
 from splatgraft.editor.front.project_folders import ProjectFolder
 from splatgraft.editor.front.project_process import ProcessOptions, ProjectProcess
-from splatgraft.editor.front.project_proxy import Streams, is_websocket, pass_on
+from splatgraft.editor.front.project_proxy import Streams, answer_from, ask, is_websocket
 from splatgraft.editor.front.project_states import ProjectState, ProjectStates
 from splatgraft.editor.front.start_page import LIST_PATH, PROJECTS_PATH, THUMBNAILS_PATH, ProjectCard
 from splatgraft.editor.front.thumbnails import thumbnail
@@ -35,6 +35,7 @@ _IDLE_LOOK_SECONDS = 30.0
 _PORTS = 1000
 """How many ports are tried."""
 _HTML = "text/html; charset=utf-8"
+_CLOSED = "expected a project that is open, found it closed: load its page again"
 _NO_PAGE = "expected a page of the editor, found no such page"
 
 
@@ -157,7 +158,14 @@ class FrontServer:
         if answer is not None:
             await _send(writer, answer, decision.cookie)
             return
-        await pass_on(Request(inner, request.headers), streams, process, cookie=decision.cookie)
+        try:
+            asked = await ask(Request(inner, request.headers), process)
+        except (OSError, EOFError):
+            # the process ended just now
+            await _send(writer, refusal(http.HTTPStatus.SERVICE_UNAVAILABLE, _CLOSED), decision.cookie)
+            return
+        asked = replace(asked, head=with_cookie(asked.head, decision.cookie))
+        await answer_from(asked, request, streams, process)
 
     # which page
 
@@ -198,8 +206,7 @@ class FrontServer:
             return self._problem_answer(process, problem, request)
         if process.is_running and inner == "/" and not is_websocket(request):
             return Answer(start_page.waiting_page(process.project, base=self._root(request)), _HTML)
-        sentence = "expected a project that is open, found it closed: load its page again"
-        return refusal(http.HTTPStatus.SERVICE_UNAVAILABLE, sentence)
+        return refusal(http.HTTPStatus.SERVICE_UNAVAILABLE, _CLOSED)
 
     def _problem_answer(self, process: ProjectProcess, problem: str, request: Request) -> Answer:
         others = "" if self._options.is_single else "All projects"

@@ -111,7 +111,11 @@ class ProjectProcess:
     async def _serve(self) -> None:
         pipe = asyncio.subprocess.PIPE
         process = await asyncio.create_subprocess_exec(
-            *self._options.command(self.project.file), stdin=pipe, stdout=pipe
+            *self._options.command(self.project.file),
+            stdin=pipe,
+            stdout=pipe,
+            # Ctrl-C is for the server, which then ends the process
+            start_new_session=True,
         )
         self._process = process
         assert process.stdin is not None

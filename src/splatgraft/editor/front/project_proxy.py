@@ -3,12 +3,13 @@
 import asyncio
 import contextlib
 import tempfile
+from dataclasses import dataclass
 
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
 from splatgraft.editor.access.access_control import cookie_name
-from splatgraft.editor.front.http_messages import MAX_HEAD_BYTES, with_cookie
+from splatgraft.editor.front.http_messages import MAX_HEAD_BYTES
 from splatgraft.editor.front.project_process import ProjectProcess
 
 _KEPT = ("Accept-Encoding", *(f"Sec-WebSocket-{name}" for name in ("Key", "Version", "Protocol", "Extensions")))
@@ -20,30 +21,50 @@ _IN_MEMORY = 16 << 20
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
-async def pass_on(request: Request, streams: Streams, process: ProjectProcess, *, cookie: str | None) -> None:
-    """Pass a request on and its answer back.
+@dataclass(frozen=True)
+class Asked:
+    """The beginning of a process's answer."""
+
+    head: bytes
+    """Status and headers."""
+    streams: Streams
+    """Of the process; the rest of the answer follows."""
+
+
+async def ask(request: Request, process: ProjectProcess) -> Asked:
+    """Pass a request on.
 
     Args:
         request: The request, with the path that the process knows.
-        streams: Of the browser.
         process: The process, which has a port.
-        cookie: A Set-Cookie header for the answer; None: none.
 
     Raises:
-        OSError: If the process or the browser is gone.
+        OSError, EOFError: If the process is gone.
     """
-    port = process.port
+    port = process.port or 0
     reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=MAX_HEAD_BYTES)
     try:
-        writer.write(_inner_request(request, port or 0, process.token).serialize())
+        writer.write(_inner_request(request, port, process.token).serialize())
         await writer.drain()
-        head = await reader.readuntil(b"\r\n\r\n")
-        if is_websocket(request):
-            await _pass_websocket(with_cookie(head, cookie), streams, (reader, writer), process)
-        else:
-            await _pass_answer(with_cookie(head, cookie), streams[1], reader)
-    finally:
+        return Asked(await reader.readuntil(b"\r\n\r\n"), (reader, writer))
+    except BaseException:
         writer.close()
+        raise
+
+
+async def answer_from(asked: Asked, request: Request, streams: Streams, process: ProjectProcess) -> None:
+    """Pass an answer back, and a websocket's bytes in both directions until one side ends.
+
+    Raises:
+        OSError: If the browser is gone.
+    """
+    try:
+        if is_websocket(request):
+            await _pass_websocket(asked.head, streams, asked.streams, process)
+        else:
+            await _pass_answer(asked.head, streams[1], asked.streams[0])
+    finally:
+        asked.streams[1].close()
 
 
 def is_websocket(request: Request) -> bool:

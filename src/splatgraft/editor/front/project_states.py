@@ -24,6 +24,8 @@ _REST_SHARE = 20
 """Seconds between two looks at the steps over the seconds that a look took."""
 _REST_SECONDS = (2.0, 10.0)
 """Least and longest time between two looks."""
+_KEEP_SECONDS = 60.0
+"""How long the process waits for the next look."""
 _CHANGED = (
     *(PROJECT_FILE, PLACEMENT_FILE, "light.json", "erased.npy", "corrections.npy", "prompts.json"),
     *(f"{EDITOR_FOLDER}/{name}" for name in ("history.json", STATE_FILE)),
@@ -101,7 +103,10 @@ class ProjectStates:
 
     def _loop(self) -> None:
         while self._open:
-            self._wake.wait()
+            if not self._wake.wait(_KEEP_SECONDS):
+                # nobody looks: its memory is given back
+                self._end()
+                continue
             self._wake.clear()
             start = time.monotonic()
             for project in self._wanted:
@@ -124,7 +129,13 @@ class ProjectStates:
             if process is None or process.poll() is not None:
                 self._end()
                 process = self._process = subprocess.Popen(
-                    self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
+                    self._command,
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                    encoding="utf-8",
+                    # Ctrl-C is for the server, which then ends the process
+                    start_new_session=True,
                 )
             assert process.stdin is not None
             assert process.stdout is not None
