@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from editor_driver import Editor, Window, state_of
+from editor_driver import Editor, Window, state_of, wait_for_job
 from front_requests import PROJECT, child_pids, is_alive, kill
 from reverse_proxy import ProxyRules, reverse_proxy
 from test_hostile_values import made, project
@@ -172,3 +172,17 @@ def test_a_second_window_watches_and_takes_over(browser: Any, editor: Editor, pr
     first.click("Undo")
     first.until(lambda: len(state_of(project).objects or ()) == 2, what="a step back")
     pages[0].close()
+
+
+def test_a_job_goes_on_when_the_server_is_killed(browser: Any, editor: Editor, project: Path) -> None:
+    page = browser.new_page()
+    page.goto(editor.url)
+    window = open_project(page, "project ")
+    window.show_phase("Run")
+    window.start_job(project, "Harmonise and consolidate")
+    pids = child_pids(editor)
+    editor.kill()
+    wait_until(lambda: not any(is_alive(pid) for pid in pids), what="the end of the server's processes")
+    page.close()
+    wait_for_job(project)
+    assert (project.parent / "result" / "scene.ply").is_file()

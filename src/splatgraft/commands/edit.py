@@ -80,7 +80,7 @@ class Edit:
         stop_at_signals(stop.set)
 
         def started(port: int) -> None:
-            self._say_address(f"http://{self.host}:{port}", token, console)
+            self._say_address(f"http://{self._host_name()}:{port}", token, console)
 
         edit_project(
             self._options(file, is_remote=False), token, host=self.host, port=self.port, started=started, stop=stop
@@ -111,8 +111,7 @@ class Edit:
             return find_projects(self.projects) if single is None else (project_folder(single),)
 
         def started(port: int) -> None:
-            name = f"[{self.host}]" if ":" in self.host else self.host
-            address = f"{'http' if certificate is None else 'https'}://{name}:{port}"
+            address = f"{'http' if certificate is None else 'https'}://{self._host_name()}:{port}"
             self._say_address(address if public is None else f"{public.origin}{public.path}", token, console)
 
         out = () if self.out is None else (str(self.out.absolute()),)
@@ -126,6 +125,10 @@ class Edit:
     def _title(self) -> str:
         """The name of the folder that holds the projects."""
         return self.projects[0].absolute().name if len(self.projects) == 1 else "Projects"
+
+    def _host_name(self) -> str:
+        """The host in an address."""
+        return f"[{self.host}]" if ":" in self.host else self.host
 
     def _say_address(self, address: str, token: str, console: Console) -> None:
         complete = f"{address}/?token={token}"

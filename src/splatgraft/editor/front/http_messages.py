@@ -36,10 +36,17 @@ def parse_request(head: bytes) -> Request:
     try:
         next(parser)
     except StopIteration as done:
-        return done.value
+        return _checked(done.value)
     except Exception as error:  # the library has several kinds
         raise ValueError(str(error)) from error
     raise AssertionError("the parser waits for more than a whole head")
+
+
+def _checked(request: Request) -> Request:
+    """Raises: ValueError where the path is no path of plain letters, which could not be written into a header."""
+    if not request.path.startswith("/") or not request.path.isascii() or not request.path.isprintable():
+        raise ValueError
+    return request
 
 
 @dataclass(frozen=True)
