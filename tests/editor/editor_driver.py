@@ -100,7 +100,7 @@ class Editor:
             self.process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=errors, text=True)
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().strip()
-        assert self.url.startswith("http://"), self.log.read_text()[-2000:]
+        assert self.url.startswith("http"), self.log.read_text()[-2000:]
 
     @property
     def base(self) -> str:

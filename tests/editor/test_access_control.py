@@ -1,8 +1,15 @@
 """Access control of requests, and the edit lock."""
 
 import pytest
+from websockets.datastructures import Headers
 
-from splatgraft.editor.access.access_control import AccessControl, cookie_name
+from splatgraft.editor.access.access_control import (
+    AccessControl,
+    allowed_query,
+    cookie_name,
+    parse_public_address,
+    plain_headers,
+)
 from splatgraft.editor.access.edit_lock import EditLock
 
 HERE = {"Host": "127.0.0.1:8080"}
@@ -73,3 +80,55 @@ def test_one_window_holds_the_edit_lock_until_it_closes_or_another_takes_it() ->
     assert lock.held_by(9).holder == 1
     assert lock.held_by(3).without_window(3).holder == 1
     assert EditLock().with_window(1).without_window(1) == EditLock()
+
+
+def test_the_address_behind_a_proxy_is_accepted_and_no_forwarded_header_counts() -> None:
+    access = AccessControl("secret", public=parse_public_address("https://Studio.example:443/splat/"))
+    for host in ("studio.example", "127.0.0.1:8080"):
+        own = {"Host": host, "Origin": "https://studio.example", "Upgrade": "websocket"}
+        assert access.check(own, "/?token=secret").allowed, host
+        assert not access.check(own, "/?token=other").allowed, host
+        for origin in ("http://studio.example", "https://studio.example:8443", "https://evil.example", "null"):
+            assert not access.check(own | {"Origin": origin}, "/?token=secret").allowed, origin
+    evil = {"Host": "evil.example", "X-Forwarded-Host": "studio.example", "X-Forwarded-For": "127.0.0.1"}
+    assert not access.check(evil, "/?token=secret").allowed
+    foreign = {"Host": "studio.example", "Origin": "https://evil.example", "X-Forwarded-Host": "evil.example"}
+    assert not access.check(foreign, "/?token=secret").allowed
+    # the cookie goes to the editor's part of the host alone, and only encrypted
+    cookie = access.check({"Host": "studio.example"}, "/?token=secret").cookie or ""
+    assert cookie.endswith("HttpOnly; SameSite=Strict; Path=/splat; Secure")
+
+
+def test_editors_under_several_paths_of_a_host_share_the_cookie_s_name() -> None:
+    name = cookie_name("studio.example")
+    headers = {"Host": "studio.example", "Cookie": f"{name}=longer-path; {name}=root"}
+    for token in ("longer-path", "root"):
+        assert AccessControl(token, hosts=()).check(headers, "/").allowed
+    assert not AccessControl("other", hosts=()).check(headers, "/").allowed
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("studio.example", "ftp://studio.example", "https://", "https://studio.example/a?b=c", "https://a/#b"),
+        *("https://user:word@studio.example", "https://studio.example/a/../b", "https://a/b;c", "https://a/\r\nb: c"),
+        *("https://a:port", "javascript:alert(1)", "https://studio.example/ä"),
+    ],
+)
+def test_other_things_than_an_address_are_refused_as_public_address(address: str) -> None:
+    with pytest.raises(ValueError, match="--public-url: expected an address such as"):
+        parse_public_address(address)
+
+
+def test_a_page_s_query_may_hold_the_token_alone() -> None:
+    assert allowed_query("/p/a/") is None
+    assert allowed_query("/p/a/?token=t") is None
+    assert allowed_query("/?token=t&websocket=ws://evil.example") == "?token=t"
+    assert allowed_query("/?playbackPath=https://evil.example/a.viser") == "?"
+
+
+def test_repeated_headers_match_nothing() -> None:
+    headers = Headers([("Host", "127.0.0.1:8080"), ("Host", "evil.example"), ("Cookie", "a=b"), ("cookie", "c=d")])
+    found = plain_headers(headers)
+    assert found == {"Host": "127.0.0.1:8080, evil.example", "Cookie": "a=b; c=d"}
+    assert not AccessControl("secret").check(found, "/?token=secret").allowed

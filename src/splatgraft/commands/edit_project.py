@@ -13,13 +13,13 @@ from splatgraft.commands.steps.compose import Compose
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.segment import Segment
 from splatgraft.editor.session.project_access import Commands, ExportPage, ProjectFiles, Triple
-from splatgraft.editor.session.session import EDITOR_FOLDER
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.exports.export import Layer
 from splatgraft.folders.input_description import describe_input
 from splatgraft.formats import is_scene
 from splatgraft.project.layout import (
     CAMERAS_FILE,
+    EDITOR_FOLDER,
     LIGHT_FILE,
     PLACEMENT_FILE,
     SCENE_FILE,

@@ -6,11 +6,9 @@ from pathlib import Path
 
 from splatgraft.editor.session.project_access import ExportPage, ProjectFiles
 from splatgraft.exports.export import Layer
-from splatgraft.project.layout import REPORT_FILE
+from splatgraft.project.layout import EXPORTS_FOLDER, REPORT_FILE
 from splatgraft.runtime.optional_dependencies import extra_providing
 
-EXPORTS_FOLDER = "export"
-"""Folder of shared files, below the project's results."""
 _EXPORTS_PREFIX = f"{EXPORTS_FOLDER}/"
 _REPORT_NAME = "report"
 

@@ -63,6 +63,8 @@ class PageOptions:
     """Maximum number of Gaussians per scene that is sent to a browser."""
     inside: Path | None
     """Folder to which typed paths are restricted; None: no restriction."""
+    start_page: str | None = None
+    """Address of the page that lists all projects; None: there is none."""
 
 
 class Page:
@@ -355,8 +357,10 @@ class Page:
     def _header_html(self) -> str:
         where = "no project yet" if self.session is None else str(self.session.files.file.parent.name)
         saved = "all changes are saved" if self.session else ""
+        home = self.options.start_page
+        link = f'<a style="color:#ffa94d" href="{home}">All projects</a><br>' if home else ""
         return (
-            f'<div class="sg-header" style="{_TEXT_STYLE}"><b style="font-size:1.1em">{html.escape(where)}</b>'
+            f'<div class="sg-header" style="{_TEXT_STYLE}">{link}<b style="font-size:1.1em">{html.escape(where)}</b>'
             f'<span style="opacity:.6;float:right">{saved}</span></div>'
         )
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
 from splatgraft.editor.page.canvas import Canvas
+from splatgraft.editor.page.saved_preview import save_preview
 from splatgraft.editor.page.scene_view import camera_from_viser
 from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
 from splatgraft.editor.previews.preview import (
@@ -309,6 +310,8 @@ class PreviewPanel:
             self.canvas.show(request.window, with_badge(pixels, stage), _depth_behind(depth))
             self._shown_pose = _pose(request.camera)
             self._picture_seconds = seconds if stage != "coarse" else self._picture_seconds
+            if stage == "final":
+                save_preview(request.session.files.root, right.pixels)
         else:
             self._image.image = pixels
             self._size = replace(self._size, width=self._size.adapted(seconds / 2))

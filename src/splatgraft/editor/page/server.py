@@ -17,11 +17,12 @@ from viser import _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from splatgraft.editor.access.access_control import AccessControl
+from splatgraft.editor.access.access_control import AccessControl, allowed_query, plain_headers
 from splatgraft.editor.access.edit_lock import EditLock
 from splatgraft.editor.page.upload_receiver import UPLOAD_MESSAGES, UploadReceiver
 
-FILES_PREFIX = "/files/"
+FILES_PREFIX = "files/"
+"""Of the addresses of files, below the page's own address, which a reverse proxy may put under a path."""
 _CAMERA_MESSAGES = (_messages.ViewerCameraMessage, _messages.GetRenderResponseMessage)
 # this message asks viser for a public tunnel to this machine
 _BLOCKED_MESSAGES = (_messages.ShareUrlRequest,)
@@ -97,10 +98,14 @@ class GuardedServer:
         return original(*args, **options | {"process_request": partial(self._answer, inner)})
 
     def _answer(self, inner: Callable[..., Response | None], connection: Any, request: Request) -> Response | None:
-        decision = self._access.check(_plain(request.headers), request.path)
+        decision = self._access.check(plain_headers(request.headers), request.path)
         if not decision.allowed:
             return _response(http.HTTPStatus.FORBIDDEN, f"splatgraft: {decision.reason}\n".encode(), "text/plain")
-        path = request.path.partition("?")[0]
+        path, query = request.path.partition("?")[0].removeprefix("/"), allowed_query(request.path)
+        if query is not None and "Upgrade" not in request.headers:
+            moved = _response(http.HTTPStatus.FOUND, b"", "text/plain")
+            moved.headers["Location"] = query
+            return moved
         if path.startswith(FILES_PREFIX):
             found = self.files(unquote(path.removeprefix(FILES_PREFIX)))
             if found is None:
@@ -147,13 +152,6 @@ class GuardedServer:
             raise OSError(
                 f"viser {viser.__version__}: expected it to refuse other sites, found status {status}; install 1.1.1"
             )
-
-
-def _plain(headers: Headers) -> dict[str, str]:
-    names = ("Host", "Origin", "Upgrade", "Cookie")
-    found = {name: headers.get_all(name) for name in names}
-    # a repeated header is joined, so that it matches no accepted value
-    return {name: ", ".join(values) for name, values in found.items() if values}
 
 
 def _response(status: http.HTTPStatus, body: bytes, kind: str) -> Response:

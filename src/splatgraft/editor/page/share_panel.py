@@ -15,6 +15,7 @@ from splatgraft.editor.jobs.jobs import JobState
 from splatgraft.editor.page.server import FILES_PREFIX
 from splatgraft.editor.session.project_access import ExportPage
 from splatgraft.exports.export import Layer
+from splatgraft.project.layout import EXPORTS_FOLDER
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
@@ -122,7 +123,7 @@ class SharePanel:
         newest = max((p.stat().st_mtime_ns for p in (files.result, files.relit) if p.is_file()), default=0)
         rows = []
         for path in exports.written_exports(files)[:_LISTED]:
-            address, stat = f"{FILES_PREFIX}{exports.EXPORTS_FOLDER}/{quote(path.name)}", path.stat()
+            address, stat = f"{FILES_PREFIX}{EXPORTS_FOLDER}/{quote(path.name)}", path.stat()
             name = html.escape(path.name)
             is_shown = path.suffix in (".html", ".png", ".jpg", ".webp", ".gif", ".mp4")
             link = f'<a href="{address}" target="_blank">open</a> ' if is_shown else ""

@@ -27,10 +27,9 @@ from splatgraft.editor.session.state_files import as_written, find_state, state_
 from splatgraft.editor.session.state_store import StateStore
 from splatgraft.exports.export import Layer
 from splatgraft.formats.placement import ObjectPlacement, read_placement
-from splatgraft.project.layout import Side
+from splatgraft.project.layout import EDITOR_FOLDER, Side
 from splatgraft.segmentation import Box, add_correction, apply_corrections
 
-EDITOR_FOLDER = ".editor"
 _PROBLEM_STEP = "project"
 """Entry of `Project.reasons` where project.toml is invalid."""
 _PROJECT = "project.toml"
