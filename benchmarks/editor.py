@@ -73,6 +73,10 @@ class Client:
         self._gui: dict[str, dict[str, Any]] = {}
         self.has_splats = False
 
+    def close(self) -> None:
+        """End the connection."""
+        self._socket.close()
+
     def send(self, kind: str, **fields: Any) -> None:
         """Send a message as viser's page would."""
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))

@@ -35,6 +35,7 @@ class Edit:
 
     def execute(self, console: Console) -> int:
         """Serve until Ctrl-C."""
+        from splatgraft.editor.page.opening import Opening
         from splatgraft.editor.page.server import GuardedServer
 
         is_file = self.project.suffix == ".toml"
@@ -56,14 +57,16 @@ class Edit:
             is_opened = is_loopback and not self.keep_closed and open_page(address)
             wanted = "opened in the browser" if is_opened else "open this address, all of it, in a browser"
             console.say(f"{wanted}; Ctrl-C ends the editor, but not jobs that it started")
-            # torch, numba and the scenes take seconds to load, and the browser shows the page meanwhile
+            # torch, numba and the scenes take seconds to load, and the browser shows a sample of the scene meanwhile
+            opening = Opening(guarded.viser, file, file.parent if out is None else out)
             from splatgraft.commands.edit_project import FlowProject
             from splatgraft.editor.access.uploads import remove_remains
             from splatgraft.editor.page.page import Page, PageOptions
 
             remove_remains(file.parent)
             project = FlowProject(file, out, console)
-            page = Page(guarded, project, PageOptions(budget=self.budget, inside=None if is_loopback else file.parent))
+            options = PageOptions(budget=self.budget, inside=None if is_loopback else file.parent)
+            page = Page(guarded, project, options, opening=opening)
             loading.remove()
             stop.wait()
             page.close()

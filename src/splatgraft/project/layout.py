@@ -15,6 +15,7 @@ SELECTION_FILE = "selection.npy"
 IS_OBJECT_FILE = "is_object.npy"
 CAMERAS_FILE = "transforms.json"
 PLACEMENT_FILE = "placement.json"
+ERASED_FILE = "erased.npy"
 REPORT_FILE = "index.html"
 METRICS_FILE = "metrics.json"
 

@@ -11,6 +11,7 @@ import viser
 
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.editor.access.uploads import SCENES, SUFFIXES
+from splatgraft.editor.page.place_phase import hide_target, show_target
 from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
 from splatgraft.editor.session.project_access import Triple
 from splatgraft.editor.session.session import Session, backup_of
@@ -93,11 +94,11 @@ class OpenPhase:
         """Show the target, where it is reconstructed."""
         session = self._page.session
         if session is not None and session.files.target_scene.is_file():
-            self._page.view.show_splats("/target/scene", session.scenes.gaussians(session.files.target_scene))
+            show_target(self._page)
 
     def leave(self) -> None:
         """Hide the target."""
-        self._page.view.hide_splats("/target/scene")
+        hide_target(self._page)
 
     def refresh(self) -> None:
         """Show the fields of a new project, or the facts of the open one."""
@@ -165,7 +166,10 @@ class OpenPhase:
         cameras = (files.source_cameras, files.target_cameras)[index]
         if not scene.is_file():
             return f"<b>{name}</b>: not reconstructed yet"
-        text = f"<b>{name}</b>: {session.scenes.gaussians(scene).count:,} Gaussians"
+        count = session.scenes.count(scene)
+        if count is None and not self._page.loading.has(session, [scene]):
+            return f"<b>{name}</b>: being read"
+        text = f"<b>{name}</b>: {count or session.scenes.gaussians(scene).count:,} Gaussians"
         if files.without_photos[index] and cameras.is_file():
             made = session.scenes.cameras(cameras)
             up = ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in estimate_up(made).tolist())

@@ -319,6 +319,10 @@ class Session:
         """The current state with the objects that `compose` placed filled in."""
         return self.state if self.state.objects is not None else replace(self.state, objects=self.objects())
 
+    def placed_scenes(self) -> tuple[Path, ...]:
+        """The files of the target and of the placed objects."""
+        return (self.files.target_scene, *(self.scenes.object_path(item) for item in self.objects()))
+
     def placeable_object(self, index: int) -> PlaceableObject:
         """A placed object with its base.
 
