@@ -27,6 +27,7 @@ from splatgraft.editor.page.scene_loading import SceneLoading
 from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.select_phase import SelectPhase
 from splatgraft.editor.page.server import GuardedServer
+from splatgraft.editor.page.style import style_sheet
 from splatgraft.editor.page.upload_receiver import UploadButton
 from splatgraft.editor.page.windows import Windows
 from splatgraft.editor.session.project_access import Project
@@ -314,6 +315,7 @@ class Page:
         self._phase_buttons.on_click(
             self.callback(lambda event: self.show_phase(event.target.value.removeprefix(_CURRENT_MARK)))
         )
+        gui.add_html(style_sheet(self._phase_buttons._impl.uuid))
         self.job = JobPanel(self)
         self._folders: dict[str, Any] = {}
         self._phases: dict[str, Phase] = {}

@@ -19,7 +19,7 @@ from splatgraft.editor.previews.preview_relighting import PreviewRelighting
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.history import History
 from splatgraft.editor.session.placement_operations import PlaceableObject
-from splatgraft.editor.session.project_access import Commands, ExportPage, Project, ProjectFiles, Triple
+from splatgraft.editor.session.project_access import Commands, ExportPage, Project, ProjectFiles, RenderedViews
 from splatgraft.editor.session.project_backup import ProjectBackup
 from splatgraft.editor.session.scene_cache import SceneCache
 from splatgraft.editor.session.state_checks import check_state
@@ -242,7 +242,7 @@ class Session:
         paths = [path for path in state_files(self.files.file) if path.is_file()]
         return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in paths}
 
-    def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
+    def set_view(self, side: Side, views: RenderedViews) -> None:
         """Set how images of a scene without photographs are rendered; not an undo step.
 
         Raises:
@@ -251,7 +251,7 @@ class Session:
         with self._lock:
             if self.reload():
                 raise ValueError(f"{self.files.file.name}: changed outside the editor; please repeat your edit")
-            self.project.set_view(side, up=up, look=look)
+            self.project.set_view(side, views)
             self._stamps = self._read_stamps()
             self._backup.keep()
             self._use_files(self.project.files())
