@@ -270,6 +270,8 @@ class PreviewPanel:
         self._light_note = f"light in {self._relight_seconds:.1f} s"
         self._page.light_ready()
         self.update()
+        if self._light_worker.wait_idle(_REST_SECONDS):
+            relighting.prepare_drafts(request.state)
 
     def _draw(self, request: PictureRequest, *, note: str, stage: str = "") -> None:
         stage = stage or ("draft" if request.draft else "final")
