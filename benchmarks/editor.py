@@ -4,7 +4,7 @@
 project of two synthetic scenes, the target of SH degree 3, and speaks the page's own protocol through a websocket, at a
 canvas of 1280x720. No browser takes part, so what a browser needs for drawing comes on top. Times are seconds from the
 message that causes a picture to its arrival, medians of REPEATS; `final` is the light as the step computes it. Of a
-large scene the first splats and the first picture are of a sample.
+large scene the first points and the first picture are of a sample.
 """
 
 import contextlib
@@ -72,7 +72,7 @@ class Client:
             open_timeout=HANG_LIMIT,
         )
         self._gui: dict[str, dict[str, Any]] = {}
-        self.splats: set[str] = set()
+        self.scenes: set[str] = set()
 
     def close(self) -> None:
         """End the connection."""
@@ -130,8 +130,8 @@ class Client:
             self._gui[message["uuid"]] = {**message["props"], "value": message.get("value")}
         elif message["type"] == "GuiUpdateMessage" and message["uuid"] in self._gui:
             self._gui[message["uuid"]].update(message["updates"])
-        if message["type"] == "GaussianSplatsMessage":
-            self.splats.add(message["name"])
+        if message["type"] in ("GaussianSplatsMessage", "PointCloudMessage"):
+            self.scenes.add(message["name"])
 
     def caption(self) -> str:
         """What the page says about the picture."""
@@ -176,8 +176,8 @@ def measure(project: Path) -> dict[str, float]:
         found["page"] = time.monotonic() - start
         client.look(0.0)
         opened = {
-            "first splats": lambda message: bool(client.splats),
-            "all splats": lambda message: "/target/scene" in client.splats,
+            "first points": lambda message: bool(client.scenes),
+            "all splats": lambda message: "/target/scene" in client.scenes,
             "first picture": is_picture,
             "whole picture": lambda message: "Copy-paste" in client.caption() and "being read" not in client.caption(),
         }

@@ -1,4 +1,4 @@
-"""A sample of a scene is rows of its file, read without torch; the arrays for the browser are the scene's."""
+"""A sample of a scene is rows of its file, read without torch."""
 
 import subprocess
 import sys
@@ -11,7 +11,6 @@ from shapes import ring
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.spherical_harmonics import C0
-from splatgraft.editor.page.splat_arrays import splat_arrays
 from splatgraft.editor.session.scene_sample import read_first_view, read_sample, sample_count
 from splatgraft.formats import write_cameras, write_gaussians
 
@@ -44,6 +43,7 @@ def test_a_sample_is_some_rows_of_the_file(tmp_path: Path) -> None:
         (sample.band_0, scene.sh[:, 0]),
     ):
         assert np.array_equal(found, whole[rows].numpy())
+    assert np.allclose(sample.colors, (0.5 + C0 * scene.sh[rows, 0]).clamp(0, 1).numpy(), atol=1e-6)
     # enlarged by the same factor along all axes, which is no less than 1 and grows no Gaussian beyond the largest
     growth = sample.log_scales - scene.log_scales[rows].numpy()
     assert growth.min() >= 0
@@ -83,31 +83,6 @@ def test_files_of_other_layouts_have_no_sample(tmp_path: Path) -> None:
     sample = read_sample(tmp_path / "broken.ply")
     assert sample is not None
     assert sample.rows[0] == 2
-
-
-def test_arrays_for_the_browser_are_the_scene_s(tmp_path: Path) -> None:
-    scene = random_gaussians(200, sh_degree=1)
-    parts = (scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh[:, 0])
-    means, log_scales, quaternions, logits, band_0 = (part.numpy() for part in parts)
-    arrays = splat_arrays(means, log_scales, quaternions, opacity_logits=logits, band_0=band_0)
-    wanted = scene.covariances.numpy()
-    # float32: products of three numbers of 24 bits, relative to the largest entry of each matrix
-    largest = abs(wanted).max((1, 2), keepdims=True)
-    assert abs(arrays.covariances * arrays.unit**2 - wanted).max() < 1e-5 * largest.max()
-    assert np.allclose(arrays.centers * arrays.unit, means, rtol=1e-6)
-    assert np.allclose(arrays.opacities[:, 0], scene.opacities.numpy(), rtol=1e-5)
-    assert np.allclose(arrays.rgbs, (0.5 + C0 * band_0).clip(0, 1), atol=1e-6)
-
-
-@pytest.mark.filterwarnings("error")
-def test_arrays_of_extreme_values_are_finite() -> None:
-    ones = np.ones((3, 3), np.float32)
-    log_scales = np.float32([[88, 88, 88], [-100, -100, -np.inf], [0, 0, 0]])
-    quaternions = np.float32([[0, 0, 0, 0], [1, 0, 0, 0], [1e-20, 0, 0, 0]])
-    logits = np.float32([-200, 200, 0])
-    arrays = splat_arrays(ones, log_scales, quaternions, opacity_logits=logits, band_0=ones)
-    assert np.isfinite(arrays.covariances).all()
-    assert np.isfinite(arrays.opacities).all()
 
 
 def test_the_first_view_is_through_the_first_camera(tmp_path: Path) -> None:

@@ -10,12 +10,17 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from splatgraft.editor.page.splat_arrays import SplatArrays, splat_arrays
 from splatgraft.editor.session.scene_sample import SceneSample, View, read_first_view, read_sample
 from splatgraft.project.layout import CAMERAS_FILE, ERASED_FILE, OBJECT_FILE, SCENE_FILE, Layout, Side
 
 COARSE_NODE = "/coarse"
 """The node of the sample."""
+_PANEL_WIDTH = 372
+"""Pixels; the narrowest at which three numbers are legible beside their label."""
+_POINT_SIZE = 0.5
+"""Size of a point over the median Gaussian's enlarged standard deviation."""
+_MOVED = 1e-3
+"""Distance of a view from where it was set, over that to what it looks at, above which its user has moved it."""
 _OTHER_FILES = (("compose", "target"), ("compose", "object"), ("segment", "scene"))
 """Keys of project.toml that name files outside the layout."""
 
@@ -31,8 +36,9 @@ class Opening:
             project: project.toml, which need not exist.
             root: The folder of the results.
         """
+        set_theme(server)
         self._server, self._lock = server, threading.Lock()
-        self._placed: set[int] = set()
+        self._placed: dict[int, View] = {}
         self._is_open = True
         self.scene: Path | None = None
         """File of the scene that is shown; None where none is."""
@@ -53,37 +59,53 @@ class Opening:
             server.on_client_connect(lambda client: self._place(client, view))
 
     def close(self) -> frozenset[int]:
-        """Leave the windows that open from now on to the page; gives those whose view was set."""
+        """Leave the windows to the page; gives those whose user has moved the view meanwhile."""
         with self._lock:
             self._is_open = False
-            return frozenset(self._placed)
+            windows = self._server.get_clients()
+            return frozenset(number for number, view in self._placed.items() if _has_left(windows.get(number), view))
 
     def _place(self, window: viser.ClientHandle, view: View) -> None:
         with self._lock:
             if self._is_open:
-                self._placed.add(window.client_id)
+                self._placed[window.client_id] = view
                 look_through(window, view)
 
 
-def add_coarse(server: viser.ViserServer, sample: SceneSample) -> viser.GaussianSplatHandle:
-    """Show a sample of a scene, in place of an earlier one."""
-    arrays = splat_arrays(
-        sample.means,
-        sample.log_scales,
-        sample.quaternions,
-        opacity_logits=sample.opacity_logits,
-        band_0=sample.band_0,
-    )
-    return add_splats(server.scene, COARSE_NODE, arrays)
+def _has_left(window: viser.ClientHandle | None, view: View) -> bool:
+    if window is None:
+        return False
+    distance = float(np.linalg.norm(view.look_at - view.position))
+    return float(np.linalg.norm(np.asarray(window.camera.position) - view.position)) > _MOVED * distance
 
 
-def add_splats(scene: viser.SceneApi, name: str, arrays: SplatArrays) -> viser.GaussianSplatHandle:
-    """Add a node of splats in the world's frame."""
-    handle = scene.add_gaussian_splats(
-        name, centers=arrays.centers, covariances=arrays.covariances, rgbs=arrays.rgbs, opacities=arrays.opacities
+def set_theme(server: viser.ViserServer) -> None:
+    """The look of the page and the place of its panel."""
+    gui = server.gui
+    gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(224, 122, 46))
+    gui.set_panel_label("splatgraft")
+    gui.main_panel.dock_right()
+    gui.main_panel.set_width(_PANEL_WIDTH)
+    server.scene.world_axes.visible = False
+
+
+def add_coarse(server: viser.ViserServer, sample: SceneSample) -> viser.PointCloudHandle:
+    """Show a sample of a scene as points, in place of an earlier one.
+
+    Points need no sorting and no blending, and small ones little filling: a browser without a GPU would draw as many
+    splats, or points as large as them, for half a minute while nothing else happens on the page.
+    """
+    solid = sample.select(sample.opacity_logits > 0)
+    widths = np.exp(np.sort(solid.log_scales, axis=1)[:, 1])
+    return server.scene.add_point_cloud(
+        COARSE_NODE,
+        solid.means,
+        solid.colors,
+        point_size=_POINT_SIZE * float(np.median(widths)) if len(widths) else 1.0,
+        point_shape="square",
+        point_shading="flat",
+        precision="float32",
     )
-    handle.scale = arrays.unit
-    return handle
 
 
 def look_through(window: viser.ClientHandle, view: View) -> None:

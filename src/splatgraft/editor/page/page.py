@@ -19,7 +19,7 @@ from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.keys import Keys
 from splatgraft.editor.page.light_phase import LightPhase
 from splatgraft.editor.page.open_phase import OpenPhase
-from splatgraft.editor.page.opening import Opening
+from splatgraft.editor.page.opening import Opening, set_theme
 from splatgraft.editor.page.place_phase import PlacePhase
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.page.run_phase import RunPhase
@@ -36,8 +36,6 @@ from splatgraft.editor.session.session import Session, backup_of
 
 PHASES = ("Open", "Select", "Place", "Light", "Run")
 _POLL_SECONDS = 0.4
-_PANEL_WIDTH = 372
-"""Pixels; the narrowest at which three numbers are legible beside their label."""
 _CURRENT_MARK = "\u25cf "
 _TEXT_STYLE = "font-size:.85em;line-height:1.45;padding:2px 12px"
 
@@ -82,6 +80,8 @@ class Page:
         self.problem: str | None = None
         """Why project.toml could not be opened; None where it could, or where there is none."""
         self._seen_project: tuple[int, int] | None = None
+        if opening is None:
+            set_theme(self.server)
         self._try_session()
         self.view = SceneView(self.server, budget=options.budget, coarse=None if opening is None else opening.scene)
         self.loading = SceneLoading(self.scenes_read)
@@ -305,11 +305,6 @@ class Page:
 
     def _build(self) -> None:
         gui = self.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(224, 122, 46))
-        gui.set_panel_label("splatgraft")
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(_PANEL_WIDTH)
-        self.server.scene.world_axes.visible = False
         self._header = gui.add_html("")
         self._phase_buttons = gui.add_button_group("Step", PHASES)
         self._phase_buttons.on_click(

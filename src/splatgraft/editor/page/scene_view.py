@@ -1,6 +1,6 @@
 """The 3D view: Gaussian splats, boxes and cameras as viser scene nodes."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,8 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.page.opening import COARSE_NODE, add_coarse, add_splats
-from splatgraft.editor.page.splat_arrays import splat_arrays
+from splatgraft.core.spherical_harmonics import C0
+from splatgraft.editor.page.opening import COARSE_NODE, add_coarse
 from splatgraft.editor.previews.level_of_detail import largest_coverage_indices
 from splatgraft.editor.session.gizmo import gizmo_from_similarity
 from splatgraft.editor.session.scene_sample import SceneSample
@@ -170,13 +170,20 @@ class SceneView:
         if not shown.count:
             self.remove(name)
             return None, ShownCount(0, gaussians.count)
-        parts = (shown.means, shown.log_scales, shown.quaternions, shown.opacity_logits, shown.sh[:, 0])
-        means, log_scales, quaternions, opacity_logits, band_0 = (part.numpy() for part in parts)
-        arrays = splat_arrays(means, log_scales, quaternions, opacity_logits=opacity_logits, band_0=band_0)
+        # viser stores covariances in half precision: the scene is scaled so that their range fits, the node scales back
+        unit = float(shown.log_scales.median().exp()) * 10
+        colors = (0.5 + C0 * shown.sh[:, 0]).clamp(0, 1)
         if tint is not None:
-            arrays = replace(arrays, rgbs=0.45 * arrays.rgbs + 0.55 * np.array(tint, np.float32))
-        handle = add_splats(self._scene, name, arrays)
-        self._units[name] = arrays.unit
+            colors = 0.45 * colors + 0.55 * torch.tensor(tint)
+        covariances = (shown.covariances / unit**2).clamp(-6e4, 6e4)
+        handle = self._scene.add_gaussian_splats(
+            name,
+            centers=(shown.means / unit).numpy(),
+            covariances=covariances.numpy(),
+            rgbs=colors.numpy(),
+            opacities=shown.opacities[:, None].numpy(),
+        )
+        self._units[name] = unit
         return handle, ShownCount(shown.count, gaussians.count)
 
     def _place(self, handle: viser.GaussianSplatHandle, transform: Similarity) -> None:

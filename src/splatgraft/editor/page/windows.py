@@ -20,20 +20,20 @@ class Windows:
 
     def __init__(self, page: Page) -> None:
         """Start without windows; `connect` makes them known."""
-        self._placed: frozenset[int] = frozenset()
+        self._keep_view: frozenset[int] = frozenset()
         self._page, self._guarded, self._server = page, page.guarded, page.server
         self._notices: dict[int, Any] = {}
         self._views: dict[str, tuple[Any, ...]] = {}
         self.on_moved: list[Callable[[int], None]] = []
         """Called with the number of a window whose view or shape has changed."""
 
-    def connect(self, placed: frozenset[int]) -> None:
+    def connect(self, moved: frozenset[int]) -> None:
         """Handle windows that are open, open and close from now on; the page must be built.
 
         Args:
-            placed: Numbers of the windows that look through the first camera already.
+            moved: Numbers of the windows that keep their view, as their user has moved it.
         """
-        self._placed = placed
+        self._keep_view = moved
         self._guarded.on_edit_lock_changed = self._holder_changed
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(lambda client: self._notices.pop(client.client_id, None))
@@ -79,7 +79,7 @@ class Windows:
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self._moved(client.client_id))
-        if client.client_id not in self._placed:
+        if client.client_id not in self._keep_view:
             self._set_first_view(client)
         self._update_notices()
         self._page.preview.update()
