@@ -1,14 +1,22 @@
 """Draft relighting: light computed on a coarse composite, upsampled to all Gaussians."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
 import torch
+from test_hostile_values import made, project
 
+from splatgraft.commands.edit_project import FlowProject
 from splatgraft.composition import compose
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.previews.draft_preview import coarse_composite, coarsen, upsample_light
+from splatgraft.editor.previews import preview_relighting
+from splatgraft.editor.previews.draft_preview import CoarseGaussians, coarse_composite, coarsen, upsample_light
+from splatgraft.editor.session.session import Session
 from splatgraft.relighting.layers import LayerWeights, unchanged
+
+__all__ = ["made", "project"]
 
 
 def cloud(count: int, seed: int) -> Gaussians:
@@ -52,3 +60,35 @@ def test_each_gaussian_gets_the_light_of_the_nearest_coarse_one() -> None:
     assert int((distance == 0).sum()) == 80
     assert lit.report == ("a sentence",)
     assert lit.shaded(LayerWeights()).count == whole.count
+
+
+def test_what_drafts_share_is_computed_before_the_first_move(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preview_relighting, "TARGET_BUDGET", 60)
+    monkeypatch.setattr(preview_relighting, "OBJECT_BUDGET", 30)
+    reduced: list[int] = []
+
+    def counted(gaussians: Gaussians, budget: int) -> CoarseGaussians:
+        reduced.append(gaussians.count)
+        return coarsen(gaussians, budget)
+
+    monkeypatch.setattr(preview_relighting, "coarsen", counted)
+    drafts = []
+    for is_prepared in (False, True):
+        session = Session(FlowProject(project))
+        state = session.placed_state()
+        session.relighting.draft(state)
+        # the target and the object; the source follows
+        assert len(reduced) == 2
+        session.relighting.relit(state)
+        if is_prepared:
+            session.relighting.prepare_drafts(state)
+            assert len(reduced) == 3
+        session.set_placement(
+            0, replace(session.objects()[0].target_from_object, translation=torch.tensor([0.1, 0, 0]))
+        )
+        drafts.append(session.relighting.draft(session.placed_state()))
+        assert len(reduced) == 3
+        reduced.clear()
+        session.undo()
+    assert torch.equal(drafts[0].shadow, drafts[1].shadow)
+    assert torch.equal(drafts[0].shade, drafts[1].shade)

@@ -7,10 +7,13 @@ import cv2
 import numpy as np
 import pytest
 from test_hostile_values import made, page_of, project
+from test_typed_numbers import arrives, is_handled
 from tiny_project import ball, photograph, plane
 from waiting import wait_until
 
+from splatgraft.editor.session.project_access import RenderedViews
 from splatgraft.editor.session.state_files import read_state
+from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.folders.input_description import describe_input
 from splatgraft.formats import write_gaussians
 
@@ -107,5 +110,28 @@ def test_there_is_a_way_back_from_a_project_and_back_to_it(project: Path) -> Non
         assert read_state(project).objects is not None
         assert page.require_session().undo()
         wait_until(lambda: page.session is not None, what="the project")
+    finally:
+        close()
+
+
+def test_an_opened_project_shows_how_its_scenes_are_viewed(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = with_keys(project.read_text(), "source", {"up": [0.0, -1.0, 0.0], "look": "within"})
+    project.write_text(with_keys(text, "target", {"up": [0.0, 0.25, 1.0]}))
+    page, close = page_of(project)
+    try:
+        page.show_phase("Open")
+        phase = cast("Any", page._phases["Open"])
+        assert (phase._looks["source"].value, phase._ups["source"].value) == ("from within", "-y")
+        assert (phase._looks["target"].value, phase._ups["target"].value) == ("from around", "(0, 0.25, 1)")
+        # one of them is changed: the other one stays
+        session = page.require_session()
+        monkeypatch.setattr(page, "run", lambda to, title: None)
+        arrives(phase._looks["target"], "from within")
+        is_handled(phase._looks["target"])
+        assert session.files.rendered_views[1] == RenderedViews((0.0, 0.25, 1.0), is_within=True)
+        arrives(phase._ups["target"], "as found")
+        is_handled(phase._ups["target"])
+        assert session.files.rendered_views[1] == RenderedViews(None, is_within=True)
+        assert session.files.rendered_views[0] == RenderedViews((0.0, -1.0, 0.0), is_within=True)
     finally:
         close()

@@ -11,6 +11,7 @@ from splatgraft.cli import main
 from splatgraft.commands.edit_project import FlowProject
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import concatenate
+from splatgraft.editor.session.project_access import RenderedViews
 from splatgraft.editor.session.session import Session
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
@@ -78,14 +79,14 @@ def test_a_box_alone_segments_and_the_whole_scene_may_be_the_object(tmp_path: Pa
 def test_up_can_be_set_and_is_no_undo_step(tmp_path: Path) -> None:
     project = scene_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, mask_source="box")
     session = Session(FlowProject(project))
-    session.set_view("target", up=(0.0, 0.0, -1.0), look=None)
+    session.set_view("target", RenderedViews(up=(0.0, 0.0, -1.0)))
     assert not session.reload()
     assert not session.undo()
     assert main(["run", str(project), "--to", "reconstruct"]) == 0
     cameras = read_cameras(project.parent / "target" / "capture")
     assert torch.allclose(estimate_up(cameras), torch.tensor([0.0, 0.0, -1.0]), atol=0.02)  # two rings of eight cameras
     assert bool((cameras.centers[:, 2] < 0).all())
-    session.set_view("target", up=None, look="within")
+    session.set_view("target", RenderedViews(is_within=True))
     assert read_toml(project)["target"] == {
         "scene": "../target.ply",
         "views": 8,

@@ -93,7 +93,12 @@ def select(window: Window, project: Path) -> None:
     window.act_until(drag_a_rectangle, lambda: state_of(project).corrections is not None, what="corrections")
     window.undo_until(project, lambda: state_of(project).corrections is None)
     window.click("Redo")
-    window.until(lambda: state_of(project).corrections is not None, what="the corrections again")
+
+    def is_redone() -> bool:
+        # the history is written after the files of the state, and only then names it
+        return state_of(project).corrections is not None and not history_of(project)["future"]
+
+    window.until(is_redone, what="the corrections again")
     selected = history_of(project)["present"]
     window.check("Brush")
     window.says("the brush is on")

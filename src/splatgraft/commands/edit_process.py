@@ -60,6 +60,7 @@ def edit_project(
     Raises:
         ValueError: If another editor has the project open.
     """
+    from splatgraft.editor.page.opening import Opening
     from splatgraft.editor.page.server import GuardedServer
 
     file = Path(options.file)
@@ -68,15 +69,18 @@ def edit_project(
         guarded = GuardedServer(AccessControl(token), host=host, port=port)
         loading = guarded.viser.gui.add_markdown("Loading the project ...")
         started(guarded.port)
-        # torch, numba and the scenes take seconds to load, and the browser shows the page meanwhile
+        # torch, numba and the scenes take seconds to load, and the browser shows a sample of the scene meanwhile
+        out = None if options.out is None else Path(options.out)
+        opening = Opening(guarded.viser, file, file.parent if out is None else out)
         from splatgraft.commands.edit_project import FlowProject
         from splatgraft.editor.access.uploads import remove_remains
         from splatgraft.editor.page.page import Page, PageOptions
 
         remove_remains(file.parent)
-        project = FlowProject(file, None if options.out is None else Path(options.out), Console())
+        project = FlowProject(file, out, Console())
         inside = file.parent if options.is_remote else None
-        page = Page(guarded, project, PageOptions(options.budget, inside, start_page=options.start_page))
+        page_options = PageOptions(options.budget, inside, start_page=options.start_page)
+        page = Page(guarded, project, page_options, opening=opening)
         loading.remove()
         stop.wait()
         page.close()

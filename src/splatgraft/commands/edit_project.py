@@ -12,7 +12,7 @@ from splatgraft.commands.steps.capture import Capture
 from splatgraft.commands.steps.compose import Compose
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.segment import Segment
-from splatgraft.editor.session.project_access import Commands, ExportPage, ProjectFiles, Triple
+from splatgraft.editor.session.project_access import Commands, ExportPage, ProjectFiles, RenderedViews
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.exports.export import Layer
 from splatgraft.folders.input_description import describe_input
@@ -76,6 +76,7 @@ class FlowProject:
             result=layout.result / SCENE_FILE,
             report=layout.report,
             without_photos=(_has_no_photos(flow, "source"), _has_no_photos(flow, "target")),
+            rendered_views=(_rendered_views(flow, "source"), _rendered_views(flow, "target")),
             light_mode=relight.light,
             relight_options=relight.options,
             place_options=compose.options,
@@ -110,9 +111,10 @@ class FlowProject:
         with atomic_write(self.file) as stream:
             stream.write(text.encode())
 
-    def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
+    def set_view(self, side: Side, views: RenderedViews) -> None:
         """Set how images of a scene without photographs are rendered."""
-        text = with_keys(self.file.read_text(encoding="utf-8"), side, {"up": up, "look": look})
+        keys = {"up": views.up, "look": "within" if views.is_within else None}
+        text = with_keys(self.file.read_text(encoding="utf-8"), side, keys)
         with atomic_write(self.file) as stream:
             stream.write(text.encode())
 
@@ -145,3 +147,8 @@ class FlowProject:
 def _has_no_photos(flow: Flow, side: Side) -> bool:
     step = flow.steps[f"{side}/capture"]
     return isinstance(step, Capture) and is_scene(step.capture)
+
+
+def _rendered_views(flow: Flow, side: Side) -> RenderedViews:
+    step = flow.steps[f"{side}/capture"]
+    return RenderedViews(step.look.up, step.look.look == "within") if isinstance(step, Capture) else RenderedViews()

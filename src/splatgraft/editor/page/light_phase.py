@@ -82,7 +82,9 @@ class LightPhase:
         weights = session.state.weights
         for key, slider in self._sliders.items():
             slider.value = float(getattr(weights, key))
-        light = self._light()
+        # the arrows stand at the object
+        is_read = self._page.loading.has(session, session.scenes.base_files(session.objects()))
+        light = self._light() if is_read else None
         is_known = light is not None and bool(session.objects())
         self._estimate_button.visible = session.files.transfers_light and not is_known and bool(session.objects())
         self._reset.disabled = session.state.light is None
@@ -108,6 +110,8 @@ class LightPhase:
 
     def _missing_reason(self) -> str:
         session = self._page.require_session()
+        if not self._page.loading.has(session, session.scenes.base_files(session.objects())):
+            return "The object is being read."
         if not session.files.transfers_light:
             return f"The physical light transfer is off: {session.relighting.light_mode_note()}."
         if not session.objects():

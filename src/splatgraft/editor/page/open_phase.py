@@ -11,8 +11,9 @@ import viser
 
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.editor.access.uploads import SCENES, SUFFIXES
+from splatgraft.editor.page.place_phase import hide_target, show_target
 from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
-from splatgraft.editor.session.project_access import Triple
+from splatgraft.editor.session.project_access import RenderedViews, Triple
 from splatgraft.editor.session.session import Session, backup_of
 from splatgraft.project.layout import Side
 
@@ -34,7 +35,7 @@ _UPS: dict[str, Triple | None] = {
     "+x": (1.0, 0.0, 0.0),
     "-x": (-1.0, 0.0, 0.0),
 }
-_LOOKS: dict[str, str | None] = {"from around": None, "from within": "within"}
+_LOOKS: dict[str, bool] = {"from around": False, "from within": True}
 
 
 class OpenPhase:
@@ -72,6 +73,7 @@ class OpenPhase:
         self._facts = gui.add_html("")
         self._looks = {side: gui.add_dropdown(f"Cameras: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}
         self._ups = {side: gui.add_dropdown(f"Up: {side}", tuple(_UPS), visible=False) for side, _ in _SIDES}
+        self._other_ups: dict[Side, dict[str, Triple | None]] = {side: {} for side, _ in _SIDES}
         self._back = gui.add_button("Back: choose other captures", icon=viser.Icon.ARROW_LEFT, color="gray")
         self._confirm = gui.add_button("Yes, set this project aside", color="red", visible=False)
         self._again = gui.add_button(
@@ -93,11 +95,11 @@ class OpenPhase:
         """Show the target, where it is reconstructed."""
         session = self._page.session
         if session is not None and session.files.target_scene.is_file():
-            self._page.view.show_splats("/target/scene", session.scenes.gaussians(session.files.target_scene))
+            show_target(self._page)
 
     def leave(self) -> None:
         """Hide the target."""
-        self._page.view.hide_splats("/target/scene")
+        hide_target(self._page)
 
     def refresh(self) -> None:
         """Show the fields of a new project, or the facts of the open one."""
@@ -122,6 +124,8 @@ class OpenPhase:
         for index, (side, _) in enumerate(_SIDES):
             without_photos = session is not None and session.files.without_photos[index]
             self._looks[side].visible = self._ups[side].visible = without_photos
+            if session is not None:
+                self._show_views(side, session.files.rendered_views[index])
         if session is None:
             return
         lines = [self._line(session, index) for index in range(len(_SIDES))]
@@ -165,7 +169,10 @@ class OpenPhase:
         cameras = (files.source_cameras, files.target_cameras)[index]
         if not scene.is_file():
             return f"<b>{name}</b>: not reconstructed yet"
-        text = f"<b>{name}</b>: {session.scenes.gaussians(scene).count:,} Gaussians"
+        count = session.scenes.count(scene)
+        if count is None and not self._page.loading.has(session, [scene]):
+            return f"<b>{name}</b>: being read"
+        text = f"<b>{name}</b>: {count or session.scenes.gaussians(scene).count:,} Gaussians"
         if files.without_photos[index] and cameras.is_file():
             made = session.scenes.cameras(cameras)
             up = ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in estimate_up(made).tolist())
@@ -175,9 +182,18 @@ class OpenPhase:
     def _title(self, session: Session) -> str:
         return "Import both scenes" if all(session.files.without_photos) else "Reconstruct both scenes"
 
+    def _show_views(self, side: Side, views: RenderedViews) -> None:
+        """Show what project.toml says; an up direction along no axis is an option of its own."""
+        self._other_ups[side] = {} if views.up in _UPS.values() else {_name_of(views.up): views.up}
+        ups = _UPS | self._other_ups[side]
+        if tuple(self._ups[side].options) != tuple(ups):
+            self._ups[side].options = tuple(ups)
+        self._ups[side].value = next(name for name, up in ups.items() if up == views.up)
+        self._looks[side].value = next(name for name, is_within in _LOOKS.items() if is_within == views.is_within)
+
     def _set_view(self, side: Side, _: viser.GuiEvent) -> None:
-        session = self._page.require_session()
-        session.set_view(side, up=_UPS[self._ups[side].value], look=_LOOKS[self._looks[side].value])
+        session, ups = self._page.require_session(), _UPS | self._other_ups[side]
+        session.set_view(side, RenderedViews(ups[self._ups[side].value], _LOOKS[self._looks[side].value]))
         self._page.run("reconstruct", "Render the scene again")
 
     def _create(self) -> None:
@@ -197,3 +213,7 @@ class OpenPhase:
         next((field for field in fields if not field.value), fields[-1]).value = str(path)
         self._looker.submit((self._source.value, self._target.value))
         self._page.say(f"{path.name}: stored as {path}")
+
+
+def _name_of(up: Triple | None) -> str:
+    return "as found" if up is None else f"({', '.join(f'{x:g}' for x in up)})"

@@ -14,27 +14,29 @@ import viser
 
 from splatgraft.editor.access.uploads import IncomingUpload, UploadRules
 from splatgraft.editor.jobs.exports import served_file
+from splatgraft.editor.page.history_controls import HistoryControls
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.keys import Keys
 from splatgraft.editor.page.light_phase import LightPhase
 from splatgraft.editor.page.open_phase import OpenPhase
+from splatgraft.editor.page.opening import Opening, set_theme
 from splatgraft.editor.page.place_phase import PlacePhase
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.page.run_phase import RunPhase
+from splatgraft.editor.page.scene_loading import SceneLoading
 from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.select_phase import SelectPhase
 from splatgraft.editor.page.server import GuardedServer
+from splatgraft.editor.page.style import style_sheet
 from splatgraft.editor.page.upload_receiver import UploadButton
 from splatgraft.editor.page.windows import Windows
 from splatgraft.editor.session.project_access import Project
+from splatgraft.editor.session.scene_sample import typical_distance
 from splatgraft.editor.session.session import Session, backup_of
 
 PHASES = ("Open", "Select", "Place", "Light", "Run")
 _POLL_SECONDS = 0.4
-_PANEL_WIDTH = 372
-"""Pixels; the narrowest at which three numbers are legible beside their label."""
 _CURRENT_MARK = "\u25cf "
-_HISTORY = ("Undo", "Redo")
 _TEXT_STYLE = "font-size:.85em;line-height:1.45;padding:2px 12px"
 
 
@@ -70,28 +72,33 @@ class PageOptions:
 class Page:
     """The page; all windows show the same one."""
 
-    def __init__(self, guarded: GuardedServer, project: Project, options: PageOptions) -> None:
-        """Build the page for a project that exists or is about to be created."""
+    def __init__(
+        self, guarded: GuardedServer, project: Project, options: PageOptions, *, opening: Opening | None = None
+    ) -> None:
+        """Build the page for a project that exists or is about to be created; `opening` is what windows show by now."""
         self.guarded, self.project, self.options = guarded, project, options
         self.server = guarded.viser
         self.session: Session | None = None
         self.problem: str | None = None
         """Why project.toml could not be opened; None where it could, or where there is none."""
         self._seen_project: tuple[int, int] | None = None
+        if opening is None:
+            set_theme(self.server)
         self._try_session()
-        self.view = SceneView(self.server, budget=options.budget)
+        self.view = SceneView(self.server, budget=options.budget, coarse=None if opening is None else opening.scene)
+        self.loading = SceneLoading(self.scenes_read)
         self.phase = "Open"
         self._lock = threading.RLock()
         self._open = True
         self.on_close: list[Callable[[], None]] = []
         self.windows = Windows(self)
         self._build()
-        self.windows.connect()
+        self.windows.connect(frozenset() if opening is None else opening.close())
         guarded.uploads.on_refused = lambda reason: self.say(reason, bad=True)
         guarded.uploads.on_progress = self._show_upload
         guarded.files = lambda name: None if self.session is None else served_file(self.session.files, name)
         self.show_phase(self._first_phase())
-        self._say_notice()
+        self.say_notice()
         threading.Thread(target=self._poll_loop, daemon=True).start()
 
     # for the phases
@@ -145,6 +152,13 @@ class Page:
             f'<div class="sg-status" style="{_TEXT_STYLE};color:{color}">{html.escape(sentence)}</div>'
         )
 
+    def say_notice(self) -> None:
+        """Show what was found on opening, in the status line; nothing where all is well."""
+        if self.session is not None and self.session.notice is not None:
+            self.say(self.session.notice, bad=True)
+        elif self.problem is not None:
+            self.say(self.problem, bad=True)
+
     def refresh(self) -> None:
         """Update the current phase, the preview, the header and the undo buttons."""
         with self._lock:
@@ -152,14 +166,14 @@ class Page:
                 self._phases[self.phase].refresh()
                 self.preview.update()
             self._header.content = self._header_html()
-            self._history_buttons.visible = self.session is not None and self.session.has_steps()
+            self._history.refresh()
 
     def open_project(self) -> None:
         """Open the project that was just created or corrected."""
         self._try_session()
         self.preview.reset()
         self.show_phase(self._first_phase())
-        self._say_notice()
+        self.say_notice()
 
     def show_phase(self, phase: str) -> None:
         """Switch to another phase."""
@@ -176,6 +190,7 @@ class Page:
                 self.windows.restore_view(self._shown_scene())
             self._status.content = ""
             with self.reported():
+                self.view.keep_coarse(self._shown_file())
                 self._phases[phase].enter()
             self.refresh()
 
@@ -208,6 +223,12 @@ class Page:
         self._phases[self.phase].enter()
         self.refresh()
 
+    def scenes_read(self) -> None:
+        """Show scenes that have been read in the background."""
+        with self._lock, self.reported():
+            if self._open and self.session is not None:
+                self.redraw()
+
     def add_upload_button(self, label: str, suffixes: tuple[str, ...], on_file: Callable[[Path], None]) -> None:
         """A button for uploads of files with these suffixes; `on_file` gets the path of a stored one."""
 
@@ -234,8 +255,7 @@ class Page:
         path = None if files is None else (files.source_cameras if self.phase == "Select" else files.target_cameras)
         if session is None or path is None or not path.is_file():
             return 1.0
-        centers = session.scenes.cameras(path).centers
-        return max(1e-6, float((centers - centers.mean(0)).norm(dim=1).median()))
+        return typical_distance(session.scenes.cameras(path).centers.numpy())
 
     def close(self) -> None:
         """End all threads."""
@@ -287,16 +307,12 @@ class Page:
 
     def _build(self) -> None:
         gui = self.gui
-        gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(224, 122, 46))
-        gui.set_panel_label("splatgraft")
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(_PANEL_WIDTH)
-        self.server.scene.world_axes.visible = False
         self._header = gui.add_html("")
         self._phase_buttons = gui.add_button_group("Step", PHASES)
         self._phase_buttons.on_click(
             self.callback(lambda event: self.show_phase(event.target.value.removeprefix(_CURRENT_MARK)))
         )
+        gui.add_html(style_sheet(self._phase_buttons._impl.uuid))
         self.job = JobPanel(self)
         self._folders: dict[str, Any] = {}
         self._phases: dict[str, Phase] = {}
@@ -314,28 +330,9 @@ class Page:
         self._status = gui.add_html("")
         self._cancel_upload = gui.add_button("Cancel the upload", icon=viser.Icon.X, color="red", visible=False)
         self._cancel_upload.on_click(self.callback(lambda _: self.guarded.uploads.cancel()))
-        self._history_buttons = gui.add_button_group("History", _HISTORY)
-        self._history_buttons.on_click(
-            self.callback(lambda e: self._undo() if e.target.value == _HISTORY[0] else self._redo())
-        )
+        self._history = HistoryControls(self)
         self._keys = Keys(self, PHASES)
-        undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
-        redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
-        undo.on_trigger(self.callback(lambda _: self._undo()))
-        redo.on_trigger(self.callback(lambda _: self._redo()))
         self.preview = PreviewPanel(self)
-
-    def _undo(self) -> None:
-        session = self.require_session()
-        session.notice = None
-        self.say("undone" if session.undo() else "nothing to undo")
-        self._say_notice()
-
-    def _redo(self) -> None:
-        session = self.require_session()
-        session.notice = None
-        self.say("redone" if session.redo() else "nothing to redo")
-        self._say_notice()
 
     def _first_phase(self) -> str:
         if self.session is None:
@@ -348,11 +345,10 @@ class Page:
     def _shown_scene(self) -> str:
         return "source" if self.phase == "Select" else "target"
 
-    def _say_notice(self) -> None:
-        if self.session is not None and self.session.notice is not None:
-            self.say(self.session.notice, bad=True)
-        elif self.problem is not None:
-            self.say(self.problem, bad=True)
+    def _shown_file(self) -> Path | None:
+        if self.session is None:
+            return None
+        return self.session.files.source_scene if self.phase == "Select" else self.session.files.target_scene
 
     def _header_html(self) -> str:
         where = "no project yet" if self.session is None else str(self.session.files.file.parent.name)

@@ -16,6 +16,7 @@ from splatgraft.editor.page.box_handles import BoxHandles
 from splatgraft.editor.page.object_gizmo import SNAP_DEGREES, ObjectGizmo
 from splatgraft.editor.page.size_controls import SizeControls
 from splatgraft.editor.session import placement_operations
+from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.gizmo import (
     Gizmo,
     degrees_from_quaternion,
@@ -102,8 +103,11 @@ class PlacePhase:
         elif not session.objects() and not session.files.object.is_file():
             problem = "There is no object yet: cut one out in Select, or add one from a file."
         objects = session.objects() if session.files.target_scene.is_file() else ()
-        self._note.visible, self._note.content = problem is not None, f'<div style="padding:2px 12px">{problem}</div>'
         self._suggest.visible = not objects and problem is None
+        if session.files.target_scene.is_file() and not show_target(self._page):
+            problem = problem or session.scenes.reading_note(session.files.target_scene)
+        self._note.visible, self._note.content = problem is not None, f'<div style="padding:2px 12px">{problem}</div>'
+        is_usable = bool(objects) and self._page.loading.has(session, session.scenes.base_files(objects))
         for control in (
             self._object_choice,
             self._position,
@@ -113,11 +117,9 @@ class PlacePhase:
             self._snap,
             self._object_buttons,
         ):
-            control.visible = bool(objects)
-        if session.files.target_scene.is_file():
-            show_target(self._page)
+            control.visible = is_usable
         self._chosen = max(0, min(self._chosen, len(objects) - 1))
-        if objects:
+        if is_usable:
             names = tuple(f"{i + 1}: {session.scenes.object_path(item).name}" for i, item in enumerate(objects))
             if tuple(self._object_choice.options) != names:
                 self._object_choice.options = names
@@ -327,10 +329,33 @@ class PlacePhase:
         return replace(placed, translation=placed.translation + rise * up) if abs(rise) < near else placed
 
 
-def show_target(page: Page) -> None:
-    """Show the target and the placed objects in the 3D view."""
+def show_target(page: Page) -> bool:
+    """Show the target and the placed objects in the 3D view, or a sample of a target that is being read.
+
+    Returns:
+        Whether all of them are shown.
+    """
     session = page.require_session()
-    state, view = session.placed_state(), page.view
+    state, view, path = session.placed_state(), page.view, session.files.target_scene
+    objects = state.objects or ()
+    if page.loading.has(session, [path]):
+        _show_kept(page, session, state)
+        view.remove_coarse()
+    elif not view.is_shown("/target/scene"):
+        sample = session.scenes.sample(path)
+        flags = None if state.erased is None else state.erased.numpy()
+        view.show_coarse(path, sample if flags is None or sample is None else sample.without(flags))
+    for index, item in enumerate(objects):
+        if page.loading.has(session, [session.scenes.object_path(item)]):
+            gaussians = session.scenes.gaussians(session.scenes.object_path(item))
+            view.show_splats(f"/target/objects/{index}", gaussians, transform=item.target_from_object)
+    for name in [n for n in view.shown if n.startswith("/target/objects/") and int(n.split("/")[-1]) >= len(objects)]:
+        view.remove_splats(name)
+    return page.loading.has(session, session.placed_scenes())
+
+
+def _show_kept(page: Page, session: Session, state: EditState) -> None:
+    """The target without its erased Gaussians."""
     target = session.scenes.gaussians(session.files.target_scene)
     if state.erased is not None and len(state.erased) != target.count:
         raise ValueError(
@@ -338,13 +363,7 @@ def show_target(page: Page) -> None:
             "restore all erased, or undo"
         )
     shown = None if state.erased is None else session.scenes.complement("erased", state.erased)
-    view.show_splats("/target/scene", target, which=shown)
-    objects = state.objects or ()
-    for index, item in enumerate(objects):
-        gaussians = session.scenes.gaussians(session.scenes.object_path(item))
-        view.show_splats(f"/target/objects/{index}", gaussians, transform=item.target_from_object)
-    for name in [n for n in view.shown if n.startswith("/target/objects/") and int(n.split("/")[-1]) >= len(objects)]:
-        view.remove_splats(name)
+    page.view.show_splats("/target/scene", target, which=shown)
 
 
 def hide_target(page: Page) -> None:

@@ -6,7 +6,7 @@ import html
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
 from splatgraft.editor.page.canvas import Canvas
+from splatgraft.editor.page.picture_request import SOURCE_KINDS, PictureRequest, pose_of
 from splatgraft.editor.page.saved_preview import save_preview
 from splatgraft.editor.page.scene_view import camera_from_viser
 from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
 
 
-_SOURCE_KINDS: tuple[PictureKind, PictureKind] = ("Source", "Object alone")
 _DRAFT_LIMIT = 1.5
 """Seconds; where drafts of the light take longer, images without the light transfer are shown first."""
 _REST_SECONDS = 0.1
@@ -54,27 +54,6 @@ _DEPTH_SHARE = 0.5
 """Resolution of the depth behind the gizmos over that of the picture."""
 _MIN_ASPECT = 1.2
 """Minimum width over height of the picture in the panel."""
-
-
-@dataclass(frozen=True)
-class _PictureRequest:
-    """What the worker is to draw."""
-
-    session: Session
-    state: EditState
-    camera: Cameras
-    left: PictureKind
-    right: PictureKind
-    split: float
-    window: viser.ClientHandle | None
-    """The window whose canvas shows the picture; None: the panel shows it."""
-    is_dragging: bool = False
-    """Whether something is being dragged; then a draft suffices."""
-    is_moved: bool = False
-    """Whether the camera has moved; the picture is drawn when it rests."""
-    draft: bool = False
-    budget: int | None = None
-    """Maximum number of Gaussians; None: all."""
 
 
 class PreviewPanel:
@@ -171,7 +150,7 @@ class PreviewPanel:
         self._panel.visible = request is not None
         self._image.visible = request is not None and request.window is None
         self._is_on_canvas = request is not None and request.window is not None
-        if request is None or request.window is None or (is_moved and _pose(request.camera) != self._shown_pose):
+        if request is None or request.window is None or (is_moved and pose_of(request.camera) != self._shown_pose):
             self.canvas.clear()
         if request is not None:
             self._worker.submit(replace(request, is_moved=is_moved))
@@ -188,7 +167,7 @@ class PreviewPanel:
         pixels = request.session.preview.picture(request.right, request.state, request.camera)
         write_image(path, torch.from_numpy(pixels.astype(np.float32) / 255))
 
-    def _request(self, *, width: int | None = None) -> _PictureRequest | None:
+    def _request(self, *, width: int | None = None) -> PictureRequest | None:
         session, window = self._page.session, self._page.windows.editing()
         if session is None or not self._scene(session).is_file():
             return None
@@ -205,8 +184,8 @@ class PreviewPanel:
         else:
             camera = cameras[int(self._camera_slider.value)]
             camera = camera.resized((width or self._size.width) / camera.width)
-        left, right = _SOURCE_KINDS if self._page.phase == "Select" else (self._left.value, self._right.value)
-        return _PictureRequest(
+        left, right = SOURCE_KINDS if self._page.phase == "Select" else (self._left.value, self._right.value)
+        return PictureRequest(
             session=session,
             state=self._dragged_state or session.placed_state(),
             camera=camera,
@@ -253,17 +232,22 @@ class PreviewPanel:
             self._camera_slider.value = (int(self._camera_slider.value) + by) % len(cameras)
             self._to_camera()
 
-    def _work(self, request: _PictureRequest) -> None:
+    def _work(self, request: PictureRequest) -> None:
         if request.is_moved and not self._worker.wait_idle(_REST_SECONDS):
             return
         relighting, state = request.session.relighting, request.state
+        if not self._page.loading.has(request.session, request.scenes()):
+            # drawn again when the scenes are there
+            self._draw_once(
+                replace(request.without_light(), is_sample=True), note="the scene is being read", stage="coarse"
+            )
+            return
         if not {request.left, request.right} & set(NEEDS_LIGHT) or relighting.is_relit(state):
             self._draw(request, note=self._light_note)
             return
         if self._draft_seconds > _DRAFT_LIMIT and not relighting.has_draft(state):
             # first the images that need no light transfer
-            fast = replace(request, **{side: _without_light(getattr(request, side)) for side in ("left", "right")})
-            self._draw(fast, note="light: computing ...", stage="copy-paste")
+            self._draw(request.without_light(), note="light: computing ...", stage="copy-paste")
             if self._worker.superseded:
                 return
         start = time.monotonic()
@@ -274,7 +258,7 @@ class PreviewPanel:
         if not request.is_dragging:
             self._light_worker.submit(request)
 
-    def _compute_light(self, request: _PictureRequest) -> None:
+    def _compute_light(self, request: PictureRequest) -> None:
         """The light as the step computes it, when nothing has changed for a moment."""
         relighting = request.session.relighting
         if relighting.is_relit(request.state) or not self._light_worker.wait_idle(
@@ -287,8 +271,10 @@ class PreviewPanel:
         self._light_note = f"light in {self._relight_seconds:.1f} s"
         self._page.light_ready()
         self.update()
+        if self._light_worker.wait_idle(_REST_SECONDS):
+            relighting.prepare_drafts(request.state)
 
-    def _draw(self, request: _PictureRequest, *, note: str, stage: str = "") -> None:
+    def _draw(self, request: PictureRequest, *, note: str, stage: str = "") -> None:
         stage = stage or ("draft" if request.draft else "final")
         if request.window is not None and self._picture_seconds > _COARSE_ABOVE:
             camera = request.camera.resized(_COARSE_SHARE)
@@ -297,7 +283,7 @@ class PreviewPanel:
                 return
         self._draw_once(request, note=note, stage=stage)
 
-    def _draw_once(self, request: _PictureRequest, *, note: str, stage: str) -> None:
+    def _draw_once(self, request: PictureRequest, *, note: str, stage: str) -> None:
         start = time.monotonic()
         problems: list[str] = []
         left, right = self._both(request, problems)
@@ -308,7 +294,7 @@ class PreviewPanel:
         if request.window is not None:
             depth = right.depth if request.split < 0.5 else left.depth
             self.canvas.show(request.window, with_badge(pixels, stage), _depth_behind(depth))
-            self._shown_pose = _pose(request.camera)
+            self._shown_pose = pose_of(request.camera)
             self._picture_seconds = seconds if stage != "coarse" else self._picture_seconds
             if stage == "final":
                 save_preview(request.session.files.root, right.pixels)
@@ -330,7 +316,7 @@ class PreviewPanel:
             )
         )
 
-    def _both(self, request: _PictureRequest, problems: list[str]) -> tuple[Picture, Picture]:
+    def _both(self, request: PictureRequest, problems: list[str]) -> tuple[Picture, Picture]:
         """Both pictures; one alone is drawn where the other one is not seen."""
         if request.split <= 0 or request.left == request.right:
             right = self._picture(request.right, request, problems)
@@ -338,23 +324,28 @@ class PreviewPanel:
         left = self._picture(request.left, request, problems)
         return (left, left) if request.split >= 1 else (left, self._picture(request.right, request, problems))
 
-    def _picture(self, kind: PictureKind, request: _PictureRequest, problems: list[str]) -> Picture:
+    def _picture(self, kind: PictureKind, request: PictureRequest, problems: list[str]) -> Picture:
         camera = request.camera
         state, result = request.state, request.session.files.result
         stamp = result.stat().st_mtime_ns if result.is_file() else 0
-        selection = request.session.selection() if self._page.phase == "Select" else None
+        is_selected = self._page.phase == "Select" and not request.is_sample
+        selection = request.session.selection() if is_selected else None
         edits = (state.objects, state.erased, state.light, state.weights, selection)
         relit = request.draft and request.session.relighting.is_relit(state)
-        key = (_pose(camera), request.draft, relit, request.budget or 0, stamp, *edits)
+        drawn = (request.draft, relit, request.budget or 0, request.is_sample)
+        key = (pose_of(camera), *drawn, stamp, *edits)
         try:
             return self._pictures.get(kind, key, lambda: self._rendered(kind, request, selection))
         except ValueError as error:
             problems.append(str(error))
             return Picture(np.full((camera.height, camera.width, 3), 48, np.uint8))
 
-    def _rendered(self, kind: PictureKind, request: _PictureRequest, selection: Tensor | None) -> Picture:
+    def _rendered(self, kind: PictureKind, request: PictureRequest, selection: Tensor | None) -> Picture:
         preview = request.session.preview
-        if kind in _SOURCE_KINDS:
+        if request.is_sample:
+            scene = request.session.scenes.files.source_scene if kind in SOURCE_KINDS else None
+            return preview.sampled_view(request.state, request.camera, source=scene)
+        if kind in SOURCE_KINDS:
             return Picture(preview.source_picture(selection if kind == "Object alone" else None, request.camera))
         return preview.view(kind, request.state, request.camera, draft=request.draft, budget=request.budget)
 
@@ -366,15 +357,6 @@ class PreviewPanel:
         self._caption.content = (
             f'<div class="sg-caption" style="font-size:.78em;opacity:.75;padding:0 12px">{text}</div>'
         )
-
-
-def _without_light(kind: PictureKind) -> PictureKind:
-    return "Copy-paste" if kind in NEEDS_LIGHT else kind
-
-
-def _pose(camera: Cameras) -> bytes:
-    """Pose, intrinsics and size, which identify a view."""
-    return b"".join(part.numpy().tobytes() for part in (camera.world_from_camera, camera.intrinsics, camera.sizes))
 
 
 def _depth_behind(depth: np.ndarray | None) -> np.ndarray | None:

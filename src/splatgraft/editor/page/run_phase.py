@@ -90,7 +90,7 @@ class RunPhase:
         link = f'<a href="{FILES_PREFIX}{REPORT_FILE}" target="_blank">Open the report</a>' if has_report else ""
         mark = " (out of date)" if why_report else ""
         self._share.refresh()
-        self._link.content = f'<div style="padding:2px 12px">{link}{mark}</div>'
+        self._link.content = f'<div style="font-size:.8em;line-height:1.5;padding:2px 12px">{link}{mark}</div>'
 
     def _set_method(self) -> None:
         session = self._page.require_session()

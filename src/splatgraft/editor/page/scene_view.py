@@ -1,6 +1,7 @@
 """The 3D view: Gaussian splats, boxes and cameras as viser scene nodes."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,8 +14,10 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import C0
+from splatgraft.editor.page.opening import COARSE_NODE, add_coarse
 from splatgraft.editor.previews.level_of_detail import largest_coverage_indices
 from splatgraft.editor.session.gizmo import gizmo_from_similarity
+from splatgraft.editor.session.scene_sample import SceneSample
 from splatgraft.segmentation import Box
 
 Color = tuple[float, float, float]
@@ -35,14 +38,39 @@ class ShownCount:
 class SceneView:
     """Scene nodes by name; unchanged splats are not sent again."""
 
-    def __init__(self, server: viser.ViserServer, *, budget: int) -> None:
-        """Show nothing yet; `budget` is the maximum number of Gaussians per node."""
-        self._scene = server.scene
+    def __init__(self, server: viser.ViserServer, *, budget: int, coarse: Path | None = None) -> None:
+        """Show nothing more yet.
+
+        Args:
+            server: The server of the windows.
+            budget: Maximum number of Gaussians per node.
+            coarse: The scene of which a sample is shown already.
+        """
+        self._server, self._scene = server, server.scene
         self._budget = budget
         self._splats: dict[str, tuple[tuple[object, ...], viser.GaussianSplatHandle | None, ShownCount]] = {}
         self._references: dict[str, object] = {}
         self._units: dict[str, float] = {}
         self.shown: dict[str, ShownCount] = {}
+        self._coarse = coarse
+
+    def show_coarse(self, scene: Path, sample: SceneSample | None) -> None:
+        """Show a sample of a scene until `remove_coarse`; None shows what was shown before."""
+        if scene == self._coarse or sample is None or not len(sample.means):
+            return
+        add_coarse(self._server, sample)
+        self._coarse = scene
+
+    def keep_coarse(self, scene: Path | None) -> None:
+        """Remove the sample unless it is of this scene."""
+        if scene != self._coarse:
+            self.remove_coarse()
+
+    def remove_coarse(self) -> None:
+        """Remove the sample; nothing where there is none."""
+        if self._coarse is not None:
+            self.remove(COARSE_NODE)
+            self._coarse = None
 
     def show_splats(
         self,
@@ -84,7 +112,13 @@ class SceneView:
 
     def visible_splats(self) -> tuple[str, ...]:
         """Names of the nodes of splats that are shown."""
-        return tuple(name for name, (_, handle, _) in self._splats.items() if handle is not None and handle.visible)
+        names = [name for name, (_, handle, _) in self._splats.items() if handle is not None and handle.visible]
+        return (*names, *(() if self._coarse is None else (COARSE_NODE,)))
+
+    def is_shown(self, name: str) -> bool:
+        """Whether a node of splats is shown."""
+        _, handle, _ = self._splats.get(name, (None, None, None))
+        return handle is not None and bool(handle.visible)
 
     def remove_splats(self, name: str) -> None:
         """Remove one node of splats."""

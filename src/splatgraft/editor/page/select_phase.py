@@ -14,6 +14,7 @@ from splatgraft.editor.page.photo_clicks import PhotoClicks
 from splatgraft.editor.page.scene_view import TINT, Color, camera_from_viser
 from splatgraft.editor.session.edit_state import BoxNumbers
 from splatgraft.editor.session.picking import Rectangle, in_rectangle
+from splatgraft.editor.session.session import Session
 from splatgraft.formats import read_capture
 from splatgraft.segmentation import Box, Keep, default_box
 
@@ -74,7 +75,9 @@ class SelectPhase:
         if not self._is_active:
             self._page.server.scene.on_rect_select(modifier="shift")(self._rectangle_drawn)
         self._is_active = True
-        self._draw()
+        session = self._page.session
+        if session is None or self._is_read(session):
+            self._draw()
 
     def leave(self) -> None:
         """Hide the source."""
@@ -91,6 +94,8 @@ class SelectPhase:
         """Update selection, counts and box."""
         session = self._page.session
         if session is None or not self._is_active:
+            return
+        if session.files.source_scene.is_file() and not self._is_read(session):
             return
         state = session.state
         name = next((n for n, value in _SOURCES.items() if value == (state.mask_source or "auto")), None)
@@ -141,6 +146,15 @@ class SelectPhase:
         self._page.gui.add_command("Brush on or off", hotkey="B").on_trigger(callback(lambda _: self._toggle_brush()))
         self._clear.on_click(callback(lambda _: self._set(corrections=None)))
 
+    def _is_read(self, session: Session) -> bool:
+        """Whether the source is at hand; otherwise a sample of it is shown until it is."""
+        path, scenes = session.files.source_scene, session.scenes
+        if self._page.loading.has(session, [path]):
+            return True
+        self._page.view.show_coarse(path, scenes.sample(path))
+        self._count.content = _line(scenes.reading_note(path))
+        return False
+
     def _draw(self) -> None:
         session = self._page.session
         if session is None or not session.files.source_scene.is_file():
@@ -155,6 +169,7 @@ class SelectPhase:
             self._page.view.hide_splats("/source/rest")
         else:
             self._page.view.show_splats("/source/rest", scene, which=session.scenes.complement("selected", selection))
+        self._page.view.remove_coarse()
         kind = "the object" if session.scenes.segmented() is not None else "inside the box"
         shown = [s for n, s in self._page.view.shown.items() if n.startswith("/source") and s.count < s.total]
         limited = f"<br>{sum(s.count for s in shown):,} are shown; the files contain all" if shown else ""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import viser
 
 from splatgraft.core.cameras import Cameras
+from splatgraft.editor.page.opening import look_through
+from splatgraft.editor.session.scene_sample import View
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
@@ -26,14 +27,20 @@ class Windows:
 
     def __init__(self, page: Page) -> None:
         """Start without windows; `connect` makes them known."""
+        self._keep_view: frozenset[int] = frozenset()
         self._page, self._guarded, self._server = page, page.guarded, page.server
         self._notices: dict[int, Sequence[Callable[[], None]]] = {}
         self._views: dict[str, tuple[Any, ...]] = {}
         self.on_moved: list[Callable[[int], None]] = []
         """Called with the number of a window whose view or shape has changed."""
 
-    def connect(self) -> None:
-        """Handle windows that open and close from now on; the page must be built."""
+    def connect(self, moved: frozenset[int]) -> None:
+        """Handle windows that are open, open and close from now on; the page must be built.
+
+        Args:
+            moved: Numbers of the windows that keep their view, as their user has moved it.
+        """
+        self._keep_view = moved
         self._guarded.on_edit_lock_changed = self._holder_changed
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
@@ -49,16 +56,14 @@ class Windows:
         if window is None:
             return
         pose = camera.world_from_camera[0].double().numpy()
-        # the whole photograph is in view, however narrow the window
-        aspect = camera.width / camera.height
-        half = camera.height / (2 * float(camera.intrinsics[0, 1, 1]))
-        if window.camera.aspect > 0:
-            half *= max(1.0, aspect / window.camera.aspect)
-        with window.atomic():
-            window.camera.up_direction = -pose[:3, 1]
-            window.camera.position = pose[:3, 3]
-            window.camera.look_at = pose[:3, 3] + pose[:3, 2] * self._page.scene_scale()
-            window.camera.fov = 2 * math.atan(half)
+        view = View(
+            position=pose[:3, 3],
+            look_at=pose[:3, 3] + pose[:3, 2] * self._page.scene_scale(),
+            up=-pose[:3, 1],
+            half_height=camera.height / (2 * float(camera.intrinsics[0, 1, 1])),
+            aspect=camera.width / camera.height,
+        )
+        look_through(window, view)
 
     def save_view(self, scene: str) -> None:
         """Store the editing window's view of `scene`."""
@@ -81,7 +86,8 @@ class Windows:
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self._moved(client.client_id))
-        self._set_first_view(client)
+        if client.client_id not in self._keep_view:
+            self._set_first_view(client)
         self._update_notices()
         self._page.preview.update()
 

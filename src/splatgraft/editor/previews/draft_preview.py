@@ -72,7 +72,8 @@ def upsample_light(relit: Relit, composite: Composite, parts: Sequence[CoarseGau
         shade=relit.shade[row],
         shadow=relit.shadow[row],
         bounce=relit.bounce[row],
-        slope=torch.zeros_like(relit.slope[row]),  # valid over the width of a coarse Gaussian only
+        # valid over the width of a coarse Gaussian only
+        slope=relit.slope.new_zeros(len(row), *relit.slope.shape[1:]),
         gloss=relit.gloss[row],
         bands_replaced=relit.bands_replaced[row],
         objects=tuple(placed.in_target() for placed in composite.objects),

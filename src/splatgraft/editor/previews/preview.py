@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -127,10 +128,7 @@ class Preview:
                 scene = self._memo.get(
                     f"coarse {kind}", (scene, budget), lambda: scene.select(largest_coverage_indices(scene, budget))
                 )
-            found = render(scene, camera, outputs=frozenset({"color", "depth"}))
-            # where little is drawn, depth is that of haze
-            depth = torch.where(found.alpha[0] > 0.5, found.depth[0], torch.inf)
-            return Picture(_bytes(found.color[0]), depth.numpy())
+            return _drawn(scene, camera)
 
     def _layer(
         self, kind: PictureKind, state: EditState, camera: Cameras, *, draft: bool
@@ -146,6 +144,23 @@ class Preview:
         scene = self._scenes.gaussians(self._scenes.files.source_scene)
         color = render(scene if which is None else scene.select(which), camera).color
         return _bytes(color[0])
+
+    def sampled_view(self, state: EditState, camera: Cameras, *, source: Path | None) -> Picture:
+        """Render a sample of a scene, before the whole scene has been read.
+
+        Args:
+            state: The edits.
+            camera: One camera.
+            source: File of the source, where it is drawn; None: the target with its objects.
+
+        Raises:
+            ValueError: If a file is missing or invalid.
+        """
+        if source is None:
+            scene = self._scenes.sampled_composite(state).bake()[0]
+        else:
+            scene = self._scenes.sampled_gaussians(source) or self._scenes.gaussians(source)
+        return _drawn(scene, camera)
 
     def _scene(self, kind: PictureKind, state: EditState, *, draft: bool) -> Gaussians:
         if kind == "Result":
@@ -225,6 +240,13 @@ def with_badge(pixels: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarra
     patch[:] = patch // 3
     cv2.putText(out, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (235, 235, 235), 1, cv2.LINE_AA)
     return out
+
+
+def _drawn(scene: Gaussians, camera: Cameras) -> Picture:
+    found = render(scene, camera, outputs=frozenset({"color", "depth"}))
+    # where little is drawn, depth is that of haze
+    depth = torch.where(found.alpha[0] > 0.5, found.depth[0], torch.inf)
+    return Picture(_bytes(found.color[0]), depth.numpy())
 
 
 def _bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -70,6 +70,19 @@ class PreviewRelighting:
         """
         return self._make_once("draft", state, self._draft)
 
+    def prepare_drafts(self, state: EditState) -> None:
+        """Compute once what drafts after a move share, which the first draft left out: what lights the source scene.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        composite, sources = self.composite(state), self._scenes.source_scenes(state)
+        if not (_is_large(composite) and self._memo.has("relit")):
+            return
+        with self._draft_lock:
+            shared = (composite.target, composite.erased, *sources)
+            self._memo.get("drafts prepared", shared, lambda: self._draft(state))
+
     def best_available(self, state: EditState) -> Relit:
         """The full transfer where it is memoised, else a draft.
 

@@ -19,6 +19,16 @@ Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
+class RenderedViews:
+    """How images of a scene without photographs are rendered."""
+
+    up: Triple | None = None
+    """Up direction in the scene's frame; None: estimated."""
+    is_within: bool = False
+    """Whether the cameras look outwards from the middle of the scene, else at it from around."""
+
+
+@dataclass(frozen=True)
 class ProjectFiles:
     """Paths and options of one project; most files need not exist yet."""
 
@@ -56,6 +66,8 @@ class ProjectFiles:
     """The folder of index.html."""
     without_photos: tuple[bool, bool]
     """Whether source and target are scenes without photographs, whose images are rendered from the scene."""
+    rendered_views: tuple[RenderedViews, RenderedViews]
+    """How the images of source and target are rendered, where they are scenes without photographs."""
     light_mode: LightMode
     """`light` of [relight]: the physical transfer, a gain of the object alone, or nothing."""
     relight_options: RelightOptions
@@ -106,14 +118,8 @@ class Project(Protocol):
         """
         ...
 
-    def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
-        """Set how images of a scene without photographs are rendered.
-
-        Args:
-            side: Source or target.
-            up: Up direction in the scene's frame; None: estimated.
-            look: `within` for cameras inside the scene; None: cameras around it.
-        """
+    def set_view(self, side: Side, views: RenderedViews) -> None:
+        """Set how images of a scene without photographs are rendered."""
         ...
 
     def run_command(self, to: str, title: str) -> Commands:

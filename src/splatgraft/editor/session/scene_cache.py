@@ -1,7 +1,7 @@
 """Cache of a project's scenes and cameras, invalidated when a file changes, and composites of the placed objects."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,14 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.placement_operations import PlaceableObject, placeable_object
 from splatgraft.editor.session.project_access import ProjectFiles
+from splatgraft.editor.session.scene_sample import SceneSample, read_sample, sample_count
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.formats.placement import ObjectPlacement, read_erased
 from splatgraft.relighting import SourceScene
 from splatgraft.runtime.memo import Memo
+
+_LARGE_BYTES = 12_000_000
+"""A file below is read within a tenth of a second."""
 
 
 class SceneCache:
@@ -32,6 +36,7 @@ class SceneCache:
         self._contents: dict[tuple[str, Path], tuple[tuple[int, int], Any]] = {}
         self._derived = Memo()
         self._lock = threading.RLock()
+        self._file_locks: dict[tuple[str, Path], threading.RLock] = {}
 
     def gaussians(self, path: Path) -> Gaussians:
         """The scene in a file.
@@ -40,6 +45,45 @@ class SceneCache:
             ValueError: If the file is missing or invalid.
         """
         return self._read("gaussians", path, read_gaussians)
+
+    def is_at_hand(self, path: Path) -> bool:
+        """Whether `gaussians` answers at once: the scene is in memory, or its file is small or missing."""
+        stamp, cached = _stamp(path), self._contents.get(("gaussians", path))
+        return stamp[1] < _LARGE_BYTES or (cached is not None and cached[0] == stamp)
+
+    def count(self, path: Path) -> int | None:
+        """Number of Gaussians in a file; None where only reading all of it would tell.
+
+        Raises:
+            ValueError: If the file is missing or invalid.
+        """
+        return self.gaussians(path).count if self.is_at_hand(path) else sample_count(path)
+
+    def reading_note(self, path: Path) -> str:
+        """What the page says while a scene is read."""
+        count = self.count(path)
+        return (
+            "The scene is being read."
+            if count is None
+            else (f"{count:,} Gaussians are being read. A sample is shown meanwhile.")
+        )
+
+    def sample(self, path: Path) -> SceneSample | None:
+        """Some of a scene's Gaussians, without reading all; None where the file's layout does not allow it."""
+        return self._read("sample", path, read_sample)
+
+    def sampled_gaussians(self, path: Path, erased: Bool[Tensor, "n"] | None = None) -> Gaussians | None:
+        """As `sample`, with constant colours, without the Gaussians whose flag in `erased` is set."""
+        whole = self.sample(path)
+        if whole is None:
+            return None
+
+        def make() -> Gaussians:
+            found = whole if erased is None else whole.without(erased.numpy())
+            parts = (found.means, found.log_scales, found.quaternions, found.opacity_logits, found.band_0[:, None])
+            return Gaussians(*(torch.from_numpy(part.copy()) for part in parts))
+
+        return self.derive(f"sampled {path}", (whole, erased), make)
 
     def cameras(self, path: Path) -> Cameras:
         """The cameras in a file.
@@ -68,6 +112,11 @@ class SceneCache:
     def object_path(self, item: ObjectPlacement) -> Path:
         """The file of a placed object."""
         return item.object_path or self.files.object
+
+    def base_files(self, objects: Sequence[ObjectPlacement]) -> tuple[Path, ...]:
+        """The scenes that `placeable_object` reads for these objects."""
+        paths = tuple(self.object_path(item) for item in objects)
+        return (*paths, self.files.surroundings) if self.files.object in paths else paths
 
     def placeable_object(self, item: ObjectPlacement) -> PlaceableObject:
         """A placed object with its base.
@@ -100,6 +149,21 @@ class SceneCache:
             erased = self.derive("none erased", (target,), lambda: torch.zeros(target.count, dtype=torch.bool))
         return compose(target, objects, target_from_objects=moves, erased=erased)
 
+    def sampled_composite(self, state: EditState) -> Composite:
+        """A sample of the target with those placed objects that are in memory or small.
+
+        Raises:
+            ValueError: If a file is missing or invalid.
+        """
+        path = self.files.target_scene
+        target = self.sampled_gaussians(path, state.erased) or self.gaussians(path)
+        items = [item for item in state.objects or () if self.is_at_hand(self.object_path(item))]
+        objects = [self.gaussians(self.object_path(item)) for item in items]
+        none_erased = torch.zeros(target.count, dtype=torch.bool)
+        return compose(
+            target, objects, target_from_objects=[item.target_from_object for item in items], erased=none_erased
+        )
+
     def complement(self, name: str, flags: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """The inverted flags; the same tensor for the same flags of that name."""
         return self.derive(f"complement {name}", (flags,), lambda: ~flags)
@@ -114,8 +178,9 @@ class SceneCache:
         return [source if flag else None for flag in own]
 
     def _read(self, kind: str, path: Path, read: Callable[[Path], Any]) -> Any:
-        with self._lock:
-            stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)
+        # one lock per file: while a large scene is read, others are still to be had
+        with self._file_locks.setdefault((kind, path), threading.RLock()):
+            stamp = _stamp(path)
             cached = self._contents.get((kind, path))
             if cached is None or cached[0] != stamp:
                 cached = (stamp, read(path))
@@ -126,3 +191,7 @@ class SceneCache:
         """The memoised result of `make`, computed again when one of `inputs` is another object."""
         with self._lock:
             return self._derived.get(name, inputs, make)
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    return (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)

@@ -19,7 +19,7 @@ from splatgraft.editor.previews.preview_relighting import PreviewRelighting
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.history import History
 from splatgraft.editor.session.placement_operations import PlaceableObject
-from splatgraft.editor.session.project_access import Commands, ExportPage, Project, ProjectFiles, Triple
+from splatgraft.editor.session.project_access import Commands, ExportPage, Project, ProjectFiles, RenderedViews
 from splatgraft.editor.session.project_backup import ProjectBackup
 from splatgraft.editor.session.scene_cache import SceneCache
 from splatgraft.editor.session.state_checks import check_state
@@ -241,7 +241,7 @@ class Session:
         paths = [path for path in state_files(self.files.file) if path.is_file()]
         return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in paths}
 
-    def set_view(self, side: Side, *, up: Triple | None, look: str | None) -> None:
+    def set_view(self, side: Side, views: RenderedViews) -> None:
         """Set how images of a scene without photographs are rendered; not an undo step.
 
         Raises:
@@ -250,7 +250,7 @@ class Session:
         with self._lock:
             if self.reload():
                 raise ValueError(f"{self.files.file.name}: changed outside the editor; please repeat your edit")
-            self.project.set_view(side, up=up, look=look)
+            self.project.set_view(side, views)
             self._stamps = self._read_stamps()
             self._backup.keep()
             self._use_files(self.project.files())
@@ -317,6 +317,10 @@ class Session:
     def placed_state(self) -> EditState:
         """The current state with the objects that `compose` placed filled in."""
         return self.state if self.state.objects is not None else replace(self.state, objects=self.objects())
+
+    def placed_scenes(self) -> tuple[Path, ...]:
+        """The files of the target and of the placed objects."""
+        return (self.files.target_scene, *(self.scenes.object_path(item) for item in self.objects()))
 
     def placeable_object(self, index: int) -> PlaceableObject:
         """A placed object with its base.

@@ -13,14 +13,14 @@ from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.formats.corrections import read_corrections, write_corrections
 from splatgraft.formats.placement import Placement, read_placement, write_placement
 from splatgraft.formats.prompts import read_prompts, write_prompts
-from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE
+from splatgraft.project.layout import ERASED_FILE, LIGHT_FILE, PLACEMENT_FILE
 from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.settings import MAX_TEXT_BYTES, read_toml
 
 _PARTS = {"objects": ("objects", "erased")}
 """Fields of the state that are read together: placement.json names erased.npy."""
-CORRECTIONS_FILE, ERASED_FILE, PROMPTS_FILE = "corrections.npy", "erased.npy", "prompts.json"
+CORRECTIONS_FILE, PROMPTS_FILE = "corrections.npy", "prompts.json"
 _FILES = {
     "objects": PLACEMENT_FILE,
     "corrections": CORRECTIONS_FILE,
