@@ -12,7 +12,7 @@ import pytest
 import torch
 from tiny_project import ball, photograph, plane
 
-ITERATIONS = 3000
+ITERATIONS = 5000
 """Lines of progress come once a second at most: with fewer steps a run could end before its first line."""
 
 
@@ -48,7 +48,7 @@ def test_stopped_at_random_times_the_scene_is_that_of_one_run(tmp_path: Path, se
     for number in (signal.SIGINT, signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGINT):
         run = start(tmp_path / "photos", out)
         at_work(run, lines)
-        time.sleep(generator.uniform(0.0, 0.5))
+        time.sleep(generator.uniform(0.0, 0.3))
         run.send_signal(number)
         rest = run.communicate()[1]
         if run.returncode == 0:
