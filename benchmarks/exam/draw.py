@@ -2,7 +2,7 @@
 
 import random
 
-from splatgraft.synthesis.benchmark import BenchmarkScene, BenchmarkSize, plan
+from splatgraft.synthesis.benchmark import BenchmarkScene, BenchmarkSize, draw_scene
 from splatgraft.synthesis.jobs import RenderSize
 from splatgraft.synthesis.pairs import KINDS
 
@@ -21,14 +21,5 @@ def draw_scenes(number: int, count: int) -> tuple[BenchmarkScene, ...]:
     """
     rng = random.Random(f"exam-{number}")
     kinds = rng.sample(KINDS, len(KINDS))
-    return tuple(_draw_scene(rng, kinds[i % len(kinds)], i) for i in range(count))
-
-
-def _draw_scene(rng: random.Random, kind: str, index: int) -> BenchmarkScene:
-    while True:
-        scene = BenchmarkScene(f"{index:02d}_{kind}", kind, rng.randrange(*_SEEDS), rng.randrange(*_SEEDS))
-        try:
-            plan(scene, SIZE)
-        except ValueError:
-            continue
-        return scene
+    order = [kinds[i % len(kinds)] for i in range(count)]
+    return tuple(draw_scene(rng, f"{i:02d}_{kind}", kind, _SEEDS, SIZE) for i, kind in enumerate(order))

@@ -22,7 +22,7 @@ from splatgraft.relighting.light.place_description import (
     cell_directions,
     cell_solid_angles,
     describe_place,
-    upright_frame,
+    upright_from_world,
 )
 from splatgraft.training.light_examples import light_example, read_examples, write_examples
 
@@ -49,7 +49,7 @@ def test_cells_cover_the_sphere():
 
 @pytest.mark.parametrize("up", [UP, torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.6, 0.0, -0.8])])
 def test_the_frame_is_a_rotation_whose_last_row_is_up(up):
-    frame = upright_frame(up)
+    frame = upright_from_world(up)
     assert torch.allclose(frame @ up, torch.tensor([0.0, 0.0, 1.0]), atol=1e-6)
     assert float(torch.linalg.det(frame)) == pytest.approx(1.0, abs=1e-5)
 
@@ -70,7 +70,7 @@ def test_a_description_is_finite_and_names_its_parts(found):
 def test_the_estimated_map_has_the_sun_where_the_estimate_has_it(found):
     place = describe_place(found)
     radiance = place.maps[MAPS.index("estimated")].exp2()
-    frame = upright_frame(found.evidence.up)
+    frame = upright_from_world(found.evidence.up)
     middle = (radiance * cell_solid_angles())[..., None] * cell_directions()
     brightest = torch.nn.functional.normalize(middle.sum((0, 1)), dim=0) @ frame
     normals = even_directions(2000)
@@ -81,7 +81,7 @@ def test_the_estimated_map_has_the_sun_where_the_estimate_has_it(found):
 def test_the_truth_lights_surfaces_as_the_panorama_does(found):
     panorama = day(sky=1.0, sun=1.0, radius_deg=1.0)
     example = light_example("scene/new", found, panorama, [{"direction": SUN.tolist(), "irradiance": [3.0, 2.0, 1.0]}])
-    frame = upright_frame(found.evidence.up)
+    frame = upright_from_world(found.evidence.up)
     normals = even_directions(100)
     cosine = (normals @ frame.T @ cell_directions().reshape(-1, 3).T).clamp_min(0)
     power = example.truth.reshape(-1, 3) * cell_solid_angles().reshape(-1, 1)

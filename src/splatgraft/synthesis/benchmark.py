@@ -183,6 +183,25 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
     return target, source
 
 
+def draw_scene(rng: random.Random, name: str, kind: str, seeds: tuple[int, int], size: BenchmarkSize) -> BenchmarkScene:
+    """Draw the seeds of a scene and its object; those whose scene has no room for the cameras are drawn again.
+
+    Args:
+        rng: Is advanced.
+        name: Of the scene.
+        kind: Of the scene.
+        seeds: First seed and the one behind the last.
+        size: Number of views.
+    """
+    while True:
+        scene = BenchmarkScene(name, kind, rng.randrange(*seeds), rng.randrange(*seeds))
+        try:
+            plan(scene, size)
+        except ValueError:
+            continue
+        return scene
+
+
 def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
     """Read the cameras of a rendered job and convert them from OpenGL to OpenCV axes."""
     found = json.loads((out / "cameras.json").read_text())

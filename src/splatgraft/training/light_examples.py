@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.relighting.light.estimate import EstimatedLight
@@ -20,7 +20,7 @@ from splatgraft.relighting.light.place_description import (
     PlaceDescription,
     cell_solid_angles,
     describe_place,
-    upright_frame,
+    upright_from_world,
 )
 from splatgraft.relighting.light.true_light import panorama_pixels
 from splatgraft.runtime.atomic_file import atomic_write
@@ -56,13 +56,13 @@ def light_example(
         panorama: True light without the suns, equirectangular, in the estimate's world frame.
         suns: Entries of suns.json: direction (unit, towards the sun) and irradiance (linear rgb).
     """
-    frame = upright_frame(found.evidence.up)
+    rotation = upright_from_world(found.evidence.up)
     directions, solid_angles = panorama_pixels(panorama)
     power = panorama * solid_angles[..., None]
-    towards = directions.reshape(-1, 3) @ frame.T
+    towards = directions.reshape(-1, 3) @ rotation.T
     total = torch.zeros(ROWS * COLUMNS, 3).index_add_(0, _cells(towards), power.reshape(-1, 3))
     if suns:
-        towards = torch.tensor([sun["direction"] for sun in suns]).float() @ frame.T
+        towards = torch.tensor([sun["direction"] for sun in suns]).float() @ rotation.T
         total.index_add_(0, _cells(towards), torch.tensor([sun["irradiance"] for sun in suns]).float())
     truth = total.reshape(ROWS, COLUMNS, 3) / cell_solid_angles()[..., None]
     return LightExample(name, describe_place(found), truth)
@@ -102,7 +102,7 @@ def read_examples(path: Path) -> list[LightExample]:
     return [LightExample(name, PlaceDescription(maps, numbers), truth.exp2()) for name, maps, numbers, truth in rows]
 
 
-def _cells(towards: Float[Tensor, "n 3"]) -> Tensor:
+def _cells(towards: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
     row = (towards[:, 2].clamp(-1, 1).acos() / math.pi * ROWS).long().clamp_max(ROWS - 1)
     turn = torch.atan2(towards[:, 1], towards[:, 0]) % (2 * math.pi)
     return row * COLUMNS + (turn / (2 * math.pi) * COLUMNS).long().clamp_max(COLUMNS - 1)

@@ -17,7 +17,7 @@ from splatgraft.formats import read_capture
 from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.relighting.light.estimate import NoLight, fit_light
 from splatgraft.segmentation import segment
-from splatgraft.synthesis.benchmark import BenchmarkScene, BenchmarkSize, gather_capture, plan
+from splatgraft.synthesis.benchmark import BenchmarkScene, BenchmarkSize, draw_scene, gather_capture, plan
 from splatgraft.synthesis.jobs import Job, render_job
 from splatgraft.synthesis.pairs import KINDS
 from splatgraft.training.light_examples import LightExample, light_example, write_examples
@@ -38,17 +38,10 @@ class LightScene:
     reconstruction: ReconstructOptions
 
 
-def draw_scene(seed: int, number: int, size: BenchmarkSize) -> BenchmarkScene:
-    """Draw a scene; the kinds follow each other, and a scene without room for the cameras is drawn again."""
-    rng = random.Random(f"lights-{seed}-{number}")
-    while True:
-        kind = KINDS[number % len(KINDS)]
-        which = BenchmarkScene(f"{seed}_{number:05d}_{kind}", kind, rng.randrange(*_SEEDS), rng.randrange(*_SEEDS))
-        try:
-            plan(which, size)
-        except ValueError:
-            continue
-        return which
+def draw_light_scene(seed: int, number: int, size: BenchmarkSize) -> BenchmarkScene:
+    """Draw a scene; the kinds follow each other."""
+    rng, kind = random.Random(f"lights-{seed}-{number}"), KINDS[number % len(KINDS)]
+    return draw_scene(rng, f"{seed}_{number:05d}_{kind}", kind, _SEEDS, size)
 
 
 def make_light_examples(scene: LightScene, work: Path, out: Path, blender_python: Path) -> None:

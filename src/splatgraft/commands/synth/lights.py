@@ -9,7 +9,7 @@ from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task
 from splatgraft.synthesis.benchmark import BenchmarkSize
-from splatgraft.workflow.light_examples import LightScene, draw_scene, make_light_examples
+from splatgraft.workflow.light_examples import LightScene, draw_light_scene, make_light_examples
 from splatgraft.workflow.rendered_data import RenderWorkers, read_render_size, write_failures
 
 _BUDGET = 20_000
@@ -51,7 +51,7 @@ class SynthLights:
             for number in range(self.first, self.first + self.scenes):
                 work, out = self.out / "work" / f"{number:05d}", self.out / f"{number:05d}.npz"
                 if not out.is_file():
-                    scene = LightScene(draw_scene(self.seed, number, size), size, fit)
+                    scene = LightScene(draw_light_scene(self.seed, number, size), size, fit)
                     tasks.append(Task(out.name, partial(make_light_examples, scene, work, out, python)))
             failures = self.workers.run(tasks, console) if tasks else []
             write_failures(self.out, failures, console)

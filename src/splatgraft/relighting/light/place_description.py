@@ -78,7 +78,7 @@ def cell_solid_angles() -> Float[Tensor, "12 24"]:
     return ((edges[:-1] - edges[1:]) * 2 * math.pi / COLUMNS)[:, None].expand(ROWS, COLUMNS)
 
 
-def upright_frame(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+def upright_from_world(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """A rotation whose rows are two horizontal axes and `up`: it takes world directions to the upright frame."""
     return frames_along(-up[None])[0]
 
@@ -104,7 +104,7 @@ def around_cells(
 def describe_place(found: EstimatedLight) -> PlaceDescription:
     """Describe what is known at the place of an estimate, and the estimate itself."""
     evidence = found.evidence
-    turned = DIRECTIONS @ upright_frame(evidence.up).T
+    turned = DIRECTIONS @ upright_from_world(evidence.up).T
     even = torch.ones(len(DIRECTIONS))
     of_directions = _direction_values(found)
     by_direction = around_cells(of_directions, turned, _DIRECTION_WIDTH, even)[0]
@@ -144,7 +144,7 @@ def _surface_maps(found: EstimatedLight) -> Float[Tensor, "12 24 4"]:
     surfaces = found.evidence.surfaces
     if not len(surfaces.points):
         return torch.zeros(ROWS, COLUMNS, 4)
-    normals = surfaces.normals @ upright_frame(found.evidence.up).T
+    normals = surfaces.normals @ upright_from_world(found.evidence.up).T
     values = torch.stack([_log(surfaces.colors.mean(1)), found.hidden.residual, surfaces.visibility.mean(1)], 1)
     mean, total = around_cells(values, normals, _NORMAL_WIDTH, surfaces.weights)
     # where no surface faces, the mean of all
