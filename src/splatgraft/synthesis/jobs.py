@@ -13,7 +13,9 @@ from splatgraft.runtime.child_process import run_logged
 from splatgraft.runtime.workers import Task
 from splatgraft.synthesis.scene import Camera, Part, Scene, Vector, World
 
-Pass = Literal["color", "depth", "normal", "albedo", "mask"]
+Pass = Literal["color", "depth", "normal", "albedo", "mask", "groups"]
+"""`groups` is the linear light of every lamp alone and of the world, at the exposure of the pictures: NNNN_groups.npy
+(g, h, w, 3), in the order of light_groups.json. Where any take has it, probes have a first axis of groups too."""
 _WORKER = Path(__file__).parent / "blender" / "worker.py"
 
 

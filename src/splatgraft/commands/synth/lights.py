@@ -37,6 +37,8 @@ class SynthLights:
     """Of each of a scene's two captures."""
     samples: int = 8
     """Light paths per pixel."""
+    mixtures: int = 8
+    """Other lights of each place, mixed from the light of each lamp; 0 renders the scene's own light alone."""
     iterations: int = 1000
     """Of each reconstruction, with at most 20,000 Gaussians."""
     workers: RenderWorkers = field(default_factory=RenderWorkers)
@@ -51,7 +53,7 @@ class SynthLights:
             for number in range(self.first, self.first + self.scenes):
                 work, out = self.out / "work" / f"{number:05d}", self.out / f"{number:05d}.npz"
                 if not out.is_file():
-                    scene = LightScene(draw_light_scene(self.seed, number, size), size, fit)
+                    scene = LightScene(draw_light_scene(self.seed, number, size), size, fit, self.mixtures)
                     tasks.append(Task(out.name, partial(make_light_examples, scene, work, out, python)))
             failures = self.workers.run(tasks, console) if tasks else []
             write_failures(self.out, failures, console)
