@@ -85,14 +85,23 @@ def test_the_truth_lights_surfaces_as_the_panorama_does(found):
     frame = upright_from_world(found.evidence.up)
     normals = even_directions(100)
     cosine = (normals @ frame.T @ cell_directions().reshape(-1, 3).T).clamp_min(0)
-    power = example.truth.reshape(-1, 3) * cell_solid_angles().reshape(-1, 1)
+    power = example.truth.radiance.reshape(-1, 3) * cell_solid_angles().reshape(-1, 1)
     sun = (normals @ SUN).clamp_min(0)[:, None] * torch.tensor([3.0, 2.0, 1.0])
     wanted = lit_by(panorama, normals) + sun
     # a cell is 15 degrees wide: the sun is off by up to half its diagonal, 10 degrees
     away = (cosine @ power - wanted).abs() / wanted.max()
     assert float(away.max()) < math.sin(math.radians(10)) * 0.8
+    normals = cell_directions().reshape(-1, 3)
+    exact = lit_by(panorama, normals @ frame) + (normals @ frame @ SUN).clamp_min(0)[:, None] * torch.tensor(
+        [3.0, 2.0, 1.0]
+    )
+    assert torch.allclose(example.truth.irradiance.reshape(-1, 3), exact, rtol=0.01, atol=1e-3)
+    of_estimate = found.light.irradiance(normals @ frame)
+    # as sources and harmonics of degree 2: the light is the same, its shape a little smoother
+    ratio = example.estimated.irradiance.reshape(-1, 3) / of_estimate
+    assert float((ratio.log2().abs()).mean()) < 0.15
     # all power is there: that of the panorama is four times its mean irradiance
-    total = (example.truth * cell_solid_angles()[..., None]).sum()
+    total = (example.truth.radiance * cell_solid_angles()[..., None]).sum()
     assert float(total) == pytest.approx(
         6.0 + 4 * float(lit_by(panorama, even_directions(4000)).mean(0).sum()), rel=0.01
     )
@@ -102,13 +111,16 @@ def test_files_hold_what_was_written(found, tmp_path):
     panorama = day(sky=1.0, sun=1e5, radius_deg=3.0)
     examples = [light_example(f"scene/{side}", found, panorama, []) for side in ("old", "new")]
     write_examples(tmp_path / "one.npz", examples)
-    assert (tmp_path / "one.npz").stat().st_size < 30_000
+    assert (tmp_path / "one.npz").stat().st_size < 40_000
     again = read_examples(tmp_path / "one.npz")
     assert [example.name for example in again] == ["scene/old", "scene/new"]
     assert again[0].scene == "scene"
     # half precision: 11 bits
     assert torch.allclose(again[1].place.maps, examples[1].place.maps, rtol=1e-3, atol=1e-3)
-    assert torch.allclose(again[1].truth, examples[1].truth, rtol=0.02)
+    for light in ("truth", "estimated"):
+        for part in ("radiance", "irradiance"):
+            values = [getattr(getattr(one[1], light), part).clamp_min(1e-6) for one in (again, examples)]
+            assert torch.allclose(*values, rtol=0.02)
 
 
 def test_bad_files_are_one_line(found, tmp_path):
@@ -120,7 +132,7 @@ def test_bad_files_are_one_line(found, tmp_path):
     with np.load(path) as arrays:
         kept = dict(arrays)
     np.savez(path, **{**kept, "version": np.array(99)})
-    with pytest.raises(ValueError, match=r"bad.npz: expected examples of version 2, found version 99"):
+    with pytest.raises(ValueError, match=r"bad.npz: expected examples of version 3, found version 99"):
         read_examples(path)
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(ValueError, match=r"bad.npz: expected examples of light"):
@@ -137,10 +149,10 @@ def test_synth_lights_makes_examples_and_goes_on(tmp_path, capsys):
     path = tmp_path / "lights" / "00000.npz"
     examples = read_examples(path)
     assert [Path(example.name).name for example in examples] == ["old", "old1", "old2", "new", "new1", "new2"]
-    assert all(float(example.truth.mean()) > 0 for example in examples)
+    assert all(float(example.truth.radiance.mean()) > 0 for example in examples)
     # one room under other lights: what is seen and what is true change together
     for a, b in itertools.combinations(examples[:3], 2):
-        assert not torch.allclose(a.truth, b.truth, rtol=0.05)
+        assert not torch.allclose(a.truth.radiance, b.truth.radiance, rtol=0.05)
         assert not torch.allclose(a.place.maps, b.place.maps, rtol=0.05)
     assert not any((tmp_path / "lights" / "work").glob("*"))
     written = path.stat().st_mtime_ns
