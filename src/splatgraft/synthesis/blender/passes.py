@@ -82,6 +82,7 @@ def _outputs(folder, names, matte, denoised):
             tree.links.new(light, out.inputs[_slot(name)])
             continue
         denoise = tree.nodes.new("CompositorNodeDenoise")
+        denoise.prefilter = "FAST"
         tree.links.new(light, denoise.inputs["Image"])
         tree.links.new(layers.outputs["Denoising Normal"], denoise.inputs["Normal"])
         tree.links.new(layers.outputs["Denoising Albedo"], denoise.inputs["Albedo"])
