@@ -39,6 +39,7 @@ _TABLE = (
     ("synth pack", "synth.pack", "pack training pairs into tar files, also for object storage"),
     ("train flux", "train.flux", "train the paper's harmoniser on pairs"),
     ("train compact", "train.compact", "train the compact harmoniser on rendered pairs"),
+    ("train light", "train.light", "train the correction of the estimated light"),
     ("train removal", "train.removal", "train the object removal on pairs"),
     ("train embed", "train.embed", "compute the empty prompt's embeddings once"),
     ("weights list", "weights.list", "say which networks there are, their licences, sizes, and what is fetched"),

@@ -16,7 +16,9 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
+from splatgraft.relighting.light.learned.ensemble import LightEnsemble
+from splatgraft.relighting.light.learned.learned_light import fit_learned_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.shading.depth_normals import fuse_normals
 from splatgraft.relighting.shading.irradiance import irradiance
@@ -40,8 +42,9 @@ class SourceScene:
     """In the object's own frame."""
     cameras: Cameras
     """Of the capture, in the same frame."""
-    light: Light | None = None
-    """At the object's place, in the same frame, where it is known; otherwise it is estimated."""
+    light: Light | LightEnsemble | None = None
+    """At the object's place, in the same frame, where it is known; otherwise it is estimated, and corrected by networks
+    where there are any."""
     normals: Float[Tensor, "n 3"] | None = None
     """Unit, of the object's Gaussians, outward, in the same frame, where they are known; otherwise estimated."""
 
@@ -112,14 +115,14 @@ def prepare_object(
     maps = object_shadow_maps(gaussians, sphere, samples)
     source_lighting, notes = None, None
     if source is not None:
-        found = source.light or _source_light(placed.gaussians, source, index, cache)
+        found = source.light if isinstance(source.light, Light) else _source_light(placed, source, index, cache)
         if isinstance(found, NoLight):
             notes = found.reason
         else:
             estimate = found if isinstance(found, EstimatedLight) else None
             source_light = found.light if isinstance(found, EstimatedLight) else found
             notes = source_light.describe(estimate_up(source.cameras))
-            notes += "." if source.light is None else ", as given."
+            notes += "." if estimate is not None else ", as given."
             source_light = source_light.rotated(placed.target_from_object.rotation)
             source_samples = sample_light(source_light)
             shares = self_visibility(maps, gaussians, normals.vectors, source_samples)
@@ -194,8 +197,9 @@ def _moved(prepared: PreparedObject, placed: PlacedObject, samples: LightSamples
     )
 
 
-def _source_light(gaussians: Gaussians, source: SourceScene, index: int, cache: Memo) -> EstimatedLight | NoLight:
+def _source_light(placed: PlacedObject, source: SourceScene, index: int, cache: Memo) -> EstimatedLight | NoLight:
     """The light that object `index` was captured in, estimated once for all copies of one object."""
+    gaussians = placed.gaussians
     for earlier in range(index):
         cached = cache.peek(f"source light {earlier}", (gaussians, source))
         if cached is not None:
@@ -203,7 +207,8 @@ def _source_light(gaussians: Gaussians, source: SourceScene, index: int, cache: 
 
     def estimate() -> EstimatedLight | NoLight:
         # the object's shadow in its capture is evidence too
+        networks = source.light if isinstance(source.light, LightEnsemble) else None
         place = bounding_sphere(gaussians)
-        return fit_light(source.gaussians, place, source.cameras, object_gaussians=gaussians)
+        return fit_learned_light(source.gaussians, place, source.cameras, networks, object_gaussians=gaussians)
 
     return cache.get(f"source light {index}", (gaussians, source), estimate)

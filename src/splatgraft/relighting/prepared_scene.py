@@ -13,7 +13,9 @@ from torch import Tensor
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
+from splatgraft.relighting.light.learned.ensemble import LightEnsemble
+from splatgraft.relighting.light.learned.learned_light import fit_learned_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.source_distance import with_source_distances
 from splatgraft.relighting.light.sun_visibility import observed_sun_visibility
@@ -73,7 +75,7 @@ def prepare_scene(
     *,
     spheres: Sequence[BoundingSphere],
     reach: float,
-    light: Light | None,
+    light: Light | LightEnsemble | None,
     cache: Memo,
 ) -> PreparedScene | NoLight:
     """Prepare a scene for objects.
@@ -83,14 +85,15 @@ def prepare_scene(
         cameras: Of its capture.
         spheres: Of the objects, at least one.
         reach: Object radii to which shadows are computed.
-        light: At the objects' place, its sources seen from there; None to estimate it.
+        light: At the objects' place, its sources seen from there; None to estimate it, or networks that correct the
+            estimate.
         cache: Reused where the scene is the same and the place has moved little.
     """
     center = torch.stack([sphere.center for sphere in spheres]).mean(0)
     place = BoundingSphere(center, max(sphere.radius for sphere in spheres))
     region = _region(scene, place, reach, cache)
-    if light is None:
-        estimate = _estimated_light(scene, cameras, place, region, cache)
+    if light is None or isinstance(light, LightEnsemble):
+        estimate = _estimated_light(scene, cameras, place, region, light, cache)
         if isinstance(estimate, NoLight):
             return estimate
         known = estimate.light
@@ -160,18 +163,23 @@ def _receiver_indices(
 
 
 def _estimated_light(
-    scene: Gaussians, cameras: Cameras, place: BoundingSphere, region: BoundingSphere, cache: Memo
+    scene: Gaussians,
+    cameras: Cameras,
+    place: BoundingSphere,
+    region: BoundingSphere,
+    networks: LightEnsemble | None,
+    cache: Memo,
 ) -> EstimatedLight | NoLight:
     """The light at `place`; after a move within the region the sources are kept and the ambient light is new.
 
     Shadow maps and the object's own shading are cached with the sources.
     """
-    cached: EstimatedLight | None = cache.peek("light", (scene, region))
+    cached: EstimatedLight | None = cache.peek("light", (scene, region, networks))
     if cached is not None:
         return cached.at(scene, cameras, place)
-    found = fit_light(scene, place, cameras)
+    found = fit_learned_light(scene, place, cameras, networks)
     if not isinstance(found, NoLight):
-        cache.put("light", (scene, region), found)
+        cache.put("light", (scene, region, networks), found)
     return found
 
 

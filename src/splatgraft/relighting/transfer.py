@@ -19,7 +19,8 @@ from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.spherical_harmonics import MAX_DEGREE, coefficient_count
 from splatgraft.relighting.layers import Relit, unchanged
-from splatgraft.relighting.light.estimate import NoLight
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
+from splatgraft.relighting.light.learned.ensemble import LightEnsemble
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.prepared_object import PreparedObject, SourceScene, prepare_object
 from splatgraft.relighting.prepared_scene import PreparedScene, prepare_scene
@@ -83,7 +84,7 @@ def relight(
     cameras: Cameras,
     *,
     sources: Sequence[SourceScene | None] = (),
-    light: Light | None = None,
+    light: Light | LightEnsemble | None = None,
     options: RelightOptions = RelightOptions(),
     cache: Memo | None = None,
 ) -> Relit:
@@ -96,7 +97,8 @@ def relight(
         cameras: The target's cameras; from them follows the up direction.
         sources: For every object the scene that it was taken from, without the object, whose light is divided out;
             None, or no sources at all, where it is not known: the object then keeps its mean brightness.
-        light: The light at the place of the objects; estimated from the target where not given.
+        light: The light at the place of the objects; estimated from the target where not given. Networks
+            correct the estimate.
         options: How far shadows reach and how many Gaussians may be added.
         cache: Intermediate results, which later calls with the same objects at other places use again.
 
@@ -125,7 +127,8 @@ def relight(
         return unchanged(
             baked, is_object, objects=in_target, report=(f"{scene.reason} The object is pasted as it is.",)
         )
-    report = [scene.light.describe(estimate_up(cameras)) + (", as given." if light is not None else ".")]
+    report = [scene.light.describe(estimate_up(cameras)) + (", as given." if scene.estimate is None else ".")]
+    report += [] if scene.estimate is None else _correction_note(scene.estimate)
     objects = []
     for number, one, source in placed:
         prepared = prepare_object(one, source, cameras, light=scene.light, index=number - 1, cache=cache)
@@ -135,6 +138,19 @@ def relight(
             report.append(unknown_light(number))
         objects.append(_lit_object(prepared, scene))
     return _assembled(scene, objects, cameras.spread(options.fitted_views), options=options, baked=baked, report=report)
+
+
+def _correction_note(estimate: EstimatedLight) -> list[str]:
+    """A sentence on what networks changed; none where there are no networks."""
+    correction = estimate.correction
+    if correction is None:
+        return []
+    plain = estimate.hidden.radiance(estimate.evidence, estimate.tint)
+    stops = float((estimate.radiance.mean() / plain.mean().clamp_min(1e-9)).log2())
+    note = f"Networks changed the new place's light by {stops:+.1f} stops, give or take {correction.level_sd:.1f}"
+    if correction.distance > 1:
+        note += f"; the place is unlike those that they learned from ({correction.distance:.1f} times as far as most)"
+    return [f"{note}."]
 
 
 def unknown_light(number: int) -> str:

@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.relighting.light.estimate import EstimatedLight
@@ -19,6 +19,7 @@ from splatgraft.relighting.light.place_description import (
     ROWS,
     PlaceDescription,
     cell_directions,
+    cell_of,
     cell_solid_angles,
     describe_place,
     upright_from_world,
@@ -60,6 +61,11 @@ class LightExample:
         """By which examples are held out together."""
         return self.name.partition("/")[0]
 
+    @property
+    def side(self) -> str:
+        """SCENE/old or SCENE/new: other lights of it are mixtures of the same lamps."""
+        return self.name.rstrip("0123456789")
+
 
 def light_example(
     name: str, found: EstimatedLight, panorama: Float[Tensor, "h w 3"], suns: Sequence[dict[str, Any]]
@@ -87,7 +93,7 @@ def light_example(
 
 def _cell_light(towards: Float[Tensor, "n 3"], power: Float[Tensor, "n 3"]) -> CellLight:
     """Of light from upright directions, radiance times solid angle."""
-    total = torch.zeros(ROWS * COLUMNS, 3).index_add_(0, _cells(towards), power.float())
+    total = torch.zeros(ROWS * COLUMNS, 3).index_add_(0, cell_of(towards), power.float())
     normals = cell_directions().reshape(-1, 3)
     irradiance = (normals @ towards.T).clamp_min(0) @ power.float()
     shape = (ROWS, COLUMNS, 3)
@@ -134,12 +140,6 @@ def read_examples(path: Path) -> list[LightExample]:
 def _log_light(example: LightExample) -> Float[Tensor, "4 12 24 3"]:
     parts = [part for light in (example.truth, example.estimated) for part in (light.radiance, light.irradiance)]
     return torch.stack(parts).clamp_min(_DARKEST).log2()
-
-
-def _cells(towards: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    row = (towards[:, 2].clamp(-1, 1).acos() / math.pi * ROWS).long().clamp_max(ROWS - 1)
-    turn = torch.atan2(towards[:, 1], towards[:, 0]) % (2 * math.pi)
-    return row * COLUMNS + (turn / (2 * math.pi) * COLUMNS).long().clamp_max(COLUMNS - 1)
 
 
 def _half(tensors: Sequence[Tensor]) -> np.ndarray:

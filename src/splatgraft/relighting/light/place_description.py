@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.core.directions import frames_along
@@ -76,6 +76,13 @@ def cell_solid_angles() -> Float[Tensor, "12 24"]:
     """Steradians; they sum to 4 pi."""
     edges = torch.cos(torch.arange(ROWS + 1) * math.pi / ROWS)
     return ((edges[:-1] - edges[1:]) * 2 * math.pi / COLUMNS)[:, None].expand(ROWS, COLUMNS)
+
+
+def cell_of(towards: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    """Index of the cell that each upright direction lies in, row by row."""
+    row = (towards[:, 2].clamp(-1, 1).acos() / math.pi * ROWS).long().clamp_max(ROWS - 1)
+    turn = torch.atan2(towards[:, 1], towards[:, 0]) % (2 * math.pi)
+    return row * COLUMNS + (turn / (2 * math.pi) * COLUMNS).long().clamp_max(COLUMNS - 1)
 
 
 def upright_from_world(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:

@@ -1,0 +1,1 @@
+"""A learned correction of the estimated light at a place."""
