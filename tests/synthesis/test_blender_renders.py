@@ -287,6 +287,18 @@ def test_light_groups_sum_to_the_render_with_all_lamps_and_a_mixture_to_one_with
         assert suns[0]["irradiance"] == pytest.approx(true_suns[0]["irradiance"], rel=1e-4)
 
 
+def test_a_sun_lamp_is_listed_and_its_disc_is_not_in_the_panorama(tmp_path):
+    sun = Lamp("sun", (1.0, 1.0, 1.0), 3.0, direction=(1, 0, -1), size=0.03)
+    takes = (Take("without", scene=True), Take("light", scene=True, probe=(0.0, 0.0, 0.3)))
+    job = Job(floor_scene(lamps=[sun]), {}, (Camera((0, -3, 1.6), (0, 0, 0.2)),), takes, TINY)
+    out = rendered(job, tmp_path / "out")
+    assert len(json.loads((out / "light" / "suns.json").read_text())) == 1
+    panorama = np.load(out / "light" / "0000.npy")
+    # the upper half is an even sky: nothing in it is brighter than the rest by more than noise
+    sky = panorama[:28].max(-1)
+    assert sky.max() < 1.5 * np.median(sky)
+
+
 def test_a_model_of_the_users_fits_its_place_and_stands_on_it(tmp_path):
     # a flat slab, 4 x 2 x 0.5 in the file's units, far from the file's origin; .obj files have y up
     corners = [(x, y, z) for x in (10, 14) for y in (3, 3.5) for z in (-2, 0)]

@@ -28,7 +28,9 @@ def measure(scene, world, point, things):
     """
     cycles, layer = bpy.context.scene.cycles, bpy.context.scene
     lamps = [thing for thing in things if thing.type == "LIGHT"]
-    for thing in lamps:
+    # a sun's disc would be in the panorama and in the list
+    shown = [thing for thing in lamps if thing.data.type != "SUN"]
+    for thing in shown:
         thing.visible_camera = True
     layer.render.resolution_x, layer.render.resolution_y = WIDTH, HEIGHT
     layer.render.film_transparent = False  # otherwise the world is not rendered
@@ -42,7 +44,7 @@ def measure(scene, world, point, things):
         cycles.use_denoising = True
         disc = _around(_towards_sun(world), 0.5 * world["sun_size"] + _DISC_MARGIN)
         panorama = np.where(disc[..., None], panorama, with_sun)
-    for thing in lamps:
+    for thing in shown:
         thing.visible_camera = False
     described = zip(scene["lamps"], lamps, strict=False)  # none where the scene is hidden
     suns = [_lamp_sun(lamp, thing) for lamp, thing in described if lamp["kind"] == "sun"]
