@@ -1,6 +1,5 @@
 """Examples for learning the light: upright maps of what is known, the truth in the same cells, files."""
 
-import itertools
 import math
 import os
 from pathlib import Path
@@ -144,14 +143,14 @@ def test_bad_files_are_one_line(found, tmp_path):
 def test_synth_lights_makes_examples_and_goes_on(tmp_path, capsys):
     python = os.environ["SPLATGRAFT_BLENDER_PYTHON"]
     words = ["synth", "lights", str(tmp_path / "lights"), "--seed", "3", "--blender-python", python]
-    small = ["--size", "96x64", "--views", "8", "--samples", "2", "--iterations", "150", "--mixtures", "2"]
+    small = ["--size", "96x64", "--views", "8", "--samples", "2", "--iterations", "150", "--mixtures", "1"]
     assert main([*words, *small, "--scenes", "1"]) == 0
     path = tmp_path / "lights" / "00000.npz"
     examples = read_examples(path)
-    assert [Path(example.name).name for example in examples] == ["old", "old1", "old2", "new", "new1", "new2"]
+    assert [Path(example.name).name for example in examples] == ["old", "old1", "new", "new1"]
     assert all(float(example.truth.radiance.mean()) > 0 for example in examples)
     # one room under other lights: what is seen and what is true change together
-    for a, b in itertools.combinations(examples[:3], 2):
+    for a, b in (examples[:2], examples[2:]):
         assert not torch.allclose(a.truth.radiance, b.truth.radiance, rtol=0.05)
         assert not torch.allclose(a.place.maps, b.place.maps, rtol=0.05)
     assert not any((tmp_path / "lights" / "work").glob("*"))
