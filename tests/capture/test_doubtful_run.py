@@ -40,7 +40,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             {
                 "name": name,
                 "world_from_camera": (pose + torch.tensor([0, 0, 0, float(i)])).tolist(),
-                "camera": [40.0, 20.0, 15.0, 0.0],
+                "camera": [40.0, 40.0, 20.0, 15.0, 0.0, 0.0, 0.0, 0.0],
                 "camera_id": 1,
                 "observations": 500,
             }

@@ -1,9 +1,14 @@
-"""Density control: the children of a split Gaussian."""
+"""Density control: the children of a split Gaussian, and which Gaussian is split."""
 
 import torch
 
+from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.reconstruction.density import split
+from splatgraft.fitting import FitState, Step
+from splatgraft.fitting.adam import no_moments
+from splatgraft.fitting.view_colors import ViewColors
+from splatgraft.reconstruction.density import DensityControl, split
+from splatgraft.rendering import RenderOptions
 
 
 def test_children_lie_on_the_long_axis_and_keep_its_variance():
@@ -26,3 +31,32 @@ def test_children_lie_on_the_long_axis_and_keep_its_variance():
     variance = shift.square().sum(1) + (one.covariances @ long_axis[..., None])[..., 0].mul(long_axis).sum(1)
     assert torch.allclose(variance, parents.scales.amax(1) ** 2, rtol=1e-4)
     assert torch.equal(one.sh, parents.sh)
+
+
+def split_parents(error_every: int) -> list[float]:
+    """x of the Gaussians that stay whole: three side by side, of equal gradients but for the left one, which has a
+    tenth more; the residual lies under the right one."""
+    gaussians = Gaussians(
+        means=torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]]),
+        log_scales=torch.full((3, 3), -2.0),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1),
+        opacity_logits=torch.full((3,), 2.0),
+        sh=torch.zeros(3, 1, 3),
+    )
+    pose = look_at(torch.tensor([[0.0, -4, 0]]), torch.zeros(3), torch.tensor([0.0, 0, 1]))
+    camera = pinhole(pose, 48.0, width=48, height=32)
+    residual = torch.zeros(32, 48, 3)
+    residual[:, 30:] = -0.2
+    gradients = {"means": torch.tensor([[1.1, 0, 0], [1, 0, 0], [1, 0, 0]])}
+    seen = torch.ones(3, dtype=torch.bool)
+    step = Step(camera, seen, gradients, 0.0, residual, RenderOptions())
+    state = FitState(
+        10, gaussians, no_moments({"means": gaussians.means}, 3), ViewColors.identity(1, torch.device("cpu"))
+    )
+    control = DensityControl(4, 3, 10, 10, 20, camera.centers, error_every=error_every)
+    return control.update(state, step).gaussians.means[:2, 0].tolist()
+
+
+def test_the_gaussian_that_covers_an_error_is_split_before_one_of_a_larger_gradient():
+    assert split_parents(error_every=0) == [0, 1]
+    assert split_parents(error_every=1) == [-1, 0]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splatgraft.core import cameras as camera_values
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.image_metrics import psnr
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages, held_out
@@ -19,6 +19,8 @@ from splatgraft.reconstruction import (
     reconstruct,
 )
 from splatgraft.reconstruction import memory as memory_module
+from splatgraft.reconstruction.initialization import SeedPoints, from_points
+from splatgraft.reconstruction.options import Quality
 from splatgraft.rendering import render
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
@@ -87,9 +89,12 @@ def test_held_out_views_are_found_again(capture):
     assert held_out_psnr(scene, capture, 8) > 20
 
 
-def test_a_killed_reconstruction_resumes_bit_for_bit(capture, monkeypatch):
+@pytest.mark.parametrize("more", [False, True], ids=["draft", "with all that standard adds"])
+def test_a_killed_reconstruction_resumes_bit_for_bit(capture, monkeypatch, more):
     monkeypatch.setattr("splatgraft.fitting.loop._CHECKPOINT_SECONDS", -1.0)
-    options = ReconstructOptions(iterations=60, budget=220, sh_degree=1, seed=5)
+    options = ReconstructOptions(
+        iterations=60, budget=220, sh_degree=1, seed=5, random_background=more, far_shell=more, error_splits=more
+    )
     whole = reconstruct(capture, options)
     checkpoint = Memo()
 
@@ -124,6 +129,59 @@ def test_the_budget_holds_at_every_moment(capture):
     scene = reconstruct(capture, ReconstructOptions(iterations=60, budget=100, sh_degree=0), progress=watch)
     assert scene.count <= 100
     assert max(counts) <= 100
+
+
+@pytest.fixture
+def before_walls(capture, tmp_path) -> PosedImages:
+    """The blobs inside a large sphere that is dark on one side and bright on the other; no points on it."""
+    truth = reconstruct(capture, ReconstructOptions(iterations=1, budget=150, sh_degree=0, quality="draft"))
+    direction = torch.nn.functional.normalize(torch.randn(3000, 3, generator=torch.Generator().manual_seed(3)), dim=1)
+    shade = (0.05 + 0.6 * (direction[:, :1] > 0)).expand(-1, 3)
+    walls = replace(
+        from_points(SeedPoints(30 * direction, shade, torch.full((3000,), torch.inf))),
+        opacity_logits=torch.full((3000,), 6.0),
+    )
+    paths = tuple(tmp_path / f"{i}.png" for i in range(16))
+    with torch.no_grad():
+        for path, image in zip(paths, render(concatenate([truth, walls]), capture.cameras).color, strict=True):
+            write_image(path, image.clamp(0, 1))
+    return replace(capture, image_paths=paths)
+
+
+def holes(scene: Gaussians, capture: PosedImages) -> float:
+    """Share of the light from behind the scene."""
+    with torch.no_grad():
+        return float(1 - render(scene, capture.cameras).alpha.mean())
+
+
+def test_a_random_background_leaves_no_holes_before_dark_walls(before_walls):
+    options = ReconstructOptions(
+        iterations=200, budget=1500, sh_degree=0, random_background=False, far_shell=True, error_splits=False
+    )
+    fixed = reconstruct(before_walls, options)
+    random = reconstruct(before_walls, replace(options, random_background=True))
+    # what comes through dark walls from a random background, half bright in the mean, is an error of as much
+    assert holes(random, before_walls) < 0.5 * holes(fixed, before_walls)
+
+
+def test_a_far_shell_shows_held_out_views_what_is_behind_the_points(before_walls):
+    options = ReconstructOptions(
+        iterations=200, budget=1500, sh_degree=0, eval_every=8, quality="draft", error_splits=False
+    )
+    without = held_out_psnr(reconstruct(before_walls, options), before_walls, 8)
+    # a decibel is a fifth of the squared error: walls fill most of these pictures
+    assert held_out_psnr(reconstruct(before_walls, replace(options, far_shell=True)), before_walls, 8) > without + 1
+
+
+def test_draft_has_nothing_of_what_standard_adds_and_an_object_alone_no_surroundings():
+    def choices(quality: Quality, surroundings: bool) -> tuple[bool | None, ...]:
+        options = ReconstructOptions(quality=quality).decided(surroundings)
+        return options.random_background, options.far_shell, options.error_splits
+
+    assert choices("draft", True) == (False, False, False)
+    assert choices("standard", True) == choices("high", True) == (True, True, True)
+    assert choices("standard", False) == (False, False, True)
+    assert ReconstructOptions(quality="draft", far_shell=True).decided(False).far_shell
 
 
 def test_without_points_it_says_so_and_goes_on(capture):

@@ -21,7 +21,7 @@ class Lens:
     focal_px: float
     """Focal length, pixels of the (shrunk) photos."""
     distortion: float
-    """Coefficient k of COLMAP's SIMPLE_RADIAL, for image coordinates over the focal length."""
+    """First radial coefficient (k of COLMAP's SIMPLE_RADIAL), for image coordinates over the focal length."""
 
     @property
     def focal_in_sides(self) -> float:

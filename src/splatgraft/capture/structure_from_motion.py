@@ -174,7 +174,7 @@ def _lenses(model: Mapping[str, Any], folder: Path) -> tuple[Lens, ...]:
             photos=tuple(Path(image["name"]).stem for image in images),
             size=stored_size(folder / images[0]["name"]),
             focal_px=images[0]["camera"][0],
-            distortion=images[0]["camera"][3],
+            distortion=images[0]["camera"][4],
         )
         for images in sorted(groups.values(), key=len, reverse=True)
     )
@@ -248,10 +248,10 @@ def _posed_images(model: Mapping[str, Any], photos: Path, masks: Mapping[str, Pa
     mask_paths: list[Path | None] = []
     for image in model["images"]:
         copy, path = photos / image["name"], workspace / "images" / image["name"]
-        f, cx, cy, k = image["camera"]
+        fx, fy, cx, cy, *coefficients = image["camera"]
         size = stored_size(copy)
-        matrix = torch.tensor([[f, 0, cx], [0, f, cy], [0, 0, 1]], dtype=torch.float64)
-        distortion = Distortion(matrix, torch.tensor([k, 0, 0, 0, 0], dtype=torch.float64), size)
+        matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+        distortion = Distortion(matrix, torch.tensor([*coefficients, 0], dtype=torch.float64), size)
         intrinsics.append(write_undistorted(copy, path, distortion))
         mask_paths.append(None)
         if copy.name in masks:

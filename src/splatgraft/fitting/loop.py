@@ -91,6 +91,8 @@ class FitOptions:
     """Of the order of views."""
     rendering: RenderOptions = field(default_factory=RenderOptions)
     """Background, low-pass and near plane."""
+    random_background: bool = False
+    """Whether each step draws the scene over another colour, by chance, instead of that of `rendering`."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,10 @@ class Step:
     """Of the loss, by field."""
     rate_of_means: float
     """Learning rate of the centres in this step, world units."""
+    residual: Float[Tensor, "h w 3"]
+    """The rendered image minus the photograph, sRGB."""
+    rendering: RenderOptions
+    """With which it was rendered."""
 
 
 Control = Callable[[FitState, Step], FitState]
@@ -170,9 +176,7 @@ def fit(
             index = _view_of(state.iteration, len(views), options.seed)
             view = views.at(index, visit=state.iteration // len(views), done=done)
             image, camera = view.image, view.camera
-            rendering = options.rendering
-            if view.low_pass_px2 is not None:
-                rendering = replace(rendering, low_pass_px2=view.low_pass_px2)
+            rendering = _rendering_of(view, state.iteration, options)
             leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
             drawn = render(replace(state.gaussians, **leaves), camera, options=rendering)
             fits_colors = options.view_color_rate > 0
@@ -194,7 +198,8 @@ def fit(
             if not adam.step(values, gradients, moments=state.moments, rates=rates, visible=seen):
                 raise _diverged(state, "a gradient that is not finite")
             rate = options.rates.means_at(done) if "means" in names else 0.0
-            state = control(replace(state, iteration=state.iteration + 1), Step(camera, seen, gradients, rate))
+            last = Step(camera, seen, gradients, rate, picture.detach() - image, rendering)
+            state = control(replace(state, iteration=state.iteration + 1), last)
             recent = value if recent == 0 else 0.95 * recent + 0.05 * value
             if state.iteration % _REPORT_EVERY == 0 or state.iteration == options.iterations:
                 message = f"loss {recent:.4f}, {state.gaussians.count / 1000:.1f}k Gaussians"
@@ -219,6 +224,23 @@ def _view_of(iteration: int, count: int, seed: int) -> int:
     """The view of an iteration: each pass visits all views in an order that depends on seed and pass only."""
     generator = torch.Generator().manual_seed((seed * 1_000_003 + iteration // count) % 2**62)
     return int(torch.randperm(count, generator=generator)[iteration % count])
+
+
+def _rendering_of(view: View, iteration: int, options: FitOptions) -> RenderOptions:
+    """How the view is drawn in an iteration."""
+    rendering = options.rendering
+    if view.low_pass_px2 is not None:
+        rendering = replace(rendering, low_pass_px2=view.low_pass_px2)
+    if options.random_background:
+        rendering = replace(rendering, background=_background_of(iteration, options.seed))
+    return rendering
+
+
+def _background_of(iteration: int, seed: int) -> tuple[float, float, float]:
+    """The colour behind the scene in an iteration, uniform in sRGB; depends on seed and iteration only."""
+    generator = torch.Generator().manual_seed((seed * 1_000_003 + iteration) % 2**62 + 1)
+    red, green, blue = torch.rand(3, generator=generator).tolist()
+    return red, green, blue
 
 
 def _start(gaussians: Gaussians, names: tuple[str, ...], views: int) -> FitState:

@@ -16,6 +16,8 @@ class StepCost:
     """Per Gaussian: projection, colours, Adam."""
     pixel: float = 0.3e-6
     """Per pixel: blending and loss."""
+    error: float = 0.1
+    """Share of all this that measuring the covered error adds."""
 
 
 def predict_cpu_seconds(capture: PosedImages, options: ReconstructOptions, cost: StepCost = StepCost()) -> float:
@@ -35,7 +37,8 @@ def predict_cpu_seconds(capture: PosedImages, options: ReconstructOptions, cost:
         begin = part.until
     # about a sixth fewer than the budget on average, as it is reached late
     gaussians = options.most_gaussians * 5 / 6
-    return options.all_iterations * (cost.fixed + cost.gaussian * gaussians + cost.pixel * pixels)
+    step = cost.fixed + cost.gaussian * gaussians + cost.pixel * pixels
+    return options.all_iterations * step * (1 + cost.error * options.splits_by_error)
 
 
 def describe_duration(seconds: float) -> str:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -30,10 +30,20 @@ class SeedPoints:
     def __len__(self) -> int:
         return len(self.points)
 
+    @staticmethod
+    def none() -> "SeedPoints":
+        """No points."""
+        return SeedPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+
     def drawn(self, count: int, seed: int) -> "SeedPoints":
         """At most `count` of the points, drawn at random, in their order."""
-        order = torch.randperm(len(self), generator=torch.Generator().manual_seed(seed))[:count].sort().values
-        return SeedPoints(self.points[order], self.colors[order], self.widest[order])
+        return self.select(
+            torch.randperm(len(self), generator=torch.Generator().manual_seed(seed))[:count].sort().values
+        )
+
+    def select(self, which: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> "SeedPoints":
+        """The chosen points."""
+        return SeedPoints(self.points[which], self.colors[which], self.widest[which])
 
     def joined(self, other: "SeedPoints") -> "SeedPoints":
         """These points, then the others."""

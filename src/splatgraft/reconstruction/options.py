@@ -1,6 +1,6 @@
 """Options of a reconstruction, and the presets of each quality."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from splatgraft.core.posed_images import PosedImages
@@ -34,12 +34,15 @@ class _Preset:
     budget: int
     longest_side_px: int
     sampling: tuple[Sampling, ...] = SPARSE
+    beyond_draft: bool = False
+    """Whether backgrounds are drawn by chance, the start has a far shell, and splits look at covered errors: `draft`
+    has none of them, since the numbers of the light estimate were fitted on draft scenes."""
 
 
 _PRESETS: dict[str, _Preset] = {
     "draft": _Preset(1_000, 25_000, 640),
-    "standard": _Preset(4_000, 100_000, 960),
-    "high": _Preset(10_000, 250_000, 1280),
+    "standard": _Preset(4_000, 100_000, 960, beyond_draft=True),
+    "high": _Preset(10_000, 250_000, 1280, beyond_draft=True),
     # iterations and image size as published; 3DGS-MCMC's usual bound
     "full": _Preset(30_000, 1_000_000, 1600, DENSE),
 }
@@ -66,6 +69,14 @@ class ReconstructOptions:
     photo_colors: bool | None = None
     """Whether each photo has its own exposure and white balance, which then stay out of the scene; None: where its EXIF
     says that they differ."""
+    random_background: bool | None = None
+    """Whether each step draws the scene over another colour, so that dark surfaces are not fitted by holes before
+    `background`; None: at `standard` and `high`, unless the photos show an object alone before `background`."""
+    far_shell: bool | None = None
+    """Whether the start has Gaussians behind everything, in the colours around; None: likewise."""
+    error_splits: bool | None = None
+    """Whether Gaussians are split by gradient and covered error, not by the gradient alone; None: at `standard` and
+    `high`."""
     eval_every: int = 0
     """Every how many views one is held out, from the first (3DGS: 8); 0 holds out none."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -99,6 +110,25 @@ class ReconstructOptions:
     def most_gaussians(self) -> int:
         """The budget, given or of the quality."""
         return _PRESETS[self.quality].budget if self.budget is None else self.budget
+
+    @property
+    def splits_by_error(self) -> bool:
+        """Whether splits look at the error that a Gaussian covers, given or of the quality."""
+        return _PRESETS[self.quality].beyond_draft if self.error_splits is None else self.error_splits
+
+    def decided(self, surroundings: bool) -> "ReconstructOptions":
+        """The same options with the choices made that the quality and the photos decide.
+
+        Args:
+            surroundings: Whether the photos show what is around, and not an object alone before `background`.
+        """
+        usual = _PRESETS[self.quality].beyond_draft and surroundings
+        return replace(
+            self,
+            random_background=usual if self.random_background is None else self.random_background,
+            far_shell=usual if self.far_shell is None else self.far_shell,
+            error_splits=self.splits_by_error,
+        )
 
     def sampling(self, served: PosedImages) -> tuple[Sampling, ...]:
         """Which pixels of the served capture the steps see, from the first to the last.

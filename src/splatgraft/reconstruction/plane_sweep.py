@@ -75,7 +75,7 @@ def sweep(
         nearest = max(nearest, float(_nearest(known, cameras).quantile(options.known_nearest)))
     depths = 1 / torch.linspace(1 / (options.far * reach), 1 / nearest, options.depths)
     search = _Search(tuple(cameras), tuple(images), known, depths, reach, options)
-    none = SeedPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+    none = SeedPoints.none()
     return reduce(SeedPoints.joined, (search.view(i) for i in range(len(cameras))), none)
 
 
@@ -98,7 +98,7 @@ class _Search:
         x, y = x[free].float() + 0.5, y[free].float() + 0.5
         others = self._neighbours(view)
         if len(x) == 0 or not others:
-            return SeedPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+            return SeedPoints.none()
         step = self.options.spacing_px * torch.tensor([-1.0, 0.0, 1.0])
         dy, dx = (grid.flatten() for grid in torch.meshgrid(step, step, indexing="ij"))
         pixels = torch.stack([x[:, None] + dx, y[:, None] + dy], -1)

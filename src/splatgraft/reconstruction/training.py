@@ -11,10 +11,11 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.fitting import FitOptions, FitState, LearningRates, Step, fit
 from splatgraft.reconstruction.density import DensityControl
+from splatgraft.reconstruction.far_shell import ShellOptions, shell_points, shell_radius, shows_surroundings
 from splatgraft.reconstruction.image_pyramid import Pyramid, read_pyramid
 from splatgraft.reconstruction.initialization import SeedPoints, from_points, looked_at, random_seeds, scene_extent
 from splatgraft.reconstruction.memory import require_memory
@@ -36,6 +37,8 @@ class ScheduleOptions:
     """Points of both kinds below which random ones are taken."""
     sweep: SweepOptions = field(default_factory=SweepOptions)
     """The search for points where the capture has none."""
+    shell: ShellOptions = field(default_factory=ShellOptions)
+    """The shell behind the scene, where the options ask for one."""
     start_share: float = 0.6
     """Gaussians at the start at most, over the budget; the others come where the density control wants them."""
     published_opacity: float = 0.1
@@ -52,6 +55,8 @@ class ScheduleOptions:
     """Share of the steps after which the budget may be reached."""
     stop_at: float = 0.8
     """Share of the steps after which Gaussians are neither split nor removed."""
+    error_every: int = 4
+    """Steps between two measurements of the error that each Gaussian covers, where the options ask for it."""
     means_power: float = 0.5
     """Exponent of the published length over the run's, the factor on the rate of the centres."""
     most_means: float = 4.0
@@ -96,6 +101,7 @@ def reconstruct(
         raise ValueError(f"reconstruct: expected at least 2 views to fit, found {len(capture)}")
     capture = options.served(capture)
     views = read_pyramid(capture, options.sampling(capture), device=options.device, progress=progress)
+    options = options.decided(_show_surroundings(views, options, schedule))
     start = _start(capture, views, options, schedule, progress=progress).to(options.device)
     control = _Control(
         options.sh_degree,
@@ -108,6 +114,7 @@ def reconstruct(
         seed=options.seed,
         view_color_rate=schedule.color_rate if options.photo_colors else 0.0,
         rendering=RenderOptions(background=options.background),
+        random_background=bool(options.random_background),
     )
     fitted = fit(start, views, options=fit_options, control=control, progress=progress, checkpoint=checkpoint)
     return fitted.with_sh_degree(options.sh_degree)
@@ -150,10 +157,28 @@ def _start(
         else:
             found = f"{found}: {len(swept)} found by comparing views"
         progress(0, options.all_iterations, found)
-    start = from_points(seeds.drawn(most, options.seed))
+    shell = _shell(capture, views, options.most_gaussians, schedule.shell) if options.far_shell else SeedPoints.none()
+    start = from_points(seeds.drawn(max(1, most - len(shell)), options.seed))
+    if len(shell):
+        # apart from the others, whose spacing bounds that of isolated points
+        start = concatenate([start, from_points(shell)])
     short = options.all_iterations < schedule.published_iterations
     opacity = schedule.short_run_opacity if short else schedule.published_opacity
     return replace(start, opacity_logits=torch.full_like(start.opacity_logits, opacity).logit())
+
+
+def _show_surroundings(views: Pyramid, options: ReconstructOptions, schedule: ScheduleOptions) -> bool:
+    _, images = views.reduced(schedule.shell.longest_side_px)
+    return shows_surroundings(images, options.background, schedule.shell)
+
+
+def _shell(capture: PosedImages, views: Pyramid, budget: int, options: ShellOptions) -> SeedPoints:
+    """Points behind the scene."""
+    cameras, images = views.reduced(options.longest_side_px)
+    focus, reach = looked_at(capture.cameras)
+    radius = shell_radius(capture.points, focus, reach, options)
+    count = max(1, int(options.share * budget))
+    return shell_points(cameras, images, center=focus, radius=radius, count=count, margin_deg=options.margin_deg)
 
 
 def _density(
@@ -167,6 +192,7 @@ def _density(
         full_at=int(schedule.full_at * n),
         stop=int(schedule.stop_at * n),
         camera_centers=cameras.centers.to(options.device),
+        error_every=schedule.error_every if options.splits_by_error else 0,
     )
 
 

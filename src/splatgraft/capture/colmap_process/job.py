@@ -67,6 +67,14 @@ class Search:
     """A second start that is closer to the first than this share gives the same model."""
     poor_share: float = 0.8
     """A photo with less than this of the median photo's share of matches explained is posed anew."""
+    lens_observations: int = 300
+    """Points that the photos of one camera must see for its whole lens to be solved: 30 for each of its numbers."""
+    lens_rounds: int = 3
+    """How often a lens is solved, each time with the matches that the last one explains."""
+    lens_error: float = 0.9
+    """Share to which the mean reprojection error of these photos must fall for their lenses to be taken."""
+    alike: float = 0.99
+    """Models whose score is above this share of the best one's are compared by their reprojection errors."""
     adjustments: int = 5
     """The most bundle adjustments in a row, each followed by dropping outliers (COLMAP: ba_global_max_refinements)."""
     adjusted_change: float = 0.0005

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .job import SEARCH
+from .lenses import lens_numbers
 
 Answer = dict[str, Any]
 """A model as plain numbers: its images with poses and cameras, its points, and its score."""
@@ -32,12 +33,18 @@ def read_matches(database: Path) -> Matches:
 
 
 def best_of(database: Path, models: list[Any], photos: int) -> Answer:
-    """The best of `models` as plain numbers; without images where there is none."""
+    """The best of `models` as plain numbers; without images where there is none.
+
+    Where nearly all matches are explained, a model with a wrong lens explains as many as one with the right lens, so
+    that among models of about the same score the reprojection error decides.
+    """
     matches = read_matches(database)
     if not models:
         return {"images": [], "points": [], "mean_reprojection_px": 0.0, "explained": 0.0, "score": 0.0}
-    best = max(models, key=lambda model: posed_and_explained(matches, model))
-    return _numbers(matches, best) | {"score": posed_and_explained(matches, best) / photos}
+    scores = [posed_and_explained(matches, model) for model in models]
+    alike = [i for i, score in enumerate(scores) if score >= SEARCH.alike * max(scores)]
+    best = min(alike, key=lambda i: models[i].compute_mean_reprojection_error())
+    return _numbers(matches, models[best]) | {"score": scores[best] / photos}
 
 
 def posed_and_explained(matches: Matches, model: Any) -> float:
@@ -93,7 +100,7 @@ def _numbers(matches: Matches, model: Any) -> Answer:
             {
                 "name": image.name,
                 "world_from_camera": image.cam_from_world().inverse().matrix().tolist(),
-                "camera": model.cameras[image.camera_id].params.tolist(),
+                "camera": lens_numbers(model.cameras[image.camera_id]),
                 "camera_id": image.camera_id,
                 "observations": int((seen[image.image_id] >= 0).sum()),
             }
