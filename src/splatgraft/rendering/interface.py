@@ -84,6 +84,12 @@ class ViewOperator(Protocol):
         """W^T image."""
         ...
 
+    def blend_and_transpose(
+        self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
+    ) -> Float[Tensor, "n 3"]:
+        """W^T (weights * W values), in which pixels count by `weights`; all alike where none are given."""
+        ...
+
 
 def render(
     gaussians: Gaussians,
