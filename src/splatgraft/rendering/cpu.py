@@ -215,9 +215,14 @@ class CpuViewOperator:
         with KERNEL_LOCK:
             lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
             self._lists = lists.without_hidden(self._view)
-            _, alpha = self._lists.blend(np.empty((gaussians.count, 0), np.float32), self._view, cpu_blend.ALL)
-        self.alpha = torch.from_numpy(alpha)
         self.visible = torch.from_numpy(self._lists.drawn)
+
+    @cached_property
+    def alpha(self) -> Float[Tensor, "h w"]:
+        """Accumulated opacity in [0, 1], computed when it is first asked for."""
+        with KERNEL_LOCK:
+            nothing = np.empty((self._lists.count, 0), np.float32)
+            return torch.from_numpy(self._lists.blend(nothing, self._view, cpu_blend.ALL)[1])
 
     def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
         """W values, over black; differentiable in `values`."""
@@ -239,6 +244,16 @@ class CpuViewOperator:
                 lists.splats, lists.start, lists.entries, lists.slots, _array(values)[lists.order], pixels, sums
             )
             return torch.from_numpy(lists.sum_slots(sums))
+
+    def transpose_residual(self, values: Float[Tensor, "n"], target: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
+        """W^T (target - W values)."""
+        lists = self._lists
+        sums = np.empty((len(lists.entries), 1), np.float32)
+        with KERNEL_LOCK:
+            cpu_normal_matrix.transpose_residual(
+                lists.splats, lists.start, lists.entries, lists.slots, _array(values)[lists.order], _array(target), sums
+            )
+            return torch.from_numpy(lists.sum_slots(sums)[:, 0])
 
 
 def _transpose(lists: _TileLists, image: Tensor) -> Tensor:

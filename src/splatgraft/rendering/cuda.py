@@ -68,6 +68,10 @@ class CudaViewOperator:
         image = self.blend(values)
         return self.blend_transpose(image if weights is None else image * weights[..., None])
 
+    def transpose_residual(self, values: Float[Tensor, "n"], target: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
+        """W^T (target - W values)."""
+        return self.blend_transpose(target[..., None] - self.blend(values[:, None]))[:, 0]
+
     def _draw(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return _draw(self._gaussians, self._camera, values, self._options)
 
