@@ -127,7 +127,13 @@ def measure(size: Size, say: Callable[[str], None] = print) -> dict[str, object]
     images = timed("render", lambda: [_picture(scene, camera).cpu() for camera in seen_by])
     harmonized = LazySequence(len(images), lambda index: spoilt(images[index], index).to(device))
     options = replace(ConsolidateOptions(), polish_passes=size.passes)
-    result = timed("consolidate", lambda: consolidate(scene, seen_by, harmonized, options))
+    since = time.process_time()
+
+    def progress(done: int, total: int, text: str) -> None:
+        if done < 10 or done % 200 == 0:
+            say(f"consolidate {done}/{total} cpu_seconds={time.process_time() - since:.0f} {text}")
+
+    result = timed("consolidate", lambda: consolidate(scene, seen_by, harmonized, options, progress=progress))
     before = float(psnr(spoilt(images[0], 0), images[0]))
     after = float(psnr(_picture(result, seen_by[0]).cpu(), images[0]))
     return {

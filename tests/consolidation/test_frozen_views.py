@@ -1,11 +1,13 @@
 """Frozen views: equal to the renderer, cropped cameras, transposes, the cache."""
 
+from dataclasses import replace
+
 import torch
 from conftest import ball, ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatgraft.consolidation.frozen_views import Views, memory_bytes
+from splatgraft.consolidation.frozen_views import Views
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
@@ -57,9 +59,43 @@ def test_a_cropped_camera_sees_a_cut_of_the_picture():
 
 def test_the_budget_bounds_what_is_kept():
     scene, cameras = ball(300, degree=2, seed=3), ring(6, 40)
-    one = memory_bytes(views_of(scene, cameras)[0])
-    assert one > 300 * 9 * 4
+    one = views_of(scene, cameras)[0].own_bytes
+    assert one > 40 * 40 * 4  # the opacity of every pixel alone
     views = views_of(scene, cameras, cache_bytes=int(2.5 * one))
     kept = [views[index] is views[index] for index in range(6)]
     assert 1 <= sum(kept) <= 3
     assert views_of(scene, cameras, cache_bytes=0)[0] is not None
+
+
+def test_what_is_cached_stays_cached_where_a_view_is_not_cropped():
+    scene, cameras = ball(300, degree=2, seed=4), ring(3, 40)
+    views = views_of(scene, cameras)
+    operators = [views[index].operator for index in range(3)]
+    part = views.restricted(torch.arange(300) > 9, [(0, 0, 40, 40), None, (0, 0, 39, 40)])
+    assert part[0].operator is operators[0]
+    assert part[1].operator is not operators[2]
+
+
+@given(st.integers(0, 3))
+def test_an_expansion_and_its_transposes_are_products_with_the_basis(degree):
+    scene, cameras = ball(150, degree=degree, seed=8), ring(1, 40)
+    scene = replace(scene, means=torch.cat([scene.means[:140], scene.means[140:] + 50]))
+    view = views_of(scene, cameras)[0]
+    generator = torch.Generator().manual_seed(degree)
+    basis, shown = view.expansion.basis * view.visible[:, None], view.visible
+    assert not bool(shown[140:].any())
+    colors, weights = torch.randn(150, 3, generator=generator), torch.rand(150, 1, generator=generator)
+    # float32 sums of at most 16 terms of size 1
+    assert torch.allclose(view.expansion.colors(scene.sh), torch.einsum("mk,mkc->mc", basis, scene.sh), atol=1e-5)
+    outer = basis[:, :, None] * colors[:, None, :]
+    added, written = torch.ones_like(scene.sh), torch.ones_like(scene.sh)
+    view.expansion.add_transpose(colors, added)
+    view.expansion.write_transpose(colors, written)
+    assert torch.allclose(added, 1 + outer, atol=1e-5)
+    assert torch.allclose(written, torch.where(shown[:, None, None], outer, 1), atol=1e-5)
+    squares = torch.zeros(150, basis.shape[1], basis.shape[1])
+    view.expansion.add_squares(weights, squares)
+    assert torch.allclose(squares, (weights * basis)[:, :, None] * basis[:, None, :], atol=1e-5)
+    sh = scene.sh.clone().requires_grad_()
+    view.expansion.colors(sh).backward(colors)
+    assert torch.allclose(sh.grad, outer, atol=1e-5)

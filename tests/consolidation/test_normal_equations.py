@@ -35,7 +35,7 @@ def test_equals_dense_ridge_regression():
     for index in range(5):
         blend = views[index].operator.blend(torch.eye(40)).reshape(-1, 40).double()
         root = weights[index].flatten().double().sqrt()[:, None]
-        design = (blend[:, :, None] * views[index].basis.double()[None]).reshape(-1, 160)
+        design = (blend[:, :, None] * views[index].expansion.basis.double()[None]).reshape(-1, 160)
         rows.append(root * design)
         right.append(root * (images[index].reshape(-1, 3).double() - 0.5 * blend.sum(1, keepdim=True)))
         seen += blend.T @ (root[:, 0] ** 2 * blend.sum(1))

@@ -57,3 +57,25 @@ def test_nothing_to_see():
     assert not operator.alpha.any()
     assert not operator.blend(torch.zeros(0, 3)).any()
     assert operator.blend_transpose(torch.ones(29, 37, 3)).shape == (0, 3)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_blending_and_transposing_at_once_equals_one_after_the_other(weighted):
+    operator = rendering.view_operator(random_scene(400, 0, seed=6), camera(100, 70))
+    generator = torch.Generator().manual_seed(7)
+    values, weights = torch.randn(400, 3, generator=generator), torch.rand(70, 100, generator=generator)
+    picture = operator.blend(values)
+    wanted = operator.blend_transpose(picture * weights[..., None] if weighted else picture)
+    # the same products in the same order
+    assert torch.equal(operator.blend_and_transpose(values, weights if weighted else None), wanted)
+
+
+def test_the_transposed_residual_equals_one_after_the_other():
+    operator = rendering.view_operator(random_scene(400, 0, seed=8), camera(100, 70))
+    generator = torch.Generator().manual_seed(9)
+    values, target = torch.randn(400, generator=generator), torch.randn(70, 100, generator=generator)
+    picture = operator.blend(values[:, None])[..., 0]
+    target[:32] = picture[:32]  # tiles without any error
+    wanted = operator.blend_transpose((target - picture)[..., None])[:, 0]
+    # the same float32 products, summed over rows in another order
+    assert torch.allclose(operator.transpose_residual(values, target), wanted, atol=1e-5)

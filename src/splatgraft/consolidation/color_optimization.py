@@ -42,6 +42,7 @@ def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
     """
     views, start = targets.views, 0
     sh = sh.clone().contiguous()
+    gradient = torch.zeros_like(sh)
     moments = adam.no_moments({"sh": sh}, len(sh))
     saved = checkpoint.load()
     if saved is not None:
@@ -51,11 +52,13 @@ def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
     shares[:3] = 1.0
     for iteration in range(start, options.iterations):
         index = _view_of(iteration, len(views), seed)
-        view, leaf = views[index], sh.detach().requires_grad_()
-        picture = view.render(leaf)
+        view = views[index]
+        colors = view.colors(sh).requires_grad_()
+        picture = view.draw(colors)
         picture, target = _weighted_pair(picture, targets.target(index), views.weight(index))
         value = loss(picture, target)
-        (gradient,) = torch.autograd.grad(value, leaf)
+        # rows of Gaussians that the view does not show keep an earlier view's gradient, and are not updated
+        view.expansion.write_transpose(torch.autograd.grad(value, colors)[0], gradient)
         rates = options.rate * _decay(iteration / options.iterations, options.final_ratio) * shares
         if not adam.step({"sh": sh}, {"sh": gradient}, moments=moments, rates={"sh": rates}, visible=view.visible):
             name = views.cameras.names[index]

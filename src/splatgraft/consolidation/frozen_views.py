@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from splatgraft.consolidation.expansion import Expansion
 from splatgraft.consolidation.options import ImageSequence
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras, Window
@@ -25,8 +26,8 @@ class View:
 
     operator: ViewOperator
     """From the values of all n Gaussians to pixels."""
-    basis: Float[Tensor, "m k"]
-    """Spherical harmonics towards each active Gaussian."""
+    expansion: Expansion
+    """From coefficients of the active Gaussians to their colours towards the view."""
     static: Float[Tensor, "h w 3"] | None
     """Image of the other Gaussians and the background; None where that is zero."""
     active: Int[Tensor, "m"] | None
@@ -37,26 +38,46 @@ class View:
         """Which active Gaussians have weight in the view."""
         return self.operator.visible if self.active is None else self.operator.visible[self.active]
 
+    @property
+    def own_bytes(self) -> int:
+        """Memory that no other view shares."""
+        return sum(memory_bytes(part) for part in (self.operator, self.static, self.expansion.shown))
+
     def colors(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
-        """The expansion towards this view, plus one half, not clamped."""
-        return torch.einsum("mk,mkc->mc", self.basis, sh) + 0.5
+        """The expansion towards this view, plus one half, not clamped; one half where the view shows nothing."""
+        return self.expansion.colors(sh) + 0.5
 
     def blend(self, colors: Float[Tensor, "m c"]) -> Float[Tensor, "h w c"]:
         """The linear part: active Gaussians over black."""
-        if self.active is None:
-            return self.operator.blend(colors)
-        values = colors.new_zeros(len(self.operator.visible), colors.shape[1])
-        return self.operator.blend(values.index_copy(0, self.active, colors))
+        return self.operator.blend(self._of_all(colors))
 
     def render(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "h w 3"]:
         """The image, with colours clamped at zero as every 3DGS renderer does; differentiable."""
-        picture = self.blend(self.colors(sh).clamp_min(0))
+        return self.draw(self.colors(sh))
+
+    def draw(self, colors: Float[Tensor, "m 3"]) -> Float[Tensor, "h w 3"]:
+        """The image of colours, clamped at zero; differentiable."""
+        picture = self.blend(colors.clamp_min(0))
         return picture if self.static is None else picture + self.static
 
     def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "m c"]:
         """The transpose of `blend`."""
         values = self.operator.blend_transpose(image)
         return values if self.active is None else values[self.active]
+
+    def blend_and_transpose(
+        self, colors: Float[Tensor, "m 3"], weights: Float[Tensor, "h w"] | None
+    ) -> Float[Tensor, "m 3"]:
+        """`blend`, then pixels times `weights` where given, then `blend_transpose`."""
+        values = self.operator.blend_and_transpose(self._of_all(colors), weights)
+        return values if self.active is None else values[self.active]
+
+    def _of_all(self, colors: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
+        """The colours among zeros of the Gaussians that are not active."""
+        if self.active is None:
+            return colors
+        values = colors.new_zeros(len(self.operator.visible), colors.shape[1])
+        return values.index_copy(0, self.active, colors)
 
 
 class Views:
@@ -80,6 +101,7 @@ class Views:
         self.composite, self.cameras, self.images, self.weights = composite, cameras, images, weights
         self.rendering, self.cache_bytes = rendering, cache_bytes
         self.active: Tensor | None = None
+        self._means = composite.means.float().contiguous()
         self._cached: dict[int, View] = {}
         self._cached_bytes = 0
 
@@ -88,7 +110,10 @@ class Views:
         return len(self.cameras)
 
     def restricted(self, active: Bool[Tensor, "n"], windows: Sequence[Window | None]) -> "Views":
-        """The same views with some Gaussians active, cropped to `windows`, and without those whose window is None."""
+        """The same views with some Gaussians active, cropped to `windows`, and without those whose window is None.
+
+        The cache goes to the new views, as far as they are not cropped.
+        """
         chosen = [i for i, window in enumerate(windows) if window is not None]
         kept = [window for window in windows if window is not None]
         restricted = Views(
@@ -99,35 +124,54 @@ class Views:
             rendering=self.rendering,
             cache_bytes=self.cache_bytes,
         )
-        restricted.active = None if bool(active.all()) else torch.nonzero(active).flatten()
+        if not bool(active.all()):
+            restricted.active = torch.nonzero(active).flatten()
+            restricted._means = self._means[active]
+        for place, (index, window) in enumerate(zip(chosen, kept, strict=True)):
+            known = self._cached.pop(index, None)
+            if known is not None and window == (0, 0, *self.cameras.sizes[index].tolist()):
+                restricted._keep(place, restricted._view(place, known.operator))
+        self._cached, self._cached_bytes = {}, 0
         return restricted
 
     def __getitem__(self, index: int) -> View:
         """The view's map, from the cache or built anew."""
         if index in self._cached:
             return self._cached[index]
-        view = self._build(index)
-        size = memory_bytes(view)
-        if self._cached_bytes + size <= self.cache_bytes:
-            self._cached[index] = view
-            self._cached_bytes += size
+        view = self._view(index, view_operator(self.composite, self.cameras[index], self.rendering))
+        self._keep(index, view)
         return view
 
-    def _build(self, index: int) -> View:
+    def _keep(self, index: int, view: View) -> None:
+        if self._cached_bytes + view.own_bytes <= self.cache_bytes:
+            self._cached[index] = view
+            self._cached_bytes += view.own_bytes
+
+    def _view(self, index: int, operator: ViewOperator) -> View:
         scene, camera = self.composite, self.cameras[index]
-        operator = view_operator(scene, camera, self.rendering)
-        directions = torch.nn.functional.normalize(scene.means - camera.centers, dim=-1)
-        static = None
+        static, visible = None, operator.visible
         if any(self.rendering.background):
             static = (1 - operator.alpha)[..., None] * operator.alpha.new_tensor(self.rendering.background)
         if self.active is not None:
-            colors = spherical_harmonics.colors(scene.sh, directions)
-            colors[self.active] = 0
-            others = operator.blend(colors)
-            static = others if static is None else static + others
-            directions = directions[self.active]
-        basis = spherical_harmonics.basis(directions, scene.sh_degree)
-        return View(operator=operator, basis=basis, static=static, active=self.active)
+            static = self._fixed(operator, camera, static)
+            visible = visible[self.active]
+        shown = torch.nonzero(visible).flatten().int()
+        expansion = Expansion(self._means, camera.centers[0].float().contiguous(), shown, scene.sh_degree)
+        return View(operator=operator, expansion=expansion, static=static, active=self.active)
+
+    def _fixed(self, operator: ViewOperator, camera: Cameras, behind: Tensor | None) -> Tensor | None:
+        """What the Gaussians that are not active add to the image; None where neither they nor `behind` are seen."""
+        fixed = operator.visible.clone()
+        fixed[self.active] = False
+        which = torch.nonzero(fixed).flatten()
+        if not len(which):
+            return behind
+        scene = self.composite
+        colors = scene.sh.new_zeros(scene.count, 3)
+        directions = torch.nn.functional.normalize(scene.means[which] - camera.centers, dim=-1)
+        colors[which] = spherical_harmonics.colors(scene.sh[which], directions)
+        others = operator.blend(colors)
+        return others if behind is None else behind + others
 
     def target(self, index: int) -> Float[Tensor, "h w 3"]:
         """The harmonised image of a view.

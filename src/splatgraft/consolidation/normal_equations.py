@@ -19,6 +19,8 @@ from splatgraft.runtime.progress import Progress, silent
 
 _FACTORED_AT_ONCE = 2**14
 """Gaussians per batch of Cholesky factorisations, which bounds the memory."""
+_COMPARED_VIEWS = 40
+"""Views at most on which ridges are compared."""
 _HOLD_OUT_EVERY = 5
 """Every how many views one is left out while ridges are compared."""
 
@@ -33,8 +35,8 @@ class _Equations:
     """Indices of the views that count."""
     seen: Float[Tensor, "m 1"]
     """Pixels that each Gaussian makes up, summed over all views (row sums of W^T W)."""
-    factor: Float[Tensor, "m k k"]
-    """Cholesky factors of the preconditioner, one block per Gaussian, with the row sums of W^T W on its diagonal."""
+    inverse: Float[Tensor, "m k k"]
+    """The preconditioner: per Gaussian the inverse of a block with the row sums of W^T W on its diagonal."""
     ridge: Float[Tensor, "m k"]
     """Weight of the prior, pixels."""
 
@@ -46,11 +48,9 @@ class _Equations:
         """The matrix times coefficients."""
         out = self.ridge[..., None] * sh
         for index in self.which:
-            view, weight = self.views[index], self.views.weight(index)
-            picture = view.blend(torch.einsum("mk,mkc->mc", view.basis, sh))
-            if weight is not None:
-                picture = picture * weight[..., None]
-            out += view.basis[:, :, None] * view.blend_transpose(picture)[:, None, :]
+            view = self.views[index]
+            colors = view.blend_and_transpose(view.expansion.colors(sh), self.views.weight(index))
+            view.expansion.add_transpose(colors, out)
         return out
 
 
@@ -92,9 +92,16 @@ def solve(
 def _select_ridge(
     prior: Float[Tensor, "m k 3"], targets: CorrectedTargets, equations: _Equations, options: SolveOptions
 ) -> float:
-    """The ridge whose short solution without every 5th view predicts those views best (cross-validation)."""
-    held_out = range(_HOLD_OUT_EVERY // 2, len(targets.views), _HOLD_OUT_EVERY)
-    fitted = [index for index in equations.which if index not in held_out]
+    """The ridge whose short solution without every 5th view predicts those views best (cross-validation).
+
+    Of many views some are enough, evenly spaced: the ridge is one number, and a share of the pixels that are seen.
+    """
+    count = len(targets.views)
+    compared = min(count, _COMPARED_VIEWS)
+    chosen = [place * count // compared for place in range(compared)]
+    held_out = chosen[_HOLD_OUT_EVERY // 2 :: _HOLD_OUT_EVERY]
+    fitted = [index for index in chosen if index not in held_out]
+    equations = replace(equations, seen=equations.seen * (compared / count))
     residual, _ = _residual(prior, targets, fitted, refine=False)
     errors = {}
     for band_ridge in options.band_ridges:
@@ -112,13 +119,13 @@ def _build_equations(prior: Float[Tensor, "m k 3"], views: Views, band_ridge: fl
         view, weight = views[index], views.weight(index)
         share = view.blend(prior.new_ones(m, 1))
         share = view.blend_transpose(share if weight is None else share * weight[..., None])
-        blocks.baddbmm_((share * view.basis)[:, :, None], view.basis[:, None, :])
+        view.expansion.add_squares(share, blocks)
         seen += share
     ridge = _ridge(seen, k, band_ridge, prior_px)
     blocks.diagonal(dim1=1, dim2=2).add_(ridge)
     for part in blocks.split(_FACTORED_AT_ONCE):  # in place: the blocks are the largest thing in memory
-        part.copy_(torch.linalg.cholesky(part))
-    return _Equations(views, range(len(views)), seen, factor=blocks, ridge=ridge)
+        part.copy_(torch.cholesky_inverse(torch.linalg.cholesky(part)))
+    return _Equations(views, range(len(views)), seen, inverse=blocks, ridge=ridge)
 
 
 def _ridge(seen: Float[Tensor, "m 1"], k: int, band_ridge: float, prior_px: float) -> Float[Tensor, "m k"]:
@@ -137,7 +144,7 @@ def _residual(
         if refine:
             targets.refine(index, picture)
         difference = _difference(targets, index, picture)
-        out += view.basis[:, :, None] * view.blend_transpose(difference)[:, None, :]
+        view.expansion.add_transpose(view.blend_transpose(difference), out)
         squares += float((difference**2).sum())
         count += difference.numel()
     return out, (squares / count) ** 0.5
@@ -156,14 +163,14 @@ def _difference(targets: CorrectedTargets, index: int, picture: Float[Tensor, "h
 def _conjugate_gradient(residual: Float[Tensor, "m k 3"], equations: _Equations, steps: int) -> Float[Tensor, "m k 3"]:
     """`steps` steps on the correction, each colour channel by itself; the products are summed in double precision."""
     solution = torch.zeros_like(residual)
-    conditioned = torch.cholesky_solve(residual, equations.factor)
+    conditioned = torch.bmm(equations.inverse, residual)
     direction, before = conditioned, _dot(residual, conditioned)
     for _ in range(steps):
         image_of = equations.apply(direction)
         length = before / _dot(direction, image_of).clamp_min(1e-30)
         solution += length * direction
         residual = residual - length * image_of
-        conditioned = torch.cholesky_solve(residual, equations.factor)
+        conditioned = torch.bmm(equations.inverse, residual)
         now = _dot(residual, conditioned)
         direction = conditioned + (now / before.clamp_min(1e-30)) * direction
         before = now

@@ -75,7 +75,7 @@ class ConsolidateOptions:
     """The descent of `adam`."""
     unchanged_below: float = 2.0 / 255
     """Pixels that differ less than this from the composite's render are unchanged; 0: all count as changed. `fast`."""
-    cache_bytes: int = 256 * 2**20
+    cache_bytes: int = 3 * 2**30
     """Bytes of tile lists and bases cached between passes; the rest is computed again in each pass."""
     rendering: RenderOptions = field(default_factory=RenderOptions)
     """How the scene is rendered."""

@@ -1,6 +1,6 @@
 """Rendering on the CPU: numba kernels for projection, tile lists and blending, as torch autograd functions."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.rendering import cpu_blend, cpu_project, cpu_tiles
+from splatgraft.rendering import cpu_blend, cpu_normal_matrix, cpu_project, cpu_tiles
 from splatgraft.rendering.channels import CHANNEL_COUNTS, assemble_render
 from splatgraft.rendering.interface import Output, Render, RenderOptions
 from splatgraft.runtime.kernel_lock import KERNEL_LOCK
@@ -78,12 +78,14 @@ class _View:
 class _TileLists:
     """The splats of one view, nearest first, and which tiles list them."""
 
+    count: int
+    """Gaussians of the scene, n."""
     order: np.ndarray
     """(m,) Gaussian of each splat."""
     splats: np.ndarray
     """(m, 8) in the order of `order`."""
     depths: np.ndarray
-    """(n,) along the optical axis; set where visible."""
+    """(n,) along the optical axis; set where visible; empty in lists without hidden splats."""
     start: np.ndarray
     """(tiles + 1,) where each tile's list begins in `entries`."""
     entries: np.ndarray
@@ -99,12 +101,12 @@ class _TileLists:
         cpu_project.project(means, log_scales, quaternions, logits, view.numbers, view.antialiased, splats, depths)
         order = cpu_tiles.depth_order(splats, depths)
         packed, start, entries, slots, first = cpu_tiles.bin_splats(splats, order, view.width, view.height)
-        return _TileLists(order, packed, depths, start, entries, slots, first)
+        return _TileLists(len(means), order, packed, depths, start, entries, slots, first)
 
     @cached_property
     def drawn(self) -> np.ndarray:
         """(n,) whether any tile lists the Gaussian."""
-        out = np.zeros(len(self.depths), np.bool_)
+        out = np.zeros(self.count, np.bool_)
         out[self.order[np.diff(self.first) > 0]] = True
         return out
 
@@ -114,12 +116,18 @@ class _TileLists:
         shown = self.blend_transpose(ones, cpu_blend.MIN_TRANSMITTANCE)[:, 0] > 0
         listed = shown[self.slots]
         shown_before, listed_before = (np.concatenate([[0], np.cumsum(x)]).astype(np.int32) for x in (shown, listed))
-        return replace(
-            self,
+        first = shown_before[self.first]
+        kept = first[1:] > first[:-1]
+        place = (np.cumsum(kept) - 1).astype(np.int32)
+        return _TileLists(
+            count=self.count,
+            order=self.order[kept],
+            splats=self.splats[kept],
+            depths=np.empty(0, np.float32),
             start=listed_before[self.start],
-            entries=self.entries[listed],
+            entries=place[self.entries[listed]],
             slots=shown_before[self.slots[listed]],
-            first=shown_before[self.first],
+            first=np.concatenate([first[:1], first[1:][kept]]),
         )
 
     def blend(self, values: np.ndarray, view: _View, least: np.float32) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +145,7 @@ class _TileLists:
 
     def sum_slots(self, sums: np.ndarray) -> np.ndarray:
         """Sums of entries (e, c) added up per Gaussian (n, c)."""
-        out = np.zeros((len(self.drawn), sums.shape[1]), np.float32)
+        out = np.zeros((self.count, sums.shape[1]), np.float32)
         cpu_blend.sum_slots(sums, self.first, self.order, out)
         return out
 
@@ -207,9 +215,14 @@ class CpuViewOperator:
         with KERNEL_LOCK:
             lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
             self._lists = lists.without_hidden(self._view)
-            _, alpha = self._lists.blend(np.empty((gaussians.count, 0), np.float32), self._view, cpu_blend.ALL)
-        self.alpha = torch.from_numpy(alpha)
         self.visible = torch.from_numpy(self._lists.drawn)
+
+    @cached_property
+    def alpha(self) -> Float[Tensor, "h w"]:
+        """Accumulated opacity in [0, 1], computed when it is first asked for."""
+        with KERNEL_LOCK:
+            nothing = np.empty((self._lists.count, 0), np.float32)
+            return torch.from_numpy(self._lists.blend(nothing, self._view, cpu_blend.ALL)[1])
 
     def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
         """W values, over black; differentiable in `values`."""
@@ -218,6 +231,29 @@ class CpuViewOperator:
     def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
         """W^T image."""
         return _transpose(self._lists, image)
+
+    def blend_and_transpose(
+        self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
+    ) -> Float[Tensor, "n 3"]:
+        """W^T (weights * W values); weights of 1 where none are given."""
+        lists, view = self._lists, self._view
+        pixels = np.ones((view.height, view.width), np.float32) if weights is None else _array(weights)
+        sums = np.empty((len(lists.entries), values.shape[1]), np.float32)
+        with KERNEL_LOCK:
+            cpu_normal_matrix.blend_and_transpose(
+                lists.splats, lists.start, lists.entries, lists.slots, _array(values)[lists.order], pixels, sums
+            )
+            return torch.from_numpy(lists.sum_slots(sums))
+
+    def transpose_residual(self, values: Float[Tensor, "n"], target: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
+        """W^T (target - W values)."""
+        lists = self._lists
+        sums = np.empty((len(lists.entries), 1), np.float32)
+        with KERNEL_LOCK:
+            cpu_normal_matrix.transpose_residual(
+                lists.splats, lists.start, lists.entries, lists.slots, _array(values)[lists.order], _array(target), sums
+            )
+            return torch.from_numpy(lists.sum_slots(sums)[:, 0])
 
 
 def _transpose(lists: _TileLists, image: Tensor) -> Tensor:

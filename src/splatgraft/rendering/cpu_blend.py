@@ -44,7 +44,7 @@ E0, E1, E2, E3, E4 = (float32(x) for x in (0.99999994, 0.9999898, 0.49976337, 0.
 
 @njit(cache=True)
 @no_type_check
-def _shape(splats, s, x0, y0):
+def splat_shape(splats, s, x0, y0):
     """Centre in the tile, the quadratic's a, b, c and constant over 16, first and one past the last row."""
     mx, my = splats[s, MX] - x0 - HALF, splats[s, MY] - y0 - HALF
     # a thousandth of a pixel covers rounding, and each pixel is tested exactly; truncation is floor above 0
@@ -57,7 +57,7 @@ def _shape(splats, s, x0, y0):
 
 @njit(cache=True)
 @no_type_check
-def _alpha(across, dx, along, down):
+def alpha_row(across, dx, along, down):
     """A row of alpha before the cap, 0 below 1/255, of the exponent `across` + `along` dx + `down` (all over 16)."""
     x = across + dx * along + down
     e = (((x * E4 + E3) * x + E2) * x + E1) * x + E0
@@ -84,7 +84,7 @@ def _blend_rgb(splats, entries, values, x0, y0, work, least):
     """Planes of `work`: transmittance, red, green, blue."""
     for k in range(entries.shape[0]):
         s = entries[k]
-        mx, my, a, b, c, d, top, bottom = _shape(splats, s, x0, y0)
+        mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
         dx = lanes() - mx
         across = dx * dx * a + d
@@ -92,7 +92,7 @@ def _blend_rgb(splats, entries, values, x0, y0, work, least):
             dy = float32(y) - my
             at = y * TILE
             before = load(work, at)
-            weight = smaller(_alpha(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            weight = smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
             store(work, at, before - weight)
             store(work, at + PIXELS, load(work, at + PIXELS) + weight * red)
             store(work, at + 2 * PIXELS, load(work, at + 2 * PIXELS) + weight * green)
@@ -107,14 +107,14 @@ def _blend_any(splats, entries, values, x0, y0, work, least):
     """Planes of `work`: transmittance, then the channels."""
     for k in range(entries.shape[0]):
         s = entries[k]
-        mx, my, a, b, c, d, top, bottom = _shape(splats, s, x0, y0)
+        mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         dx = lanes() - mx
         across = dx * dx * a + d
         for y in range(top, bottom):
             dy = float32(y) - my
             at = y * TILE
             before = load(work, at)
-            weight = smaller(_alpha(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            weight = smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
             store(work, at, before - weight)
             for channel in range(values.shape[1]):
                 at += PIXELS
@@ -125,7 +125,7 @@ def _blend_any(splats, entries, values, x0, y0, work, least):
 
 @njit(cache=True)
 @no_type_check
-def _open_tile(tile, width, planes):
+def open_tile(tile, width, planes):
     """Corner of the tile, and its planes: transmittance 1, the others 0."""
     tiles_x = (width + TILE - 1) // TILE
     work = np.zeros(planes * PIXELS, np.float32)
@@ -142,7 +142,7 @@ def blend(splats, start, entries, values, image, alpha, least):
     """
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
-        x0, y0, work = _open_tile(tile, alpha.shape[1], 1 + channels)
+        x0, y0, work = open_tile(tile, alpha.shape[1], 1 + channels)
         listed = entries[start[tile] : start[tile + 1]]
         if channels == RGB:
             _blend_rgb(splats, listed, values, float32(x0), float32(y0), work, least)
@@ -158,7 +158,7 @@ def blend(splats, start, entries, values, image, alpha, least):
 
 @njit(cache=True)
 @no_type_check
-def _read(image, x0, y0, work, plane):
+def read_tile(image, x0, y0, work, plane):
     """Copy the tile at x0, y0 of `image (h, w)` into a plane, which stays 0 outside the image."""
     for y in range(y0, min(y0 + TILE, image.shape[0])):
         for x in range(x0, min(x0 + TILE, image.shape[1])):
@@ -170,7 +170,7 @@ def _read(image, x0, y0, work, plane):
 def _transpose_rgb(splats, entries, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, red, green, blue."""
     for k in range(entries.shape[0]):
-        mx, my, a, b, c, d, top, bottom = _shape(splats, entries[k], x0, y0)
+        mx, my, a, b, c, d, top, bottom = splat_shape(splats, entries[k], x0, y0)
         dx = lanes() - mx
         across = dx * dx * a + d
         red, green, blue = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
@@ -178,7 +178,7 @@ def _transpose_rgb(splats, entries, slots, x0, y0, work, sums, least):
             dy = float32(y) - my
             at = y * TILE
             before = load(work, at)
-            weight = smaller(_alpha(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            weight = smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
             store(work, at, before - weight)
             red = red + weight * load(work, at + PIXELS)
             green = green + weight * load(work, at + 2 * PIXELS)
@@ -197,7 +197,7 @@ def _transpose_any(splats, entries, slots, x0, y0, work, sums, least):
     channels = sums.shape[1]
     column = np.empty(channels * TILE, np.float32)
     for k in range(entries.shape[0]):
-        mx, my, a, b, c, d, top, bottom = _shape(splats, entries[k], x0, y0)
+        mx, my, a, b, c, d, top, bottom = splat_shape(splats, entries[k], x0, y0)
         dx = lanes() - mx
         across = dx * dx * a + d
         column[:] = ZERO
@@ -205,7 +205,7 @@ def _transpose_any(splats, entries, slots, x0, y0, work, sums, least):
             dy = float32(y) - my
             at = y * TILE
             before = load(work, at)
-            weight = smaller(_alpha(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            weight = smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
             store(work, at, before - weight)
             for channel in range(channels):
                 at += PIXELS
@@ -223,10 +223,10 @@ def blend_transpose(splats, start, entries, slots, image, sums, least):
     """Fill `sums (e, c)`: for every entry, the sum over its pixels of weight times `image (c, h, w)`."""
     channels = image.shape[0]
     for tile in prange(start.shape[0] - 1):
-        x0, y0, work = _open_tile(tile, image.shape[2], 1 + channels)
+        x0, y0, work = open_tile(tile, image.shape[2], 1 + channels)
         listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
         for c in range(channels):
-            _read(image[c], x0, y0, work, 1 + c)
+            read_tile(image[c], x0, y0, work, 1 + c)
         if channels == RGB:
             used = _transpose_rgb(splats, listed, places, float32(x0), float32(y0), work, sums, least)
         else:
@@ -257,7 +257,7 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, rest, gradients of alpha, red, green, blue."""
     for k in range(entries.shape[0]):
         s, slot = entries[k], slots[k]
-        mx, my, a, b, c, d, top, bottom = _shape(splats, s, x0, y0)
+        mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
         dx = lanes() - mx
         across = dx * dx * a + d
@@ -267,7 +267,7 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
             dy = float32(y) - my
             at = y * TILE
             before = load(work, at)
-            uncapped = _alpha(across, dx, b * dy, c * dy * dy)
+            uncapped = alpha_row(across, dx, b * dy, c * dy * dy)
             alpha = smaller(uncapped, MAX_ALPHA)
             weight = alpha * before
             to_red, to_green = load(work, at + 3 * PIXELS), load(work, at + 4 * PIXELS)
@@ -297,7 +297,7 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
     column = np.empty(channels * TILE, np.float32)
     for k in range(entries.shape[0]):
         s, slot = entries[k], slots[k]
-        mx, my, a, b, c, d, top, bottom = _shape(splats, s, x0, y0)
+        mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         dx = lanes() - mx
         across = dx * dx * a + d
         s0, sy, syy = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
@@ -306,7 +306,7 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
             dy = float32(y) - my
             at = y * TILE
             before = load(work, at)
-            uncapped = _alpha(across, dx, b * dy, c * dy * dy)
+            uncapped = alpha_row(across, dx, b * dy, c * dy * dy)
             alpha = smaller(uncapped, MAX_ALPHA)
             weight = alpha * before
             value = load(work, at + 2 * PIXELS)
@@ -333,11 +333,11 @@ def blend_backward(splats, start, entries, slots, values, image, alpha, grad_ima
     """Fill `sums (e, 6 + c)`: for every entry its moments for `project_backward`, and its values' gradients."""
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
-        x0, y0, work = _open_tile(tile, alpha.shape[1], 3 + channels)
+        x0, y0, work = open_tile(tile, alpha.shape[1], 3 + channels)
         listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
-        _read(grad_alpha, x0, y0, work, 2)
+        read_tile(grad_alpha, x0, y0, work, 2)
         for c in range(channels):
-            _read(grad_image[c], x0, y0, work, 3 + c)
+            read_tile(grad_image[c], x0, y0, work, 3 + c)
         # contribution of what lies behind a splat; before the first splat, gradient times final pixel
         for y in range(y0, min(y0 + TILE, alpha.shape[0])):
             for x in range(x0, min(x0 + TILE, alpha.shape[1])):

@@ -61,6 +61,17 @@ class CudaViewOperator:
             values = image.new_zeros(self._gaussians.count, image.shape[-1], requires_grad=True)
             return torch.autograd.grad(self._draw(values)[0], values, image)[0]
 
+    def blend_and_transpose(
+        self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
+    ) -> Float[Tensor, "n 3"]:
+        """W^T (weights * W values); weights of 1 where none are given."""
+        image = self.blend(values)
+        return self.blend_transpose(image if weights is None else image * weights[..., None])
+
+    def transpose_residual(self, values: Float[Tensor, "n"], target: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
+        """W^T (target - W values)."""
+        return self.blend_transpose(target[..., None] - self.blend(values[:, None]))[:, 0]
+
     def _draw(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return _draw(self._gaussians, self._camera, values, self._options)
 

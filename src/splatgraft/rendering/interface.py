@@ -71,10 +71,13 @@ class Render:
 class ViewOperator(Protocol):
     """The fixed linear map W from Gaussian values to pixels of one view: geometry and opacity are frozen."""
 
-    alpha: Float[Tensor, "h w"]
-    """Accumulated opacity in [0, 1]."""
     visible: Bool[Tensor, "n"]
     """Which Gaussians have weight in some pixel."""
+
+    @property
+    def alpha(self) -> Float[Tensor, "h w"]:
+        """Accumulated opacity in [0, 1]."""
+        ...
 
     def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
         """W values, over black. Differentiable in `values`."""
@@ -82,6 +85,16 @@ class ViewOperator(Protocol):
 
     def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
         """W^T image."""
+        ...
+
+    def blend_and_transpose(
+        self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
+    ) -> Float[Tensor, "n 3"]:
+        """W^T (weights * W values), in which pixels count by `weights`; all alike where none are given."""
+        ...
+
+    def transpose_residual(self, values: Float[Tensor, "n"], target: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
+        """W^T (target - W values)."""
         ...
 
 

@@ -139,9 +139,8 @@ def occluded_irradiance(
 
 @njit(cache=True, fastmath=True, inline="always")
 @no_type_check
-def _soft_cosine(cosine, softness):
-    """Mean of max(0, cos) over a cone, approximated by a quadratic; as `shading.irradiance.soft_cosine`."""
-    edge = np.sin(softness)
+def _soft_cosine(cosine, edge):
+    """Mean of max(0, cos) over a cone whose radius has the sine `edge`; as `shading.irradiance.soft_cosine`."""
     if cosine >= edge:
         return cosine
     if cosine <= -edge:
@@ -163,6 +162,7 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
         count, j = (search, t) if t < search else (taps, t - search)
         r, angle = np.sqrt((j + 0.5) / count), j * _GOLDEN_ANGLE
         disk[t, 0], disk[t, 1] = r * np.cos(angle), r * np.sin(angle)
+    spreads, edges = np.tan(np.minimum(softness, _WIDEST_CONE)), np.sin(softness)
     for i in prange(len(points)):
         x, y, z = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
         for k in range(len(frames)):
@@ -171,7 +171,7 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
             lx, ly, lz = -f[2, 0] - near * x, -f[2, 1] - near * y, -f[2, 2] - near * z
             square = max(lx * lx + ly * ly + lz * lz, np.float32(1e-6))
             cosine = (lx * normals[i, 0] + ly * normals[i, 1] + lz * normals[i, 2]) / np.sqrt(square)
-            weight = _soft_cosine(cosine, softness[k]) * sample_visibility[i, k] / square
+            weight = _soft_cosine(cosine, edges[k]) * sample_visibility[i, k] / square
             if weight <= 0:
                 continue
             for c in range(3):
@@ -181,7 +181,7 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
             zoom = np.float32(1) / max(np.float32(1) + near * depth, np.float32(1e-3))
             u = zoom * (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z)
             v = zoom * (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z)
-            spread = np.tan(min(softness[k], _WIDEST_CONE))
+            spread = spreads[k]
             # change of the cosine over the cone: directions below the surface give no light
             tilt_u = spread * (f[0, 0] * normals[i, 0] + f[0, 1] * normals[i, 1] + f[0, 2] * normals[i, 2])
             tilt_v = spread * (f[1, 0] * normals[i, 0] + f[1, 1] * normals[i, 1] + f[1, 2] * normals[i, 2])
@@ -190,26 +190,29 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
             blocked, red, green, blue = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
             if depth > -radius and abs(u) < radius + width and abs(v) < radius + width:
                 found, distance = np.float32(0), np.float32(0)
+                level_size, level_start, over = size, 0, np.float32(1) / texel
                 for t in range(search + taps):
                     if t == search:
                         if found < _LEAST_ALPHA:
                             break
                         behind = max(np.float32(0), distance / found)
                         width = spread * zoom * behind / (np.float32(1) + near * (depth - behind))
+                    if t in (0, search):
+                        # the mip level whose pixels are about as wide as the distance between taps
+                        gap = width / texel * (search_gap if t < search else tap_gap)
+                        level_size, level_start, scale = size, 0, np.float32(1)
+                        while level_size > _COARSEST and gap > scale * _BLUR:
+                            level_start += level_size * level_size
+                            level_size //= 2
+                            scale *= 2
+                        over = np.float32(1) / (texel * scale)
                     tap_cosine = max(np.float32(0), cosine + disk[t, 0] * tilt_u + disk[t, 1] * tilt_v)
                     if t >= search:
                         facing += tap_cosine
                     if tap_cosine <= 0:
                         continue
-                    # the mip level whose pixels are about as wide as the distance between taps
-                    gap = width / texel * (search_gap if t < search else tap_gap)
-                    level_size, level_start, scale = size, 0, np.float32(1)
-                    while level_size > _COARSEST and gap > scale * _BLUR:
-                        level_start += level_size * level_size
-                        level_size //= 2
-                        scale *= 2
-                    pu = (u + disk[t, 0] * width + radius) / (texel * scale) - np.float32(0.5)
-                    pv = (v + disk[t, 1] * width + radius) / (texel * scale) - np.float32(0.5)
+                    pu = (u + disk[t, 0] * width + radius) * over - np.float32(0.5)
+                    pv = (v + disk[t, 1] * width + radius) * over - np.float32(0.5)
                     column, row = int(np.floor(pu)), int(np.floor(pv))
                     fu, fv = pu - column, pv - row
                     for dv in range(2):
@@ -234,7 +237,7 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
                 blocked, red, green, blue = blocked / facing, red / facing, green / facing, blue / facing
             blocked = min(blocked, np.float32(1))
             # radiance of the unlit side over the solid angle it fills: of the sample's cone, pi * sin^2
-            cone = np.float32(np.pi) * np.sin(softness[k]) ** 2
+            cone = np.float32(np.pi) * edges[k] ** 2
             for c in range(3):
                 out[1, i, c] += weight * (1 - blocked) * irradiance[k, c]
             out[2, i, 0] += weight * red * cone

@@ -20,6 +20,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.shadows.receivers import Receivers
 from splatgraft.relighting.shadows.scene_ratio import SceneRatio
+from splatgraft.relighting.shadows.view_culling import gaussians_in_view
 from splatgraft.rendering import ViewOperator, view_operator
 
 RatioAt = Callable[[Float[Tensor, "p 3"], Float[Tensor, "p 3"], Int[Tensor, "p"]], Float[Tensor, "p"]]
@@ -57,18 +58,31 @@ class ViewFitSettings:
 
 @dataclass(frozen=True)
 class _FittedView:
-    """One view of the m Gaussians in front of a camera."""
+    """One view of the Gaussians in front of a camera, of which the first m are receivers."""
 
     which: Int[Tensor, "m"]
-    """Their positions among receivers and others together."""
+    """Positions of these among all receivers."""
+    count: int
+    """Gaussians in front of the camera; those after the first m have a value of 1."""
     weights: ViewOperator
-    """From values of the m Gaussians to pixels."""
+    """From values of all these Gaussians to pixels."""
     target: Float[Tensor, "h w"]
     """What the values must blend to: where no shadow is near, what they blend to at first."""
     directions: Float[Tensor, "m 3"]
-    """Unit, from the camera to each Gaussian."""
+    """Unit, from the camera to each receiver."""
     wide: Bool[Tensor, "m"]
-    """Which Gaussians the view draws as wide as they are."""
+    """Which receivers the view draws as wide as they are."""
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """All n Gaussians of a scene, its r receivers first."""
+
+    gaussians: Gaussians
+    widths: Float[Tensor, "n"]
+    """Largest standard deviations, world units."""
+    values: Float[Tensor, "r"]
+    """Of the receivers, before the fit; the others have a value of 1."""
 
 
 @dataclass(frozen=True)
@@ -130,21 +144,21 @@ def fit_to_views(
     shadowed = (1 - grey).abs() > settings.changed
     if not bool(shadowed.any()) or not len(cameras):
         return ratio
-    count = len(grey)
-    scene = concatenate([receivers.gaussians, others.with_sh_degree(receivers.gaussians.sh_degree)])
-    values = torch.cat([grey.clamp_min(settings.darkest) ** (1 / settings.gamma), torch.ones(others.count)])
+    gaussians = concatenate([receivers.gaussians, others.with_sh_degree(receivers.gaussians.sh_degree)])
+    values = grey.clamp_min(settings.darkest) ** (1 / settings.gamma)
+    scene = _Scene(gaussians, gaussians.log_scales.max(1).values.exp(), values)
     surfaces = _Surfaces.of(receivers)
     views = []
     for camera in cameras:
         cut = _cut_to(camera, receivers.gaussians.means[shadowed], settings)
         if cut is not None:
-            found = _view(scene, cut, values, surfaces, ratio_at=ratio_at, settings=settings)
+            found = _view(scene, cut, surfaces, ratio_at=ratio_at, settings=settings)
             views += [found] if found is not None else []
-    value, slope, known = _solved(values, views, count, settings)
-    wanted, before = value[:count] ** settings.gamma, ratio.shadow.mean(1).clamp_min(1e-6)
+    value, slope, known = _solved(values, views, settings)
+    wanted, before = value**settings.gamma, ratio.shadow.mean(1).clamp_min(1e-6)
     factor = ((wanted - ratio.bounce.mean(1)) / before).clamp_min(0)
     shadow = (ratio.shadow * factor[:, None]).clamp(settings.darkest, 1)
-    slope = settings.gamma * (value[:count] ** (settings.gamma - 1))[:, None] * slope[:count]
+    slope = settings.gamma * (value ** (settings.gamma - 1))[:, None] * slope
     return SceneRatio(
         shadow=torch.where(known[:, None], shadow, ratio.shadow),
         bounce=ratio.bounce,
@@ -153,31 +167,30 @@ def fit_to_views(
 
 
 def _solved(
-    values: Float[Tensor, "n"], views: Sequence[_FittedView], count: int, settings: ViewFitSettings
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Bool[Tensor, "r"]]:
-    """Values and slopes of all Gaussians, of which the first `count` may change, and which of these were fitted."""
-    values, slope, weight = values.clone(), torch.zeros(len(values), 3), torch.zeros(len(values))
-    for view in views:
-        weight.index_add_(0, view.which, view.weights.blend_transpose(torch.ones_like(view.target)[..., None])[:, 0])
+    values: Float[Tensor, "r"], views: Sequence[_FittedView], settings: ViewFitSettings
+) -> tuple[Float[Tensor, "r"], Float[Tensor, "r 3"], Bool[Tensor, "r"]]:
+    """Values and slopes of the receivers, and which of these were fitted."""
+    slope, weight = torch.zeros(len(values), 3), torch.zeros(len(values))
     wide = torch.zeros(len(values), dtype=torch.bool)
     for view in views:
+        seen = view.weights.blend_transpose(torch.ones_like(view.target)[..., None])[: len(view.which), 0]
+        weight[view.which] += seen
         wide[view.which] |= view.wide
     step = torch.where(wide & (weight > settings.least_weight), 1 / weight.clamp_min(settings.least_weight), 0)
-    step[count:] = 0
     least = settings.darkest ** (1 / settings.gamma)
     for _ in range(settings.rounds):
         change, turn = torch.zeros_like(values), torch.zeros_like(slope)
         for view in views:
-            seen = values[view.which] + (slope[view.which] * view.directions).sum(1)
-            error = view.target - view.weights.blend(seen[:, None])[..., 0]
-            back = view.weights.blend_transpose(error[..., None])
-            change.index_add_(0, view.which, back[:, 0])
-            turn.index_add_(0, view.which, back * view.directions)
+            seen = torch.ones(view.count)
+            seen[: len(view.which)] = values[view.which] + (slope[view.which] * view.directions).sum(1)
+            back = view.weights.transpose_residual(seen, view.target)[: len(view.which)]
+            change[view.which] += back
+            turn[view.which] += back[:, None] * view.directions
         values = (values + step * change).clamp(least, 1)
         slope = slope + step[:, None] * turn
         most = torch.minimum(settings.most_slope * values, 1 - values)[:, None]
         slope = slope * (most / slope.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1)
-    return values, slope, (step > 0)[:count]
+    return values, slope, step > 0
 
 
 def _cut_to(camera: Cameras, points: Float[Tensor, "s 3"], settings: ViewFitSettings) -> Cameras | None:
@@ -203,24 +216,21 @@ def _projected(camera: Cameras, points: Float[Tensor, "n 3"]) -> tuple[Float[Ten
 
 
 def _view(
-    scene: Gaussians,
+    scene: _Scene,
     camera: Cameras,
-    values: Float[Tensor, "n"],
     surfaces: _Surfaces,
     *,
     ratio_at: RatioAt,
     settings: ViewFitSettings,
 ) -> _FittedView | None:
     """What one camera shows: per pixel, the ratio where its ray meets the receivers' surface."""
-    pixels, depth = _projected(camera, scene.means)
-    width = scene.scales.max(1).values * camera.intrinsics[0, 0, 0] / depth.clamp_min(1e-6)
-    inside = (pixels > -3 * width[:, None]).all(1) & (pixels < camera.sizes[0] + 3 * width[:, None]).all(1)
-    which = ((depth > 0) & inside).nonzero()[:, 0]
-    weights = view_operator(scene.select(which), camera)
-    receiving = which < len(surfaces.points)
-    features = torch.zeros(len(which), 5)
-    features[:, 0] = values[which]
-    features[receiving, 1:4], features[receiving, 4] = surfaces.points[which[receiving]], 1
+    which, drawn_px = gaussians_in_view(scene.gaussians.means, scene.widths, camera)
+    gaussians = scene.gaussians.select(which)
+    weights = view_operator(gaussians, camera)
+    receivers = which[: int((which < len(surfaces.points)).sum())]
+    features, first = torch.zeros(len(which), 5), slice(len(receivers))
+    features[:, 0], features[first, 0] = 1, scene.values[receivers]
+    features[first, 1:4], features[first, 4] = surfaces.points[receivers], 1
     blended = weights.blend(features)
     value, mass = blended[..., 0], blended[..., 4]
     changed = (value / weights.alpha.clamp_min(1e-6) - 1).abs() > settings.changed
@@ -236,8 +246,8 @@ def _view(
     target = value.clone()
     ratio = ratio_at(points, surfaces.normals[nearest], nearest).clamp(settings.darkest, 1) ** (1 / settings.gamma)
     target[fitted] = weights.alpha[fitted] * ratio
-    directions = F.normalize(scene.means[which] - origin, dim=1)
-    return _FittedView(which, weights, target, directions, width[which] > settings.narrowest_px)
+    directions = F.normalize(gaussians.means[first] - origin, dim=1)
+    return _FittedView(receivers, len(which), weights, target, directions, drawn_px[first] > settings.narrowest_px)
 
 
 def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:

@@ -1,0 +1,173 @@
+"""The linear map from SH coefficients to colours towards one view, and its transposes, for the Gaussians it shows.
+
+On the CPU numba kernels evaluate the basis for each Gaussian in turn: nothing of the size of the coefficients is made.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatgraft.core import spherical_harmonics
+from splatgraft.rendering.cpu_basis import basis_at
+from splatgraft.runtime.kernel_lock import serialized
+
+_PART = 512
+"""Gaussians of one task of a kernel."""
+_MOST = 16
+"""Coefficients of degree 3."""
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """Spherical harmonics of m Gaussians towards one camera."""
+
+    means: Float[Tensor, "m 3"]
+    """World units; shared by all views."""
+    center: Float[Tensor, "3"]
+    """Of the camera."""
+    shown: Int[Tensor, "s"]
+    """Gaussians with weight in the view, ascending int32; the maps are 0 for the others."""
+    degree: int
+    """Of the harmonics."""
+
+    @property
+    def basis(self) -> Float[Tensor, "m k"]:
+        """The harmonics of all Gaussians."""
+        return self._basis(slice(None))
+
+    def colors(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
+        """The sum of harmonics times coefficients; differentiable."""
+        return _Colors.apply(self, sh) if sh.requires_grad else self._colors(sh)
+
+    def add_transpose(self, colors: Float[Tensor, "m 3"], out: Float[Tensor, "m k 3"]) -> None:
+        """Add the transpose of `colors` at some colours to `out`."""
+        if self._on_cpu:
+            _add_transpose(*self._numbers, colors.contiguous().numpy(), out.numpy())
+        else:
+            out[self.shown] += self._basis(self.shown)[:, :, None] * colors[self.shown][:, None, :]
+
+    def write_transpose(self, colors: Float[Tensor, "m 3"], out: Float[Tensor, "m k 3"]) -> None:
+        """Set the rows `shown` of `out` to the transpose at some colours; the other rows stay as they are."""
+        if self._on_cpu:
+            _write_transpose(*self._numbers, colors.contiguous().numpy(), out.numpy())
+        else:
+            out[self.shown] = self._basis(self.shown)[:, :, None] * colors[self.shown][:, None, :]
+
+    def add_squares(self, weights: Float[Tensor, "m 1"], out: Float[Tensor, "m k k"]) -> None:
+        """Add weight times harmonics times their transpose of every Gaussian to `out`."""
+        if self._on_cpu:
+            _add_squares(*self._numbers, weights.contiguous().numpy(), out.numpy())
+        else:
+            basis = self._basis(self.shown)
+            out[self.shown] += (weights[self.shown] * basis)[:, :, None] * basis[:, None, :]
+
+    @property
+    def _on_cpu(self) -> bool:
+        return self.means.device.type == "cpu"
+
+    @property
+    def _numbers(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.means.numpy(), self.center.numpy(), self.shown.numpy()
+
+    def _basis(self, which: Tensor | slice) -> Float[Tensor, "s k"]:
+        directions = torch.nn.functional.normalize(self.means[which] - self.center, dim=-1)
+        return spherical_harmonics.basis(directions, self.degree)
+
+    def _colors(self, sh: Tensor) -> Tensor:
+        out = sh.new_zeros(len(sh), 3)
+        if self._on_cpu:
+            _fill_colors(*self._numbers, sh.contiguous().numpy(), out.numpy())
+        else:
+            out[self.shown] = torch.einsum("mk,mkc->mc", self._basis(self.shown), sh[self.shown])
+        return out
+
+
+class _Colors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, expansion: Expansion, sh: Tensor) -> Tensor:
+        ctx.expansion, ctx.shape = expansion, sh.shape
+        return expansion._colors(sh.detach())
+
+    @staticmethod
+    def backward(ctx, grad):
+        out = grad.new_zeros(ctx.shape)
+        ctx.expansion.write_transpose(grad, out)
+        return None, out
+
+
+@numba.njit(cache=True)
+@no_type_check
+def _basis_towards(mean, center, k, out):
+    x, y, z = float(mean[0]) - center[0], float(mean[1]) - center[1], float(mean[2]) - center[2]
+    over = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
+    basis_at(x * over, y * over, z * over, k, out)
+
+
+@serialized
+@numba.njit(cache=True, parallel=True)
+@no_type_check
+def _fill_colors(means, center, shown, sh, out):
+    n, k = shown.shape[0], sh.shape[1]
+    for part in numba.prange((n + _PART - 1) // _PART):
+        basis = np.empty(_MOST, np.float32)
+        for i in range(part * _PART, min(n, (part + 1) * _PART)):
+            g = shown[i]
+            _basis_towards(means[g], center, k, basis)
+            red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+            for j in range(k):
+                red += basis[j] * sh[g, j, 0]
+                green += basis[j] * sh[g, j, 1]
+                blue += basis[j] * sh[g, j, 2]
+            out[g, 0], out[g, 1], out[g, 2] = red, green, blue
+
+
+@serialized
+@numba.njit(cache=True, parallel=True)
+@no_type_check
+def _add_transpose(means, center, shown, colors, out):
+    n, k = shown.shape[0], out.shape[1]
+    for part in numba.prange((n + _PART - 1) // _PART):
+        basis = np.empty(_MOST, np.float32)
+        for i in range(part * _PART, min(n, (part + 1) * _PART)):
+            g = shown[i]
+            _basis_towards(means[g], center, k, basis)
+            for j in range(k):
+                for c in range(3):
+                    out[g, j, c] += basis[j] * colors[g, c]
+
+
+@serialized
+@numba.njit(cache=True, parallel=True)
+@no_type_check
+def _write_transpose(means, center, shown, colors, out):
+    n, k = shown.shape[0], out.shape[1]
+    for part in numba.prange((n + _PART - 1) // _PART):
+        basis = np.empty(_MOST, np.float32)
+        for i in range(part * _PART, min(n, (part + 1) * _PART)):
+            g = shown[i]
+            _basis_towards(means[g], center, k, basis)
+            for j in range(k):
+                for c in range(3):
+                    out[g, j, c] = basis[j] * colors[g, c]
+
+
+@serialized
+@numba.njit(cache=True, parallel=True)
+@no_type_check
+def _add_squares(means, center, shown, weights, out):
+    n, k = shown.shape[0], out.shape[1]
+    for part in numba.prange((n + _PART - 1) // _PART):
+        basis = np.empty(_MOST, np.float32)
+        for i in range(part * _PART, min(n, (part + 1) * _PART)):
+            g = shown[i]
+            _basis_towards(means[g], center, k, basis)
+            for a in range(k):
+                scaled = weights[g, 0] * basis[a]
+                for b in range(k):
+                    out[g, a, b] += scaled * basis[b]

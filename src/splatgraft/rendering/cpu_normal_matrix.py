@@ -1,0 +1,121 @@
+"""Blending and its transpose in one pass over the tiles, for least squares over pixels: numba kernels.
+
+All pixels of a tile are drawn by the tile's own list, so that W^T W needs no image, and each weight is computed once.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import float32, njit, prange
+
+from splatgraft.rendering.cpu_blend import MAX_ALPHA, PIXELS, ZERO, alpha_row, open_tile, read_tile, splat_shape
+from splatgraft.rendering.cpu_simd import broadcast, lanes, load, smaller, store, total
+from splatgraft.rendering.cpu_tiles import TILE
+
+
+@njit(cache=True)
+@no_type_check
+def _blend_and_keep(splats, entries, values, x0, y0, work, weights):
+    """Fill the planes transmittance, red, green, blue of `work`, and append every row of weights to `weights`."""
+    kept = 0
+    for k in range(entries.shape[0]):
+        s = entries[k]
+        mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
+        red, green, blue = values[s, 0], values[s, 1], values[s, 2]
+        dx = lanes() - mx
+        across = dx * dx * a + d
+        for y in range(top, bottom):
+            dy = float32(y) - my
+            at = y * TILE
+            before = load(work, at)
+            weight = smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            store(work, at, before - weight)
+            store(work, at + PIXELS, load(work, at + PIXELS) + weight * red)
+            store(work, at + 2 * PIXELS, load(work, at + 2 * PIXELS) + weight * green)
+            store(work, at + 3 * PIXELS, load(work, at + 3 * PIXELS) + weight * blue)
+            store(weights, kept, weight)
+            kept += TILE
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def blend_and_transpose(splats, start, entries, slots, values, pixel_weights, sums):
+    """Fill `sums (e, 3)` with `blend_transpose` of the image of `values (m, 3)` times `pixel_weights (h, w)`.
+
+    The weights of a tile's splats are computed once for both.
+    """
+    for tile in prange(start.shape[0] - 1):
+        x0, y0, work = open_tile(tile, pixel_weights.shape[1], 5)
+        listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
+        weights = np.empty(listed.shape[0] * PIXELS, np.float32)
+        _blend_and_keep(splats, listed, values, float32(x0), float32(y0), work, weights)
+        read_tile(pixel_weights, x0, y0, work, 4)
+        for at in range(0, PIXELS, TILE):
+            share = load(work, at + 4 * PIXELS)
+            for plane in range(1, 4):
+                store(work, at + plane * PIXELS, load(work, at + plane * PIXELS) * share)
+        kept = 0
+        for k in range(listed.shape[0]):
+            _, _, _, _, _, _, top, bottom = splat_shape(splats, listed[k], float32(x0), float32(y0))
+            red, green, blue = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
+            for y in range(top, bottom):
+                weight, at = load(weights, kept), y * TILE
+                kept += TILE
+                red = red + weight * load(work, at + PIXELS)
+                green = green + weight * load(work, at + 2 * PIXELS)
+                blue = blue + weight * load(work, at + 3 * PIXELS)
+            slot = places[k]
+            sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(red), total(green), total(blue)
+
+
+@njit(cache=True)
+@no_type_check
+def _blend_one_and_keep(splats, entries, values, x0, y0, work, weights):
+    """As `_blend_and_keep` for one channel: planes transmittance and value."""
+    kept = 0
+    for k in range(entries.shape[0]):
+        s = entries[k]
+        mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
+        value = values[s]
+        dx = lanes() - mx
+        across = dx * dx * a + d
+        for y in range(top, bottom):
+            dy = float32(y) - my
+            at = y * TILE
+            before = load(work, at)
+            weight = smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
+            store(work, at, before - weight)
+            store(work, at + PIXELS, load(work, at + PIXELS) + weight * value)
+            store(weights, kept, weight)
+            kept += TILE
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def transpose_residual(splats, start, entries, slots, values, target, sums):
+    """Fill `sums (e, 1)` with `blend_transpose` of `target (h, w)` less the image of `values (m,)`."""
+    for tile in prange(start.shape[0] - 1):
+        x0, y0, work = open_tile(tile, target.shape[1], 2)
+        listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
+        weights = np.empty(listed.shape[0] * PIXELS, np.float32)
+        _blend_one_and_keep(splats, listed, values, float32(x0), float32(y0), work, weights)
+        image = work[PIXELS:].copy()
+        work[PIXELS:] = ZERO
+        differs = False
+        for y in range(y0, min(y0 + TILE, target.shape[0])):
+            for x in range(x0, min(x0 + TILE, target.shape[1])):
+                at = (y - y0) * TILE + x - x0
+                work[PIXELS + at] = target[y, x] - image[at]
+                differs |= work[PIXELS + at] != ZERO
+        if not differs:
+            for k in range(listed.shape[0]):
+                sums[places[k], 0] = ZERO
+            continue
+        kept = 0
+        for k in range(listed.shape[0]):
+            _, _, _, _, _, _, top, bottom = splat_shape(splats, listed[k], float32(x0), float32(y0))
+            added = broadcast(ZERO)
+            for y in range(top, bottom):
+                added = added + load(weights, kept) * load(work, PIXELS + y * TILE)
+                kept += TILE
+            sums[places[k], 0] = total(added)
