@@ -10,8 +10,6 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from splatgraft.relighting.light.learned.network import (
@@ -102,6 +100,8 @@ def write_ensemble(path: Path, ensemble: LightEnsemble, notes: dict[str, str]) -
         ensemble: The networks.
         notes: How they were trained, for the header.
     """
+    from safetensors.torch import save
+
     tensors = {
         f"{i}.{name}": tensor.detach().to(torch.float16).contiguous()
         for i, network in enumerate(ensemble.networks)
@@ -127,6 +127,8 @@ def read_ensemble(path: Path) -> LightEnsemble:
     Raises:
         ValueError: The file is missing, broken or holds something else.
     """
+    from safetensors import SafetensorError, safe_open
+
     try:
         with safe_open(str(path), "pt") as file:
             header = file.metadata() or {}
