@@ -21,6 +21,7 @@ from splatgraft.editor.front.project_states import ProjectStates
 from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.desktop import open_page
+from splatgraft.runtime.process_end import end_process
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ class Edit:
         is_direct = self.host in LOOPBACK and not (self.public_url or self.tls_certificate or self.tls_key)
         if single is not None and is_direct:
             self._edit_one(single, console)
+            end_process(0)
         else:
             self._serve(single, console)
         return 0

@@ -13,10 +13,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from splatgraft.editor.access.access_control import LOOPBACK, AccessControl
 from splatgraft.project.folder_lock import locked
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.process_end import end_process
 
 _END_SECONDS = 3.0
 """How long the child may take to end by itself."""
@@ -98,8 +100,8 @@ def stop_at_signals(stop: Callable[[], object]) -> None:
         signal.signal(number, lambda *_: stop())
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Serve until the input ends."""
+def main(arguments: Sequence[str]) -> NoReturn:
+    """Serve until the input ends, and end the process."""
     options = EditOptions(**json.loads(arguments[0]))
     stop = threading.Event()
     stop_at_signals(stop.set)
@@ -124,9 +126,9 @@ def main(arguments: Sequence[str]) -> int:
         edit_project(options, token, host=LOOPBACK[0], port=0, started=started, stop=stop)
     except (ValueError, OSError) as error:
         print(json.dumps({"error": " ".join(str(error).split())}), file=answer, flush=True)
-        return 2
-    return 0
+        end_process(2)
+    end_process(0)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(sys.argv[1:])

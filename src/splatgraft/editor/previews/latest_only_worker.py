@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
+_JOIN_SECONDS = 1.0
 
 
 class LatestOnlyWorker(Generic[T]):
@@ -41,11 +42,11 @@ class LatestOnlyWorker(Generic[T]):
             return not self._wake.wait_for(lambda: bool(self._waiting) or not self._open, timeout=seconds)
 
     def close(self) -> None:
-        """Discard the waiting request, finish the current one and stop the thread."""
+        """Discard the waiting request and stop the thread after the current one, which may outlast this call."""
         with self._wake:
             self._open, self._waiting = False, []
             self._wake.notify()
-        self._thread.join(timeout=10)
+        self._thread.join(timeout=_JOIN_SECONDS)
 
     def _run(self) -> None:
         while True:
