@@ -7,6 +7,7 @@ from conftest import ball, ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from splatgraft.consolidation import ConsolidateOptions
 from splatgraft.consolidation.frozen_views import Views
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.lazy_sequence import LazySequence
@@ -14,8 +15,9 @@ from splatgraft.runtime.lazy_sequence import LazySequence
 
 def views_of(scene, cameras, **changes) -> Views:
     images = LazySequence(len(cameras), lambda index: torch.zeros(40, 40, 3))
-    options = {"weights": None, "rendering": RenderOptions(), "cache_bytes": 2**24} | changes
-    return Views(scene, cameras, images, **options)
+    # exact maps, which are compared with the renderer
+    exact = ConsolidateOptions(least_row_weight=0.0, cache_bytes=2**24)
+    return Views(scene, cameras, images, weights=None, options=replace(exact, **changes))
 
 
 def test_render_equals_the_renderer_with_and_without_a_subset():

@@ -58,8 +58,7 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
         cameras,
         images,
         weights=weights,
-        rendering=options.rendering,
-        cache_bytes=options.cache_bytes,
+        options=options,
     )
     if options.method == "adam":
         sh = optimize_colors(
@@ -82,6 +81,7 @@ def _consolidate_fast(composite: Gaussians, views: Views, options: ConsolidateOp
     targets = CorrectedTargets(views, options.view_error)
     prior = drop_higher_bands(composite.sh)[active]
     sh = solve(prior, targets, options.solve, progress=progress)
+    targets.keep()
     if options.polish_passes:
         polish = replace(options.polish, iterations=options.polish_passes * len(views))
         sh = optimize_colors(sh, targets, polish, loss=options.loss, seed=options.seed, progress=progress)
