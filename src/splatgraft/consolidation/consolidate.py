@@ -33,8 +33,8 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
     changed pixel sees keep their colours exactly. The same inputs and seed give the same result.
 
     Memory above the inputs, for n Gaussians with k coefficients: 4 n (k^2 + 50 k) bytes for `fast`, 4 n 24 k for
-    `adam`, plus up to `options.cache_bytes` (views are kept until it is full), the tile lists of two views and a few
-    images; beyond that it does not grow with the number of views.
+    `adam`, plus up to `options.cache_bytes` (views, then their corrected images, are kept until it is full), the tile
+    lists of two views and a few images; beyond that it does not grow with the number of views.
 
     Args:
         composite: The scene of which the images were made.

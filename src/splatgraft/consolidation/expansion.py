@@ -82,7 +82,7 @@ class Expansion:
         if self._on_cpu:
             flat = tuple(x.view(len(x), -1).numpy() for x in (sh, moments.first["sh"], moments.second["sh"]))
             numbers = colors.contiguous().numpy(), flat, moments.steps.numpy(), rates.numpy()
-            return _descend(*self._numbers, *numbers) == 0
+            return _descend(self._numbers, *numbers) == 0
         gradient = torch.zeros_like(sh)
         self.write_transpose(colors, gradient)
         visible = torch.zeros(len(sh), dtype=torch.bool, device=sh.device)
@@ -206,9 +206,9 @@ def _add_squares(means, center, shown, weights, out):
 @serialized
 @numba.njit(cache=True, parallel=True)
 @no_type_check
-def _descend(means, center, shown, colors, rows, steps, rates):
+def _descend(seen, colors, rows, steps, rates):
     """`_write_transpose` and `adam.update_row` without a gradient in memory; returns the rows that are not finite."""
-    values, firsts, seconds = rows
+    (means, center, shown), (values, firsts, seconds) = seen, rows
     n, k = shown.shape[0], rates.shape[0] // 3
     bad = 0
     for part in numba.prange((n + _PART - 1) // _PART):

@@ -132,7 +132,7 @@ def bias_corrections(step):
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
 @no_type_check
 def update_row(value, gradient, moments, corrections, rate):
-    """Update one Gaussian's row of a field in place; returns 1 where its gradient is not finite, which changes nothing."""
+    """Update one Gaussian's row of a field in place; returns 1 and changes nothing where a number is not finite."""
     (first, second), (correct_1, correct_2) = moments, corrections
     one, b1, b2 = np.float32(1), np.float32(BETA_1), np.float32(BETA_2)
     columns = value.shape[0]

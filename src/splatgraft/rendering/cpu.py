@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.rendering import cpu_blend, cpu_normal_matrix, cpu_project, cpu_tiles
+from splatgraft.rendering import cpu_blend, cpu_normal_matrix, cpu_project, cpu_rows, cpu_tiles
 from splatgraft.rendering.channels import CHANNEL_COUNTS, assemble_render
 from splatgraft.rendering.interface import Output, Render, RenderOptions
 from splatgraft.runtime.kernel_lock import KERNEL_LOCK
@@ -122,7 +122,7 @@ class _TileLists:
         """
         rows = np.empty((len(self.entries), 2), np.uint8)
         size = view.height, view.width
-        cpu_blend.find_rows(self.splats, self.start, self.entries, size, np.float32(least_row_weight), rows)
+        cpu_rows.find_rows(self.splats, self.start, self.entries, size, np.float32(least_row_weight), rows)
         listed = rows[:, 1] > 0
         shown = np.empty_like(listed)
         shown[self.slots] = listed

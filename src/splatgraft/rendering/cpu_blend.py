@@ -79,7 +79,7 @@ def alpha_row(across, dx, along, down):
 
 @njit(cache=True)
 @no_type_check
-def _saturated(work, least):
+def saturated(work, least):
     """Whether the transmittance of all pixels of the tile is below `least`."""
     most = load(work, 0)
     for y in range(1, TILE):
@@ -107,7 +107,7 @@ def _blend_rgb(splats, entries, rows, values, x0, y0, work, least):
             store(work, at + PIXELS, load(work, at + PIXELS) + weight * red)
             store(work, at + 2 * PIXELS, load(work, at + 2 * PIXELS) + weight * green)
             store(work, at + 3 * PIXELS, load(work, at + 3 * PIXELS) + weight * blue)
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             break
 
 
@@ -130,7 +130,7 @@ def _blend_any(splats, entries, rows, values, x0, y0, work, least):
             for channel in range(values.shape[1]):
                 at += PIXELS
                 store(work, at, load(work, at) + weight * values[s, channel])
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             break
 
 
@@ -198,7 +198,7 @@ def _transpose_rgb(splats, entries, rows, slots, x0, y0, work, sums, least):
             blue = blue + weight * load(work, at + 3 * PIXELS)
         slot = slots[k]
         sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(red), total(green), total(blue)
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
 
@@ -226,7 +226,7 @@ def _transpose_any(splats, entries, rows, slots, x0, y0, work, sums, least):
                 store(column, channel * TILE, load(column, channel * TILE) + weight * load(work, at))
         for channel in range(channels):
             sums[slots[k], channel] = total(load(column, channel * TILE))
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
 
@@ -234,7 +234,10 @@ def _transpose_any(splats, entries, rows, slots, x0, y0, work, sums, least):
 @njit(cache=True, parallel=True)
 @no_type_check
 def blend_transpose(splats, start, entries, rows, slots, image, sums, least):
-    """Fill `sums (e, c)`: for every entry, the sum over its pixels of weight times `image (c, h, w)`; `rows` as in `blend`."""
+    """Fill `sums (e, c)`: for every entry, the sum over its pixels of weight times `image (c, h, w)`.
+
+    `rows` as in `blend`.
+    """
     channels = image.shape[0]
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = open_tile(tile, image.shape[2], 1 + channels)
@@ -248,39 +251,6 @@ def blend_transpose(splats, start, entries, rows, slots, image, sums, least):
             used = _transpose_any(splats, listed, spans, places, float32(x0), float32(y0), work, sums, least)
         for k in range(used, listed.shape[0]):
             sums[places[k]] = ZERO
-
-
-@njit(cache=True, parallel=True)
-@no_type_check
-def find_rows(splats, start, entries, size, least_weight, rows):
-    """Fill `rows (e, 2)`: first and one past the last row of each entry whose pixels' weights add up to more than a bound.
-
-    `size`: height and width of the image, outside of which nothing counts. Both are 0 for entries without such a row.
-    A tile is done when every pixel's transmittance is below `MIN_TRANSMITTANCE`.
-    """
-    height, width = size
-    for tile in prange(start.shape[0] - 1):
-        x0, y0, work = open_tile(tile, width, 2)
-        for y in range(min(TILE, height - y0)):
-            work[PIXELS + y * TILE : PIXELS + y * TILE + min(TILE, width - x0)] = ONE
-        for k in range(start[tile], start[tile + 1]):
-            rows[k, 0], rows[k, 1] = 0, 0
-        for k in range(start[tile], start[tile + 1]):
-            mx, my, a, b, c, d, top, bottom = splat_shape(splats, entries[k], float32(x0), float32(y0))
-            dx = lanes() - mx
-            across = dx * dx * a + d
-            for y in range(top, bottom):
-                dy = float32(y) - my
-                at = y * TILE
-                before = load(work, at)
-                weight = smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
-                store(work, at, before - weight)
-                if total(weight * load(work, at + PIXELS)) > least_weight:
-                    if rows[k, 1] == 0:
-                        rows[k, 0] = y
-                    rows[k, 1] = y + 1
-            if (k - start[tile]) % BATCH == BATCH - 1 and _saturated(work, MIN_TRANSMITTANCE):
-                break
 
 
 @njit(cache=True)
@@ -332,7 +302,7 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
         sums[slot, MOMENTS] = total(sum_red)
         sums[slot, MOMENTS + 1] = total(sum_green)
         sums[slot, MOMENTS + 2] = total(sum_blue)
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
 
@@ -370,7 +340,7 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
         _write_moments(sums, slot, dx, s0, sy, syy)
         for channel in range(channels):
             sums[slot, MOMENTS + channel] = total(load(column, channel * TILE))
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
 
