@@ -5,7 +5,7 @@ import contextlib
 import json
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +40,7 @@ class ProjectProcess:
         self.problem = ""
         """Why the last process ended, in one line; empty where none ended by itself."""
         self.windows = 0
-        """Open websockets."""
+        """Open windows."""
         self._process: asyncio.subprocess.Process | None = None
         self._watch: asyncio.Task[None] | None = None
         self._answered = asyncio.Event()
@@ -69,14 +69,15 @@ class ProjectProcess:
             return None
         return await self.open(wait_seconds)
 
-    def window_opened(self) -> None:
-        """Count a websocket."""
+    @contextlib.contextmanager
+    def window(self) -> Iterator[None]:
+        """Count an open window meanwhile."""
         self.windows += 1
-
-    def window_closed(self) -> None:
-        """Count a websocket no longer."""
-        self.windows -= 1
-        self._used = time.monotonic()
+        try:
+            yield
+        finally:
+            self.windows -= 1
+            self._used = time.monotonic()
 
     async def end_if_idle(self) -> None:
         """End the process where no window has been open for long."""
