@@ -171,8 +171,14 @@ def test_the_window_without_the_edit_lock_is_refused_also_in_the_middle(
     locked = {"type": "locked", "text": "another window edits this project"}
     assert Upload(editor.url, second_key, ChosenFile(scene)).answer == locked
     upload.send_parts(until=200_000)
-    take = next(uuid for uuid, props in second._gui.items() if props.get("label") == "Edit here instead")
-    second.send("GuiUpdateMessage", uuid=take, updates={"value": True})
+    takes: list[str] = []
+
+    def has_button() -> bool:
+        takes.extend(uuid for uuid, props in second._gui.items() if props.get("label") == "Edit here instead")
+        return bool(takes)
+
+    second.until(has_button)
+    second.send("GuiUpdateMessage", uuid=takes[0], updates={"value": True})
 
     def is_handed_over() -> bool:
         again = Upload(editor.url, second_key, ChosenFile(scene))
@@ -189,6 +195,33 @@ def test_the_window_without_the_edit_lock_is_refused_also_in_the_middle(
     again.connection.send("cancel")
     assert again.end() == {"type": "cancelled"}
     assert arriving(project) == []
+
+
+def test_the_upload_of_the_last_window_goes_on_while_its_window_is_lost(
+    editor: Editor, project: Path, open_window: Callable[[], tuple[Client, str]], scene: bytes
+) -> None:
+    window, key = open_window()
+    upload = ready(editor.url, key, ChosenFile(scene))
+    upload.begin()
+    upload.send_parts(until=100_000)
+    upload.cut()
+    window.close()
+    # viser's page connects again only while it has the focus
+    again = Upload(editor.url, key, upload.file)
+    assert again.begin() == 100_000
+    again.send_parts(until=200_000)
+    assert Upload(editor.url, "guess", upload.file).answer["type"] == "wait"
+    # but not where another window edits by then
+    other, other_key = open_window()
+    again.connection.send(scene[200_000:250_000])
+    assert again.hear()["type"] == "wait"
+    other.close()
+    wait_until(lambda: Upload(editor.url, other_key, upload.file).answer["type"] == "sample", what="the last window")
+    assert Upload(editor.url, key, upload.file).answer["type"] == "wait"
+    last = Upload(editor.url, other_key, upload.file)
+    assert last.begin() == 200_000
+    last.connection.send("cancel")
+    assert last.end() == {"type": "cancelled"}
 
 
 def test_a_changed_file_starts_anew_and_cancel_removes(

@@ -41,6 +41,7 @@ class ProjectProcess:
         """Why the last process ended, in one line; empty where none ended by itself."""
         self.windows = 0
         """Open windows."""
+        self._websockets = 0
         self._process: asyncio.subprocess.Process | None = None
         self._watch: asyncio.Task[None] | None = None
         self._answered = asyncio.Event()
@@ -70,18 +71,20 @@ class ProjectProcess:
         return await self.open(wait_seconds)
 
     @contextlib.contextmanager
-    def window(self) -> Iterator[None]:
-        """Count an open window meanwhile."""
-        self.windows += 1
+    def websocket(self, *, is_window: bool) -> Iterator[None]:
+        """Keep the process meanwhile, for a window or for an upload, which has a websocket of its own."""
+        self._websockets += 1
+        self.windows += is_window
         try:
             yield
         finally:
-            self.windows -= 1
+            self.windows -= is_window
+            self._websockets -= 1
             self._used = time.monotonic()
 
     async def end_if_idle(self) -> None:
         """End the process where no window has been open for long."""
-        if self.is_running and not self.windows and time.monotonic() - self._used > self._options.idle_seconds:
+        if self.is_running and not self._websockets and time.monotonic() - self._used > self._options.idle_seconds:
             await self.end()
 
     async def end(self) -> None:

@@ -66,9 +66,7 @@ async def answer_from(asked: Asked, request: Request, streams: Streams, process:
     """
     try:
         if is_websocket(request):
-            # an upload has a websocket of its own
-            is_window = request.path == "/"
-            with process.window() if is_window else contextlib.nullcontext():
+            with process.websocket(is_window=request.path == "/"):
                 await _pass_websocket(asked.head, streams, asked.streams)
         else:
             await _pass_answer(asked.head, streams[1], asked.streams[0])

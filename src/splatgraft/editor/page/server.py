@@ -63,6 +63,7 @@ class GuardedServer:
         self.files: Callable[[str], Path | None] = lambda name: None
         self._access = access
         self._window_keys: dict[str, int] = {}
+        self._last_key: str | None = None
         self._pages: dict[bool, Response] = {}
         self.uploads = UploadReceiver(self._may_edit)
         with _PATCH_LOCK:
@@ -115,9 +116,15 @@ class GuardedServer:
     def _forget_window_key(self, window: int) -> None:
         for key in [key for key, number in tuple(self._window_keys.items()) if number == window]:
             del self._window_keys[key]
+            if self.edit_lock.holder is None:
+                self._last_key = key
 
     def _may_edit(self, key: str) -> bool | None:
+        """Whether a window edits; None where its connection is lost, and another window is open or edited since."""
         window = self._window_keys.get(key)
+        if window is None and self.edit_lock.holder is None and key == self._last_key:
+            # viser's page connects again only while it has the focus; the upload of the last window goes on meanwhile
+            return True
         return None if window not in self.edit_lock.windows else window == self.edit_lock.holder
 
     def _serve(self, original: Callable[..., Any], handler: Callable[..., Any], *args: Any, **options: Any) -> Any:
