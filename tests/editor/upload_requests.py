@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from editor import Client
-from waiting import HANG_LIMIT
+from waiting import HANG_LIMIT, wait_until
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
@@ -44,11 +44,14 @@ def opened_window(url: str) -> tuple[Client, str]:
     keys: list[str] = []
 
     def has_key() -> bool:
+        # to the end of what has arrived: `Client.until` drops the rest of the messages that came together
+        for _ in window.messages(0.1):
+            pass
         contents = [str(props.get("content")) for props in window._gui.values()]
         keys.extend(re.findall(r'<splatgraft-window key="([^"]+)"', " ".join(contents)))
         return bool(keys)
 
-    window.until(has_key)
+    wait_until(has_key, what="the key of a window")
     return window, keys[-1]
 
 
