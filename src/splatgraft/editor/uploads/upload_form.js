@@ -229,6 +229,8 @@
       const { file, received, state, text, isOver } = upload;
       const bar = this.find("progress");
       this.find(".name").textContent = file.name;
+      // these sentences begin with the name
+      this.find(".name").hidden = ["stored", "refused"].includes(state);
       bar.setAttribute("aria-label", `Upload of ${file.name}`);
       bar.value = received / Math.max(1, file.size);
       const share = Math.floor((100 * received) / Math.max(1, file.size));
