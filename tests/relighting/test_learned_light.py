@@ -27,9 +27,11 @@ from splatgraft.relighting.light.place_description import (
     describe_place,
     upright_from_world,
 )
+from splatgraft.relighting.light.radiance_correction import RatioShares
 
 PLACE = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
 SUN = torch.tensor([0.6 * 0.764, 0.6 * 0.645, 0.8])
+SHARES = RatioShares(level=0.4, tint=0.25)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +65,7 @@ def random_place(seed=0):
 
 def ensemble_of(network, place):
     others = torch.stack([network_inputs(place) + 0.05 * torch.randn_like(place.maps[:1]) for _ in range(50)])
-    return LightEnsemble((network,), SeenPlaces.of(others))
+    return LightEnsemble((network,), SeenPlaces.of(others), SHARES)
 
 
 def test_a_turn_of_the_place_turns_the_correction():
@@ -89,7 +91,7 @@ def test_another_exposure_changes_nothing(scene):
 def test_an_untrained_network_changes_little(found):
     network = LightNetwork().eval()
     correction, _ = ensemble_of(network, describe_place(found)).correct(describe_place(found))
-    changed = radiance_correction(correction, found, 0.0).apply(found.radiance)
+    changed = radiance_correction(correction, found, shares=SHARES, distance=0.0).apply(found.radiance)
     assert 0.7 < float(changed.sum() / found.radiance.sum()) < 1.4
 
 
@@ -105,9 +107,9 @@ def test_files_hold_the_networks_and_bad_ones_are_one_line(tmp_path):
         read_ensemble(tmp_path / "none.safetensors")
     other = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(2)}, str(other), {"format": "splatgraft light network 0"})
-    with pytest.raises(ValueError, match=r"other.safetensors: expected 'splatgraft light network 1' in its header"):
+    with pytest.raises(ValueError, match=r"other.safetensors: expected 'splatgraft light network 2' in its header"):
         read_ensemble(other)
-    save_file({"a": torch.zeros(2)}, str(tmp_path / "empty.safetensors"), {"format": "splatgraft light network 1"})
+    save_file({"a": torch.zeros(2)}, str(tmp_path / "empty.safetensors"), {"format": "splatgraft light network 2"})
     with pytest.raises(ValueError, match=r"empty.safetensors: expected the tensors of the light network, found"):
         read_ensemble(tmp_path / "empty.safetensors")
     path.write_bytes(path.read_bytes()[:500])
@@ -132,7 +134,7 @@ def test_a_place_unlike_the_training_is_corrected_less_and_less_surely():
 
 def test_twice_the_light_is_twice_the_light_and_keeps_its_sun(scene, found):
     double = LightCorrection(torch.ones(1, 12, 24, 3), torch.full((1, 12, 24), -30.0), torch.zeros(1, 3))
-    changed = found.corrected(radiance_correction(double, found, 0.0), scene, PLACE)
+    changed = found.corrected(radiance_correction(double, found, shares=SHARES, distance=0.0), scene, PLACE)
     normals = even_directions(60)
     ratio = changed.light.irradiance(normals) / found.light.irradiance(normals)
     assert torch.allclose(ratio, torch.full_like(ratio, 2.0), rtol=0.02)
@@ -150,7 +152,7 @@ def test_a_missed_lamp_lights_what_faces_it(scene, found):
     lamp = torch.full((1, 12, 24), -30.0)
     lamp[0, 4, 7] = (4 * math.pi / cell_solid_angles()[4, 7]).log2()
     nothing = LightCorrection(torch.zeros(1, 12, 24, 3), lamp, torch.zeros(1, 3))
-    changed = found.corrected(radiance_correction(nothing, found, 0.0), scene, PLACE)
+    changed = found.corrected(radiance_correction(nothing, found, shares=SHARES, distance=0.0), scene, PLACE)
     towards = cell_directions()[4, 7] @ upright_from_world(found.evidence.up)
     added = changed.light.irradiance(towards[None]) - found.light.irradiance(towards[None])
     # as much light as all the rest gives from everywhere: 4 pi times the mean radiance
@@ -177,7 +179,7 @@ def test_a_transfer_takes_networks_for_both_places_and_says_what_they_changed(sc
         last.bias.copy_(torch.tensor(biases))
     place = random_place()
     count = len(network_inputs(place))
-    ensemble = LightEnsemble((network,), SeenPlaces(torch.zeros(count), torch.zeros(count, count), 1.0))
+    ensemble = LightEnsemble((network,), SeenPlaces(torch.zeros(count), torch.zeros(count, count), 1.0), SHARES)
     around = even_directions(400)
     ball = surfels(PLACE.center + 0.2 * around, around, width=0.02)
     at = Similarity(1.0, torch.eye(3), torch.zeros(3))
@@ -191,3 +193,32 @@ def test_a_transfer_takes_networks_for_both_places_and_says_what_they_changed(sc
     # both places twice as bright: as before; one alone changes the share of the level that is applied
     assert shades[1] == pytest.approx(shades[0], abs=0.03)
     assert shades[2] > shades[0] + 0.2
+
+
+def test_of_the_ratio_of_two_corrected_lights_the_share_is_applied_that_training_found(scene):
+    around = even_directions(400)
+    ball = surfels(PLACE.center + 0.2 * around, around, width=0.02)
+    at = Similarity(1.0, torch.eye(3), torch.zeros(3))
+    composite = Composite(scene, (PlacedObject(ball, at),), torch.zeros(scene.count, dtype=torch.bool))
+    darker = sunlit_scene(SUN, 1.0)
+    nothing = LightNetwork().eval().requires_grad_(False)
+    for last in (nothing.cells[-1], nothing.whole[-1]):
+        assert isinstance(last, torch.nn.Conv2d | torch.nn.Linear)
+        assert last.bias is not None
+        last.weight.zero_()
+        last.bias.zero_()
+    count = len(network_inputs(random_place()))
+
+    def level(share: float, mean: float = 0.0) -> float:
+        """Mean logarithm of the shading, in stops."""
+        seen = SeenPlaces(torch.full((count,), mean), torch.eye(count), 10.0)
+        ensemble = LightEnsemble((nothing,), seen, RatioShares(share, 0.0))
+        relit = relight(composite, views(), sources=[SourceScene(darker, views(), ensemble)], light=ensemble)
+        return float(relit.shade[relit.is_object].log2().mean())
+
+    none, half, whole = level(0.0), level(0.5), level(1.0)
+    assert whole - none > 0.3
+    assert half - none == pytest.approx(0.5 * (whole - none), abs=0.05)
+    # places unlike those of the training: the share of an estimate without networks
+    far = level(1.0, mean=1000.0)
+    assert far == pytest.approx(none + SHARES.level * (whole - none), abs=0.05)

@@ -13,6 +13,7 @@ from splatgraft.training.light_training import (
     IrradianceErrors,
     LightData,
     LightTrainingOptions,
+    ratio_shares,
     train_light,
 )
 
@@ -103,3 +104,25 @@ def test_the_command_trains_and_its_weights_load(tmp_path, capsys):
     capsys.readouterr()
     assert main(["train", "light", str(tmp_path / "out"), "--out", str(tmp_path / "again")]) == 2
     assert "expected .npz files as `splatgraft synth lights` writes, found none" in capsys.readouterr().err
+
+
+def test_shares_are_the_slopes_of_the_true_ratios_on_the_found_ones():
+    generator = torch.Generator().manual_seed(0)
+    stops, tints = torch.randn(60, 1, 1, 1, generator=generator), 0.3 * torch.randn(60, 1, 1, 1, generator=generator)
+    warm = torch.tensor([1.0, 0.0, -1.0])
+    found = (stops + tints * warm).expand(60, 12, 24, 3)
+    truth = (2 + 0.5 * stops + 0.25 * tints * warm).expand(60, 12, 24, 3)
+    shares = ratio_shares(found, truth, places(30))
+    assert shares.level == pytest.approx(0.5, abs=0.03)
+    assert shares.tint == pytest.approx(0.25, abs=0.03)
+    opposite = ratio_shares(-found, truth, places(30))
+    assert (opposite.level, opposite.tint) == (0.0, 0.0)
+
+
+def test_lights_of_one_place_count_as_one_place_for_the_shares():
+    examples = places(2, lights=4)
+    levels = torch.tensor([0.0, 1.0] * 2 + [0.0, 3.0] * 2)
+    truth = torch.tensor([0.0, 1.0] * 2 + [0.0, 0.0] * 2)
+    one = [values[:, None, None, None].expand(8, 12, 24, 3) for values in (levels, truth)]
+    alone = ratio_shares(one[0][[0, 1, 4, 5]], one[1][[0, 1, 4, 5]], [examples[i] for i in (0, 1, 4, 5)])
+    assert ratio_shares(*one, examples).level == pytest.approx(alone.level, abs=1e-5)

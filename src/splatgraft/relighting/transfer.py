@@ -5,7 +5,7 @@ multiplied by ratios of irradiance. No training, no rendered views.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 
 import torch
@@ -22,6 +22,7 @@ from splatgraft.relighting.layers import Relit, unchanged
 from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
 from splatgraft.relighting.light.learned.ensemble import LightEnsemble
 from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.radiance_correction import belief
 from splatgraft.relighting.prepared_object import PreparedObject, SourceScene, prepare_object
 from splatgraft.relighting.prepared_scene import PreparedScene, prepare_scene
 from splatgraft.relighting.shading.gloss import gloss_bands
@@ -169,8 +170,7 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
     source = prepared.source_lighting
     if source is None:
         return _LitObject(prepared, visibility, received, unknown_origin_ratio(received, opacities), None)
-    are_told = scene.estimate is None and source.estimate is None
-    settings = KNOWN_LIGHTS if are_told else ShadeSettings()
+    settings = _shade_settings(scene.estimate, source.estimate)
     shade = shade_ratio(received, source.irradiance, opacities, settings=settings)
     if not bool(source.materials.glossy.any()):
         return _LitObject(prepared, visibility, received, shade, None)
@@ -178,6 +178,23 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
     reflected = reflected_light(scene.light, scene.samples, shares).scaled(scale)
     gloss = gloss_bands(prepared.gaussians, normals.vectors, source.materials, reflected, shade=shade)
     return _LitObject(prepared, visibility, received, shade, gloss)
+
+
+def _shade_settings(new: EstimatedLight | None, old: EstimatedLight | None) -> ShadeSettings:
+    """By what is known of the two lights; None for one that was told."""
+    if new is None and old is None:
+        return KNOWN_LIGHTS
+    plain = ShadeSettings()
+    corrections = [one.correction for one in (new, old) if one is not None and one.correction is not None]
+    if len(corrections) < sum(one is not None for one in (new, old)):
+        return plain
+    believed = min(belief(one.distance) for one in corrections)
+    shares = corrections[0].shares
+    return replace(
+        plain,
+        level_share=plain.level_share + believed * (shares.level - plain.level_share),
+        tint_share=plain.tint_share + believed * (shares.tint - plain.tint_share),
+    )
 
 
 def _assembled(

@@ -22,6 +22,7 @@ from splatgraft.relighting.light.learned.network import (
     network_inputs,
 )
 from splatgraft.relighting.light.place_description import COLUMNS, cell_directions, cell_solid_angles
+from splatgraft.relighting.light.radiance_correction import RatioShares
 from splatgraft.runtime.progress import Progress
 from splatgraft.training.light_examples import LightExample
 
@@ -132,6 +133,8 @@ class TrainedLight:
     """Of the estimates, in the order of the examples."""
     after: IrradianceErrors
     """The same by the network that left the example's scene out."""
+    shares_before: RatioShares
+    """What ratios between the uncorrected lights of places are worth."""
     log_sd: Float[Tensor, "n 3"]
     """What that network said of its errors: log2 standard deviations, stops."""
 
@@ -192,11 +195,43 @@ def train_light(
         say(f"network {fold + 1}: irradiance of scenes left out off by {after:.3f} stops, {before:.3f} uncorrected")
         networks.append(network.eval().requires_grad_(False))
     return TrainedLight(
-        LightEnsemble(tuple(networks), SeenPlaces.of(data.inputs)),
+        LightEnsemble(tuple(networks), SeenPlaces.of(data.inputs), ratio_shares(found, data.truth, examples)),
         IrradianceErrors.of(data.estimated, data.truth),
         IrradianceErrors.of(found, data.truth),
+        ratio_shares(data.estimated, data.truth, examples),
         log_sd,
     )
+
+
+def ratio_shares(
+    found: Float[Tensor, "n 12 24 3"], truth: Float[Tensor, "n 12 24 3"], examples: Sequence[LightExample]
+) -> RatioShares:
+    """The shares by which log ratios between places come closest to the true ones, in the least squares' sense.
+
+    An object may go from any place to any other, so all pairs count alike: the slope is that of the true on the found
+    values over the places. Lights of one side of a scene count as one place.
+
+    Args:
+        found: Log2 irradiance.
+        truth: The same, true.
+        examples: In the same order.
+    """
+    sides = [one.side for one in examples]
+    weights = torch.tensor([1 / sides.count(side) for side in sides])
+    level, tint = [], []
+    for values in (found, truth):
+        parts = IrradianceErrors.of(values, torch.zeros_like(values))
+        level.append(parts.level[:, None])
+        tint.append(parts.tint)
+    return RatioShares(_slope(level[0], level[1], weights), _slope(tint[0], tint[1], weights))
+
+
+def _slope(found: Float[Tensor, "n c"], truth: Float[Tensor, "n c"], weights: Float[Tensor, "n"]) -> float:
+    """Of a line through centred values, in [0, 1]."""
+    share = (weights / weights.sum())[:, None]
+    away, true_away = (values - (share * values).sum(0) for values in (found, truth))
+    slope = (share * away * true_away).sum() / (share * away**2).sum().clamp_min(1e-9)
+    return float(slope.clamp(0, 1))
 
 
 def _train(

@@ -1,7 +1,7 @@
 """The command `train light`: examples of known light become the networks that correct the estimated light."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
@@ -64,6 +64,8 @@ def _held_out(examples: list[LightExample], trained: TrainedLight) -> dict[str, 
         "level": float((trained.after.level / claimed[:, 0]).square().mean().sqrt()),
         "tint": float((trained.after.tint.square().sum(1) / 2).sqrt().div(claimed[:, 2]).square().mean().sqrt()),
     }
+    for name, shares in (("uncorrected", trained.shares_before), ("corrected", trained.ensemble.shares)):
+        found[f"share of ratios between places that is applied, {name}"] = asdict(shares)
     return found
 
 

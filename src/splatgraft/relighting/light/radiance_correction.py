@@ -7,6 +7,25 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
+class RatioShares:
+    """How much of a ratio between the light of two places is applied to an object's mean colour."""
+
+    level: float
+    """Share, in [0, 1], of its gray part, in logarithms: the slope of the true level on the found one."""
+    tint: float
+    """The same of its tint."""
+
+
+def belief(distance: float) -> float:
+    """Share, in [0, 1], of a correction that is applied at a place so far from those of the training.
+
+    Args:
+        distance: 1 is that of the farthest hundredth of the training's places.
+    """
+    return 1.0 if distance <= 1 else distance**-2
+
+
+@dataclass(frozen=True)
 class RadianceCorrection:
     """Of the k `DIRECTIONS`."""
 
@@ -18,6 +37,8 @@ class RadianceCorrection:
     """Standard deviation of the level of the corrected irradiance, stops."""
     tint_sd: float
     """The same of its tint, stops: root mean square over the channels."""
+    shares: RatioShares
+    """What a ratio of corrected lights is worth."""
     distance: float
     """Of the place from those that the network saw in training; above 1 it is unlike them, and is corrected less."""
 

@@ -19,9 +19,10 @@ from splatgraft.relighting.light.learned.network import (
     network_inputs,
 )
 from splatgraft.relighting.light.place_description import PlaceDescription, cell_solid_angles
+from splatgraft.relighting.light.radiance_correction import RatioShares, belief
 from splatgraft.runtime.atomic_file import atomic_write
 
-FORMAT = "splatgraft light network 1"
+FORMAT = "splatgraft light network 2"
 WEIGHTS_FILE = "light.safetensors"
 _RIDGE = 0.02
 """Added to the variances of the summary: what hardly varied in training says little."""
@@ -64,6 +65,8 @@ class LightEnsemble:
 
     networks: tuple[LightNetwork, ...]
     seen: SeenPlaces
+    shares: RatioShares
+    """What a ratio of corrected lights was worth on scenes that were left out of training."""
 
     @torch.no_grad()
     def correct(self, place: PlaceDescription) -> tuple[LightCorrection, float]:
@@ -75,7 +78,7 @@ class LightEnsemble:
         inputs = network_inputs(place)
         found = [network(inputs[None]) for network in self.networks]
         distance = self.seen.distance(inputs)
-        believed = 1.0 if distance <= 1 else distance**-2
+        believed = belief(distance)
         gains, lamps = torch.stack([one.gain for one in found]), torch.stack([one.lamp.exp2() for one in found])
         gain = gains.mean(0)
         areas = cell_solid_angles()
@@ -109,6 +112,7 @@ def write_ensemble(path: Path, ensemble: LightEnsemble, notes: dict[str, str]) -
     }
     seen = ensemble.seen
     tensors |= {
+        "shares": torch.tensor([ensemble.shares.level, ensemble.shares.tint]),
         "seen.mean": seen.mean,
         "seen.precision": seen.precision.contiguous(),
         "seen.farthest": torch.tensor(seen.farthest),
@@ -147,7 +151,8 @@ def read_ensemble(path: Path) -> LightEnsemble:
             )
             networks.append(network.eval().requires_grad_(False))
         seen = SeenPlaces(tensors["seen.mean"], tensors["seen.precision"], float(tensors["seen.farthest"]))
-    except (KeyError, ValueError, RuntimeError) as error:
+        shares = RatioShares(*tensors["shares"].tolist())
+    except (KeyError, ValueError, TypeError, RuntimeError) as error:
         found = str(error).splitlines()[0]
         raise ValueError(f"{path}: expected the tensors of the light network, found {found}") from error
-    return LightEnsemble(tuple(networks), seen)
+    return LightEnsemble(tuple(networks), seen, shares)

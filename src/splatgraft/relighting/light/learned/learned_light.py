@@ -17,7 +17,7 @@ from splatgraft.relighting.light.place_description import (
     describe_place,
     upright_from_world,
 )
-from splatgraft.relighting.light.radiance_correction import RadianceCorrection
+from splatgraft.relighting.light.radiance_correction import RadianceCorrection, RatioShares
 from splatgraft.relighting.light.surroundings import DIRECTIONS
 
 
@@ -42,15 +42,19 @@ def fit_learned_light(
     if ensemble is None or isinstance(found, NoLight):
         return found
     correction, distance = ensemble.correct(describe_place(found))
-    return found.corrected(radiance_correction(correction, found, distance), scene, place)
+    change = radiance_correction(correction, found, shares=ensemble.shares, distance=distance)
+    return found.corrected(change, scene, place)
 
 
-def radiance_correction(correction: LightCorrection, found: EstimatedLight, distance: float) -> RadianceCorrection:
+def radiance_correction(
+    correction: LightCorrection, found: EstimatedLight, *, shares: RatioShares, distance: float
+) -> RadianceCorrection:
     """A correction of cells as one of `DIRECTIONS`, in the estimate's frame.
 
     Args:
         correction: Of one place (b = 1).
         found: The estimate at the place.
+        shares: What ratios of corrected lights are worth.
         distance: Of the place from what the networks saw.
     """
     frame = upright_from_world(found.evidence.up)
@@ -61,4 +65,4 @@ def radiance_correction(correction: LightCorrection, found: EstimatedLight, dist
     nearest = (cell_directions().reshape(-1, 3) @ frame @ DIRECTIONS.T).argmax(1)
     missed = torch.zeros(len(DIRECTIONS)).index_add_(0, nearest, power) * len(DIRECTIONS) / (4 * math.pi)
     level_sd, _, tint_sd = correction.log_sd[0].exp2().tolist()
-    return RadianceCorrection(gain, missed, level_sd=level_sd, tint_sd=tint_sd, distance=distance)
+    return RadianceCorrection(gain, missed, level_sd=level_sd, tint_sd=tint_sd, shares=shares, distance=distance)
