@@ -1,5 +1,6 @@
 """Uploads through the editor's server, as the form of its page makes them: broken, continued, refused, taken over."""
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -116,8 +117,13 @@ def test_a_restarted_server_continues(tmp_path: Path, scene: bytes) -> None:
         # a part that is on its way when the server dies may have arrived or not
         first.connection.send(scene[250_000:260_000])
         editor.kill()
+        old = project.parent / "uploads" / ".incoming_0123456789abcdef_100_old.ply"
+        old.write_bytes(b"x" * 10)
+        os.utime(old, (1e9, 1e9))
         editor = Editor(project)
         window, key = opened_window(editor.url)
+        window.until(lambda: "old.ply: its upload was not continued for 7 days" in contents(window))
+        assert not old.exists()
         second = ready(editor.url, key, ChosenFile(scene))
         assert second.begin() in (250_000, 260_000)
         second.send_parts()
