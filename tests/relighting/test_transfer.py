@@ -12,7 +12,7 @@ from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
 from splatgraft.core.images import LUMINANCE, linear_from_srgb
 from splatgraft.core.similarity import Similarity
-from splatgraft.core.spherical_harmonics import rgb_from_dc
+from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.relighting import (
     LayerWeights,
     Light,
@@ -27,6 +27,7 @@ from splatgraft.relighting import (
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.shading.gain import apply_gain
 from splatgraft.relighting.shading.irradiance import ShadeSettings, shade_ratio
+from splatgraft.relighting.transfer import SHADOW_POWER
 from splatgraft.runtime.memo import Memo
 
 SKY = fit_ambient(torch.tensor([0.4, 0.5, 0.6]))
@@ -255,6 +256,23 @@ def test_even_lights_change_a_share_of_the_tint_and_of_the_level():
     assert not torch.allclose(expected, torch.zeros(3), atol=0.15)
     # the shells' splats overlap to an alpha below 1 in places, the same in both; 10% for their blending in sRGB
     assert torch.allclose(shade.mean(0), expected, atol=0.1)
+
+
+def test_shadows_under_an_estimated_light_have_its_power_and_those_under_a_told_one_do_not():
+    shell = even_directions(4000)
+    colors = torch.where(shell[:, 2:] > 0.5, torch.tensor(0.9), torch.tensor(0.3)).expand(-1, 3)
+    sky = surfels(20 * shell, -shell, width=0.7)
+    target = concatenate([floor(), replace(sky, sh=dc_from_rgb(colors[:, None]))])
+    composite = placed((ball(), at(0.0, 0.0, 0.35)), target=target)
+    found = relight(composite, cameras(), options=WHOLE)
+    assert found.light is not None
+    assert found.estimate is not None
+    told = relight(composite, cameras(), light=found.light, options=WHOLE)
+    assert float(darkness(told)[0].max()) > 0.1
+    assert torch.allclose(found.shadow, told.shadow**SHADOW_POWER, atol=1e-4)
+    # the slope is that of the power: the ratio seen from a side changes as the power of the sum does
+    grey = told.shadow.mean(1, keepdim=True)
+    assert torch.allclose(found.slope, SHADOW_POWER * grey ** (SHADOW_POWER - 1) * told.slope, atol=1e-4)
 
 
 def test_shade_takes_the_stated_shares_of_level_and_tint():

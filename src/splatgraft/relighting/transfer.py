@@ -65,6 +65,11 @@ class RelightOptions:
     """Views of the target in which shadows are fitted to the surface that is seen; 0: none, for a quick draft."""
 
 
+SHADOW_POWER = 1.3
+"""Exponent of shadows under a light that was estimated: an average over what is possible has less contrast than the
+light itself. Fitted by benchmarks/fit_shadows.py."""
+
+
 @dataclass(frozen=True)
 class _LitObject:
     """One object of n Gaussians in the prepared scene."""
@@ -214,7 +219,7 @@ def _assembled(
     rest = torch.ones(scene_count, dtype=torch.bool)
     rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
-    on_objects = [_on_object(i, objects) for i in range(len(objects))]
+    on_objects = [_on_object(i, objects, _shadow_power(scene)) for i in range(len(objects))]
     replaced = [torch.full((o.prepared.gaussians.count,), o.prepared.source_lighting is not None) for o in objects]
     object_rows = torch.arange(scene_count, baked.count)
     gaussians = concatenate([baked.select(rest_index), receivers.gaussians, baked.select(object_rows)])
@@ -288,7 +293,12 @@ def _on_scene(
 
     rest = torch.ones(pressed.count, dtype=torch.bool)
     rest[receivers.origin] = False
-    return receivers, fit_to_views(receivers, total, pressed.select(rest), cameras, ratio_at=ratio_at)
+    fitted = fit_to_views(receivers, total, pressed.select(rest), cameras, ratio_at=ratio_at)
+    return receivers, fitted.strengthened(_shadow_power(scene))
+
+
+def _shadow_power(scene: PreparedScene) -> float:
+    return 1.0 if scene.estimate is None else SHADOW_POWER
 
 
 def _glosses(objects: list[_LitObject], gaussians: Gaussians) -> Float[Tensor, "m k 3"]:
@@ -304,8 +314,8 @@ def _glosses(objects: list[_LitObject], gaussians: Gaussians) -> Float[Tensor, "
     return out
 
 
-def _on_object(index: int, objects: list[_LitObject]) -> SceneRatio:
-    """Shadow and bounce of all other objects on one."""
+def _on_object(index: int, objects: list[_LitObject], power: float) -> SceneRatio:
+    """Shadow and bounce of all other objects on one; shadows to a power."""
     one = objects[index]
     gaussians, normals = one.prepared.gaussians, one.prepared.normals.vectors
     shadow, bounce = torch.ones(gaussians.count, 3), torch.zeros(gaussians.count, 3)
@@ -314,4 +324,4 @@ def _on_object(index: int, objects: list[_LitObject]) -> SceneRatio:
             maps, visibility = other.prepared.maps, one.sample_visibility
             ratio = scene_ratio(maps, gaussians.means, normals, sample_visibility=visibility)
             shadow, bounce = shadow * ratio.shadow, bounce + ratio.bounce
-    return SceneRatio(shadow=shadow, bounce=bounce, slope=torch.zeros_like(shadow))
+    return SceneRatio(shadow=shadow, bounce=bounce, slope=torch.zeros_like(shadow)).strengthened(power)

@@ -225,6 +225,11 @@ class SceneRatio:
     slope: Float[Tensor, "m 3"]
     """View dependence of both, world axes: seen along the unit vector d, slope . d is added (grey)."""
 
+    def strengthened(self, power: float) -> "SceneRatio":
+        """With `power` times the logarithm of every shadow."""
+        grey = self.shadow.mean(1, keepdim=True)
+        return SceneRatio(self.shadow**power, self.bounce, power * grey ** (power - 1) * self.slope)
+
 
 def scene_ratio(
     maps: ObjectShadowMaps,

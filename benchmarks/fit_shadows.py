@@ -1,0 +1,90 @@
+"""Fits the strength of shadows under an estimated light over rendered scenes, and checks it across scenes.
+
+`python benchmarks/fit_shadows.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `python
+benchmarks/exam` renders them. A light that is averaged over what is possible has less contrast than the true one, so
+shadows come out too weak. The objective is the share that is removed of pasting's error, the RMSE of the ratio of
+luminance with the object to that without it over all pixels beside the object: a strong shadow in a wrong place costs.
+Every power of a grid is tried; it is chosen with each scene left out in turn, too, and the share of the scene left out
+is reported.
+"""
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from exam.evaluate_scene import measure_row
+from exam.rows import make_row
+from exam.scene_files import ExamScene, read_scene
+
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.evaluation.measure import luminance_ratio
+from splatgraft.evaluation.regions import find_regions
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.relighting import relight
+from splatgraft.relighting.shadows.scene_ratio import SceneRatio
+from splatgraft.relighting.transfer import SHADOW_POWER
+from splatgraft.runtime.console import Console
+
+POWERS = (1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0)
+
+
+def ratio_error(result: Gaussians, scene: ExamScene) -> float:
+    """RMSE of the luminance ratio over all pixels beside the object, mean over views."""
+    errors = []
+    for view in scene.views:
+        truth = view.truth
+        apart = luminance_ratio(view.picture(result), view.background) - luminance_ratio(truth.image, truth.background)
+        errors.append(float((apart[~find_regions(truth).object] ** 2).mean().sqrt()))
+    return sum(errors) / len(errors)
+
+
+def shares(scene: ExamScene) -> tuple[list[float], list[float]]:
+    """For each power the share of the error that is removed: beside the object, and in the band of the true shadow."""
+    pasted = make_row("paste", scene)[0]
+    before, band_before = ratio_error(pasted, scene), measure_row(pasted, scene.views)["shadow"]
+    relit = relight(scene.composite, scene.cameras, sources=[scene.source])
+    everywhere, band = [], []
+    for power in POWERS:
+        # the transfer has today's power in its layers
+        factor = power / SHADOW_POWER
+        ratio = SceneRatio(relit.shadow, relit.bounce, relit.slope).strengthened(factor)
+        result = replace(relit, shadow=ratio.shadow, slope=ratio.slope).bake()[0]
+        everywhere.append(1 - ratio_error(result, scene) / before)
+        found = measure_row(result, scene.views)["shadow"]
+        assert found is not None
+        assert band_before is not None
+        band.append(1 - found / band_before)
+    return everywhere, band
+
+
+def main() -> None:
+    """Fit and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
+    parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
+    options = parser.parse_args()
+    sizes = ReconstructOptions(iterations=1000, budget=20_000)
+    rows, bands = [], []
+    for folder, work in zip(options.scenes, options.work, strict=True):
+        for path in sorted(p.parent for p in folder.glob("*/placement.json")):
+            everywhere, band = shares(read_scene(path, work / path.name, sizes, Console()))
+            rows.append(everywhere)
+            bands.append(band)
+            best = POWERS[max(range(len(POWERS)), key=everywhere.__getitem__)]
+            print(f"{path.name}: best {best}; {' '.join(f'{share:.3f}' for share in everywhere)}", flush=True)
+    table, in_band = torch.tensor(rows), torch.tensor(bands)
+    for i, power in enumerate(POWERS):
+        print(f"power {power}: removed {table[:, i].mean():.3f}, in the true shadow {in_band[:, i].mean():.3f}")
+    best = int(table.mean(0).argmax())
+    left_out = [float(table[i, torch.cat([table[:i], table[i + 1 :]]).mean(0).argmax()]) for i in range(len(table))]
+    print(f"fitted: power {POWERS[best]}, removed {table.mean(0)[best]:.3f} (1.0: {table[:, 0].mean():.3f})")
+    print(f"each scene by the power of the others: removed {sum(left_out) / len(left_out):.3f}")
+
+
+if __name__ == "__main__":
+    main()
