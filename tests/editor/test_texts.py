@@ -18,7 +18,8 @@ def texts_of(page: Any) -> list[str]:
         for name in ("label", "hint"):
             found.add(getattr(getattr(props, "props", None), name, None))
         found |= set(getattr(getattr(props, "props", None), "options", None) or ())
-        found |= set(re.findall(r'<splatgraft-upload [^>]*label="([^"]*)"', str(getattr(props, "props", None))))
+        for child in getattr(handle, "_children", {}).values():
+            found |= set(re.findall(r'<splatgraft-upload [^>]*label="([^"]*)"', str(getattr(child, "content", ""))))
     return sorted(text for text in found if isinstance(text, str) and text.strip())
 
 
