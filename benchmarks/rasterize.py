@@ -152,13 +152,13 @@ def main() -> None:
     color_sums = np.empty((len(entries), 3), np.float32)
     totals = np.zeros((COUNT, sums.shape[1]), np.float32)
 
-    least = cpu_blend.MIN_TRANSMITTANCE
+    least, whole = cpu_blend.MIN_TRANSMITTANCE, np.empty((0, 2), np.uint8)
 
     def sort_and_list() -> None:
         cpu_tiles.bin_splats(rows, cpu_tiles.depth_order(rows, splats.depths), WIDTH, HEIGHT)
 
     def forward() -> None:
-        cpu_blend.blend(packed, start, entries, colors, image, alpha, least)
+        cpu_blend.blend(packed, start, entries, whole, colors, image, alpha, least)
 
     def backward() -> None:
         cpu_blend.blend_backward(
@@ -167,7 +167,7 @@ def main() -> None:
         cpu_blend.sum_slots(sums, first, order, totals)
 
     def transpose() -> None:
-        cpu_blend.blend_transpose(packed, start, entries, slots, gradients[:3], color_sums, least)
+        cpu_blend.blend_transpose(packed, start, entries, whole, slots, gradients[:3], color_sums, least)
 
     plain_image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     limits = np.log(255 * splats.opacities)

@@ -3,14 +3,15 @@
 import torch
 from conftest import ball, ring
 
+from splatgraft.consolidation import ConsolidateOptions
 from splatgraft.consolidation.changed_region import drop_higher_bands, restrict_to_changes
 from splatgraft.consolidation.frozen_views import Views
 from splatgraft.core.gaussians import concatenate
-from splatgraft.rendering import RenderOptions, render
+from splatgraft.rendering import render
 
 
 def views_of(scene, cameras, images) -> Views:
-    return Views(scene, cameras, images, weights=None, rendering=RenderOptions(), cache_bytes=2**24)
+    return Views(scene, cameras, images, weights=None, options=ConsolidateOptions(cache_bytes=2**24))
 
 
 def scene_with_a_satellite():

@@ -7,15 +7,18 @@ from conftest import ball, ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from splatgraft.consolidation import ConsolidateOptions
 from splatgraft.consolidation.frozen_views import Views
+from splatgraft.fitting import adam
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
 
 def views_of(scene, cameras, **changes) -> Views:
     images = LazySequence(len(cameras), lambda index: torch.zeros(40, 40, 3))
-    options = {"weights": None, "rendering": RenderOptions(), "cache_bytes": 2**24} | changes
-    return Views(scene, cameras, images, **options)
+    # exact maps, which are compared with the renderer
+    exact = ConsolidateOptions(least_row_weight=0.0, cache_bytes=2**24)
+    return Views(scene, cameras, images, weights=None, options=replace(exact, **changes))
 
 
 def test_render_equals_the_renderer_with_and_without_a_subset():
@@ -74,6 +77,27 @@ def test_what_is_cached_stays_cached_where_a_view_is_not_cropped():
     part = views.restricted(torch.arange(300) > 9, [(0, 0, 40, 40), None, (0, 0, 39, 40)])
     assert part[0].operator is operators[0]
     assert part[1].operator is not operators[2]
+
+
+def test_a_fused_step_of_descent_is_adam_on_the_transpose():
+    scene, cameras = ball(150, degree=2, seed=9), ring(2, 40)
+    views, generator = views_of(scene, cameras), torch.Generator().manual_seed(10)
+    rates = torch.rand(27, generator=generator)
+    fused, plain = scene.sh.clone(), scene.sh.clone()
+    of_fused, of_plain = (adam.no_moments({"sh": fused}, 150) for _ in range(2))
+    for turn in range(4):
+        view, colors = views[turn % 2], torch.randn(150, 3, generator=generator)
+        if turn == 3:
+            colors[int(torch.nonzero(view.visible)[0]), 1] = torch.nan
+        gradient = torch.zeros_like(plain)
+        view.expansion.write_transpose(colors, gradient)
+        of = {"moments": of_plain, "visible": view.visible, "rates": {"sh": rates}}
+        finite = adam.step({"sh": plain}, {"sh": gradient}, **of)
+        assert view.expansion.descend(fused, colors, moments=of_fused, rates=rates) == finite == (turn < 3)
+    # the same operations, compiled twice
+    assert torch.allclose(fused, plain, atol=1e-6)
+    assert torch.equal(of_fused.steps, of_plain.steps)
+    assert torch.allclose(of_fused.second["sh"], of_plain.second["sh"], rtol=1e-5)
 
 
 @given(st.integers(0, 3))

@@ -9,13 +9,15 @@ from splatgraft.consolidation.changed_region import drop_higher_bands
 from splatgraft.consolidation.corrected_targets import CorrectedTargets
 from splatgraft.consolidation.frozen_views import Views
 from splatgraft.consolidation.normal_equations import _build_equations, _select_ridge, solve
-from splatgraft.consolidation.options import SolveOptions
+from splatgraft.consolidation.options import ConsolidateOptions, SolveOptions
 from splatgraft.consolidation.view_errors import ViewErrorOptions
-from splatgraft.rendering import RenderOptions, render
+from splatgraft.rendering import render
 
 
 def views_of(scene, cameras, images, weights=None) -> Views:
-    return Views(scene, cameras, images, weights=weights, rendering=RenderOptions(), cache_bytes=2**24)
+    return Views(
+        scene, cameras, images, weights=weights, options=ConsolidateOptions(least_row_weight=0.0, cache_bytes=2**24)
+    )
 
 
 def test_equals_dense_ridge_regression():

@@ -1,5 +1,7 @@
 """The operator of one view: linear, equal to the renderer, and with its adjoint as transpose."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from scenes import camera, random_scene
@@ -68,6 +70,30 @@ def test_blending_and_transposing_at_once_equals_one_after_the_other(weighted):
     wanted = operator.blend_transpose(picture * weights[..., None] if weighted else picture)
     # the same products in the same order
     assert torch.equal(operator.blend_and_transpose(values, weights if weighted else None), wanted)
+
+
+def test_rows_of_no_weight_are_left_out_of_the_map_and_of_its_transpose():
+    scene = random_scene(4000, 0, seed=10)
+    scene = replace(scene, opacity_logits=scene.opacity_logits + 3)  # most lie behind others
+    exact = rendering.view_operator(scene, camera(100, 70))
+    operator = rendering.view_operator(scene, camera(100, 70), least_row_weight=1e-4)
+    generator = torch.Generator().manual_seed(11)
+    values, image = torch.rand(4000, 3, generator=generator), torch.randn(70, 100, 3, generator=generator)
+    assert 0 < operator.visible.sum() < exact.visible.sum()
+    assert not (operator.visible & ~exact.visible).any()
+    # 16 rows in each of 35 tiles
+    weights = exact.blend_transpose(torch.ones(70, 100, 1))[~operator.visible]
+    assert weights.max() < 16 * 35 * 1e-4
+    # a pixel loses at most 1e-4 of each of some 100 Gaussians of its tile, and gains as much of those behind
+    assert (operator.blend(values) - exact.blend(values)).abs().max() < 5e-3
+    left = (operator.blend(values).double() * image).sum()
+    right = (operator.blend_transpose(image).double() * values).sum()
+    # float32 sums, which cancel
+    assert abs(left - right) < 1e-6 * operator.blend(values).norm() * image.norm()
+    # the same products in the same order
+    both = operator.blend_transpose(operator.blend(values))
+    assert torch.equal(operator.blend_and_transpose(values, None), both)
+    assert torch.allclose(operator.blend(torch.ones(4000, 1))[..., 0], operator.alpha, atol=1e-5)
 
 
 def test_the_transposed_residual_equals_one_after_the_other():

@@ -42,7 +42,6 @@ def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
     """
     views, start = targets.views, 0
     sh = sh.clone().contiguous()
-    gradient = torch.zeros_like(sh)
     moments = adam.no_moments({"sh": sh}, len(sh))
     saved = checkpoint.load()
     if saved is not None:
@@ -57,10 +56,8 @@ def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
         picture = view.draw(colors)
         picture, target = _weighted_pair(picture, targets.target(index), views.weight(index))
         value = loss(picture, target)
-        # rows of Gaussians that the view does not show keep an earlier view's gradient, and are not updated
-        view.expansion.write_transpose(torch.autograd.grad(value, colors)[0], gradient)
         rates = options.rate * _decay(iteration / options.iterations, options.final_ratio) * shares
-        if not adam.step({"sh": sh}, {"sh": gradient}, moments=moments, rates={"sh": rates}, visible=view.visible):
+        if not view.expansion.descend(sh, torch.autograd.grad(value, colors)[0], moments=moments, rates=rates):
             name = views.cameras.names[index]
             raise ValueError(f"consolidate: expected finite gradients, found others in {name} at iteration {iteration}")
         if (iteration + 1) % options.save_every == 0:

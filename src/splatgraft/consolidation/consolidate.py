@@ -33,8 +33,8 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
     changed pixel sees keep their colours exactly. The same inputs and seed give the same result.
 
     Memory above the inputs, for n Gaussians with k coefficients: 4 n (k^2 + 50 k) bytes for `fast`, 4 n 24 k for
-    `adam`, plus up to `options.cache_bytes` (views are kept until it is full), the tile lists of two views and a few
-    images; beyond that it does not grow with the number of views.
+    `adam`, plus up to `options.cache_bytes` (views, then their corrected images, are kept until it is full), the tile
+    lists of two views and a few images; beyond that it does not grow with the number of views.
 
     Args:
         composite: The scene of which the images were made.
@@ -58,8 +58,7 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
         cameras,
         images,
         weights=weights,
-        rendering=options.rendering,
-        cache_bytes=options.cache_bytes,
+        options=options,
     )
     if options.method == "adam":
         sh = optimize_colors(
@@ -82,6 +81,7 @@ def _consolidate_fast(composite: Gaussians, views: Views, options: ConsolidateOp
     targets = CorrectedTargets(views, options.view_error)
     prior = drop_higher_bands(composite.sh)[active]
     sh = solve(prior, targets, options.solve, progress=progress)
+    targets.keep()
     if options.polish_passes:
         polish = replace(options.polish, iterations=options.polish_passes * len(views))
         sh = optimize_colors(sh, targets, polish, loss=options.loss, seed=options.seed, progress=progress)

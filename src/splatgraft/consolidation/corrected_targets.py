@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.consolidation.frozen_views import Views
+from splatgraft.consolidation.frozen_views import Views, memory_bytes
 from splatgraft.consolidation.view_errors import ViewError, ViewErrorOptions, no_view_error, refine
 
 
@@ -17,14 +17,25 @@ class CorrectedTargets:
         """Start without errors; with `options` None none are estimated."""
         self.views, self.options = views, options
         self._of_view: list[ViewError | None] = [None] * len(views)
+        self._kept: dict[int, Tensor] | None = None
 
     def target(self, index: int) -> Float[Tensor, "h w 3"]:
         """The view's image, corrected by its error as estimated so far."""
+        if self._kept is not None and index in self._kept:
+            return self._kept[index]
         image, view_error = self.views.target(index), self._of_view[index]
-        return image if view_error is None else view_error.correct(image)
+        corrected = image if view_error is None else view_error.correct(image)
+        if self._kept is not None and self.views.take_bytes(memory_bytes(corrected)):
+            self._kept[index] = corrected
+        return corrected
+
+    def keep(self) -> None:
+        """From now on keep corrected images in what the views leave of their cache; errors are not refined any more."""
+        self._kept = {}
 
     def refine(self, index: int, render: Float[Tensor, "h w 3"]) -> None:
         """Refine the view's error against a render of the current scene."""
+        assert self._kept is None
         if self.options is None:
             return
         image = self.views.target(index)

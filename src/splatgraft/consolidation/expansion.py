@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
+from splatgraft.fitting import adam
 from splatgraft.rendering.cpu_basis import basis_at
 from splatgraft.runtime.kernel_lock import serialized
 
@@ -58,6 +59,35 @@ class Expansion:
             _write_transpose(*self._numbers, colors.contiguous().numpy(), out.numpy())
         else:
             out[self.shown] = self._basis(self.shown)[:, :, None] * colors[self.shown][:, None, :]
+
+    def descend(
+        self,
+        sh: Float[Tensor, "m k 3"],
+        colors: Float[Tensor, "m 3"],
+        *,
+        moments: adam.Moments,
+        rates: Float[Tensor, "3*k"],
+    ) -> bool:
+        """One step of `adam.step` on the coefficients that are shown, along the transpose of `colors` at a gradient.
+
+        Args:
+            sh: Changed in place, with `moments` of the field "sh".
+            colors: The loss's gradient by the colours.
+            moments: Of the coefficients.
+            rates: Learning rate of each coefficient, flattened.
+
+        Returns:
+            False where a gradient was not finite; the rows with such gradients stay unchanged.
+        """
+        if self._on_cpu:
+            flat = tuple(x.view(len(x), -1).numpy() for x in (sh, moments.first["sh"], moments.second["sh"]))
+            numbers = colors.contiguous().numpy(), flat, moments.steps.numpy(), rates.numpy()
+            return _descend(self._numbers, *numbers) == 0
+        gradient = torch.zeros_like(sh)
+        self.write_transpose(colors, gradient)
+        visible = torch.zeros(len(sh), dtype=torch.bool, device=sh.device)
+        visible[self.shown] = True
+        return adam.step({"sh": sh}, {"sh": gradient}, moments=moments, rates={"sh": rates}, visible=visible)
 
     def add_squares(self, weights: Float[Tensor, "m 1"], out: Float[Tensor, "m k k"]) -> None:
         """Add weight times harmonics times their transpose of every Gaussian to `out`."""
@@ -171,3 +201,28 @@ def _add_squares(means, center, shown, weights, out):
                 scaled = weights[g, 0] * basis[a]
                 for b in range(k):
                     out[g, a, b] += scaled * basis[b]
+
+
+@serialized
+@numba.njit(cache=True, parallel=True)
+@no_type_check
+def _descend(seen, colors, rows, steps, rates):
+    """`_write_transpose` and `adam.update_row` without a gradient in memory; returns the rows that are not finite."""
+    (means, center, shown), (values, firsts, seconds) = seen, rows
+    n, k = shown.shape[0], rates.shape[0] // 3
+    bad = 0
+    for part in numba.prange((n + _PART - 1) // _PART):
+        basis, gradient = np.empty(_MOST, np.float32), np.empty(3 * _MOST, np.float32)
+        counted, corrections = np.int32(0), (np.float32(1), np.float32(1))
+        for i in range(part * _PART, min(n, (part + 1) * _PART)):
+            g = shown[i]
+            _basis_towards(means[g], center, k, basis)
+            for j in range(k):
+                for c in range(3):
+                    gradient[3 * j + c] = basis[j] * colors[g, c]
+            steps[g] += 1
+            if steps[g] != counted:
+                counted = steps[g]
+                corrections = adam.bias_corrections(counted)
+            bad += adam.update_row(values[g], gradient, (firsts[g], seconds[g]), corrections, rates)
+    return bad

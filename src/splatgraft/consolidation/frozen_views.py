@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatgraft.consolidation.expansion import Expansion
-from splatgraft.consolidation.options import ImageSequence
+from splatgraft.consolidation.options import ConsolidateOptions, ImageSequence
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras, Window
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.rendering import RenderOptions, ViewOperator, view_operator
+from splatgraft.rendering import ViewOperator, view_operator
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class View:
 class Views:
     """v views of one composite, whose `active` Gaussians may change colour.
 
-    The first views whose operators fit `cache_bytes` are cached; the others are projected and sorted on each access.
-    Images and weights are read one at a time.
+    The first views whose operators fit `options.cache_bytes` are cached; the others are projected and sorted on each
+    access. Images and weights are read one at a time.
     """
 
     def __init__(
@@ -94,12 +94,11 @@ class Views:
         images: ImageSequence,
         *,
         weights: ImageSequence | None,
-        rendering: RenderOptions,
-        cache_bytes: int,
+        options: ConsolidateOptions,
     ) -> None:
         """All Gaussians are active and all pixels count."""
         self.composite, self.cameras, self.images, self.weights = composite, cameras, images, weights
-        self.rendering, self.cache_bytes = rendering, cache_bytes
+        self.options = options
         self.active: Tensor | None = None
         self._means = composite.means.float().contiguous()
         self._cached: dict[int, View] = {}
@@ -121,8 +120,7 @@ class Views:
             self.cameras[chosen].cropped(kept),
             _Cropped(self.images, chosen, kept),
             weights=None if self.weights is None else _Cropped(self.weights, chosen, kept),
-            rendering=self.rendering,
-            cache_bytes=self.cache_bytes,
+            options=self.options,
         )
         if not bool(active.all()):
             restricted.active = torch.nonzero(active).flatten()
@@ -138,20 +136,27 @@ class Views:
         """The view's map, from the cache or built anew."""
         if index in self._cached:
             return self._cached[index]
-        view = self._view(index, view_operator(self.composite, self.cameras[index], self.rendering))
+        rendering, least = self.options.rendering, self.options.least_row_weight
+        operator = view_operator(self.composite, self.cameras[index], rendering, least_row_weight=least)
+        view = self._view(index, operator)
         self._keep(index, view)
         return view
 
     def _keep(self, index: int, view: View) -> None:
-        if self._cached_bytes + view.own_bytes <= self.cache_bytes:
+        if self.take_bytes(view.own_bytes):
             self._cached[index] = view
-            self._cached_bytes += view.own_bytes
+
+    def take_bytes(self, count: int) -> bool:
+        """Whether the cache has room for so many more bytes, which then count as taken."""
+        has_room = self._cached_bytes + count <= self.options.cache_bytes
+        self._cached_bytes += count if has_room else 0
+        return has_room
 
     def _view(self, index: int, operator: ViewOperator) -> View:
         scene, camera = self.composite, self.cameras[index]
         static, visible = None, operator.visible
-        if any(self.rendering.background):
-            static = (1 - operator.alpha)[..., None] * operator.alpha.new_tensor(self.rendering.background)
+        if any(self.options.rendering.background):
+            static = (1 - operator.alpha)[..., None] * operator.alpha.new_tensor(self.options.rendering.background)
         if self.active is not None:
             static = self._fixed(operator, camera, static)
             visible = visible[self.active]

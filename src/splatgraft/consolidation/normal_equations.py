@@ -19,6 +19,8 @@ from splatgraft.runtime.progress import Progress, silent
 
 _FACTORED_AT_ONCE = 2**14
 """Gaussians per batch of Cholesky factorisations, which bounds the memory."""
+_SUMMED_AT_ONCE = 2**12
+"""Gaussians per batch of a dot product."""
 _COMPARED_VIEWS = 40
 """Views at most on which ridges are compared."""
 _HOLD_OUT_EVERY = 5
@@ -178,4 +180,7 @@ def _conjugate_gradient(residual: Float[Tensor, "m k 3"], equations: _Equations,
 
 
 def _dot(a: Float[Tensor, "m k 3"], b: Float[Tensor, "m k 3"]) -> Float[Tensor, "3"]:
-    return (a.double() * b.double()).sum((0, 1)).to(a.dtype)
+    # in parts, which stay in the processor's cache
+    parts = zip(a.split(_SUMMED_AT_ONCE), b.split(_SUMMED_AT_ONCE), strict=True)
+    total = sum((x.double() * y.double()).sum((0, 1)) for x, y in parts)
+    return torch.as_tensor(total).to(a)

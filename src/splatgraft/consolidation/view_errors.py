@@ -105,7 +105,7 @@ def _refine_tint(
             knots.numel(), device=knots.device
         )
         right = rows.T @ (robust * slope * residual[..., channel]) @ columns
-        step = torch.linalg.solve(normal, right.flatten() - ridge * knots.flatten())
+        step = _solve(normal, right.flatten() - ridge * knots.flatten())
         channels.append(knots + step.reshape(knots.shape))
     return torch.stack(channels, -1)
 
@@ -123,8 +123,8 @@ def _refine_flow(
     residual = smooth_render - smooth_image
     robust = _robust_weights(residual, confidence, options)
     dx, dy = _slopes(0.5 * (smooth_image + smooth_render))
-    xx, xy, yy = ((a * b).sum(-1) * robust for a, b in ((dx, dx), (dx, dy), (dy, dy)))
-    right = torch.stack([rows.T @ (robust * (d * residual).sum(-1)) @ columns for d in (dx, dy)])
+    xx, xy, yy = (_over_channels(a * b) * robust for a, b in ((dx, dx), (dx, dy), (dy, dy)))
+    right = torch.stack([rows.T @ (robust * _over_channels(d * residual)) @ columns for d in (dx, dy)])
     cross = _normal_matrix(xy, rows, columns)
     normal = torch.cat(
         [
@@ -136,9 +136,7 @@ def _refine_flow(
     ridge = (options.residual_sigma / options.flow_sigma_px) ** 2 * _observations_per_knot(
         robust, xx.numel(), len(knots) // 2, options
     )
-    step = torch.linalg.solve(
-        normal + ridge * torch.eye(len(knots), device=knots.device), right.flatten() - ridge * knots
-    )
+    step = _solve(normal + ridge * torch.eye(len(knots), device=knots.device), right.flatten() - ridge * knots)
     moved = (knots + step).reshape(2, *flow.shape[:2]).permute(1, 2, 0)
     return moved.clamp(-options.most_flow * options.flow_sigma_px, options.most_flow * options.flow_sigma_px)
 
@@ -147,7 +145,7 @@ def _robust_weights(
     residual: Float[Tensor, "h w 3"], confidence: Float[Tensor, "h w"], options: ViewErrorOptions
 ) -> Float[Tensor, "h w"]:
     """Confidence times Geman-McClure weights of the residual."""
-    squares = (residual**2).mean(-1) / options.residual_sigma**2
+    squares = _over_channels(residual**2) / (3 * options.residual_sigma**2)
     return confidence / (1 + squares) ** 2
 
 
@@ -164,6 +162,11 @@ def _normal_matrix(
     across = weights @ (columns[:, :, None] * columns[:, None, :]).reshape(-1, b * b)
     down = (rows[:, :, None] * rows[:, None, :]).reshape(-1, a * a).T @ across
     return down.reshape(a, a, b, b).permute(0, 2, 1, 3).reshape(a * b, a * b)
+
+
+def _solve(normal: Float[Tensor, "k k"], right: Float[Tensor, "k"]) -> Float[Tensor, "k"]:
+    """The solution of symmetric, positive definite equations."""
+    return torch.cholesky_solve(right[:, None], torch.linalg.cholesky(normal))[:, 0]
 
 
 def _knots(length: int, cell_px: float) -> int:
@@ -203,10 +206,20 @@ def _warp(image: Float[Tensor, "h w 3"], flow: Float[Tensor, "h w 2"]) -> Float[
 
 
 def _blur(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    taps = image.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16
-    planes = F.pad(image.permute(2, 0, 1)[:, None], (2, 2, 2, 2), mode="replicate")
-    planes = F.conv2d(F.conv2d(planes, taps.reshape(1, 1, 1, 5)), taps.reshape(1, 1, 5, 1))
-    return planes[:, 0].permute(1, 2, 0)
+    """Binomial taps 1 4 6 4 1 along both axes; the border repeats."""
+    for axis in (0, 1):
+        length = image.shape[axis]
+        first, last = image.narrow(axis, 0, 1), image.narrow(axis, length - 1, 1)
+        padded = torch.cat([first, first, image, last, last], axis)
+        a, b, c, d, e = (padded.narrow(axis, shift, length) for shift in range(5))
+        image = (a + e).add_(b + d, alpha=4.0).add_(c, alpha=6.0).mul_(1 / 16)
+    return image
+
+
+def _over_channels(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+    # torch sums a last axis of three numbers several times as slowly
+    red, green, blue = image.unbind(-1)
+    return red + green + blue
 
 
 def _slopes(image: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]]:

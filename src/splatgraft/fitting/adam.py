@@ -117,35 +117,54 @@ def _step_numba(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bo
     return _update_rows(values, gradients, (firsts, seconds), (steps.numpy(), visible.numpy()), numbers) == 0
 
 
+@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@no_type_check
+def bias_corrections(step):
+    """Factors on the first and the second moment after the update number `step`, counted from 1."""
+    one = np.float32(1)
+    return (
+        one / (one - np.float32(BETA_1) ** np.float32(step)),
+        one / (one - np.float32(BETA_2) ** np.float32(step)),
+    )
+
+
 # divisions follow numpy, since a check for zero would be a branch in the loop
 @numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@no_type_check
+def update_row(value, gradient, moments, corrections, rate):
+    """Update one Gaussian's row of a field in place; returns 1 and changes nothing where a number is not finite."""
+    (first, second), (correct_1, correct_2) = moments, corrections
+    one, b1, b2 = np.float32(1), np.float32(BETA_1), np.float32(BETA_2)
+    columns = value.shape[0]
+    bad = 0
+    for j in range(columns):
+        if not abs(gradient[j]) < np.float32(1e18):  # its square would leave float32; also catches nan
+            bad = 1
+    if bad == 0:
+        for j in range(columns):
+            g = gradient[j]
+            m = b1 * first[j] + (one - b1) * g
+            v = b2 * second[j] + (one - b2) * g * g
+            first[j] = m
+            second[j] = v
+            value[j] -= rate[j] * m * correct_1 / (np.sqrt(v * correct_2) + np.float32(EPSILON))
+    return bad
+
+
+@numba.njit(cache=True)
 @no_type_check
 def _update_part(value, gradient, moments, part, rate):
     """Update the rows that `part` = (first, last, steps, visible) names; returns how many have no finite gradient."""
     first, second = moments
     begin, end, steps, visible = part
-    columns = value.shape[1]
-    one = np.float32(1)
-    b1, b2 = np.float32(BETA_1), np.float32(BETA_2)
-    bad = 0
+    bad, counted, corrections = 0, np.int32(0), (np.float32(1), np.float32(1))
     for i in range(begin, end):
         if not visible[i]:
             continue
-        correct_1 = one / (one - b1 ** np.float32(steps[i]))
-        correct_2 = one / (one - b2 ** np.float32(steps[i]))
-        row_bad = 0
-        for j in range(columns):
-            if not abs(gradient[i, j]) < np.float32(1e18):  # its square would leave float32; also catches nan
-                row_bad = 1
-        bad += row_bad
-        if row_bad == 0:
-            for j in range(columns):
-                g = gradient[i, j]
-                m = b1 * first[i, j] + (one - b1) * g
-                v = b2 * second[i, j] + (one - b2) * g * g
-                first[i, j] = m
-                second[i, j] = v
-                value[i, j] -= rate[j] * m * correct_1 / (np.sqrt(v * correct_2) + np.float32(EPSILON))
+        if steps[i] != counted:
+            counted = steps[i]
+            corrections = bias_corrections(counted)
+        bad += update_row(value[i], gradient[i], (first[i], second[i]), corrections, rate)
     return bad
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.rendering import cpu_blend, cpu_normal_matrix, cpu_project, cpu_tiles
+from splatgraft.rendering import cpu_blend, cpu_normal_matrix, cpu_project, cpu_rows, cpu_tiles
 from splatgraft.rendering.channels import CHANNEL_COUNTS, assemble_render
 from splatgraft.rendering.interface import Output, Render, RenderOptions
 from splatgraft.runtime.kernel_lock import KERNEL_LOCK
@@ -32,9 +32,11 @@ def render(
     return assemble_render(image, alpha, visible, outputs=outputs, has_features=features is not None, options=options)
 
 
-def view_operator(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> "CpuViewOperator":
+def view_operator(
+    gaussians: Gaussians, camera: Cameras, options: RenderOptions, least_row_weight: float
+) -> "CpuViewOperator":
     """`rendering.view_operator` for tensors on the CPU."""
-    return CpuViewOperator(gaussians, camera, options)
+    return CpuViewOperator(gaussians, camera, options, least_row_weight)
 
 
 def _stack(parts: tuple[Tensor, ...]) -> Tensor:
@@ -94,6 +96,8 @@ class _TileLists:
     """(e,) index of each entry's sums, so that those of one splat are adjacent."""
     first: np.ndarray
     """(m + 1,) where each splat's slots begin."""
+    rows: np.ndarray
+    """(e, 2) uint8, first and one past the last row of the tile that counts; empty: as far as the splat reaches."""
 
     @staticmethod
     def of(view: _View, means: np.ndarray, log_scales: np.ndarray, quaternions: np.ndarray, logits: np.ndarray):
@@ -101,7 +105,8 @@ class _TileLists:
         cpu_project.project(means, log_scales, quaternions, logits, view.numbers, view.antialiased, splats, depths)
         order = cpu_tiles.depth_order(splats, depths)
         packed, start, entries, slots, first = cpu_tiles.bin_splats(splats, order, view.width, view.height)
-        return _TileLists(len(means), order, packed, depths, start, entries, slots, first)
+        rows = np.empty((0, 2), np.uint8)
+        return _TileLists(len(means), order, packed, depths, start, entries, slots, first, rows)
 
     @cached_property
     def drawn(self) -> np.ndarray:
@@ -110,11 +115,17 @@ class _TileLists:
         out[self.order[np.diff(self.first) > 0]] = True
         return out
 
-    def without_hidden(self, view: _View) -> "_TileLists":
-        """Lists of the splats with weight in some pixel of the tile; rendered to the end they give the same image."""
-        ones = np.ones((1, view.height, view.width), np.float32)
-        shown = self.blend_transpose(ones, cpu_blend.MIN_TRANSMITTANCE)[:, 0] > 0
-        listed = shown[self.slots]
+    def without_hidden(self, view: _View, least_row_weight: float) -> "_TileLists":
+        """Lists of the splats with weight in some pixel of the tile, and the rows in which they have more than a bound.
+
+        With the bound 0, rendered to the end, they give the same image.
+        """
+        rows = np.empty((len(self.entries), 2), np.uint8)
+        size = view.height, view.width
+        cpu_rows.find_rows(self.splats, self.start, self.entries, size, np.float32(least_row_weight), rows)
+        listed = rows[:, 1] > 0
+        shown = np.empty_like(listed)
+        shown[self.slots] = listed
         shown_before, listed_before = (np.concatenate([[0], np.cumsum(x)]).astype(np.int32) for x in (shown, listed))
         first = shown_before[self.first]
         kept = first[1:] > first[:-1]
@@ -128,19 +139,26 @@ class _TileLists:
             entries=place[self.entries[listed]],
             slots=shown_before[self.slots[listed]],
             first=np.concatenate([first[:1], first[1:][kept]]),
+            rows=rows[listed],
         )
+
+    def in_order(self, values: np.ndarray) -> np.ndarray:
+        """Of `values (n, c)` those of the splats, (m, c)."""
+        out = np.empty((len(self.order), values.shape[1]), np.float32)
+        cpu_blend.gather(values, self.order, out)
+        return out
 
     def blend(self, values: np.ndarray, view: _View, least: np.float32) -> tuple[np.ndarray, np.ndarray]:
         """Blended `values (n, c)` as (c, h, w), and alpha (h, w)."""
         image = np.empty((values.shape[1], view.height, view.width), np.float32)
         alpha = np.empty((view.height, view.width), np.float32)
-        cpu_blend.blend(self.splats, self.start, self.entries, values[self.order], image, alpha, least)
+        cpu_blend.blend(self.splats, self.start, self.entries, self.rows, self.in_order(values), image, alpha, least)
         return image, alpha
 
     def blend_transpose(self, image: np.ndarray, least: np.float32) -> np.ndarray:
         """For every slot (e, c) the sum over pixels of weight times `image (c, h, w)`."""
         sums = np.empty((len(self.entries), len(image)), np.float32)
-        cpu_blend.blend_transpose(self.splats, self.start, self.entries, self.slots, image, sums, least)
+        cpu_blend.blend_transpose(self.splats, self.start, self.entries, self.rows, self.slots, image, sums, least)
         return sums
 
     def sum_slots(self, sums: np.ndarray) -> np.ndarray:
@@ -189,7 +207,7 @@ class _RenderView(torch.autograd.Function):
         with KERNEL_LOCK:
             sums = np.empty((len(lists.entries), cpu_blend.MOMENTS + values.shape[1]), np.float32)
             cpu_blend.blend_backward(
-                lists.splats, lists.start, lists.entries, lists.slots, values[lists.order],
+                lists.splats, lists.start, lists.entries, lists.slots, lists.in_order(values),
                 image, alpha, _array(grad_image), _array(grad_alpha), sums, cpu_blend.MIN_TRANSMITTANCE,
             )  # fmt: skip
             totals = lists.sum_slots(sums)
@@ -209,12 +227,12 @@ class _RenderView(torch.autograd.Function):
 class CpuViewOperator:
     """`ViewOperator` on the CPU: tile lists of the visible splats are made once and always rendered to their ends."""
 
-    def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> None:
-        """Project, sort, make tile lists, and drop hidden splats."""
+    def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions, least_row_weight: float) -> None:
+        """Project, sort, make tile lists, and drop hidden splats and rows."""
         self._view = _View.of(camera, options)
         with KERNEL_LOCK:
             lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
-            self._lists = lists.without_hidden(self._view)
+            self._lists = lists.without_hidden(self._view, least_row_weight)
         self.visible = torch.from_numpy(self._lists.drawn)
 
     @cached_property
@@ -241,8 +259,9 @@ class CpuViewOperator:
         sums = np.empty((len(lists.entries), values.shape[1]), np.float32)
         with KERNEL_LOCK:
             cpu_normal_matrix.blend_and_transpose(
-                lists.splats, lists.start, lists.entries, lists.slots, _array(values)[lists.order], pixels, sums
-            )
+                lists.splats, lists.start, lists.entries, lists.rows, lists.slots,
+                lists.in_order(_array(values)), pixels, sums,
+            )  # fmt: skip
             return torch.from_numpy(lists.sum_slots(sums))
 
     def transpose_residual(self, values: Float[Tensor, "n"], target: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
@@ -251,8 +270,9 @@ class CpuViewOperator:
         sums = np.empty((len(lists.entries), 1), np.float32)
         with KERNEL_LOCK:
             cpu_normal_matrix.transpose_residual(
-                lists.splats, lists.start, lists.entries, lists.slots, _array(values)[lists.order], _array(target), sums
-            )
+                lists.splats, lists.start, lists.entries, lists.rows, lists.slots,
+                lists.in_order(_array(values)[:, None])[:, 0], _array(target), sums,
+            )  # fmt: skip
             return torch.from_numpy(lists.sum_slots(sums)[:, 0])
 
 

@@ -57,6 +57,15 @@ def splat_shape(splats, s, x0, y0):
 
 @njit(cache=True)
 @no_type_check
+def kept_rows(rows, k, top, bottom):
+    """First and one past the last row of entry k: those of `rows (e, 2)`, or `top` and `bottom` where it is empty."""
+    if rows.shape[0] > 0:
+        return int(rows[k, 0]), int(rows[k, 1])
+    return top, bottom
+
+
+@njit(cache=True)
+@no_type_check
 def alpha_row(across, dx, along, down):
     """A row of alpha before the cap, 0 below 1/255, of the exponent `across` + `along` dx + `down` (all over 16)."""
     x = across + dx * along + down
@@ -70,7 +79,7 @@ def alpha_row(across, dx, along, down):
 
 @njit(cache=True)
 @no_type_check
-def _saturated(work, least):
+def saturated(work, least):
     """Whether the transmittance of all pixels of the tile is below `least`."""
     most = load(work, 0)
     for y in range(1, TILE):
@@ -80,11 +89,12 @@ def _saturated(work, least):
 
 @njit(cache=True)
 @no_type_check
-def _blend_rgb(splats, entries, values, x0, y0, work, least):
+def _blend_rgb(splats, entries, rows, values, x0, y0, work, least):
     """Planes of `work`: transmittance, red, green, blue."""
     for k in range(entries.shape[0]):
         s = entries[k]
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
+        top, bottom = kept_rows(rows, k, top, bottom)
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
         dx = lanes() - mx
         across = dx * dx * a + d
@@ -97,17 +107,18 @@ def _blend_rgb(splats, entries, values, x0, y0, work, least):
             store(work, at + PIXELS, load(work, at + PIXELS) + weight * red)
             store(work, at + 2 * PIXELS, load(work, at + 2 * PIXELS) + weight * green)
             store(work, at + 3 * PIXELS, load(work, at + 3 * PIXELS) + weight * blue)
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             break
 
 
 @njit(cache=True)
 @no_type_check
-def _blend_any(splats, entries, values, x0, y0, work, least):
+def _blend_any(splats, entries, rows, values, x0, y0, work, least):
     """Planes of `work`: transmittance, then the channels."""
     for k in range(entries.shape[0]):
         s = entries[k]
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
+        top, bottom = kept_rows(rows, k, top, bottom)
         dx = lanes() - mx
         across = dx * dx * a + d
         for y in range(top, bottom):
@@ -119,7 +130,7 @@ def _blend_any(splats, entries, values, x0, y0, work, least):
             for channel in range(values.shape[1]):
                 at += PIXELS
                 store(work, at, load(work, at) + weight * values[s, channel])
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             break
 
 
@@ -135,19 +146,20 @@ def open_tile(tile, width, planes):
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def blend(splats, start, entries, values, image, alpha, least):
+def blend(splats, start, entries, rows, values, image, alpha, least):
     """Fill `image (c, h, w)` with blended `values (m, c)` over black, and `alpha (h, w)`.
 
-    A tile is done when every pixel's transmittance is below `least`; tested once per batch of splats.
+    `rows (e, 2)`: first and one past the last row of each entry that counts; empty: as far as the splat reaches. A tile
+    is done when every pixel's transmittance is below `least`; tested once per batch of splats.
     """
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = open_tile(tile, alpha.shape[1], 1 + channels)
-        listed = entries[start[tile] : start[tile + 1]]
+        listed, spans = entries[start[tile] : start[tile + 1]], rows[start[tile] : start[tile + 1]]
         if channels == RGB:
-            _blend_rgb(splats, listed, values, float32(x0), float32(y0), work, least)
+            _blend_rgb(splats, listed, spans, values, float32(x0), float32(y0), work, least)
         else:
-            _blend_any(splats, listed, values, float32(x0), float32(y0), work, least)
+            _blend_any(splats, listed, spans, values, float32(x0), float32(y0), work, least)
         for y in range(y0, min(y0 + TILE, alpha.shape[0])):
             for x in range(x0, min(x0 + TILE, alpha.shape[1])):
                 at = (y - y0) * TILE + x - x0
@@ -167,10 +179,11 @@ def read_tile(image, x0, y0, work, plane):
 
 @njit(cache=True)
 @no_type_check
-def _transpose_rgb(splats, entries, slots, x0, y0, work, sums, least):
+def _transpose_rgb(splats, entries, rows, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, red, green, blue."""
     for k in range(entries.shape[0]):
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, entries[k], x0, y0)
+        top, bottom = kept_rows(rows, k, top, bottom)
         dx = lanes() - mx
         across = dx * dx * a + d
         red, green, blue = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
@@ -185,19 +198,20 @@ def _transpose_rgb(splats, entries, slots, x0, y0, work, sums, least):
             blue = blue + weight * load(work, at + 3 * PIXELS)
         slot = slots[k]
         sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(red), total(green), total(blue)
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
 
 
 @njit(cache=True)
 @no_type_check
-def _transpose_any(splats, entries, slots, x0, y0, work, sums, least):
+def _transpose_any(splats, entries, rows, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, the channels of the image, one for sums (at most 256 channels in rows)."""
     channels = sums.shape[1]
     column = np.empty(channels * TILE, np.float32)
     for k in range(entries.shape[0]):
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, entries[k], x0, y0)
+        top, bottom = kept_rows(rows, k, top, bottom)
         dx = lanes() - mx
         across = dx * dx * a + d
         column[:] = ZERO
@@ -212,25 +226,29 @@ def _transpose_any(splats, entries, slots, x0, y0, work, sums, least):
                 store(column, channel * TILE, load(column, channel * TILE) + weight * load(work, at))
         for channel in range(channels):
             sums[slots[k], channel] = total(load(column, channel * TILE))
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
 
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def blend_transpose(splats, start, entries, slots, image, sums, least):
-    """Fill `sums (e, c)`: for every entry, the sum over its pixels of weight times `image (c, h, w)`."""
+def blend_transpose(splats, start, entries, rows, slots, image, sums, least):
+    """Fill `sums (e, c)`: for every entry, the sum over its pixels of weight times `image (c, h, w)`.
+
+    `rows` as in `blend`.
+    """
     channels = image.shape[0]
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = open_tile(tile, image.shape[2], 1 + channels)
         listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
+        spans = rows[start[tile] : start[tile + 1]]
         for c in range(channels):
             read_tile(image[c], x0, y0, work, 1 + c)
         if channels == RGB:
-            used = _transpose_rgb(splats, listed, places, float32(x0), float32(y0), work, sums, least)
+            used = _transpose_rgb(splats, listed, spans, places, float32(x0), float32(y0), work, sums, least)
         else:
-            used = _transpose_any(splats, listed, places, float32(x0), float32(y0), work, sums, least)
+            used = _transpose_any(splats, listed, spans, places, float32(x0), float32(y0), work, sums, least)
         for k in range(used, listed.shape[0]):
             sums[places[k]] = ZERO
 
@@ -284,7 +302,7 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
         sums[slot, MOMENTS] = total(sum_red)
         sums[slot, MOMENTS + 1] = total(sum_green)
         sums[slot, MOMENTS + 2] = total(sum_blue)
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
 
@@ -322,7 +340,7 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
         _write_moments(sums, slot, dx, s0, sy, syy)
         for channel in range(channels):
             sums[slot, MOMENTS + channel] = total(load(column, channel * TILE))
-        if k % BATCH == BATCH - 1 and _saturated(work, least):
+        if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
 
@@ -351,6 +369,16 @@ def blend_backward(splats, start, entries, slots, values, image, alpha, grad_ima
             used = _backward_any(splats, listed, places, values, float32(x0), float32(y0), work, sums, least)
         for k in range(used, listed.shape[0]):
             sums[places[k]] = ZERO
+
+
+@njit(cache=True, parallel=True)
+@no_type_check
+def gather(values, order, out):
+    """Fill `out (m, c)` with the rows `order (m,)` of `values (n, c)`."""
+    for part in prange((order.shape[0] + PIXELS - 1) // PIXELS):
+        for s in range(part * PIXELS, min(order.shape[0], (part + 1) * PIXELS)):
+            for c in range(values.shape[1]):
+                out[s, c] = values[order[s], c]
 
 
 @njit(cache=True, parallel=True)

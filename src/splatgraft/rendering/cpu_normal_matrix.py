@@ -15,16 +15,26 @@ from splatgraft.rendering.cpu_tiles import TILE
 
 @njit(cache=True)
 @no_type_check
-def _blend_and_keep(splats, entries, values, x0, y0, work, weights):
+def _count(rows):
+    """Rows of all entries together, at least 1."""
+    count = 0
+    for k in range(rows.shape[0]):
+        count += int(rows[k, 1]) - int(rows[k, 0])
+    return max(count, 1)
+
+
+@njit(cache=True)
+@no_type_check
+def _blend_and_keep(splats, entries, rows, values, x0, y0, work, weights):
     """Fill the planes transmittance, red, green, blue of `work`, and append every row of weights to `weights`."""
     kept = 0
     for k in range(entries.shape[0]):
         s = entries[k]
-        mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
+        mx, my, a, b, c, d, _, _ = splat_shape(splats, s, x0, y0)
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
         dx = lanes() - mx
         across = dx * dx * a + d
-        for y in range(top, bottom):
+        for y in range(int(rows[k, 0]), int(rows[k, 1])):
             dy = float32(y) - my
             at = y * TILE
             before = load(work, at)
@@ -39,16 +49,17 @@ def _blend_and_keep(splats, entries, values, x0, y0, work, weights):
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def blend_and_transpose(splats, start, entries, slots, values, pixel_weights, sums):
+def blend_and_transpose(splats, start, entries, rows, slots, values, pixel_weights, sums):
     """Fill `sums (e, 3)` with `blend_transpose` of the image of `values (m, 3)` times `pixel_weights (h, w)`.
 
-    The weights of a tile's splats are computed once for both.
+    The weights of a tile's splats are computed once for both, in the rows `rows (e, 2)` of each entry.
     """
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = open_tile(tile, pixel_weights.shape[1], 5)
         listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
-        weights = np.empty(listed.shape[0] * PIXELS, np.float32)
-        _blend_and_keep(splats, listed, values, float32(x0), float32(y0), work, weights)
+        spans = rows[start[tile] : start[tile + 1]]
+        weights = np.empty(_count(spans) * TILE, np.float32)
+        _blend_and_keep(splats, listed, spans, values, float32(x0), float32(y0), work, weights)
         read_tile(pixel_weights, x0, y0, work, 4)
         for at in range(0, PIXELS, TILE):
             share = load(work, at + 4 * PIXELS)
@@ -56,9 +67,8 @@ def blend_and_transpose(splats, start, entries, slots, values, pixel_weights, su
                 store(work, at + plane * PIXELS, load(work, at + plane * PIXELS) * share)
         kept = 0
         for k in range(listed.shape[0]):
-            _, _, _, _, _, _, top, bottom = splat_shape(splats, listed[k], float32(x0), float32(y0))
             red, green, blue = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
-            for y in range(top, bottom):
+            for y in range(int(spans[k, 0]), int(spans[k, 1])):
                 weight, at = load(weights, kept), y * TILE
                 kept += TILE
                 red = red + weight * load(work, at + PIXELS)
@@ -70,16 +80,16 @@ def blend_and_transpose(splats, start, entries, slots, values, pixel_weights, su
 
 @njit(cache=True)
 @no_type_check
-def _blend_one_and_keep(splats, entries, values, x0, y0, work, weights):
+def _blend_one_and_keep(splats, entries, rows, values, x0, y0, work, weights):
     """As `_blend_and_keep` for one channel: planes transmittance and value."""
     kept = 0
     for k in range(entries.shape[0]):
         s = entries[k]
-        mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
+        mx, my, a, b, c, d, _, _ = splat_shape(splats, s, x0, y0)
         value = values[s]
         dx = lanes() - mx
         across = dx * dx * a + d
-        for y in range(top, bottom):
+        for y in range(int(rows[k, 0]), int(rows[k, 1])):
             dy = float32(y) - my
             at = y * TILE
             before = load(work, at)
@@ -92,13 +102,14 @@ def _blend_one_and_keep(splats, entries, values, x0, y0, work, weights):
 
 @njit(cache=True, parallel=True)
 @no_type_check
-def transpose_residual(splats, start, entries, slots, values, target, sums):
+def transpose_residual(splats, start, entries, rows, slots, values, target, sums):
     """Fill `sums (e, 1)` with `blend_transpose` of `target (h, w)` less the image of `values (m,)`."""
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = open_tile(tile, target.shape[1], 2)
         listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
-        weights = np.empty(listed.shape[0] * PIXELS, np.float32)
-        _blend_one_and_keep(splats, listed, values, float32(x0), float32(y0), work, weights)
+        spans = rows[start[tile] : start[tile + 1]]
+        weights = np.empty(_count(spans) * TILE, np.float32)
+        _blend_one_and_keep(splats, listed, spans, values, float32(x0), float32(y0), work, weights)
         image = work[PIXELS:].copy()
         work[PIXELS:] = ZERO
         differs = False
@@ -113,9 +124,8 @@ def transpose_residual(splats, start, entries, slots, values, target, sums):
             continue
         kept = 0
         for k in range(listed.shape[0]):
-            _, _, _, _, _, _, top, bottom = splat_shape(splats, listed[k], float32(x0), float32(y0))
             added = broadcast(ZERO)
-            for y in range(top, bottom):
+            for y in range(int(spans[k, 0]), int(spans[k, 1])):
                 added = added + load(weights, kept) * load(work, PIXELS + y * TILE)
                 kept += TILE
             sums[places[k], 0] = total(added)

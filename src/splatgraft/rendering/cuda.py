@@ -34,8 +34,10 @@ def render(
     )
 
 
-def view_operator(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> "CudaViewOperator":
-    """`rendering.view_operator` for tensors on a CUDA device.
+def view_operator(
+    gaussians: Gaussians, camera: Cameras, options: RenderOptions, _least_row_weight: float
+) -> "CudaViewOperator":
+    """`rendering.view_operator` for tensors on a CUDA device; gsplat leaves nothing out.
 
     Raises: ValueError where gsplat is not installed.
     """
