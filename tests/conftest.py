@@ -3,6 +3,8 @@
 No test may fail because the machine is slow or busy: time limits (pyproject.toml) are there against hangs alone.
 """
 
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -37,6 +39,18 @@ SLOW = (
     "training",
 )
 """Folders and files of tests that train, run whole steps or start servers."""
+
+
+_THREAD_SECONDS = 60.0
+"""Longest wait for all threads: that of a page which no test closed never ends."""
+
+
+def pytest_sessionfinish() -> None:
+    """Wait for the editor's threads, since Python aborts where one of them is in torch when it ends."""
+    end = time.monotonic() + _THREAD_SECONDS
+    for thread in threading.enumerate():
+        if thread.name.startswith("splatgraft"):
+            thread.join(max(0.0, end - time.monotonic()))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -39,12 +39,12 @@ def raised_messages() -> Iterator[tuple[str, str]]:
     """Every message with words of its own, and the file that has it."""
     for path in sorted((ROOT / "src").rglob("*.py")):
         for scope in ast.walk(ast.parse(path.read_text())):
-            if isinstance(scope, ast.FunctionDef):
+            if isinstance(scope, ast.FunctionDef | ast.AsyncFunctionDef):
                 for text in _messages(scope):
                     yield text, path.relative_to(ROOT / "src/splatgraft").as_posix()
 
 
-def _messages(function: ast.FunctionDef) -> Iterator[str]:
+def _messages(function: ast.FunctionDef | ast.AsyncFunctionDef) -> Iterator[str]:
     nodes = list(ast.walk(function))
     texts = {
         target.id: node.value

@@ -83,7 +83,7 @@ def with_browser() -> Iterator[Any]:
 
 _WATCH_CLICK = """element => {
   window.clickTaken = false;
-  const taken = event => { if (element.contains(event.target)) window.clickTaken = true; };
+  const taken = event => { if (event.composedPath().includes(element)) window.clickTaken = true; };
   document.addEventListener("click", taken, {capture: true, once: true});
 }"""
 """Records whether the next click of the page reaches an element."""

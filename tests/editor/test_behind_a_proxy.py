@@ -10,6 +10,7 @@ from editor_driver import Editor
 from front_requests import PROJECT, answer, cookie_of, opened, websocket
 from reverse_proxy import ProxyRules, reverse_proxy
 from tiny_project import ball, plane
+from upload_requests import ChosenFile, Upload
 
 from splatgraft.cli import main
 from splatgraft.editor.access.tls import read_certificate
@@ -47,6 +48,10 @@ def test_all_pages_are_reached_under_a_path(folder: Path, rules: ProxyRules) -> 
             assert "<title>Viser</title>" in opened(f"{base}/splat/p/one", cookie)
             assert websocket(f"{base}/splat/p/one", base, cookie)[0] == 101
             assert websocket(f"{base}/splat/p/one", base)[0] == 403
+            assert answer(f"{base}/splat/p/one/upload_form.js", Cookie=cookie)[0] == 200
+            upload = Upload(f"{base}/splat/p/one/?token={editor.token}", "no key", ChosenFile(b"x"))
+            assert upload.answer == {"type": "wait", "text": "the page is being loaded"}
+            assert websocket(f"{base}/splat/p/one/upload", base)[0] == 403
             for origin in ("http://127.0.0.1:1", "https://elsewhere.example", f"https://127.0.0.1:{PORT}"):
                 assert websocket(f"{base}/splat/p/one", origin, cookie)[0] == 403
                 assert answer(f"{base}/splat/list", Cookie=cookie, Origin=origin)[0] == 403
@@ -98,6 +103,9 @@ def test_https_and_encrypted_websockets(folder: Path, certificate: tuple[Path, P
         status, first = websocket(f"{editor.base}/p/one", editor.base, cookie, context)
         assert (status, len(first) > 100) == (101, True)
         assert websocket(f"{editor.base}/p/one", editor.base, "", context)[0] == 403
+        upload = Upload(f"{editor.base}/p/one/?token={editor.token}", "no key", ChosenFile(b"x"), context=context)
+        assert upload.answer["type"] == "wait"
+        assert websocket(f"{editor.base}/p/one/upload", editor.base, "", context)[0] == 403
         # an unencrypted request is not answered
         with pytest.raises((OSError, ValueError)):
             answer(editor.base.replace("https", "http"))

@@ -236,6 +236,18 @@ def test_a_slow_client_gets_the_whole_file(editor: Editor, cookie: str, folder: 
     assert found.partition(b"\r\n\r\n")[2] == content
 
 
+def test_an_upload_is_not_counted_as_a_window(editor: Editor, cookie: str) -> None:
+    from websockets.sync.client import connect
+
+    opened(f"{editor.base}/p/one/", cookie)
+    address = f"{editor.base.replace('http', 'ws', 1)}/p/one"
+    options = {"additional_headers": {"Cookie": cookie}, "origin": editor.base, "proxy": None}
+    with connect(f"{address}/upload", **options):  # pyright: ignore
+        assert b"open in" not in answer(f"{editor.base}/list", Cookie=cookie)[2]
+        with connect(address, subprotocols=["viser-v1.1.1"], **options):  # pyright: ignore
+            assert b"open in 1 window" in answer(f"{editor.base}/list", Cookie=cookie)[2]
+
+
 def test_the_server_s_end_is_that_of_its_processes(editor: Editor, cookie: str) -> None:
     opened(f"{editor.base}/p/one/", cookie)
     pids = all_child_pids(editor)

@@ -1,5 +1,6 @@
 """All texts of the page's controls, in one file that is read as a whole: texts.txt beside this test."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,15 @@ TEXTS = Path(__file__).with_name("texts.txt")
 
 
 def texts_of(page: Any) -> list[str]:
-    """Labels, hints and options of all controls, and names of the commands, in alphabetical order."""
+    """Labels, hints and options of all controls and upload forms, and names of the commands, in alphabetical order."""
     gui, found = page.server.gui, set()
     for handle in (*gui._gui_input_handle_from_uuid.values(), *gui._container_handle_from_uuid.values()):
         props = getattr(handle, "_impl", None)
         for name in ("label", "hint"):
             found.add(getattr(getattr(props, "props", None), name, None))
         found |= set(getattr(getattr(props, "props", None), "options", None) or ())
+        for child in getattr(handle, "_children", {}).values():
+            found |= set(re.findall(r'<splatgraft-upload [^>]*label="([^"]*)"', str(getattr(child, "content", ""))))
     return sorted(text for text in found if isinstance(text, str) and text.strip())
 
 

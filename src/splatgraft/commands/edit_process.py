@@ -75,15 +75,17 @@ def edit_project(
         out = None if options.out is None else Path(options.out)
         opening = Opening(guarded.viser, file, file.parent if out is None else out)
         from splatgraft.commands.edit_project import FlowProject
-        from splatgraft.editor.access.uploads import remove_remains
         from splatgraft.editor.page.page import Page, PageOptions
+        from splatgraft.editor.uploads.incoming_upload import remove_old_uploads
 
-        remove_remains(file.parent)
+        removed = remove_old_uploads(file.parent, now=time.time())
         project = FlowProject(file, out, Console())
         inside = file.parent if options.is_remote else None
         page_options = PageOptions(options.budget, inside, start_page=options.start_page)
         page = Page(guarded, project, page_options, opening=opening)
         loading.remove()
+        if removed and page.problem is None:
+            page.say("; ".join(removed))
         stop.wait()
         page.close()
         guarded.close()

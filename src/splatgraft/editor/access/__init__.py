@@ -1,1 +1,1 @@
-"""Access to the editor's server: which requests are accepted, which window edits, which uploads are stored."""
+"""Access to the editor's server: which requests are accepted, and which window edits."""

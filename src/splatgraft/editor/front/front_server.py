@@ -158,14 +158,15 @@ class FrontServer:
         if answer is not None:
             await _send(writer, answer, decision.cookie)
             return
+        passed = Request(inner, request.headers)
         try:
-            asked = await ask(Request(inner, request.headers), process)
+            asked = await ask(passed, process)
         except (OSError, EOFError):
             # the process ended just now
             await _send(writer, refusal(http.HTTPStatus.SERVICE_UNAVAILABLE, _CLOSED), decision.cookie)
             return
         asked = replace(asked, head=with_cookie(asked.head, decision.cookie))
-        await answer_from(asked, request, streams, process)
+        await answer_from(asked, passed, streams, process)
 
     # which page
 

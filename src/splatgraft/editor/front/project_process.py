@@ -5,7 +5,7 @@ import contextlib
 import json
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +40,8 @@ class ProjectProcess:
         self.problem = ""
         """Why the last process ended, in one line; empty where none ended by itself."""
         self.windows = 0
-        """Open websockets."""
+        """Open windows."""
+        self._websockets = 0
         self._process: asyncio.subprocess.Process | None = None
         self._watch: asyncio.Task[None] | None = None
         self._answered = asyncio.Event()
@@ -69,18 +70,21 @@ class ProjectProcess:
             return None
         return await self.open(wait_seconds)
 
-    def window_opened(self) -> None:
-        """Count a websocket."""
-        self.windows += 1
-
-    def window_closed(self) -> None:
-        """Count a websocket no longer."""
-        self.windows -= 1
-        self._used = time.monotonic()
+    @contextlib.contextmanager
+    def websocket(self, *, is_window: bool) -> Iterator[None]:
+        """Keep the process meanwhile, for a window or for an upload, which has a websocket of its own."""
+        self._websockets += 1
+        self.windows += is_window
+        try:
+            yield
+        finally:
+            self.windows -= is_window
+            self._websockets -= 1
+            self._used = time.monotonic()
 
     async def end_if_idle(self) -> None:
         """End the process where no window has been open for long."""
-        if self.is_running and not self.windows and time.monotonic() - self._used > self._options.idle_seconds:
+        if self.is_running and not self._websockets and time.monotonic() - self._used > self._options.idle_seconds:
             await self.end()
 
     async def end(self) -> None:

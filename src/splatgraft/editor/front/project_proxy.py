@@ -55,12 +55,19 @@ async def ask(request: Request, process: ProjectProcess) -> Asked:
 async def answer_from(asked: Asked, request: Request, streams: Streams, process: ProjectProcess) -> None:
     """Pass an answer back, and a websocket's bytes in both directions until one side ends.
 
+    Args:
+        asked: The beginning of the answer.
+        request: The request, with the path that the process knows.
+        streams: Of the browser.
+        process: The process that answers.
+
     Raises:
         OSError: If the browser is gone.
     """
     try:
         if is_websocket(request):
-            await _pass_websocket(asked.head, streams, asked.streams, process)
+            with process.websocket(is_window=request.path == "/"):
+                await _pass_websocket(asked.head, streams, asked.streams)
         else:
             await _pass_answer(asked.head, streams[1], asked.streams[0])
     finally:
@@ -95,19 +102,15 @@ async def _pass_answer(head: bytes, writer: asyncio.StreamWriter, reader: asynci
             await writer.drain()
 
 
-async def _pass_websocket(head: bytes, outer: Streams, inner: Streams, process: ProjectProcess) -> None:
-    process.window_opened()
+async def _pass_websocket(head: bytes, outer: Streams, inner: Streams) -> None:
+    outer[1].write(head)
+    ways = {asyncio.create_task(_copy(outer[0], inner[1])), asyncio.create_task(_copy(inner[0], outer[1]))}
     try:
-        outer[1].write(head)
-        ways = {asyncio.create_task(_copy(outer[0], inner[1])), asyncio.create_task(_copy(inner[0], outer[1]))}
-        try:
-            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for way in ways:
-                way.cancel()
-            await asyncio.gather(*ways, return_exceptions=True)
+        await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        process.window_closed()
+        for way in ways:
+            way.cancel()
+        await asyncio.gather(*ways, return_exceptions=True)
 
 
 async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import viser
 
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.editor.access.uploads import SCENES, SUFFIXES
 from splatgraft.editor.page.place_phase import hide_target, show_target
 from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
 from splatgraft.editor.session.project_access import RenderedViews, Triple
 from splatgraft.editor.session.session import Session, backup_of
+from splatgraft.editor.uploads.upload_checks import SCENES, SUFFIXES
 from splatgraft.project.layout import Side
 
 if TYPE_CHECKING:
@@ -65,10 +65,9 @@ class OpenPhase:
                     "Of the place", "", hint="A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
                 ),
             )
-        # viser shows upload buttons even where `visible` is false; the folder hides it
         self._uploads = gui.add_folder("From this computer")
         with self._uploads:
-            page.add_upload_button("Upload a video or a scene", SUFFIXES, self._uploaded)
+            page.uploads.add("Upload a video or a scene", SUFFIXES, self._uploaded)
         self._start = gui.add_button("Start the project", icon=viser.Icon.PLUS)
         self._facts = gui.add_html("")
         self._looks = {side: gui.add_dropdown(f"Cameras: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}

@@ -12,7 +12,6 @@ from typing import Any, Protocol, runtime_checkable
 
 import viser
 
-from splatgraft.editor.access.uploads import IncomingUpload, UploadRules
 from splatgraft.editor.jobs.exports import served_file
 from splatgraft.editor.page.history_controls import HistoryControls
 from splatgraft.editor.page.job_panel import JobPanel
@@ -28,7 +27,7 @@ from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.select_phase import SelectPhase
 from splatgraft.editor.page.server import GuardedServer
 from splatgraft.editor.page.style import style_sheet
-from splatgraft.editor.page.upload_receiver import UploadButton
+from splatgraft.editor.page.upload_forms import UploadForms
 from splatgraft.editor.page.windows import Windows
 from splatgraft.editor.session.project_access import Project
 from splatgraft.editor.session.scene_sample import typical_distance
@@ -92,13 +91,13 @@ class Page:
         self._open = True
         self.on_close: list[Callable[[], None]] = []
         self.windows = Windows(self)
+        self.uploads = UploadForms(self)
         self._build()
         self.windows.connect(frozenset() if opening is None else opening.close())
-        guarded.uploads.on_refused = lambda reason: self.say(reason, bad=True)
-        guarded.uploads.on_progress = self._show_upload
         guarded.files = lambda name: None if self.session is None else served_file(self.session.files, name)
         self.show_phase(self._first_phase())
         self.say_notice()
+        self.uploads.open()
         threading.Thread(target=self._poll_loop, daemon=True).start()
 
     # for the phases
@@ -229,19 +228,6 @@ class Page:
             if self._open and self.session is not None:
                 self.redraw()
 
-    def add_upload_button(self, label: str, suffixes: tuple[str, ...], on_file: Callable[[Path], None]) -> None:
-        """A button for uploads of files with these suffixes; `on_file` gets the path of a stored one."""
-
-        def store(upload: IncomingUpload) -> None:
-            # a large scene is checked while the page stays usable
-            with self.reported():
-                path = upload.finish()
-                self.callback(lambda _: on_file(path))(None)
-
-        button = self.gui.add_upload_button(label, icon=viser.Icon.UPLOAD, color="gray", mime_type=",".join(suffixes))
-        uploads = UploadButton(lambda: UploadRules(self.project.file.parent, suffixes), store)
-        self.guarded.uploads.register(button, uploads)
-
     def light_ready(self) -> None:
         """Update the light phase after the preview has estimated the light."""
         with self._lock:
@@ -328,8 +314,7 @@ class Page:
             with self._folders[name]:
                 self._phases[name] = kinds[name](self)
         self._status = gui.add_html("")
-        self._cancel_upload = gui.add_button("Cancel the upload", icon=viser.Icon.X, color="red", visible=False)
-        self._cancel_upload.on_click(self.callback(lambda _: self.guarded.uploads.cancel()))
+        self.uploads.add_progress()
         self._history = HistoryControls(self)
         self._keys = Keys(self, PHASES)
         self.preview = PreviewPanel(self)
@@ -359,13 +344,6 @@ class Page:
             f'<div class="sg-header" style="{_TEXT_STYLE}">{link}<b style="font-size:1.1em">{html.escape(where)}</b>'
             f'<span style="opacity:.6;float:right">{saved}</span></div>'
         )
-
-    def _show_upload(self, upload: IncomingUpload | None) -> None:
-        self._cancel_upload.visible = upload is not None and not upload.is_complete
-        if upload is not None and upload.is_complete:
-            self.say(f"{upload.path.name}: uploaded, being checked")
-        elif upload is not None:
-            self._cancel_upload.label = f"Cancel the upload ({100 * upload.received // upload.size}%)"
 
     # polling of files and jobs
 

@@ -11,7 +11,6 @@ import torch
 import viser
 
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.access.uploads import SCENES
 from splatgraft.editor.page.box_handles import BoxHandles
 from splatgraft.editor.page.object_gizmo import SNAP_DEGREES, ObjectGizmo
 from splatgraft.editor.page.size_controls import SizeControls
@@ -27,6 +26,7 @@ from splatgraft.editor.session.gizmo import (
 from splatgraft.editor.session.object_size import true_scale
 from splatgraft.editor.session.session import Session
 from splatgraft.editor.session.state_checks import check_numbers, check_state
+from splatgraft.editor.uploads.upload_checks import SCENES
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.segmentation import Box
@@ -71,7 +71,7 @@ class PlacePhase:
         with gui.add_folder("Another object", expand_by_default=False):
             self._path = gui.add_text("File", "", hint="A trained scene (.ply, .spz, .sog, ...) of the object alone")
             self._add = gui.add_button("Add this file", icon=viser.Icon.PLUS, color="gray")
-            page.add_upload_button("Upload a file", SCENES, self._add_file)
+            page.uploads.add("Upload a file", SCENES, self._add_file)
         with gui.add_folder("Erase from the target", expand_by_default=False):
             self._show_box = gui.add_checkbox("Show the box", False)
             self._erase = gui.add_button("Erase inside the box", icon=viser.Icon.ERASER, color="gray")

@@ -29,7 +29,8 @@ class SceneLoading:
             self._reading |= set(started)
         for path in started:
             # a thread for each, so that a small object does not wait for a large scene
-            threading.Thread(target=self._read, args=(session, path), daemon=True).start()
+            arguments = (session, path)
+            threading.Thread(target=self._read, args=arguments, name="splatgraft scene", daemon=True).start()
         return not missing
 
     def _read(self, session: Session, path: Path) -> None:

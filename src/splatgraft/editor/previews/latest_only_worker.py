@@ -22,7 +22,7 @@ class LatestOnlyWorker(Generic[T]):
         self._waiting: list[T] = []
         self._wake = threading.Condition()
         self._open = True
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread = threading.Thread(target=self._run, name="splatgraft preview", daemon=True)
         self._thread.start()
 
     def submit(self, request: T) -> None:
