@@ -55,6 +55,31 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
     assert window.unknown_errors() == []
 
 
+def test_a_window_that_watches_shows_the_same_picture_and_its_own_views(window: Window) -> None:
+    window.show_phase("Place")
+    window.until(lambda: is_final(window), what="the final picture")
+    first = picture_of(window)
+    page = window.page.context.new_page()
+    page.goto(window.page.url)
+    watcher = Window(page)
+    watcher.click("Watch")
+    watcher.until(lambda: difference(watcher, first) < 3, what="the picture of the editing window's view")
+    watcher.drag((450, 700), (150, 40))
+    watcher.until(lambda: difference(watcher, first) > 6, what="another view")
+    # the editing window looks from there too: its own picture tells whether the watcher's is one or splats
+    window.drag((450, 700), (150, 40))
+    second = picture_of(window)
+    watcher.until(lambda: difference(watcher, second) < 3, what="the picture of the watcher's view")
+    window.check("Draw on the canvas", False)
+    watcher.until(lambda: difference(watcher, second) > 3, what="splats")
+    window.check("Draw on the canvas", True)
+    watcher.until(lambda: difference(watcher, second) < 3, what="the picture again")
+    watcher.click("Edit here instead")
+    watcher.until(lambda: is_final(watcher), what="the final picture of the new editing window")
+    assert watcher.unknown_errors() == window.unknown_errors() == []
+    page.close()
+
+
 def test_a_duplicate_stands_beside_the_original(window: Window, project: Path) -> None:
     window.show_phase("Place")
     window.until(lambda: is_final(window), what="the final picture")

@@ -214,6 +214,22 @@ def test_the_previewed_light_equals_the_step_s_result(session: Session, light: L
     assert torch.equal(written.means, relit.means)
 
 
+def test_the_light_after_a_move_equals_the_step_s_result(session: Session) -> None:
+    relighting, first = session.relighting, session.placed_state()
+    relighting.scene(first)
+    assert not relighting.can_refine(first)
+    session.change(moved(first))
+    draft = relighting.scene(session.state, draft=True)
+    # drafts keep the sources of the light, which were estimated at another place
+    assert relighting.can_refine(session.state)
+    relighting.refined(session.state)
+    assert relighting.scene(session.state, draft=True) is not draft
+    relit = relighting.scene(session.state)
+    assert not relighting.can_refine(session.state)
+    assert main(["run", str(session.files.file), "--to", "relight"]) == 0
+    assert torch.equal(read_gaussians(session.files.relit).sh, relit.sh)
+
+
 @pytest.mark.parametrize(("seconds", "wanted"), [(0.3, 480), (0.28, 480), (1.2, 240), (0.02, 800), (60.0, 192)])
 def test_the_preview_size_adapts_to_the_rendering_time(seconds: float, wanted: int) -> None:
     assert PictureSize().adapted(seconds) == wanted

@@ -34,6 +34,8 @@ from splatgraft.relighting.shadows.shadow_maps import thinned
 from splatgraft.relighting.shadows.surface_layer import above_layer, layer_middle
 from splatgraft.runtime.memo import Memo
 
+REGION = "region"
+"""Name in a cache of the region around the objects; a cache that forgets it computes the scene and its light anew."""
 # set by hand
 _MARGIN = 1.2
 """Radius of a new region over what the objects need."""
@@ -130,7 +132,7 @@ def prepare_scene(
 
 def _region(scene: Gaussians, place: BoundingSphere, reach: float, cache: Memo) -> BoundingSphere:
     """The sphere within which shadows are computed: the cached one where it fits."""
-    cached = cache.peek("region", (scene,))
+    cached = cache.peek(REGION, (scene,))
     wanted = place.radius * reach
     least, most = _KEPT_RADII
     if cached is not None and least * wanted <= cached.radius <= most * wanted:
@@ -138,7 +140,7 @@ def _region(scene: Gaussians, place: BoundingSphere, reach: float, cache: Memo) 
         if moved < _KEPT_SHIFT * cached.radius:
             return cached
     region = BoundingSphere(place.center, _MARGIN * wanted)
-    cache.put("region", (scene,), region)
+    cache.put(REGION, (scene,), region)
     return region
 
 

@@ -106,7 +106,8 @@ def relight(
         light: The light at the place of the objects; estimated from the target where not given. Networks
             correct the estimate.
         options: How far shadows reach and how many Gaussians may be added.
-        cache: Intermediate results, which later calls with the same objects at other places use again.
+        cache: Intermediate results, which later calls with the same objects at other places use again. After a short
+            move they include the sources of the light and the region of the shadow maps: a call without them differs.
 
     Returns:
         The composite with its change of light in layers. Where no light can be estimated the layers change nothing

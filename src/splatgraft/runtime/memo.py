@@ -28,6 +28,10 @@ class Memo:
         """Store `result`, replacing the one of that name."""
         self._entries[name] = (inputs, result)
 
+    def forget(self, name: str) -> None:
+        """Discard the result of that name; nothing where there is none."""
+        self._entries.pop(name, None)
+
     def has(self, name: str) -> bool:
         """Whether a result of that name is stored, from any inputs."""
         return name in self._entries

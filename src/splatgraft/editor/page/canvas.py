@@ -2,6 +2,7 @@
 
 import threading
 
+import cv2
 import numpy as np
 import viser
 from jaxtyping import Float, UInt8
@@ -10,6 +11,8 @@ from viser import _messages
 from splatgraft.editor.page.scene_view import SceneView
 
 _JPEG_QUALITY = 90
+_DEPTH_SHARE = 0.5
+"""Resolution of the depth behind the gizmos over that of the picture."""
 
 
 class Canvas:
@@ -60,6 +63,14 @@ class Canvas:
                 self._set_splats_visible(window, True)
 
     def _set_splats_visible(self, window: viser.ClientHandle, visible: bool) -> None:
-        # to this window alone: others show splats all the time
+        # to this window alone: others show splats or pictures of their own
         for name in self._view.visible_splats():
             window._websock_connection.queue_message(_messages.SetSceneNodeVisibilityMessage(name, visible))
+
+
+def depth_behind(depth: Float[np.ndarray, "h w"] | None) -> Float[np.ndarray, "y x"] | None:
+    """A picture's depth as `Canvas.show` takes it, at half the resolution; viser stores up to 167 units."""
+    if depth is None:
+        return None
+    size = (max(1, round(depth.shape[1] * _DEPTH_SHARE)), max(1, round(depth.shape[0] * _DEPTH_SHARE)))
+    return cv2.resize(np.minimum(depth, 167.0), size, interpolation=cv2.INTER_NEAREST)

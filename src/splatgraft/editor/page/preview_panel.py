@@ -10,23 +10,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import torch
 import viser
-from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
-from splatgraft.editor.page.canvas import Canvas
+from splatgraft.editor.page.canvas import Canvas, depth_behind
 from splatgraft.editor.page.picture_request import SOURCE_KINDS, PictureRequest, pose_of
+from splatgraft.editor.page.request_pictures import RequestPictures
 from splatgraft.editor.page.saved_preview import save_preview
 from splatgraft.editor.page.scene_view import camera_from_viser
+from splatgraft.editor.page.watcher_pictures import WatcherPictures
 from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
 from splatgraft.editor.previews.preview import (
     NEEDS_LIGHT,
     PICTURE_KINDS,
-    Picture,
     PictureKind,
     PictureSize,
     wipe_comparison,
@@ -34,7 +33,6 @@ from splatgraft.editor.previews.preview import (
 )
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.session import Session
-from splatgraft.runtime.memo import Memo
 
 if TYPE_CHECKING:
     from splatgraft.editor.page.page import Page
@@ -44,14 +42,14 @@ _DRAFT_LIMIT = 1.5
 """Seconds; where drafts of the light take longer, images without the light transfer are shown first."""
 _REST_SECONDS = 0.1
 """How long the camera stands still before its picture is drawn; browsers report a moving one more often."""
+_SETTLED_SECONDS = 1.0
+"""How long nothing is edited after a move before the light of the new place is estimated, as the step does."""
 _COARSE_ABOVE = 0.4
 """Seconds; a picture that takes longer is preceded by a coarse one."""
 _COARSE_SHARE, _COARSE_BUDGET = 0.5, 120_000
 """Size of a coarse picture over the canvas's, and its number of Gaussians."""
 _MAX_WIDTH = 1920
 """Pixels; pictures of larger canvases are enlarged by the browser."""
-_DEPTH_SHARE = 0.5
-"""Resolution of the depth behind the gizmos over that of the picture."""
 _MIN_ASPECT = 1.2
 """Minimum width over height of the picture in the panel."""
 
@@ -63,11 +61,12 @@ class PreviewPanel:
         """Build the panel."""
         self._page, gui = page, page.gui
         self._size = PictureSize()
-        self._pictures = Memo()
+        self._pictures = RequestPictures()
         self._dragged_state: EditState | None = None
         self._draft_seconds, self._relight_seconds, self._picture_seconds = float("inf"), 0.0, 0.0
         self._light_note = ""
         self.canvas = Canvas(page.server, page.view)
+        self._watchers = WatcherPictures(page)
         self._shown_pose: bytes = b""
         self._canvas_size: tuple[float, int] = (0.0, 0)
         self._is_on_canvas = False
@@ -102,19 +101,22 @@ class PreviewPanel:
     def reset(self) -> None:
         """Discard cached images and timings for another project."""
         self.canvas.clear()
-        self._pictures, self._draft_seconds = Memo(), float("inf")
+        self._watchers.forget()
+        self._pictures.forget()
+        self._draft_seconds = float("inf")
 
     def scene_changed(self) -> None:
         """Switch to the cameras of the other scene; the source has only one pair of images."""
         self._left.visible = self._right.visible = self._page.phase != "Select"
         self._camera_slider.value = 0
-        self._pictures = Memo()
+        self._pictures.forget()
         self._show_cameras()
 
     def close(self) -> None:
         """End the worker threads."""
         self._worker.close()
         self._light_worker.close()
+        self._watchers.close()
 
     def first_camera(self) -> Cameras | None:
         """The first camera of the scene that the phase shows; None where there is none."""
@@ -128,7 +130,9 @@ class PreviewPanel:
 
     def camera_moved(self, window: int) -> None:
         """Show splats while a window's view moves, and its picture when it rests."""
-        if window == self._page.guarded.edit_lock.holder and self._follow.value:
+        if window != self._page.guarded.edit_lock.holder:
+            self._watchers.camera_moved(window)
+        elif self._follow.value:
             self._submit(is_moved=True)
 
     def show(self, left: PictureKind, right: PictureKind) -> None:
@@ -139,6 +143,7 @@ class PreviewPanel:
     def holder_changed(self) -> None:
         """Show the picture in the window that edits now."""
         self.canvas.clear()
+        self._watchers.clear()
         self.update()
 
     def update(self) -> None:
@@ -152,6 +157,8 @@ class PreviewPanel:
         self._is_on_canvas = request is not None and request.window is not None
         if request is None or request.window is None or (is_moved and pose_of(request.camera) != self._shown_pose):
             self.canvas.clear()
+        if request is None or request.window is None or request.is_dragging:
+            self._watchers.clear()
         if request is not None:
             self._worker.submit(replace(request, is_moved=is_moved))
 
@@ -265,6 +272,11 @@ class PreviewPanel:
             min(1.5, 0.3 * self._relight_seconds)
         ):
             return
+        if relighting.can_refine(request.state) and not relighting.is_refined(request.state):
+            relighting.refined(request.state)
+            self.update()
+            if not self._light_worker.wait_idle(_SETTLED_SECONDS):
+                return
         start = time.monotonic()
         relighting.relit(request.state)
         self._relight_seconds = time.monotonic() - start
@@ -286,16 +298,18 @@ class PreviewPanel:
     def _draw_once(self, request: PictureRequest, *, note: str, stage: str) -> None:
         start = time.monotonic()
         problems: list[str] = []
-        left, right = self._both(request, problems)
+        left, right = self._pictures.both(request, problems)
         seconds = time.monotonic() - start
         pixels = wipe_comparison(left.pixels, right.pixels, request.split)
         if request.window is not None and not self._is_on_canvas:
             return  # the canvas was given to splats while this picture was drawn
         if request.window is not None:
             depth = right.depth if request.split < 0.5 else left.depth
-            self.canvas.show(request.window, with_badge(pixels, stage), _depth_behind(depth))
+            self.canvas.show(request.window, with_badge(pixels, stage), depth_behind(depth))
             self._shown_pose = pose_of(request.camera)
             self._picture_seconds = seconds if stage != "coarse" else self._picture_seconds
+            if stage != "coarse":
+                self._watchers.editing_window_shows(request, stage)
             if stage == "final":
                 save_preview(request.session.files.root, right.pixels)
         else:
@@ -316,39 +330,6 @@ class PreviewPanel:
             )
         )
 
-    def _both(self, request: PictureRequest, problems: list[str]) -> tuple[Picture, Picture]:
-        """Both pictures; one alone is drawn where the other one is not seen."""
-        if request.split <= 0 or request.left == request.right:
-            right = self._picture(request.right, request, problems)
-            return right, right
-        left = self._picture(request.left, request, problems)
-        return (left, left) if request.split >= 1 else (left, self._picture(request.right, request, problems))
-
-    def _picture(self, kind: PictureKind, request: PictureRequest, problems: list[str]) -> Picture:
-        camera = request.camera
-        state, result = request.state, request.session.files.result
-        stamp = result.stat().st_mtime_ns if result.is_file() else 0
-        is_selected = self._page.phase == "Select" and not request.is_sample
-        selection = request.session.selection() if is_selected else None
-        edits = (state.objects, state.erased, state.light, state.weights, selection)
-        relit = request.draft and request.session.relighting.is_relit(state)
-        drawn = (request.draft, relit, request.budget or 0, request.is_sample)
-        key = (pose_of(camera), *drawn, stamp, *edits)
-        try:
-            return self._pictures.get(kind, key, lambda: self._rendered(kind, request, selection))
-        except ValueError as error:
-            problems.append(str(error))
-            return Picture(np.full((camera.height, camera.width, 3), 48, np.uint8))
-
-    def _rendered(self, kind: PictureKind, request: PictureRequest, selection: Tensor | None) -> Picture:
-        preview = request.session.preview
-        if request.is_sample:
-            scene = request.session.scenes.files.source_scene if kind in SOURCE_KINDS else None
-            return preview.sampled_view(request.state, request.camera, source=scene)
-        if kind in SOURCE_KINDS:
-            return Picture(preview.source_picture(selection if kind == "Object alone" else None, request.camera))
-        return preview.view(kind, request.state, request.camera, draft=request.draft, budget=request.budget)
-
     def _say_error(self, error: Exception) -> None:
         traceback.print_exception(error)
         self._say(" ".join(str(error).split()))
@@ -357,11 +338,3 @@ class PreviewPanel:
         self._caption.content = (
             f'<div class="sg-caption" style="font-size:.78em;opacity:.75;padding:0 12px">{text}</div>'
         )
-
-
-def _depth_behind(depth: np.ndarray | None) -> np.ndarray | None:
-    """The depth that hides gizmos; viser stores up to 167 units."""
-    if depth is None:
-        return None
-    size = (max(1, round(depth.shape[1] * _DEPTH_SHARE)), max(1, round(depth.shape[0] * _DEPTH_SHARE)))
-    return cv2.resize(np.minimum(depth, 167.0), size, interpolation=cv2.INTER_NEAREST)

@@ -50,6 +50,11 @@ class Windows:
         holder = self._guarded.edit_lock.holder
         return None if holder is None else self._server.get_clients().get(holder)
 
+    def watching(self) -> tuple[viser.ClientHandle, ...]:
+        """The windows that do not hold the edit lock."""
+        holder = self._guarded.edit_lock.holder
+        return tuple(client for number, client in self._server.get_clients().items() if number != holder)
+
     def look_through(self, camera: Cameras) -> None:
         """Move the editing window's view to a camera."""
         window = self.editing()

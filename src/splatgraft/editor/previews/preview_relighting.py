@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -22,6 +23,7 @@ from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.scene_cache import SceneCache
 from splatgraft.relighting import Light, Relit, SourceScene, relight
 from splatgraft.relighting.gain_transfer import relight_by_gain
+from splatgraft.relighting.prepared_scene import REGION
 from splatgraft.runtime.memo import Memo
 
 
@@ -32,6 +34,8 @@ class PreviewRelighting:
         """Start with empty memos."""
         self._scenes = scenes
         self._relight_memo, self._draft_memo = Memo(), Memo()
+        self._region_poses: bytes = b""
+        """Of the objects, when the region in `_relight_memo` was chosen."""
         self._memo = Memo()
         self._full_lock, self._draft_lock, self._composite_lock = threading.RLock(), threading.RLock(), threading.Lock()
 
@@ -47,20 +51,38 @@ class PreviewRelighting:
             return self._memo.get("composite", inputs, lambda: self._scenes.composite(state))
 
     def has_draft(self, state: EditState) -> bool:
-        """Whether a draft or the light itself of this state is memoised."""
-        return self.is_relit(state) or self._memo.peek("draft", self._inputs(state)) is not None
+        """Whether a draft, a refined one or the light itself of this state is memoised."""
+        return (
+            self.is_relit(state) or self.is_refined(state) or self._memo.peek("draft", self._inputs(state)) is not None
+        )
+
+    def is_refined(self, state: EditState) -> bool:
+        """Whether a refined draft of this state is memoised."""
+        return self._memo.peek("refined", self._inputs(state)) is not None
 
     def is_relit(self, state: EditState) -> bool:
         """Whether the light of this state is memoised, or project.toml selects no physical light transfer."""
         return not self._scenes.files.transfers_light or self._memo.peek("relit", self._inputs(state)) is not None
 
     def relit(self, state: EditState) -> Relit:
-        """The layers of the full light transfer of this state.
+        """The layers of the full light transfer of this state, as the step computes them.
 
         Raises:
             ValueError: If a file is missing.
         """
         return self._make_once("relit", state, self._relight)
+
+    def can_refine(self, state: EditState) -> bool:
+        """Whether objects were moved since the light was estimated: then `refined` takes less time than `relit`."""
+        return self._region_poses not in (b"", _poses(self.composite(state)))
+
+    def refined(self, state: EditState) -> Relit:
+        """All layers after a move under the sources of the light that were estimated before it, at full detail.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        return self._make_once("refined", state, self._refine)
 
     def draft(self, state: EditState) -> Relit:
         """A draft of the light transfer: shadow edges are coarse, and the first draft leaves out the source's light.
@@ -84,12 +106,14 @@ class PreviewRelighting:
             self._memo.get("drafts prepared", shared, lambda: self._draft(state))
 
     def best_available(self, state: EditState) -> Relit:
-        """The full transfer where it is memoised, else a draft.
+        """The full transfer where it is memoised, else a refined draft, else a draft.
 
         Raises:
             ValueError: If a file is missing.
         """
-        return self.relit(state) if self.is_relit(state) else self.draft(state)
+        if self.is_relit(state):
+            return self.relit(state)
+        return self.refined(state) if self.is_refined(state) else self.draft(state)
 
     def scene(self, state: EditState, *, draft: bool = False) -> Gaussians:
         """The scene that the step `relight` writes, or a draft of it.
@@ -139,13 +163,14 @@ class PreviewRelighting:
         return (self.composite(state), state.light, repr(self._scenes.files.relight_options))
 
     def _relight(self, state: EditState) -> Relit:
-        composite, sources = self.composite(state), self._scenes.source_scenes(state)
-        draft: Relit | None = self._memo.peek("draft", self._inputs(state))
-        if state.light is not None or draft is None or draft.light is None or _is_large(composite):
-            return self._relight_composite(composite, sources, light=state.light)
-        # a draft that used all Gaussians estimated the same light as the step, at the same place
-        relit = self._relight_composite(composite, sources, light=draft.light)
-        return replace(relit, report=(*draft.report[:1], *relit.report[1:]))
+        if self.can_refine(state):
+            # the step knows of no place before: sources and shadow maps are those of this one
+            self._relight_memo.forget(REGION)
+            self._region_poses = b""
+        return self._refine(state)
+
+    def _refine(self, state: EditState) -> Relit:
+        return self._relight_composite(self.composite(state), self._scenes.source_scenes(state), light=state.light)
 
     def _draft(self, state: EditState) -> Relit:
         composite, sources = self.composite(state), self._scenes.source_scenes(state)
@@ -173,6 +198,8 @@ class PreviewRelighting:
         options = replace(options, most_added=0.0, fitted_views=0) if is_draft else options
         full_target = self._scenes.gaussians(self._scenes.files.target_scene)
         memo = self._relight_memo if composite.target is full_target else self._draft_memo
+        if memo is self._relight_memo and not self._region_poses:
+            self._region_poses = _poses(composite)
         return relight(composite, cameras, sources=sources, light=light, options=options, cache=memo)
 
     def _coarse_target(self, composite: Composite) -> CoarseGaussians:
@@ -194,3 +221,11 @@ class PreviewRelighting:
 def _is_large(composite: Composite) -> bool:
     objects = [one.gaussians.count for one in composite.objects]
     return composite.kept_count > TARGET_BUDGET or max(objects, default=0) > OBJECT_BUDGET
+
+
+def _poses(composite: Composite) -> bytes:
+    """Where the objects are."""
+    moves = [one.target_from_object for one in composite.objects]
+    return b"".join(
+        part.numpy().tobytes() for m in moves for part in (torch.tensor(m.scale), m.rotation, m.translation)
+    )

@@ -103,6 +103,8 @@ class EstimatedLight:
     """Linear rgb of mean 1, of what was seen above the horizon; what no camera saw is taken to have it too."""
     region: BoundingSphere
     """Around the place: what is in it is near."""
+    place: BoundingSphere
+    """Where the sources were estimated."""
     correction: RadianceCorrection | None = None
     """What a network changed; None where the estimate stands as it is."""
 
@@ -132,6 +134,8 @@ class EstimatedLight:
         settings: PlaceSettings = PlaceSettings(),
     ) -> "EstimatedLight | NoLight":
         """At a place in the same region: the same sources, and ambient light with what is near there."""
+        if place.radius == self.place.radius and torch.equal(place.center, self.place.center):
+            return self
         scene = _usable(scene)
         panorama = panorama_at(scene, place, settings=settings)
         if isinstance(panorama, NoLight):
@@ -204,7 +208,7 @@ def fit_light(
     tint = sky / sky.mean().clamp_min(1e-6)
     radiance = hidden.radiance(evidence, tint)
     light = _light_of(radiance, evidence, region, scene, place, settings=settings.peaks)
-    return EstimatedLight(light, hidden, evidence, tint, region)
+    return EstimatedLight(light, hidden, evidence, tint, region, place)
 
 
 def _light_of(
