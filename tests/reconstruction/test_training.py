@@ -20,7 +20,7 @@ from splatgraft.reconstruction import (
 )
 from splatgraft.reconstruction import memory as memory_module
 from splatgraft.reconstruction.initialization import SeedPoints, from_points
-from splatgraft.reconstruction.options import Quality
+from splatgraft.reconstruction.options import EVERY_PIXEL, Quality
 from splatgraft.rendering import render
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
@@ -89,11 +89,30 @@ def test_held_out_views_are_found_again(capture):
     assert held_out_psnr(scene, capture, 8) > 20
 
 
-@pytest.mark.parametrize("more", [False, True], ids=["draft", "with all that standard adds"])
-def test_a_killed_reconstruction_resumes_bit_for_bit(capture, monkeypatch, more):
+def test_relocation_and_noise_find_held_out_views_too(capture):
+    options = ReconstructOptions(iterations=250, budget=300, sh_degree=1, eval_every=8, density="mcmc")
+    scene = reconstruct(capture, options)
+    assert 150 < scene.count <= 300
+    # as in `test_held_out_views_are_found_again`
+    assert held_out_psnr(scene, capture, 8) > 20
+
+
+@pytest.mark.parametrize(
+    ("more", "density"),
+    [(False, "splits"), (True, "splits"), (False, "mcmc")],
+    ids=["draft", "with all that standard adds", "mcmc"],
+)
+def test_a_killed_reconstruction_resumes_bit_for_bit(capture, monkeypatch, more, density):
     monkeypatch.setattr("splatgraft.fitting.loop._CHECKPOINT_SECONDS", -1.0)
     options = ReconstructOptions(
-        iterations=60, budget=220, sh_degree=1, seed=5, random_background=more, far_shell=more, error_splits=more
+        iterations=60,
+        budget=220,
+        sh_degree=1,
+        seed=5,
+        random_background=more,
+        far_shell=more,
+        error_splits=more,
+        density=density,
     )
     whole = reconstruct(capture, options)
     checkpoint = Memo()
@@ -171,6 +190,13 @@ def test_a_far_shell_shows_held_out_views_what_is_behind_the_points(before_walls
     without = held_out_psnr(reconstruct(before_walls, options), before_walls, 8)
     # a decibel is a fifth of the squared error: walls fill most of these pictures
     assert held_out_psnr(reconstruct(before_walls, replace(options, far_shell=True)), before_walls, 8) > without + 1
+
+
+def test_full_takes_the_published_density_control_and_every_pixel(capture):
+    assert ReconstructOptions(quality="full").density_control == "mcmc"
+    assert ReconstructOptions(quality="full").sampling(capture) == EVERY_PIXEL
+    assert ReconstructOptions(quality="full", density="splits").density_control == "splits"
+    assert all(ReconstructOptions(quality=name).density_control == "splits" for name in ("draft", "standard", "high"))
 
 
 def test_draft_has_nothing_of_what_standard_adds_and_an_object_alone_no_surroundings():

@@ -91,6 +91,10 @@ class FitOptions:
     """Of the order of views."""
     rendering: RenderOptions = field(default_factory=RenderOptions)
     """Background, low-pass and near plane."""
+    opacity_penalty: float = 0.0
+    """Weight of the mean opacity in the loss (3DGS-MCMC); a penalty moves all Gaussians in every step, seen or not."""
+    scale_penalty: float = 0.0
+    """Weight of the mean scale in the loss, per world unit."""
     random_background: bool = False
     """Whether each step draws the scene over another colour, by chance, instead of that of `rendering`."""
 
@@ -187,6 +191,9 @@ def fit(
             if not math.isfinite(value):
                 raise _diverged(state, f"a loss of {value}")
             seen = drawn.visible[0]
+            if options.opacity_penalty or options.scale_penalty:
+                loss = loss + _penalty(leaves, options)
+                seen = torch.ones_like(seen)
             found = torch.autograd.grad(loss, [*leaves.values(), *([colors] if fits_colors else [])])
             gradients = dict(zip(names, found[: len(names)], strict=True))
             if fits_colors:
@@ -211,6 +218,16 @@ def fit(
             if interrupted():
                 raise KeyboardInterrupt
     return state.gaussians
+
+
+def _penalty(leaves: dict[str, Tensor], options: FitOptions) -> Tensor | float:
+    """The penalties on the fields that are fitted."""
+    total: Tensor | float = 0.0
+    if "opacity_logits" in leaves:
+        total = total + options.opacity_penalty * leaves["opacity_logits"].sigmoid().mean()
+    if "log_scales" in leaves:
+        total = total + options.scale_penalty * leaves["log_scales"].exp().mean()
+    return total
 
 
 def _diverged(state: FitState, found: str) -> ValueError:

@@ -7,7 +7,8 @@ sum over the pixels of its blending weight times the absolute error there (the e
 Densification in Gaussian Splatting). A split is along the longest axis (Deng et al. 2025).
 
 Chosen by measurement: on a room of 36 views at 352x248, 25k Gaussians and 1000 steps, this reached 27.9 dB held out in
-20 CPU-seconds, relocation and noise as in 3DGS-MCMC (Kheradmand et al. 2024; without its two penalties) 27.7 in 22.
+20 CPU-seconds, relocation and noise as in 3DGS-MCMC (Kheradmand et al. 2024; without its two penalties) 27.7 in 22;
+`mcmc.py` has the whole method.
 """
 
 import math

@@ -7,6 +7,7 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.spherical_harmonics import MAX_DEGREE
 
 Quality = Literal["draft", "standard", "high", "full"]
+Density = Literal["splits", "mcmc"]
 
 
 @dataclass(frozen=True)
@@ -37,14 +38,15 @@ class _Preset:
     beyond_draft: bool = False
     """Whether backgrounds are drawn by chance, the start has a far shell, and splits look at covered errors: `draft`
     has none of them, since the numbers of the light estimate were fitted on draft scenes."""
+    density: Density = "splits"
 
 
 _PRESETS: dict[str, _Preset] = {
     "draft": _Preset(1_000, 25_000, 640),
     "standard": _Preset(4_000, 100_000, 960, beyond_draft=True),
     "high": _Preset(10_000, 250_000, 1280, beyond_draft=True),
-    # iterations and image size as published; 3DGS-MCMC's usual bound
-    "full": _Preset(30_000, 1_000_000, 1600, DENSE),
+    # as published: 3DGS-MCMC's settings, and the usual size of images
+    "full": _Preset(30_000, 1_000_000, 1600, EVERY_PIXEL, density="mcmc"),
 }
 
 
@@ -54,7 +56,7 @@ class ReconstructOptions:
 
     quality: Quality = "standard"
     """`draft`: 1000 steps, 25k Gaussians; `standard`: 4000, 100k; `high`: 10000, 250k, for a CPU over lunch; `full`:
-    30000, 1M, the published schedule (GPU)."""
+    30000, 1M, 3DGS-MCMC as published (GPU)."""
     iterations: int | None = None
     """Steps, one view each; every schedule scales with it."""
     budget: int | None = None
@@ -77,6 +79,9 @@ class ReconstructOptions:
     error_splits: bool | None = None
     """Whether Gaussians are split by gradient and covered error, not by the gradient alone; None: at `standard` and
     `high`."""
+    density: Density | None = None
+    """How Gaussians are added and removed: `splits`, by gradients; `mcmc`, by relocation, noise and penalties
+    (3DGS-MCMC, with its published settings); None: `mcmc` at `full`."""
     eval_every: int = 0
     """Every how many views one is held out, from the first (3DGS: 8); 0 holds out none."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -115,6 +120,11 @@ class ReconstructOptions:
     def splits_by_error(self) -> bool:
         """Whether splits look at the error that a Gaussian covers, given or of the quality."""
         return _PRESETS[self.quality].beyond_draft if self.error_splits is None else self.error_splits
+
+    @property
+    def density_control(self) -> Density:
+        """How Gaussians are added and removed, given or of the quality."""
+        return self.density or _PRESETS[self.quality].density
 
     def decided(self, surroundings: bool) -> "ReconstructOptions":
         """The same options with the choices made that the quality and the photos decide.

@@ -6,6 +6,7 @@ Gaussians. Measured on a room of 36 views at 352x248, 25k Gaussians, 1000 steps,
 rates other than the centres' eight times 28.1 (a bunch of bananas, 16 photographs: 29.0 and 29.1).
 """
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -18,6 +19,7 @@ from splatgraft.reconstruction.density import DensityControl
 from splatgraft.reconstruction.far_shell import ShellOptions, shell_points, shell_radius, shows_surroundings
 from splatgraft.reconstruction.image_pyramid import Pyramid, read_pyramid
 from splatgraft.reconstruction.initialization import SeedPoints, from_points, looked_at, random_seeds, scene_extent
+from splatgraft.reconstruction.mcmc import McmcControl, McmcOptions
 from splatgraft.reconstruction.memory import require_memory
 from splatgraft.reconstruction.options import ReconstructOptions
 from splatgraft.reconstruction.plane_sweep import SweepOptions, sweep
@@ -55,6 +57,12 @@ class ScheduleOptions:
     """Share of the steps after which the budget may be reached."""
     stop_at: float = 0.8
     """Share of the steps after which Gaussians are neither split nor removed."""
+    mcmc: McmcOptions = field(default_factory=McmcOptions)
+    """Settings of the density control `mcmc`, whose schedule follows."""
+    mcmc_start: int = 500
+    """Step of a run of the published length after which it relocates and adds (3DGS-MCMC)."""
+    mcmc_stop: int = 25_000
+    """Step from which it does not."""
     error_every: int = 4
     """Steps between two measurements of the error that each Gaussian covers, where the options ask for it."""
     means_power: float = 0.5
@@ -103,14 +111,14 @@ def reconstruct(
     views = read_pyramid(capture, options.sampling(capture), device=options.device, progress=progress)
     options = options.decided(_show_surroundings(views, options, schedule))
     start = _start(capture, views, options, schedule, progress=progress).to(options.device)
-    control = _Control(
-        options.sh_degree,
-        max(1, options.all_iterations // schedule.band_share),
-        _density(options, schedule, start.count, capture.cameras),
-    )
+    by_mcmc = options.density_control == "mcmc"
+    density = _mcmc(options, schedule) if by_mcmc else _density(options, schedule, start.count, cameras=capture.cameras)
+    control = _Control(options.sh_degree, max(1, options.all_iterations // schedule.band_share), density)
     fit_options = FitOptions(
         iterations=options.all_iterations,
-        rates=_rates(capture.cameras, options.all_iterations, schedule),
+        rates=_rates(capture.cameras, options, schedule),
+        opacity_penalty=schedule.mcmc.opacity_penalty if by_mcmc else 0.0,
+        scale_penalty=schedule.mcmc.scale_penalty if by_mcmc else 0.0,
         seed=options.seed,
         view_color_rate=schedule.color_rate if options.photo_colors else 0.0,
         rendering=RenderOptions(background=options.background),
@@ -126,7 +134,7 @@ class _Control:
 
     sh_degree: int
     band_every: int
-    density: DensityControl
+    density: DensityControl | McmcControl
 
     def __call__(self, state: FitState, step: Step) -> FitState:
         state = self.density.update(state, step)
@@ -162,6 +170,10 @@ def _start(
     if len(shell):
         # apart from the others, whose spacing bounds that of isolated points
         start = concatenate([start, from_points(shell)])
+    if options.density_control == "mcmc":
+        opacity = torch.full_like(start.opacity_logits, schedule.mcmc.start_opacity)
+        log_scales = start.log_scales + math.log(schedule.mcmc.start_scale)
+        return replace(start, opacity_logits=opacity.logit(), log_scales=log_scales)
     short = options.all_iterations < schedule.published_iterations
     opacity = schedule.short_run_opacity if short else schedule.published_opacity
     return replace(start, opacity_logits=torch.full_like(start.opacity_logits, opacity).logit())
@@ -181,14 +193,30 @@ def _shell(capture: PosedImages, views: Pyramid, budget: int, options: ShellOpti
     return shell_points(cameras, images, center=focus, radius=radius, count=count, margin_deg=options.margin_deg)
 
 
+def _mcmc(options: ReconstructOptions, schedule: ScheduleOptions) -> McmcControl:
+    n, published = options.all_iterations, schedule.published_iterations
+    return McmcControl(
+        budget=options.most_gaussians,
+        start=n * schedule.mcmc_start // published,
+        stop=n * schedule.mcmc_stop // published,
+        every=_densify_every(n, schedule),
+        seed=options.seed,
+        options=schedule.mcmc,
+    )
+
+
+def _densify_every(iterations: int, schedule: ScheduleOptions) -> int:
+    return max(1, min(schedule.densify_every, iterations // schedule.densifications))
+
+
 def _density(
-    options: ReconstructOptions, schedule: ScheduleOptions, first_count: int, cameras: Cameras
+    options: ReconstructOptions, schedule: ScheduleOptions, first_count: int, *, cameras: Cameras
 ) -> DensityControl:
     n = options.all_iterations
     return DensityControl(
         budget=options.most_gaussians,
         first_count=first_count,
-        every=max(1, min(schedule.densify_every, n // schedule.densifications)),
+        every=_densify_every(n, schedule),
         full_at=int(schedule.full_at * n),
         stop=int(schedule.stop_at * n),
         camera_centers=cameras.centers.to(options.device),
@@ -196,10 +224,10 @@ def _density(
     )
 
 
-def _rates(cameras: Cameras, iterations: int, schedule: ScheduleOptions) -> LearningRates:
+def _rates(cameras: Cameras, options: ReconstructOptions, schedule: ScheduleOptions) -> LearningRates:
     """3DGS's published rates, higher for shorter runs."""
     extent = scene_extent(cameras)
-    shorter = max(1.0, schedule.published_iterations / iterations)
+    shorter = max(1.0, schedule.published_iterations / options.all_iterations)
     means_factor = min(schedule.most_means, shorter**schedule.means_power)
     factor = min(schedule.most_others, shorter**schedule.others_power)
     return LearningRates(
@@ -207,7 +235,7 @@ def _rates(cameras: Cameras, iterations: int, schedule: ScheduleOptions) -> Lear
         means_final=1.6e-6 * extent * means_factor,
         log_scales=0.005 * factor,
         quaternions=0.001 * factor,
-        opacity_logits=0.025 * factor,
+        opacity_logits=(schedule.mcmc.opacity_rate if options.density_control == "mcmc" else 0.025) * factor,
         sh=0.0025 * factor,
         sh_higher=0.0025 / 20 * factor,
         final=schedule.short_run_final if shorter > 1 else 1.0,
