@@ -1,13 +1,12 @@
-"""Held-out quality, time and memory of reconstructions: `python benchmarks/captures.py FOLDER [--quality draft ..]`.
+"""Held-out quality, time and memory of reconstructions: `python benchmarks/captures.py FOLDER [--quality draft ..] [--device cuda]`.
 
 Every capture in FOLDER (with poses: transforms.json or COLMAP; without: a folder of photos, posed first by
 `splatgraft capture`) is reconstructed in a process of its own with every 8th view held out. One line each:
 
-    capture=NAME quality=standard views=9 psnr=.. psnr_fit=.. ssim=.. flip=.. seconds=.. cpu_seconds=.. ..
+    capture=NAME quality=standard device=cpu views=9 psnr=.. psnr_fit=.. ssim=.. flip=.. seconds=.. cpu_seconds=.. ..
 
 psnr, ssim and flip compare with the views as photographed; psnr_fit after the colours of each render were mapped to its
-photo
-by a least-squares affine map, which leaves exposure and white balance out. CPU seconds count all threads of the
+photo by a least-squares affine map, which leaves exposure and white balance out. CPU seconds count all threads of the
 reconstruction; structure from motion is not part of either time.
 """
 
@@ -61,13 +60,13 @@ def posed(capture: Path, work: Path) -> Path:
     return out
 
 
-def measure(name: str, folder: Path, quality: str) -> None:
+def measure(name: str, folder: Path, quality: str, device: str) -> None:
     """Reconstruct and print the line."""
     capture = read_capture(folder)
-    options = ReconstructOptions(quality=quality, eval_every=EVERY)  # pyright: ignore[reportArgumentType]
+    options = ReconstructOptions(quality=quality, eval_every=EVERY, device=device)  # pyright: ignore[reportArgumentType]
     reset_peak_memory()
     begin, begin_cpu = time.perf_counter(), time.process_time()
-    scene = reconstruct(capture, options)
+    scene = reconstruct(capture, options).to("cpu")
     seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     peak = peak_memory_bytes() / 2**20
     served = options.served(capture)
@@ -80,7 +79,7 @@ def measure(name: str, folder: Path, quality: str) -> None:
         rows.append(tuple(float(value) for value in found))
     decibel, of_fitted, similarity, visible = (sum(column) / len(rows) for column in zip(*rows, strict=True))
     print(
-        f"capture={name} quality={quality} views={len(rows)} psnr={decibel:.2f} psnr_fit={of_fitted:.2f} "
+        f"capture={name} quality={quality} device={device} views={len(rows)} psnr={decibel:.2f} psnr_fit={of_fitted:.2f} "
         f"ssim={similarity:.3f} flip={visible:.4f} "
         f"seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={scene.count} peak_mb={peak:.0f}",
         flush=True,
@@ -91,11 +90,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--quality", nargs="+", default=["draft", "standard"])
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--work", type=Path, default=Path("captures"), help="where posed captures are kept")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one:
-        measure(args.one, args.folder, args.quality[0])
+        measure(args.one, args.folder, args.quality[0], args.device)
         return 0
     failed = 0
     for capture in find_captures(args.folder):
@@ -106,7 +106,8 @@ def main() -> int:
             failed += 1
             continue
         for quality in args.quality:
-            command = [sys.executable, __file__, str(folder), "--quality", quality, "--one", name_of(capture)]
+            words = ["--quality", quality, "--device", args.device, "--one", name_of(capture)]
+            command = [sys.executable, __file__, str(folder), *words]
             failed += subprocess.run(command, check=False).returncode != 0
     return 1 if failed else 0
 
