@@ -1,6 +1,6 @@
-"""Held-out quality, time and memory of reconstructions: `python benchmarks/captures.py FOLDER [--quality draft ..] [--device cuda]`.
+"""Held-out quality, time and memory of reconstructions: `python benchmarks/captures.py FOLDER [--quality draft ..]`.
 
-Every capture in FOLDER (with poses: transforms.json or COLMAP; without: a folder of photos, posed first by
+`--device cuda` runs them on a card. Every capture in FOLDER (with poses: transforms.json or COLMAP; without: a folder of photos, posed first by
 `splatgraft capture`) is reconstructed in a process of its own with every 8th view held out. One line each:
 
     capture=NAME quality=standard device=cpu views=9 psnr=.. psnr_fit=.. ssim=.. flip=.. seconds=.. cpu_seconds=.. ..
@@ -79,7 +79,8 @@ def measure(name: str, folder: Path, quality: str, device: str) -> None:
         rows.append(tuple(float(value) for value in found))
     decibel, of_fitted, similarity, visible = (sum(column) / len(rows) for column in zip(*rows, strict=True))
     print(
-        f"capture={name} quality={quality} device={device} views={len(rows)} psnr={decibel:.2f} psnr_fit={of_fitted:.2f} "
+        f"capture={name} quality={quality} device={device} views={len(rows)} "
+        f"psnr={decibel:.2f} psnr_fit={of_fitted:.2f} "
         f"ssim={similarity:.3f} flip={visible:.4f} "
         f"seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={scene.count} peak_mb={peak:.0f}",
         flush=True,
