@@ -1,7 +1,8 @@
 """Held-out quality, time and memory of reconstructions: `python benchmarks/captures.py FOLDER [--quality draft ..]`.
 
 `--device cuda` runs them on a card. Every capture in FOLDER (with poses: transforms.json or COLMAP; without: a folder
-of photos, posed first by `splatgraft capture`) is reconstructed in a process of its own with every 8th view held out. One line each:
+of photos, posed first by `splatgraft capture`) is reconstructed in a process of its own with every 8th view held out.
+One line each:
 
     capture=NAME quality=standard device=cpu views=9 psnr=.. psnr_fit=.. ssim=.. flip=.. seconds=.. cpu_seconds=.. ..
 
