@@ -42,8 +42,6 @@ _DRAFT_LIMIT = 1.5
 """Seconds; where drafts of the light take longer, images without the light transfer are shown first."""
 _REST_SECONDS = 0.1
 """How long the camera stands still before its picture is drawn; browsers report a moving one more often."""
-_SETTLED_SECONDS = 1.0
-"""How long nothing is edited after a move before the light of the new place is estimated, as the step does."""
 _COARSE_ABOVE = 0.4
 """Seconds; a picture that takes longer is preceded by a coarse one."""
 _COARSE_SHARE, _COARSE_BUDGET = 0.5, 120_000
@@ -274,9 +272,8 @@ class PreviewPanel:
             return
         if relighting.can_refine(request.state) and not relighting.is_refined(request.state):
             relighting.refined(request.state)
-            self.update()
-            if not self._light_worker.wait_idle(_SETTLED_SECONDS):
-                return
+            self.update()  # once drawn, asks for the light itself
+            return
         start = time.monotonic()
         relighting.relit(request.state)
         self._relight_seconds = time.monotonic() - start

@@ -173,7 +173,9 @@ class PreviewRelighting:
             # the step knows of no place before: sources and shadow maps are those of this one
             self._relight_memo.forget(REGION)
             self._region_poses = b""
-        return self._refine(state)
+        relit = self._refine(state)
+        self._memo.forget("refined")  # a second copy of a large scene
+        return relit
 
     def _refine(self, state: EditState) -> Relit:
         return self._relight_composite(
