@@ -11,6 +11,7 @@ from splatgraft.core.cameras import pinhole
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.evaluation import evaluate, measure, true_views
+from splatgraft.folders.evaluated_scenes import Pictures
 
 TRUTHS = [example_truth(shadow, seed) for seed, shadow in enumerate((0.5, 0.97, 0.6))]
 
@@ -64,3 +65,15 @@ def test_true_views_are_paired_by_name(tmp_path: Path) -> None:
         true_views(truth, target.select(torch.tensor([True, True, False])))
     with pytest.raises(ValueError, match=r"b\.jpg: expected a mask of the object, found none"):
         true_views(target.select(torch.tensor([False, False, True])), truth)
+
+
+def test_a_view_of_the_whole_object_is_shown_before_a_larger_one_that_is_cut() -> None:
+    def at(name: str, left: int, size: int) -> Pictures:
+        mask = torch.zeros(40, 60)
+        mask[10 : 10 + size, left : left + size] = 1.0
+        return Pictures(name, *(torch.zeros(40, 60, 3) for _ in range(3)), mask=mask)
+
+    cut, whole, small, tiny = at("cut", 0, 16), at("whole", 20, 10), at("small", 20, 9), at("tiny", 20, 4)
+    assert max((cut, whole, small), key=lambda p: p.prominence) is whole
+    # one that hardly shows it is not
+    assert max((cut, tiny), key=lambda p: p.prominence) is cut

@@ -18,6 +18,9 @@ from splatgraft.formats import read_cameras, read_gaussians, read_images
 from splatgraft.project.layout import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
 from splatgraft.rendering import render
 
+_CUT_OBJECT = 0.25
+"""What the coverage of an object counts that the picture's rim cuts; set by hand."""
+
 
 @dataclass(frozen=True)
 class Pictures:
@@ -37,6 +40,12 @@ class Pictures:
     """The image with the object really there; None where there is no ground truth."""
     held_out: bool = False
     """Whether the consolidation used no image of this view."""
+
+    @property
+    def prominence(self) -> float:
+        """How well the view shows the object: its coverage, pixels; a quarter of it where the picture's rim cuts it."""
+        rim = torch.cat([self.mask[0], self.mask[-1], self.mask[:, 0], self.mask[:, -1]])
+        return float(self.mask.sum()) * (_CUT_OBJECT if bool((rim > 0.5).any()) else 1.0)
 
 
 @dataclass(frozen=True)

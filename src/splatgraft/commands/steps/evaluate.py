@@ -97,7 +97,7 @@ class Evaluate:
         shown = _spread(len(truth.names if truth else scenes.cameras), self.pictured)
         pictures = [(truth or scenes.with_width(self.width)).pictures(index) for index in shown]
         changes = [describe_change(p.result, p.copy_paste, p.mask) for p in pictures]
-        best = max(pictures, key=lambda p: float(p.mask.sum()))
+        best = max(pictures, key=lambda p: p.prominence)
         self._write_pictures(folder, best)
         turntable = _turntable(scenes, self.frames, context) if self.frames else []
         if turntable:
