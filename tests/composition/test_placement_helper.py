@@ -1,6 +1,7 @@
 """Automatic placement in a synthetic room: a table under a ceiling, a box to place on it, floaters in the air."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from splatgraft.composition import (
     support_below,
 )
 from splatgraft.composition.facing_direction import facing_yaw_deg, unseen_share
+from splatgraft.composition.height_map import height_map
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.capture_orientation import estimate_up, focus_point
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
@@ -138,6 +140,27 @@ def test_support_is_the_table_under_a_ceiling_and_through_floaters(start):
     assert float(found.normal @ UP) > math.cos(math.radians(3))
     assert found.flat_fraction > 0.8
     assert found.obstructed_fraction < 0.1
+
+
+def glossy_room():
+    """A table top that lets light through, and its reflections deep below it, as a fit of photos makes them."""
+    table = sheet((0, 0, TABLE), (0.6, 0, 0), (0, 0.4, 0), spacing=0.03)
+    table = replace(table, opacity_logits=torch.full((table.count,), -0.4))
+    below = sheet((0, 0, TABLE - 0.4), (0.6, 0, 0), (0, 0.4, 0), spacing=0.05, noise=0.1, seed=3)
+    return concatenate([sheet((0, 0, 0), (2, 0, 0), (0, 2, 0)), table, below])
+
+
+def test_a_glossy_table_is_level_and_its_edges_stay():
+    scene = glossy_room()
+    ground = height_map(scene, torch.tensor([0.0, 0, TABLE + 0.1]), up=UP, radius=1.0, top=0.5)
+    x, y = ground.points[..., 0].abs(), ground.points[..., 1].abs()
+    heights = ground.points[..., 2]
+    within = heights[(x < 0.5) & (y < 0.3)]
+    assert float((within - TABLE).abs().quantile(0.98)) < 0.02
+    assert float(heights[(x > 0.7) | (y > 0.5)].max()) < 0.1
+    placed = place_object(scene, box((0, 0, 0), (0.1, 0.1, 0.1)), cameras=(ring_of_cameras(), ring_of_cameras()))
+    assert float(placed.support.point[2]) == pytest.approx(TABLE, abs=0.02)
+    assert placed.support.flat_fraction > 0.9
 
 
 def test_support_beside_the_table_is_the_floor():
