@@ -102,6 +102,10 @@ def _median_depth(
     if not bool(solid.any()):
         return mean
     pose = camera.camera_from_world[0]
+    across = (scene.means @ pose[:2, :3].T + pose[:2, 3]).abs().amax(1)
+    # rays that are all but vertical: what is drawn lies in the square, give or take its own width
+    half = 1.2 * near / _DISTANCE
+    scene = scene.select(across < half + 4 * scene.scales.amax(1))
     depths = scene.means @ pose[2, :3] + pose[2, 3]
     levels = torch.linspace(near, float(mean[solid].max()), _LEVELS).to(mean)
     step = float(levels[1] - levels[0])
