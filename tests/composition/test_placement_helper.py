@@ -163,6 +163,15 @@ def test_a_glossy_table_is_level_and_its_edges_stay():
     assert placed.support.flat_fraction > 0.9
 
 
+def test_a_floor_below_haze_is_where_it_is():
+    floor, haze = (sheet((0, 0, z), (2, 0, 0), (0, 2, 0), spacing=0.05) for z in (0.0, 0.03))
+    haze = replace(haze, opacity_logits=torch.full((haze.count,), -2.5))
+    ground = height_map(concatenate([floor, haze]), torch.zeros(3), up=UP, radius=0.5, top=0.3, size=64)
+    heights = ground.heights[ground.alpha > 0.5]
+    assert float(heights.min()) > -0.01
+    assert float(heights.max()) < 0.03
+
+
 def test_support_beside_the_table_is_the_floor():
     found = support_below(room(), torch.tensor([-1.2, 1.0, 1.0]), up=UP, radius=0.15)
     assert abs(float(found.point[2])) < 0.01

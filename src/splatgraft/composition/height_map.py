@@ -107,10 +107,12 @@ def _median_depth(
     half = 1.2 * near / _DISTANCE
     scene = scene.select(across < half + 4 * scene.scales.amax(1))
     depths = scene.means @ pose[2, :3] + pose[2, 3]
-    levels = torch.linspace(near, float(mean[solid].max()), _LEVELS).to(mean)
-    step = float(levels[1] - levels[0])
+    deepest = float(mean[solid].max())
+    step = (deepest - near) / (_LEVELS - 2)
     if not step > 0:
         return mean
+    # one level beyond the deepest mean, so that the shares of an even surface reach a half
+    levels = near + step * torch.arange(_LEVELS).to(mean)
     options, nearer = RenderOptions(near=near), []
     for part in levels.split(_LEVELS_AT_ONCE):
         # share of each Gaussian that lies nearer than a level, in steps that join
@@ -118,7 +120,10 @@ def _median_depth(
         drawn = render(scene, camera, outputs=frozenset(), features=shares, options=options)
         nearer.append(drawn.features[0].detach())
     share = torch.cat(nearer, -1) / alpha.clamp_min(1e-6)[..., None]
-    after = (share >= 0.5).int().argmax(-1).clamp_min(1)
+    reached = share >= 0.5
+    after = reached.int().argmax(-1).clamp_min(1)
     low, high = (share.gather(-1, at[..., None])[..., 0] for at in (after - 1, after))
     median = levels[after - 1] + step * ((0.5 - low) / (high - low).clamp_min(1e-6)).clamp(0, 1)
-    return torch.where(solid & ((median - mean).abs() > _DIFFERENT * step), median, mean)
+    # a median below the last level is not known
+    known = solid & reached.any(-1)
+    return torch.where(known & ((median - mean).abs() > _DIFFERENT * step), median, mean)
