@@ -194,7 +194,7 @@ def test_a_far_shell_shows_held_out_views_what_is_behind_the_points(before_walls
 
 def test_full_takes_the_published_density_control_and_every_pixel(capture):
     assert ReconstructOptions(quality="full").density_control == "mcmc"
-    assert ReconstructOptions(quality="full").sampling(capture) == EVERY_PIXEL
+    assert ReconstructOptions(quality="full").sampling(capture.cameras) == EVERY_PIXEL
     assert ReconstructOptions(quality="full", density="splits").density_control == "splits"
     assert all(ReconstructOptions(quality=name).density_control == "splits" for name in ("draft", "standard", "high"))
 
@@ -249,16 +249,20 @@ def test_quality_chooses_what_is_not_given():
 def test_pixels_are_left_out_only_where_there_are_more_than_gaussians(capture):
     options = ReconstructOptions(quality="draft")
     large = replace(capture, cameras=capture.cameras.resized(12.0))
-    assert max(part.stride for part in options.sampling(large)) == 2
-    assert max(part.stride for part in options.sampling(capture)) == 1
-    assert max(part.stride for part in replace(options, budget=100_000).sampling(large)) == 1
+    assert max(part.stride for part in options.sampling(large.cameras)) == 2
+    assert max(part.stride for part in options.sampling(capture.cameras)) == 1
+    assert max(part.stride for part in replace(options, budget=100_000).sampling(large.cameras)) == 1
 
 
 def test_more_time_is_predicted_for_more_work(capture):
-    durations = [predict_cpu_seconds(capture, ReconstructOptions(quality=q)) for q in ("draft", "standard", "high")]
+    durations = [
+        predict_cpu_seconds(capture.cameras, ReconstructOptions(quality=q)) for q in ("draft", "standard", "high")
+    ]
     assert durations == sorted(durations)
     every_pixel = ReconstructOptions(coarse_to_fine=False)
-    assert predict_cpu_seconds(capture, every_pixel) > predict_cpu_seconds(capture, ReconstructOptions())
+    assert predict_cpu_seconds(capture.cameras, every_pixel) > predict_cpu_seconds(
+        capture.cameras, ReconstructOptions()
+    )
     assert describe_duration(312.0) == "5 minutes"
 
 

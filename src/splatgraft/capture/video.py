@@ -15,6 +15,8 @@ from splatgraft.runtime.progress import Progress, silent
 _SHARPNESS_PX = 480
 """Longest side at which sharpness is measured, so that it does not depend on the resolution."""
 _LEAST_FRAMES = 3
+VIDEO_FRAMES = 120
+"""Frames taken of a video, where it has as many and different views."""
 _MISSING_SHARE = 0.02
 """Share of the announced frames that may be missing before the file counts as cut off; containers count roughly."""
 _WIDE_STEP = 0.15
@@ -28,7 +30,7 @@ def extract_frames(
     video: Path,
     folder: Path,
     *,
-    count: int = 120,
+    count: int = VIDEO_FRAMES,
     progress: Progress = silent,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> list[Path]:

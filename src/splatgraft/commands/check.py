@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 
+from splatgraft.capture.duration import predict_pose_seconds
 from splatgraft.capture.odd_photos import find_odd_photos
 from splatgraft.capture.photo_findings import (
     Finding,
@@ -28,8 +29,8 @@ from splatgraft.runtime.console import Console
 
 _FRAMES = 40
 """Frames of a video that are looked at; the command `capture` takes 120."""
-_POSE_SECONDS, _DRAFT_SECONDS = 2.5, 45.0
-"""Per photo for poses (73 photos of 800 px in 3 minutes), and for a draft of any size; two idle cores."""
+_DRAFT_SECONDS = 45.0
+"""For a draft of any size; two idle cores."""
 _FOCAL_LENGTH = 0x920A
 
 
@@ -122,8 +123,9 @@ def _masks(count: int) -> Finding:
 
 
 def _time(photos_to_pose: int) -> Finding:
-    minutes = (_POSE_SECONDS * photos_to_pose + _DRAFT_SECONDS) / 60
-    poses = f", of which poses take {_minutes(_POSE_SECONDS * photos_to_pose / 60)}" if photos_to_pose else ""
+    posing = predict_pose_seconds(photos_to_pose)
+    minutes = (posing + _DRAFT_SECONDS) / 60
+    poses = f", of which poses take {_minutes(posing / 60)}" if photos_to_pose else ""
     return Finding("time", "good", f"about {_minutes(minutes)} to a draft on two idle cores{poses}")
 
 

@@ -65,7 +65,7 @@ def camera_files(path: Path) -> tuple[Path, ...]:
 
 
 def describe_left_out(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[str]:
-    """What of the capture at `path` is not used: one line with number and names, then the reasons of the first.
+    """What of the capture at `path` is not used: one line with number and names, then a line per kind of reason.
 
     Args:
         path: The capture.
@@ -78,4 +78,11 @@ def describe_left_out(path: Path, kept: int, left_out: Sequence[LeftOut]) -> lis
     more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
     names = ", ".join(str(one) for one in left_out[:_NAMED])
     head = f"{path}: goes on with {kept} of {total} images, without {names}{more}"
-    return [head, *(f"left out: {one.reason}" for one in left_out[:_NAMED])]
+    alike: dict[str, list[str]] = {}
+    for one in left_out:
+        alike.setdefault(one.reason.replace(one.name, ""), []).append(one.reason)
+    lines = [
+        f"left out: {reasons[0]}" + (f" (and {len(reasons) - 1} more alike)" if len(reasons) > 1 else "")
+        for reasons in alike.values()
+    ]
+    return [head, *lines[:_NAMED]]

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from splatgraft.formats import is_scene
 from splatgraft.project.layout import Side
-from splatgraft.runtime.settings import Table, from_table, read_toml
+from splatgraft.runtime.settings import Table, from_table, path_beside, read_toml
 
 T = TypeVar("T")
 
@@ -96,7 +96,7 @@ class ProjectFile:
     def scene(self, side: Side) -> Path | None:
         """The trained scene of a side, where one is named."""
         found = self.content[side].get("scene")
-        return None if found is None else self.path.parent / Path(found).expanduser()
+        return None if found is None else path_beside(self.path.parent, found)
 
     def _of_capture(self, side: Side) -> dict[str, Any]:
         """The keys of [source] or [target] that are options of `capture`; of a scene alone, pictures are made."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from splatgraft.core.posed_images import PosedImages
+from splatgraft.core.cameras import Cameras
 from splatgraft.reconstruction.options import ReconstructOptions
 
 
@@ -20,16 +20,16 @@ class StepCost:
     """Share of all this that measuring the covered error adds."""
 
 
-def predict_cpu_seconds(capture: PosedImages, options: ReconstructOptions, cost: StepCost = StepCost()) -> float:
+def predict_cpu_seconds(cameras: Cameras, options: ReconstructOptions, cost: StepCost = StepCost()) -> float:
     """CPU seconds of `reconstruct`, within about a factor of 2: scenes differ in how many Gaussians a pixel sees.
 
     Args:
-        capture: As given to `reconstruct`.
+        cameras: Of the capture that is given to `reconstruct`.
         options: Likewise.
         cost: Of a step.
     """
-    served = options.served(capture)
-    sizes = served.cameras.sizes.prod(1).double()
+    served = cameras.resized(options.served_size(cameras))
+    sizes = served.sizes.prod(1).double()
     size = float(sizes.mean()) if len(sizes) else 0.0
     pixels, begin = 0.0, 0.0
     for part in options.sampling(served):

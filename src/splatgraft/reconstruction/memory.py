@@ -27,7 +27,7 @@ def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
     """
     served = options.served(capture)
     pixels = served.cameras.sizes.prod(1).double().tolist()
-    pyramid = 3 * sum(pixels) * sum(part.factor**2 for part in options.sampling(served))
+    pyramid = 3 * sum(pixels) * sum(part.factor**2 for part in options.sampling(served.cameras))
     largest = max(pixels, default=0.0)
     numbers = 11 + 3 * coefficient_count(options.sh_degree)
     gaussians = options.most_gaussians * (4 * numbers * _COPIES + _BYTES_PER_GAUSSIAN)

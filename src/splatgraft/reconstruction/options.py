@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.spherical_harmonics import MAX_DEGREE
 
@@ -140,8 +141,8 @@ class ReconstructOptions:
             error_splits=self.splits_by_error,
         )
 
-    def sampling(self, served: PosedImages) -> tuple[Sampling, ...]:
-        """Which pixels of the served capture the steps see, from the first to the last.
+    def sampling(self, served: Cameras) -> tuple[Sampling, ...]:
+        """Which pixels of the served views the steps see, from the first to the last.
 
         Pixels are left out only as long as a step still sees as many pixels as there are Gaussians: on a room at
         352x248 with 25k Gaussians, which has fewer, every second pixel costs half a decibel.
@@ -149,13 +150,17 @@ class ReconstructOptions:
         if not self.coarse_to_fine:
             return EVERY_PIXEL
         sampling = _PRESETS[self.quality].sampling
-        sizes = served.cameras.sizes.prod(1).double()
+        sizes = served.sizes.prod(1).double()
         seen = (float(sizes.mean()) if len(sizes) else 0.0) / max(part.stride for part in sampling) ** 2
         return DENSE if sampling is SPARSE and seen < self.most_gaussians else sampling
 
     def served(self, capture: PosedImages) -> PosedImages:
         """The capture, resampled to the size at which it is fitted."""
+        return capture.resized(self.served_size(capture.cameras))
+
+    def served_size(self, cameras: Cameras) -> float:
+        """The factor by which images are resampled to the size at which they are fitted."""
         if self.resolution is not None:
-            return capture.resized(self.resolution)
-        longest = int(capture.cameras.sizes.max()) if len(capture) else 1
-        return capture.resized(min(1.0, _PRESETS[self.quality].longest_side_px / longest))
+            return self.resolution
+        longest = int(cameras.sizes.max()) if len(cameras) else 1
+        return min(1.0, _PRESETS[self.quality].longest_side_px / longest)

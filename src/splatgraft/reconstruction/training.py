@@ -108,7 +108,7 @@ def reconstruct(
     if len(capture) < 2:
         raise ValueError(f"reconstruct: expected at least 2 views to fit, found {len(capture)}")
     capture = options.served(capture)
-    views = read_pyramid(capture, options.sampling(capture), device=options.device, progress=progress)
+    views = read_pyramid(capture, options.sampling(capture.cameras), device=options.device, progress=progress)
     options = options.decided(_show_surroundings(views, options, schedule))
     start = _start(capture, views, options, schedule, progress=progress).to(options.device)
     by_mcmc = options.density_control == "mcmc"

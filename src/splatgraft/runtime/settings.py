@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import tomllib
 import types
 from collections.abc import Mapping
@@ -132,6 +133,14 @@ def _build(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
     return kind(**values)
 
 
+def path_beside(folder: Path, text: str) -> Path:
+    """The path that a file in `folder` names, without the steps up (..) that it does not need, for messages."""
+    path = folder / Path(text).expanduser()
+    plain = Path(os.path.normpath(path))
+    # beyond a symbolic link, a step up leads elsewhere
+    return plain if path.exists() and plain.exists() and plain.samefile(path) else path
+
+
 def _convert(value: Any, hint: Any, table: Table, key: str) -> Any:
     """Convert `value` to the type `hint`."""
     origin, arguments = get_origin(hint), get_args(hint)
@@ -142,7 +151,7 @@ def _convert(value: Any, hint: Any, table: Table, key: str) -> Any:
         if len(kinds) == len(value):
             return tuple(_convert(v, kind, table, key) for v, kind in zip(value, kinds, strict=True))
     if hint is Path and isinstance(value, str):
-        return table.folder / Path(value).expanduser()
+        return path_beside(table.folder, value)
     if hint is float and type(value) is int and abs(value) < _LARGEST_INT:
         return float(value)
     if hint is float and type(value) is float and math.isnan(value):

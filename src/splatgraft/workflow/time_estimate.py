@@ -1,10 +1,21 @@
-"""Time estimate of the steps of a run, from their earlier runs, or else from typical times of such steps."""
+"""Time estimate of the steps of a run, from their earlier runs, or else from their inputs and typical times."""
 
 from collections.abc import Iterable, Sequence
 
+import torch
+
+from splatgraft.capture import VIDEO_FRAMES, predict_pose_seconds
+from splatgraft.commands.steps.capture import Capture
+from splatgraft.commands.steps.reconstruct import Reconstruct
+from splatgraft.core.cameras import Cameras, pinhole
+from splatgraft.core.images import stored_size
 from splatgraft.editor.jobs.jobs import PlannedStep
+from splatgraft.folders.capture_files import has_poses
+from splatgraft.formats import is_scene, read_capture
+from splatgraft.formats.captures.masks import find_photos
 from splatgraft.project.record import read_record
 from splatgraft.project.step import Step
+from splatgraft.reconstruction import predict_cpu_seconds
 from splatgraft.workflow.flow import Flow
 
 _TYPICAL_SECONDS = {
@@ -22,6 +33,8 @@ _TYPICAL_SECONDS = {
 """Seconds in a first `splatgraft demo` on two cores, compilation of kernels included.
 
 Another project differs by a factor, which its finished steps give."""
+_COMPILATION_SECONDS = 25.0
+"""Of the kernels of a first reconstruction, a part of its typical time."""
 
 
 def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, ...]:
@@ -35,7 +48,7 @@ def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, 
         One entry per stale step; `is_measured` is false where the seconds are a guess.
     """
     measured = {name: found.seconds for name, step in flow if (found := read_record(step.out)) is not None}
-    typical = {name: _TYPICAL_SECONDS[_kind(step)] for name, step in flow}
+    typical = {name: _typical_seconds(step, flow) for name, step in flow}
     known = [name for name in measured if measured[name] > 0]
     factor = sum(measured[name] for name in known) / sum(typical[name] for name in known) if known else 1.0
     return tuple(
@@ -51,9 +64,38 @@ def describe_estimate(planned: Sequence[PlannedStep]) -> str:
     seconds = sum(step.seconds for step in planned)
     duration = f"{max(1, round(seconds / 5)) * 5:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} minutes"
     measured = all(step.is_measured for step in planned)
-    basis = "as before" if measured else "a guess from the demo on two cores"
+    basis = "as before" if measured else "a guess for two idle cores: half or twice that"
     return f"{len(planned)} step{'s' if len(planned) > 1 else ''} to run: about {duration} ({basis})"
 
 
-def _kind(step: Step) -> str:
-    return type(step).__name__.lower()
+def _typical_seconds(step: Step, flow: Flow) -> float:
+    """Seconds of a first run on two idle cores; what a step cannot read, it says itself when it runs."""
+    typical = _TYPICAL_SECONDS[type(step).__name__.lower()]
+    try:
+        if isinstance(step, Capture):
+            return typical + predict_pose_seconds(_photos_to_pose(step))
+        if isinstance(step, Reconstruct) and not torch.cuda.is_available():
+            seconds = predict_cpu_seconds(_cameras_to_fit(step, flow), step.options) / 2
+            return _COMPILATION_SECONDS + seconds
+    except (ValueError, OSError):
+        pass
+    return typical
+
+
+def _photos_to_pose(step: Capture) -> int:
+    if step.poses is not None or is_scene(step.capture) or has_poses(step.capture):
+        return 0
+    return len(find_photos(step.capture).paths) if step.capture.is_dir() else VIDEO_FRAMES
+
+
+def _cameras_to_fit(step: Reconstruct, flow: Flow) -> Cameras:
+    """The cameras of its capture, or, before that is made, one as large as the first photo will be."""
+    if has_poses(step.capture):
+        return read_capture(step.capture).cameras
+    made_by = next(made_by for _, made_by in flow if made_by.out == step.capture)
+    width, height = 1600, 1200
+    if isinstance(made_by, Capture) and made_by.capture.is_dir():
+        if has_poses(made_by.capture):
+            return read_capture(made_by.capture).cameras
+        width, height = stored_size(find_photos(made_by.capture).paths[0])
+    return pinhole(torch.eye(4)[None], float(width), width=width, height=height)

@@ -69,7 +69,7 @@ class Reconstruct:
         context.console.say(f"memory: at most about {predict_memory(capture, options) / 2**30:.1f} GiB")
         if device.type == "cpu":
             threads = torch.get_num_threads()
-            seconds = predict_cpu_seconds(capture, options) / threads
+            seconds = predict_cpu_seconds(capture.cameras, options) / threads
             context.console.say(f"time: about {describe_duration(seconds)} on {threads} idle cores, half or twice that")
         warnings = exposure_warnings(self.capture, capture.image_paths)
         if read_record(self.capture) is None:  # of its own results the command `capture` has said it
