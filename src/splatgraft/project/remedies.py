@@ -5,7 +5,7 @@ from pathlib import Path
 from splatgraft.runtime.help_link import help_link
 
 _REMEDIES = {
-    "capture": "look at the photos, then take more and sharper ones with more overlap: splatgraft check PHOTOS",
+    "capture": "add or replace the photos named, or take more, sharper and with more overlap: splatgraft check PHOTOS",
     "reconstruct": "leave the named photos out, or lock exposure and photograph again: splatgraft check PHOTOS",
     "segment": "put the box around the object, or paint what is missing: splatgraft edit {folder}, step Select",
     "compose": "drag the object to where it should stand and press Drop: splatgraft edit {folder}, step Place",
