@@ -9,7 +9,7 @@ import torch
 
 from exam.measure_light import light_errors, median_angle_deg
 from exam.rows import make_row
-from exam.scene_files import ExamScene, HeldOutView
+from exam.scene_files import ExamScene, TrueView
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_image
 from splatgraft.evaluation.benchmark.view_metrics import measure_view
@@ -83,7 +83,7 @@ def evaluate_scene(scene: ExamScene, rows: Sequence[str], picture: Path) -> Scen
     return SceneResult(scene.name, values, light, normals_deg, tuple(notes))
 
 
-def measure_row(result: Gaussians, views: Sequence[HeldOutView]) -> dict[str, float | None]:
+def measure_row(result: Gaussians, views: Sequence[TrueView]) -> dict[str, float | None]:
     """The values of `METRICS`, means over the views where they are defined."""
     found = [measure_view(view.picture(result), view.truth, background=view.background) for view in views]
     out: dict[str, float | None] = {}

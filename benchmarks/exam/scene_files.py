@@ -28,8 +28,8 @@ from splatgraft.workflow.benchmark.scene import HELD_OUT_EVERY, GroundTruthScene
 
 
 @dataclass(frozen=True)
-class HeldOutView:
-    """One view that nothing was fitted to."""
+class TrueView:
+    """One view of the target with what is true of it."""
 
     camera: Cameras
     truth: Truth
@@ -51,7 +51,10 @@ class ExamScene:
     """The target's, without the held-out ones."""
     source: SourceScene
     """The source without the object; nothing is told."""
-    views: tuple[HeldOutView, ...]
+    views: tuple[TrueView, ...]
+    """Held out: nothing was fitted to them."""
+    fitted_views: tuple[TrueView, ...]
+    """Those of `cameras`, whose pictures without the object the target was fitted to."""
     new_light: Light
     """True, at the object's place in the target, target's frame."""
     old_light: Light
@@ -83,20 +86,22 @@ def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: C
         composite=composite,
         cameras=read_cameras(composed.cameras),
         source=source,
-        views=_held_out_views(files, composite.target),
+        views=_true_views(files, composite.target, are_held_out=True),
+        fitted_views=_true_views(files, composite.target, are_held_out=False),
         new_light=_read_light(folder / "probe.npy", folder / "suns.json"),
         old_light=_read_light(folder / "old_light" / "0000.npy", folder / "old_light" / "suns.json"),
         normals=_read_normals(folder / "surface.npy", composite.objects[0].gaussians, source.cameras),
     )
 
 
-def _held_out_views(files: GroundTruthScene, target: Gaussians) -> tuple[HeldOutView, ...]:
+def _true_views(files: GroundTruthScene, target: Gaussians, *, are_held_out: bool) -> tuple[TrueView, ...]:
     truth, photographs = read_capture(files.truth), read_capture(files.target)
     views = []
-    for index in torch.nonzero(held_out(len(truth), HELD_OUT_EVERY)).flatten().tolist():
+    chosen = held_out(len(truth), HELD_OUT_EVERY) == are_held_out
+    for index in torch.nonzero(chosen).flatten().tolist():
         camera = truth.cameras[index]
         background = render(target, camera).color[0].clamp(0, 1)
-        views.append(HeldOutView(camera, true_view(truth, photographs, index), background))
+        views.append(TrueView(camera, true_view(truth, photographs, index), background))
     return tuple(views)
 
 

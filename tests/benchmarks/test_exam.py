@@ -6,14 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 from exam.draw import SIZE, draw_scenes
-from exam.evaluate_scene import SceneResult
+from exam.evaluate_scene import SceneResult, measure_row
 from exam.measure_light import light_errors, median_angle_deg, nearest_normals, seen_surface
+from exam.rows import make_row
+from exam.scene_files import ExamScene, TrueView
 from exam.summary import summarize_light, summarize_row, summary_markdown
-from shapes import ring
+from shapes import ring, surfels
 
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions
-from splatgraft.relighting import Light, LightSource
+from splatgraft.core.gaussians import concatenate
+from splatgraft.core.similarity import Similarity
+from splatgraft.evaluation import Truth
+from splatgraft.relighting import Light, LightSource, SourceScene
 from splatgraft.relighting.light.light import fit_ambient
+from splatgraft.rendering import render
 from splatgraft.synthesis import benchmark, pairs
 
 SUN = LightSource(direction=(0.0, 0.0, 1.0), irradiance=(3.0, 3.0, 3.0))
@@ -94,6 +102,45 @@ def test_true_normals_are_those_of_the_nearest_surface():
     assert angle is not None
     assert angle < 3
     assert median_angle_deg(found, found, ~chosen) is None
+
+
+def test_fitted_colours_make_the_true_shadow_in_views_they_were_not_fitted_to():
+    x, y = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(-1, 1, 41), indexing="ij")
+    points = torch.stack([x.flatten(), y.flatten(), torch.zeros(x.numel())], 1)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(points), 3)
+    in_shadow = (points[:, 0] > 0.2) & (points[:, 0] < 0.9) & (points[:, 1].abs() < 0.3)
+    # what the transfer cannot know: a shadow beside the object, under a light that makes none there
+    bright, dark = (surfels(points, up, width=0.04, srgb=shade) for shade in (0.6, 0.3))
+    shadowed = replace(bright, sh=torch.where(in_shadow[:, None, None], dark.sh, bright.sh))
+    around = even_directions(300)
+    thing = surfels(0.15 * around + torch.tensor([0.0, 0.0, 0.15]), around, width=0.02, srgb=0.5)
+    place = Similarity(1.0, torch.eye(3), torch.zeros(3))
+    composite = Composite(bright, (PlacedObject(thing, place),), torch.zeros(bright.count, dtype=torch.bool))
+    cameras, even = ring(16), replace(LIGHT, sources=())
+
+    is_thing = torch.cat([torch.zeros(bright.count, 1), torch.ones(thing.count, 1)])
+
+    def view(camera: Cameras) -> TrueView:
+        image, background = (render(s, camera).color[0].clamp(0, 1) for s in (concatenate([shadowed, thing]), bright))
+        mask = render(concatenate([bright, thing]), camera, features=is_thing).features
+        return TrueView(camera, Truth(image, background, mask[0, ..., 0]), background)
+
+    fitted = [i for i in range(16) if i % 4]
+    scene = ExamScene(
+        name="floor",
+        composite=composite,
+        cameras=cameras[fitted],
+        source=SourceScene(bright, cameras, light=even),
+        views=tuple(view(camera) for camera in cameras[::4]),
+        fitted_views=tuple(view(camera) for camera in cameras[fitted]),
+        new_light=even,
+        old_light=even,
+        normals=None,
+    )
+    rows = {row: make_row(row, scene)[0] for row in ("paste", "told-both", "fitted")}
+    error = {row: measure_row(made, scene.views)["shadow"] for row, made in rows.items()}
+    assert error["fitted"] < 0.3 * error["paste"]
+    assert error["told-both"] > 0.7 * error["paste"]
 
 
 def result(name, *rows, light=None) -> SceneResult:
