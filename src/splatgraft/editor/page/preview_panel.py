@@ -272,10 +272,13 @@ class PreviewPanel:
             return
         if relighting.can_refine(request.state) and not relighting.is_refined(request.state):
             relighting.refined(request.state)
-            self.update()  # once drawn, asks for the light itself
+            if not self._light_worker.closed:
+                self.update()  # once drawn, asks for the light itself
             return
         start = time.monotonic()
         relighting.relit(request.state)
+        if self._light_worker.closed:
+            return
         self._relight_seconds = time.monotonic() - start
         self._light_note = f"light in {self._relight_seconds:.1f} s"
         self._page.light_ready()
@@ -298,8 +301,9 @@ class PreviewPanel:
         left, right = self._pictures.both(request, problems)
         seconds = time.monotonic() - start
         pixels = wipe_comparison(left.pixels, right.pixels, request.split)
-        if request.window is not None and not self._is_on_canvas:
-            return  # the canvas was given to splats while this picture was drawn
+        # the page was closed, or the canvas given to splats, while this picture was drawn
+        if self._worker.closed or (request.window is not None and not self._is_on_canvas):
+            return
         if request.window is not None:
             depth = right.depth if request.split < 0.5 else left.depth
             self.canvas.show(request.window, with_badge(pixels, stage), depth_behind(depth))

@@ -36,6 +36,11 @@ class LatestOnlyWorker(Generic[T]):
         """Whether a newer request waits; long work may stop then."""
         return bool(self._waiting)
 
+    @property
+    def closed(self) -> bool:
+        """Whether the worker was closed while it was at work: what it writes to may be gone."""
+        return not self._open
+
     def wait_idle(self, seconds: float) -> bool:
         """Wait until a newer request arrives, at most `seconds`; whether none arrived."""
         with self._wake:
@@ -59,4 +64,5 @@ class LatestOnlyWorker(Generic[T]):
             try:
                 self._work(request)
             except Exception as error:  # one failed request must not end the thread
-                self._on_error(error)
+                if not self.closed:
+                    self._on_error(error)
