@@ -107,9 +107,9 @@ def test_files_hold_the_networks_and_bad_ones_are_one_line(tmp_path):
         read_ensemble(tmp_path / "none.safetensors")
     other = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(2)}, str(other), {"format": "splatgraft light network 0"})
-    with pytest.raises(ValueError, match=r"other.safetensors: expected 'splatgraft light network 2' in its header"):
+    with pytest.raises(ValueError, match=r"other.safetensors: expected 'splatgraft light network 3' in its header"):
         read_ensemble(other)
-    save_file({"a": torch.zeros(2)}, str(tmp_path / "empty.safetensors"), {"format": "splatgraft light network 2"})
+    save_file({"a": torch.zeros(2)}, str(tmp_path / "empty.safetensors"), {"format": "splatgraft light network 3"})
     with pytest.raises(ValueError, match=r"empty.safetensors: expected the tensors of the light network, found"):
         read_ensemble(tmp_path / "empty.safetensors")
     path.write_bytes(path.read_bytes()[:500])

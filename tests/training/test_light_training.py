@@ -18,7 +18,7 @@ from splatgraft.training.light_training import (
 )
 
 
-def places(count, lights=2, *, noise=0.1, seed=0):
+def places(count, lights=2, *, noise=0.1, seed=0, learnable=True):
     """Places whose estimate is too dark by what one of their numbers says, in stops, but for chance."""
     generator = torch.Generator().manual_seed(seed)
     found = []
@@ -28,7 +28,7 @@ def places(count, lights=2, *, noise=0.1, seed=0):
             numbers = torch.randn(len(NUMBERS), generator=generator)
             radiance = torch.rand(12, 24, 3, generator=generator) + 0.5
             irradiance = torch.full((12, 24, 3), math_pi_mean(radiance))
-            stops = 0.8 * numbers[2] + noise * torch.randn((), generator=generator)
+            stops = 0.8 * learnable * numbers[2] + noise * torch.randn((), generator=generator)
             truth = CellLight(radiance * 2**stops, irradiance * 2**stops)
             name = f"{scene:03d}/{'old' if light % 2 else 'new'}"
             found.append(LightExample(name, PlaceDescription(maps, numbers), truth, CellLight(radiance, irradiance)))
@@ -54,7 +54,17 @@ def trained():
 def test_scenes_left_out_are_corrected(trained):
     result, lines = trained
     assert float(result.after.level.abs().mean()) < 0.5 * float(result.before.level.abs().mean())
-    assert len(lines) == OPTIONS.folds
+    assert len(lines) == OPTIONS.folds + 1
+    assert result.ensemble.applied > 0.5
+
+
+def test_what_cannot_be_learned_is_not_applied_and_the_uncertainty_is_that_of_scenes_left_out():
+    """The truth differs by chance alone, which networks learn by heart."""
+    examples = places(16, noise=1.0, learnable=False)
+    found = train_light(examples, OPTIONS, say=lambda _: None, progress=lambda *_: None)
+    assert found.ensemble.applied <= 0.25
+    calibrated = found.log_sd[:, 0].exp2() * found.ensemble.sd_factors[0]
+    assert float((found.after.level / calibrated).square().mean().sqrt()) == pytest.approx(1.0, abs=0.02)
 
 
 def test_the_uncertainty_is_that_of_scenes_left_out(trained):

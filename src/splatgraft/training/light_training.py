@@ -132,11 +132,15 @@ class TrainedLight:
     before: IrradianceErrors
     """Of the estimates, in the order of the examples."""
     after: IrradianceErrors
-    """The same by the network that left the example's scene out."""
+    """The same by the network that left the example's scene out, with the share of its correction that is applied."""
     shares_before: RatioShares
     """What ratios between the uncorrected lights of places are worth."""
     log_sd: Float[Tensor, "n 3"]
     """What that network said of its errors: log2 standard deviations, stops."""
+
+
+_APPLIED = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Shares of a correction that are tried on the scenes left out."""
 
 
 def corrected_irradiance(correction: LightCorrection, data: LightData) -> Float[Tensor, "n 12 24 3"]:
@@ -168,7 +172,7 @@ def train_light(
     Args:
         examples: Of at least as many scenes as there are folds.
         options: How.
-        say: Receives a line per network.
+        say: Receives a line per network, and one on the share of their corrections that is applied.
         progress: Called with steps done, steps in all and a short text.
 
     Raises:
@@ -180,7 +184,8 @@ def train_light(
     data = LightData.of(examples)
     fold_of = {scene: i % options.folds for i, scene in enumerate(scenes)}
     folds = torch.tensor([fold_of[one.scene] for one in examples])
-    found, log_sd = data.estimated.clone(), torch.zeros(len(examples), 3)
+    found = data.estimated.expand(len(_APPLIED), *data.estimated.shape).clone()
+    log_sd = torch.zeros(len(examples), 3)
     networks = []
     for fold in range(options.folds):
         inside, outside = (folds != fold).nonzero()[:, 0], (folds == fold).nonzero()[:, 0]
@@ -189,18 +194,47 @@ def train_light(
         left_out = data.select(outside)
         with torch.no_grad():
             correction = network(left_out.inputs)
-        found[outside], log_sd[outside] = corrected_irradiance(correction, left_out), correction.log_sd
-        errors = [IrradianceErrors.of(values, left_out.truth).total for values in (left_out.estimated, found[outside])]
-        before, after = (float(one.mean()) for one in errors)
+        for i, applied in enumerate(_APPLIED):
+            found[i, outside] = corrected_irradiance(correction.weakened(applied), left_out)
+        log_sd[outside] = correction.log_sd
+        both = (left_out.estimated, found[-1, outside])
+        before, after = (float(IrradianceErrors.of(values, left_out.truth).total.mean()) for values in both)
         say(f"network {fold + 1}: irradiance of scenes left out off by {after:.3f} stops, {before:.3f} uncorrected")
         networks.append(network.eval().requires_grad_(False))
-    return TrainedLight(
-        LightEnsemble(tuple(networks), SeenPlaces.of(data.inputs), ratio_shares(found, data.truth, examples)),
-        IrradianceErrors.of(data.estimated, data.truth),
-        IrradianceErrors.of(found, data.truth),
-        ratio_shares(data.estimated, data.truth, examples),
-        log_sd,
+    weights = _side_weights(examples)
+    tried = [IrradianceErrors.of(values, data.truth) for values in found]
+    best = min(range(len(_APPLIED)), key=lambda i: float((tried[i].total * weights).sum()))
+    say(f"{_APPLIED[best]:.0%} of a correction comes closest to the truth on scenes left out")
+    ensemble = LightEnsemble(
+        tuple(networks),
+        SeenPlaces.of(data.inputs),
+        ratio_shares(found[best], data.truth, examples),
+        _APPLIED[best],
+        _sd_factors(tried[best], log_sd, weights),
     )
+    return TrainedLight(
+        ensemble,
+        before=IrradianceErrors.of(data.estimated, data.truth),
+        after=tried[best],
+        shares_before=ratio_shares(data.estimated, data.truth, examples),
+        log_sd=log_sd,
+    )
+
+
+def _side_weights(examples: Sequence[LightExample]) -> Float[Tensor, "n"]:
+    """Of the examples, sum 1: lights of one side of a scene count as one place."""
+    sides = [one.side for one in examples]
+    weights = torch.tensor([1 / sides.count(side) for side in sides])
+    return weights / weights.sum()
+
+
+def _sd_factors(
+    errors: IrradianceErrors, log_sd: Float[Tensor, "n 3"], weights: Float[Tensor, "n"]
+) -> tuple[float, float, float]:
+    """Root mean square errors over the standard deviations that were claimed for them: level, change and tint."""
+    squares = torch.stack([errors.level**2, errors.change, (errors.tint**2).sum(1) / 2], 1) / log_sd.exp2() ** 2
+    level, change, tint = (squares * weights[:, None]).sum(0).sqrt().clamp_min(0.1).tolist()
+    return level, change, tint
 
 
 def ratio_shares(
@@ -216,8 +250,7 @@ def ratio_shares(
         truth: The same, true.
         examples: In the same order.
     """
-    sides = [one.side for one in examples]
-    weights = torch.tensor([1 / sides.count(side) for side in sides])
+    weights = _side_weights(examples)
     level, tint = [], []
     for values in (found, truth):
         parts = IrradianceErrors.of(values, torch.zeros_like(values))
@@ -228,7 +261,7 @@ def ratio_shares(
 
 def _slope(found: Float[Tensor, "n c"], truth: Float[Tensor, "n c"], weights: Float[Tensor, "n"]) -> float:
     """Of a line through centred values, in [0, 1]."""
-    share = (weights / weights.sum())[:, None]
+    share = weights[:, None]
     away, true_away = (values - (share * values).sum(0) for values in (found, truth))
     slope = (share * away * true_away).sum() / (share * away**2).sum().clamp_min(1e-9)
     return float(slope.clamp(0, 1))

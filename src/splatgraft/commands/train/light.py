@@ -59,11 +59,9 @@ def _held_out(examples: list[LightExample], trained: TrainedLight) -> dict[str, 
                 "level": float(errors.level[which].abs().mean()),
                 "tint": float(errors.tint[which].norm(dim=1).mean()),
             }
-    claimed = trained.log_sd.exp2()
-    found["error over what was claimed, 1 is right"] = {
-        "level": float((trained.after.level / claimed[:, 0]).square().mean().sqrt()),
-        "tint": float((trained.after.tint.square().sum(1) / 2).sqrt().div(claimed[:, 2]).square().mean().sqrt()),
-    }
+    factors = zip(("level", "change", "tint"), trained.ensemble.sd_factors, strict=True)
+    found["error over what the networks claimed, by which their claims are multiplied"] = dict(factors)
+    found["share of a correction that is applied"] = {"share": trained.ensemble.applied}
     for name, shares in (("uncorrected", trained.shares_before), ("corrected", trained.ensemble.shares)):
         found[f"share of ratios between places that is applied, {name}"] = asdict(shares)
     return found

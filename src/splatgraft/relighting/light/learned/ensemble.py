@@ -22,7 +22,7 @@ from splatgraft.relighting.light.place_description import PlaceDescription, cell
 from splatgraft.relighting.light.radiance_correction import RatioShares, belief
 from splatgraft.runtime.atomic_file import atomic_write
 
-FORMAT = "splatgraft light network 2"
+FORMAT = "splatgraft light network 3"
 WEIGHTS_FILE = "light.safetensors"
 _RIDGE = 0.02
 """Added to the variances of the summary: what hardly varied in training says little."""
@@ -67,6 +67,10 @@ class LightEnsemble:
     seen: SeenPlaces
     shares: RatioShares
     """What a ratio of corrected lights was worth on scenes that were left out of training."""
+    applied: float = 1.0
+    """Share of a correction that came closest to the truth on those scenes, in [0, 1]."""
+    sd_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Their errors over what the networks said of them: factors on the three standard deviations of a correction."""
 
     @torch.no_grad()
     def correct(self, place: PlaceDescription) -> tuple[LightCorrection, float]:
@@ -76,7 +80,7 @@ class LightEnsemble:
             The correction, and the distance of the place: above 1 it is unlike the training's.
         """
         inputs = network_inputs(place)
-        found = [network(inputs[None]) for network in self.networks]
+        found = [network(inputs[None]).weakened(self.applied) for network in self.networks]
         distance = self.seen.distance(inputs)
         believed = belief(distance)
         gains, lamps = torch.stack([one.gain for one in found]), torch.stack([one.lamp.exp2() for one in found])
@@ -89,7 +93,7 @@ class LightEnsemble:
             LightCorrection(
                 gain=believed * gain,
                 lamp=(believed * lamps.mean(0)).clamp_min(1e-9).log2(),
-                log_sd=0.5 * variance.log2() - torch.tensor(believed).log2(),
+                log_sd=0.5 * variance.log2() + (torch.tensor(self.sd_factors) / believed).log2(),
             ),
             distance,
         )
@@ -113,6 +117,8 @@ def write_ensemble(path: Path, ensemble: LightEnsemble, notes: dict[str, str]) -
     seen = ensemble.seen
     tensors |= {
         "shares": torch.tensor([ensemble.shares.level, ensemble.shares.tint]),
+        "applied": torch.tensor(ensemble.applied),
+        "sd_factors": torch.tensor(ensemble.sd_factors),
         "seen.mean": seen.mean,
         "seen.precision": seen.precision.contiguous(),
         "seen.farthest": torch.tensor(seen.farthest),
@@ -152,7 +158,8 @@ def read_ensemble(path: Path) -> LightEnsemble:
             networks.append(network.eval().requires_grad_(False))
         seen = SeenPlaces(tensors["seen.mean"], tensors["seen.precision"], float(tensors["seen.farthest"]))
         shares = RatioShares(*tensors["shares"].tolist())
+        applied, (level, change, tint) = float(tensors["applied"]), tensors["sd_factors"].tolist()
     except (KeyError, ValueError, TypeError, RuntimeError) as error:
         found = str(error).splitlines()[0]
         raise ValueError(f"{path}: expected the tensors of the light network, found {found}") from error
-    return LightEnsemble(tuple(networks), seen, shares)
+    return LightEnsemble(tuple(networks), seen, shares, applied, (level, change, tint))

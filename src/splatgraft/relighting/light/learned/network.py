@@ -39,6 +39,8 @@ _MOST = 3.0
 """Stops by which a direction is corrected at most."""
 _NO_LAMP = -6.0
 """Log2 of the lamp's irradiance over the estimated mean, from which training starts."""
+_NO_LIGHT = 1e-9
+"""Radiance of a lamp that is not there, over the estimated mean."""
 _STRONGEST = 2.0
 """The same of the strongest lamp."""
 _UNSURE = 3.0
@@ -65,6 +67,11 @@ class LightCorrection:
     """Log2 of the radiance of a lamp in each cell, over the estimated mean radiance; white."""
     log_sd: Float[Tensor, "b 3"]
     """Log2 of standard deviations, stops: of the irradiance's level, of its change over normals, of its tint."""
+
+    def weakened(self, share: float) -> "LightCorrection":
+        """A share of the correction, in [0, 1]; as uncertain as the whole."""
+        lamp = (share * self.lamp.exp2()).clamp_min(_NO_LIGHT).log2()
+        return LightCorrection(gain=share * self.gain, lamp=lamp, log_sd=self.log_sd)
 
 
 class LightNetwork(nn.Module):

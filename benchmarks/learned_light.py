@@ -1,0 +1,171 @@
+"""What the learned correction of the light is worth in pictures of scenes that it was not trained on.
+
+    python benchmarks/learned_light.py SCENES [SCENES ...] --work FOLDER [FOLDER ...] --examples FOLDER [--more FOLDER]
+
+SCENES are folders of scenes as `python benchmarks/exam` renders them. The scenes are split in parts; for each part,
+networks are trained on the other parts and on the examples of `splatgraft synth lights` in --more, and the transfer is
+measured with and without them on the part left out. Examples of SCENES are made once and kept in --examples.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from exam.evaluate_scene import measure_row
+from exam.rows import make_row
+from exam.scene_files import ExamScene, read_scene
+
+from splatgraft.core.bounds import bounding_sphere
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.relighting import relight
+from splatgraft.relighting.light.estimate import NoLight, fit_light
+from splatgraft.relighting.light.learned.ensemble import LightEnsemble
+from splatgraft.runtime.console import Console
+from splatgraft.training.light_examples import LightExample, light_example, read_examples, write_examples
+from splatgraft.training.light_training import LightTrainingOptions, train_light
+
+_SIZES = ReconstructOptions(iterations=1000, budget=20_000)
+"""Of an exam's reconstructions."""
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """A rendered scene on disk."""
+
+    name: str
+    files: Path
+    work: Path
+    """Its reconstructions."""
+
+    def read(self) -> ExamScene:
+        """The scene; it is reconstructed where that is not done yet."""
+        return read_scene(self.files, self.work, _SIZES, Console())
+
+
+def scenes_in(folders: Sequence[Path], works: Sequence[Path]) -> list[SceneFolder]:
+    """All scenes with known light, named after the folder above their own, so that several exams can be joined."""
+    return [
+        SceneFolder(f"{folder.resolve().parent.name}-{path.name}", path, work / path.name)
+        for folder, work in zip(folders, works, strict=True)
+        for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file())
+    ]
+
+
+def examples_of(where: SceneFolder) -> list[LightExample]:
+    """The estimate and the truth at the new and the old place; a place without light is left out, and said."""
+    scene = where.read()
+    placed, source = scene.composite.objects[0], scene.source
+    new = fit_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
+    old = fit_light(
+        source.gaussians, bounding_sphere(placed.gaussians), source.cameras, object_gaussians=placed.gaussians
+    )
+    truths = {"new": ("probe.npy", "suns.json"), "old": ("old_light/0000.npy", "old_light/suns.json")}
+    examples = []
+    for (side, (panorama, suns)), found in zip(truths.items(), (new, old), strict=True):
+        if isinstance(found, NoLight):
+            print(f"{where.name}/{side}: left out, {found.reason}", flush=True)
+            continue
+        light = torch.from_numpy(np.load(where.files / panorama, allow_pickle=False)).float()
+        lamps = json.loads((where.files / suns).read_text())
+        examples.append(light_example(f"{where.name}/{side}", found, light, lamps))
+    return examples
+
+
+def kept_examples(where: SceneFolder, folder: Path) -> list[LightExample]:
+    """`examples_of`, from a file in `folder` where they were made before."""
+    path = folder / f"{where.name}.npz"
+    if not path.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_examples(path, examples_of(where))
+    return read_examples(path)
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Of one scene without and with networks."""
+
+    object: tuple[float, float]
+    """PSNR over that of pasting, dB."""
+    shadow: tuple[float, float]
+    """Share of pasting's shadow error that is removed; nan where the scene has no shadow."""
+    whole: tuple[float, float]
+    """PSNR of the whole image over that of pasting, dB."""
+
+    def __str__(self) -> str:
+        """One line."""
+        values = {"object": self.object, "shadow": self.shadow, "whole": self.whole}
+        return "  ".join(f"{name} {a:+.2f} -> {b:+.2f}" for name, (a, b) in values.items())
+
+    @staticmethod
+    def of(scene: ExamScene, networks: LightEnsemble) -> "Gains":
+        """Measure all three."""
+        results = [make_row("paste", scene)[0]]
+        results += [
+            relight(scene.composite, scene.cameras, sources=[scene.source], light=light).bake()[0]
+            for light in (None, networks)
+        ]
+        paste, *rows = [measure_row(result, scene.views) for result in results]
+
+        def against(name: str, *, is_error: bool) -> tuple[float, float]:
+            before = paste[name]
+            pairs = [None if before is None or row[name] is None else (before, row[name]) for row in rows]
+            found = [
+                float("nan") if pair is None else (1 - pair[1] / pair[0] if is_error else pair[1] - pair[0])  # type: ignore[operator]
+                for pair in pairs
+            ]
+            return found[0], found[1]
+
+        return Gains(
+            against("object", is_error=False), against("shadow", is_error=True), against("whole", is_error=False)
+        )
+
+
+def print_summary(found: Sequence[Gains]) -> None:
+    """Means over scenes, without and with networks."""
+    for name in ("object", "shadow", "whole"):
+        values = torch.tensor([getattr(one, name) for one in found])
+        values = values[values.isfinite().all(1)]
+        before, after = values.mean(0).tolist()
+        better = int((values[:, 1] > values[:, 0]).sum())
+        print(f"{name}: {before:.3f} -> {after:.3f}, better on {better} of {len(values)}")
+    worse = [sum(one.whole[i] < 0 for one in found) for i in (0, 1)]
+    print(f"whole image worse than pasted on {worse[0]} -> {worse[1]} of {len(found)}")
+
+
+def main() -> None:
+    """Train and measure part by part."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
+    parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
+    parser.add_argument("--examples", type=Path, required=True, help="folder of their examples, a file for each scene")
+    parser.add_argument("--more", type=Path, help="folder of `splatgraft synth lights`: trained on in all parts")
+    parser.add_argument("--parts", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=LightTrainingOptions().steps, help="of each network")
+    options = parser.parse_args()
+    scenes = scenes_in(options.scenes, options.work)
+    examples = {one.name: kept_examples(one, options.examples) for one in scenes}
+    files = sorted(options.more.glob("*.npz")) if options.more is not None else []
+    more = [example for file in files for example in read_examples(file)]
+    print(f"{len(scenes)} scenes, {len({one.scene for one in more})} more of synth lights", flush=True)
+    found = []
+    for part in range(options.parts):
+        inside = [e for i, s in enumerate(scenes) if i % options.parts != part for e in examples[s.name]]
+        training = LightTrainingOptions(steps=options.steps, seed=part)
+        trained = train_light([*inside, *more], training, say=print, progress=lambda *_: None)
+        for one in scenes[part :: options.parts]:
+            gains = Gains.of(one.read(), trained.ensemble)
+            print(f"{one.name:28s} {gains}", flush=True)
+            found.append(gains)
+    print_summary(found)
+
+
+if __name__ == "__main__":
+    main()
