@@ -9,9 +9,11 @@ measured with and without them on the part left out. Examples of SCENES are made
 
 import argparse
 import json
+import math
+import operator
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -107,25 +109,20 @@ class Gains:
     @staticmethod
     def of(scene: ExamScene, networks: LightEnsemble) -> "Gains":
         """Measure all three."""
-        results = [make_row("paste", scene)[0]]
-        results += [
-            relight(scene.composite, scene.cameras, sources=[scene.source], light=light).bake()[0]
-            for light in (None, networks)
-        ]
-        paste, *rows = [measure_row(result, scene.views) for result in results]
+        paste = measure_row(make_row("paste", scene)[0], scene.views)
+        found = []
+        for light in (None, networks):
+            relit = relight(scene.composite, scene.cameras, sources=[replace(scene.source, light=light)], light=light)
+            row = measure_row(relit.bake()[0], scene.views)
+            of_shadow = 1 - _over(row["shadow"], paste["shadow"], operator.truediv)
+            found.append([_over(row[name], paste[name], operator.sub) for name in ("object", "whole")] + [of_shadow])
+        (without_object, without_whole, without_shadow), (object_, whole, shadow) = found
+        return Gains((without_object, object_), (without_shadow, shadow), (without_whole, whole))
 
-        def against(name: str, *, is_error: bool) -> tuple[float, float]:
-            before = paste[name]
-            pairs = [None if before is None or row[name] is None else (before, row[name]) for row in rows]
-            found = [
-                float("nan") if pair is None else (1 - pair[1] / pair[0] if is_error else pair[1] - pair[0])  # type: ignore[operator]
-                for pair in pairs
-            ]
-            return found[0], found[1]
 
-        return Gains(
-            against("object", is_error=False), against("shadow", is_error=True), against("whole", is_error=False)
-        )
+def _over(value: float | None, pasted: float | None, compare: Callable[[float, float], float]) -> float:
+    """A value against that of pasting; nan where one is not defined."""
+    return math.nan if value is None or pasted is None else compare(value, pasted)
 
 
 def print_summary(found: Sequence[Gains]) -> None:
