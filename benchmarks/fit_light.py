@@ -27,16 +27,14 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from exam.scene_files import ExamScene, read_scene
+from exam.scene_files import ExamScene
+from exam.training_scenes import estimated_lights, scenes_in
 
-from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.directions import even_directions
-from splatgraft.reconstruction import ReconstructOptions
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem
 from splatgraft.relighting.light.radiance_search import SearchSettings, irradiance_of, search_radiance
-from splatgraft.runtime.console import Console
 
 NORMALS = even_directions(200)
 FACTORS = {
@@ -79,12 +77,8 @@ Pair: TypeAlias = tuple[TrainingPlace, TrainingPlace]
 
 def places_of(scene: ExamScene) -> Pair:
     """The new and the old place."""
-    placed, source = scene.composite.objects[0], scene.source
-    new = fit_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
-    old = fit_light(
-        source.gaussians, bounding_sphere(placed.gaussians), source.cameras, object_gaussians=placed.gaussians
-    )
-    return _place(new, scene.new_light), _place(old, scene.old_light)
+    found = estimated_lights(scene)
+    return _place(found["new"], scene.new_light), _place(found["old"], scene.old_light)
 
 
 def _place(found: EstimatedLight | NoLight, truth: Light) -> TrainingPlace:
@@ -184,15 +178,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--start", type=Path, help="numbers to start from, as --out writes them")
     options = parser.parse_args()
-    sizes = ReconstructOptions(iterations=1000, budget=20_000)
     pairs = {}
-    for folder, work in zip(options.scenes, options.work, strict=True):
-        for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file()):
-            kept = options.evidence / f"{path.name}.pt"
-            if not kept.is_file():
-                kept.parent.mkdir(parents=True, exist_ok=True)
-                torch.save(places_of(read_scene(path, work / path.name, sizes, Console())), kept)
-            pairs[path.name] = torch.load(kept, weights_only=False)
+    for one in scenes_in(options.scenes, options.work):
+        kept = options.evidence / f"{one.name}.pt"
+        if not kept.is_file():
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            torch.save(places_of(one.read()), kept)
+        pairs[one.name] = torch.load(kept, weights_only=False)
     scenes = Scenes(pairs, options.jobs)
     everything = range(len(pairs))
     numbers = {**asdict(RadianceSettings()), "temperature": SearchSettings().temperature}

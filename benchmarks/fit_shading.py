@@ -19,12 +19,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from exam.evaluate_scene import measure_row
 from exam.rows import make_row
-from exam.scene_files import ExamScene, read_scene
+from exam.scene_files import ExamScene
+from exam.training_scenes import scenes_in
 
-from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.relighting import relight
 from splatgraft.relighting.shading.irradiance import ShadeSettings, shade_ratio
-from splatgraft.runtime.console import Console
 
 FLOORS = (0.02, 0.08, 0.2)
 LEVEL_SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -57,15 +56,13 @@ def main() -> None:
     parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
     parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
     options = parser.parse_args()
-    sizes = ReconstructOptions(iterations=1000, budget=20_000)
     grid = itertools.product(SPANS, FLOORS, LEVEL_SHARES, TINT_SHARES)
     choices = [ShadeSettings(span, floor, level, tint) for span, floor, level, tint in grid]
     names, rows = [], []
-    for folder, work in zip(options.scenes, options.work, strict=True):
-        for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file()):
-            names.append(path.name)
-            rows.append(gains(read_scene(path, work / path.name, sizes, Console()), choices))
-            print(f"{path.name}: best {max(rows[-1]):+.2f} dB", flush=True)
+    for one in scenes_in(options.scenes, options.work):
+        rows.append(gains(one.read(), choices))
+        names.append(one.name)
+        print(f"{one.name}: best {max(rows[-1]):+.2f} dB", flush=True)
     table = torch.tensor(rows)
     best = int(table.mean(0).argmax())
     print(f"fitted: {table.mean(0)[best]:+.2f} dB, {choices[best]}")

@@ -19,16 +19,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from exam.evaluate_scene import measure_row
 from exam.rows import make_row
-from exam.scene_files import ExamScene, read_scene
+from exam.scene_files import ExamScene
+from exam.training_scenes import scenes_in
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.evaluation.measure import luminance_ratio
 from splatgraft.evaluation.regions import find_regions
-from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.relighting import relight
 from splatgraft.relighting.shadows.scene_ratio import SceneRatio
 from splatgraft.relighting.transfer import SHADOW_POWER
-from splatgraft.runtime.console import Console
 
 POWERS = (1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0)
 
@@ -68,15 +67,13 @@ def main() -> None:
     parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
     parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
     options = parser.parse_args()
-    sizes = ReconstructOptions(iterations=1000, budget=20_000)
     rows, bands = [], []
-    for folder, work in zip(options.scenes, options.work, strict=True):
-        for path in sorted(p.parent for p in folder.glob("*/placement.json")):
-            everywhere, band = shares(read_scene(path, work / path.name, sizes, Console()))
-            rows.append(everywhere)
-            bands.append(band)
-            best = POWERS[max(range(len(POWERS)), key=everywhere.__getitem__)]
-            print(f"{path.name}: best {best}; {' '.join(f'{share:.3f}' for share in everywhere)}", flush=True)
+    for one in scenes_in(options.scenes, options.work):
+        everywhere, band = shares(one.read())
+        rows.append(everywhere)
+        bands.append(band)
+        best = POWERS[max(range(len(POWERS)), key=everywhere.__getitem__)]
+        print(f"{one.name}: best {best}; {' '.join(f'{share:.3f}' for share in everywhere)}", flush=True)
     table, in_band = torch.tensor(rows), torch.tensor(bands)
     for i, power in enumerate(POWERS):
         print(f"power {power}: removed {table[:, i].mean():.3f}, in the true shadow {in_band[:, i].mean():.3f}")

@@ -8,7 +8,6 @@ measured with and without them on the part left out. Examples of SCENES are made
 """
 
 import argparse
-import json
 import math
 import operator
 import sys
@@ -16,72 +15,34 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from exam.evaluate_scene import measure_row
 from exam.rows import make_row
-from exam.scene_files import ExamScene, read_scene
+from exam.scene_files import ExamScene, read_probe, true_light_files
+from exam.training_scenes import TrainingScene, estimated_lights, scenes_in
 
-from splatgraft.core.bounds import bounding_sphere
-from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.relighting import relight
-from splatgraft.relighting.light.estimate import NoLight, fit_light
+from splatgraft.relighting.light.estimate import NoLight
 from splatgraft.relighting.light.learned.ensemble import LightEnsemble
-from splatgraft.runtime.console import Console
 from splatgraft.training.light_examples import LightExample, light_example, read_examples, write_examples
 from splatgraft.training.light_training import LightTrainingOptions, train_light
 
-_SIZES = ReconstructOptions(iterations=1000, budget=20_000)
-"""Of an exam's reconstructions."""
 
-
-@dataclass(frozen=True)
-class SceneFolder:
-    """A rendered scene on disk."""
-
-    name: str
-    files: Path
-    work: Path
-    """Its reconstructions."""
-
-    def read(self) -> ExamScene:
-        """The scene; it is reconstructed where that is not done yet."""
-        return read_scene(self.files, self.work, _SIZES, Console())
-
-
-def scenes_in(folders: Sequence[Path], works: Sequence[Path]) -> list[SceneFolder]:
-    """All scenes with known light, named after the folder above their own, so that several exams can be joined."""
-    return [
-        SceneFolder(f"{folder.resolve().parent.name}-{path.name}", path, work / path.name)
-        for folder, work in zip(folders, works, strict=True)
-        for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file())
-    ]
-
-
-def examples_of(where: SceneFolder) -> list[LightExample]:
+def examples_of(where: TrainingScene) -> list[LightExample]:
     """The estimate and the truth at the new and the old place; a place without light is left out, and said."""
-    scene = where.read()
-    placed, source = scene.composite.objects[0], scene.source
-    new = fit_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
-    old = fit_light(
-        source.gaussians, bounding_sphere(placed.gaussians), source.cameras, object_gaussians=placed.gaussians
-    )
-    truths = {"new": ("probe.npy", "suns.json"), "old": ("old_light/0000.npy", "old_light/suns.json")}
-    examples = []
-    for (side, (panorama, suns)), found in zip(truths.items(), (new, old), strict=True):
+    files, examples = true_light_files(where.files), []
+    for side, found in estimated_lights(where.read()).items():
         if isinstance(found, NoLight):
             print(f"{where.name}/{side}: left out, {found.reason}", flush=True)
-            continue
-        light = torch.from_numpy(np.load(where.files / panorama, allow_pickle=False)).float()
-        lamps = json.loads((where.files / suns).read_text())
-        examples.append(light_example(f"{where.name}/{side}", found, light, lamps))
+        else:
+            examples.append(light_example(f"{where.name}/{side}", found, *read_probe(*files[side])))
     return examples
 
 
-def kept_examples(where: SceneFolder, folder: Path) -> list[LightExample]:
+def kept_examples(where: TrainingScene, folder: Path) -> list[LightExample]:
     """`examples_of`, from a file in `folder` where they were made before."""
     path = folder / f"{where.name}.npz"
     if not path.is_file():

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -88,8 +89,8 @@ def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: C
         source=source,
         views=_true_views(files, composite.target, are_held_out=True),
         fitted_views=_true_views(files, composite.target, are_held_out=False),
-        new_light=_read_light(folder / "probe.npy", folder / "suns.json"),
-        old_light=_read_light(folder / "old_light" / "0000.npy", folder / "old_light" / "suns.json"),
+        new_light=_read_light(true_light_files(folder)["new"]),
+        old_light=_read_light(true_light_files(folder)["old"]),
         normals=_read_normals(folder / "surface.npy", composite.objects[0].gaussians, source.cameras),
     )
 
@@ -105,12 +106,30 @@ def _true_views(files: GroundTruthScene, target: Gaussians, *, are_held_out: boo
     return tuple(views)
 
 
-def _read_light(panorama: Path, suns: Path) -> Light:
+def true_light_files(folder: Path) -> dict[str, tuple[Path, Path]]:
+    """Panorama and suns of the `new` and the `old` place in a rendered scene's folder."""
+    old = folder / "old_light"
+    return {"new": (folder / "probe.npy", folder / "suns.json"), "old": (old / "0000.npy", old / "suns.json")}
+
+
+def read_probe(panorama: Path, suns: Path) -> tuple[Float[Tensor, "h w 3"], list[dict[str, Any]]]:
+    """True light at a place: an equirectangular panorama without the suns, linear, and the entries of suns.json.
+
+    Raises:
+        ValueError: A file is missing or damaged.
+    """
     try:
-        found = torch.from_numpy(np.load(panorama, allow_pickle=False))
-        return light_from_probe(found, json.loads(suns.read_text()))
+        return torch.from_numpy(np.load(panorama, allow_pickle=False)).float(), json.loads(suns.read_text())
     except (OSError, ValueError) as error:
         raise ValueError(f"{panorama}, {suns.name}: expected a true light, found {error}") from error
+
+
+def _read_light(where: tuple[Path, Path]) -> Light:
+    probe = read_probe(*where)
+    try:
+        return light_from_probe(*probe)
+    except ValueError as error:
+        raise ValueError(f"{where[0]}, {where[1].name}: expected a true light, found {error}") from error
 
 
 def _read_normals(path: Path, thing: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3"] | None:

@@ -97,10 +97,15 @@ def test_an_untrained_network_changes_little(found):
 
 def test_files_hold_the_networks_and_bad_ones_are_one_line(tmp_path):
     network, place = random_network(), random_place()
-    ensemble = ensemble_of(network, place)
+    ensemble = replace(ensemble_of(network, place), applied=0.5, sd_factors=(2.0, 3.0, 4.0))
     path = tmp_path / "light.safetensors"
     write_ensemble(path, ensemble, {"seed": "0"})
     again = read_ensemble(path)
+    assert (again.applied, again.sd_factors) == (0.5, (2.0, 3.0, 4.0))
+    half, whole = again.correct(place)[0], replace(again, applied=1.0, sd_factors=(1.0, 1.0, 1.0)).correct(place)[0]
+    assert torch.allclose(half.gain, 0.5 * whole.gain, atol=1e-5)
+    assert torch.allclose(half.lamp, whole.lamp - 1, atol=1e-4)
+    assert torch.allclose((half.log_sd - whole.log_sd).exp2(), torch.tensor([[2.0, 3.0, 4.0]]))
     # half precision
     assert torch.allclose(again.correct(place)[0].gain, ensemble.correct(place)[0].gain, atol=0.02)
     with pytest.raises(ValueError, match=r"none.safetensors: expected weights of the light network, found"):

@@ -84,19 +84,16 @@ class LightEnsemble:
         distance = self.seen.distance(inputs)
         believed = belief(distance)
         gains, lamps = torch.stack([one.gain for one in found]), torch.stack([one.lamp.exp2() for one in found])
-        gain = gains.mean(0)
         areas = cell_solid_angles()
         levels = (gains.mean(-1) * areas).sum((2, 3)) / areas.sum()
         variance = torch.stack([one.log_sd.exp2() ** 2 for one in found]).mean(0)
         variance[:, 0] += levels.var(0, correction=0)
-        return (
-            LightCorrection(
-                gain=believed * gain,
-                lamp=(believed * lamps.mean(0)).clamp_min(1e-9).log2(),
-                log_sd=0.5 * variance.log2() + (torch.tensor(self.sd_factors) / believed).log2(),
-            ),
-            distance,
+        whole = LightCorrection(
+            gain=gains.mean(0),
+            lamp=lamps.mean(0).log2(),
+            log_sd=0.5 * variance.log2() + (torch.tensor(self.sd_factors) / believed).log2(),
         )
+        return whole.weakened(believed), distance
 
 
 def write_ensemble(path: Path, ensemble: LightEnsemble, notes: dict[str, str]) -> None:
