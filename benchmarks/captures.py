@@ -4,11 +4,14 @@
 of photos, posed first by `splatgraft capture`) is reconstructed in a process of its own with every 8th view held out.
 One line each:
 
-    capture=NAME quality=standard device=cpu views=9 psnr=.. psnr_fit=.. ssim=.. flip=.. seconds=.. cpu_seconds=.. ..
+    capture=NAME quality=standard device=cpu views=9 longest_px=960 psnr=.. psnr_fit=.. ssim=.. flip=.. seconds=.. ..
 
 psnr, ssim and flip compare with the views as photographed; psnr_fit after the colours of each render were mapped to its
 photo by a least-squares affine map, which leaves exposure and white balance out. CPU seconds count all threads of the
 reconstruction; structure from motion is not part of either time.
+
+Every quality fits photos of its own size, and is compared at that size unless `--longest-px` gives others, one line for
+each: small pictures are easier to match, so that figures of two qualities can be compared at one size only.
 """
 
 import argparse
@@ -20,12 +23,12 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as cli.py does; read when torch and numba load
 
-import torch
 
 from splatgraft.core.flip import flip
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import fit_color, psnr, ssim
 from splatgraft.core.images import list_images
-from splatgraft.core.posed_images import held_out
+from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import read_capture
 from splatgraft.reconstruction import ReconstructOptions, reconstruct
@@ -61,8 +64,8 @@ def posed(capture: Path, work: Path) -> Path:
     return out
 
 
-def measure(name: str, folder: Path, quality: str, device: str) -> None:
-    """Reconstruct and print the line."""
+def measure(name: str, folder: Path, quality: str, device: str, longest_px: list[int]) -> None:
+    """Reconstruct and print a line for each size; without sizes, for the size at which the photos were fitted."""
     capture = read_capture(folder)
     options = ReconstructOptions(quality=quality, eval_every=EVERY, device=device)  # pyright: ignore[reportArgumentType]
     reset_peak_memory()
@@ -70,21 +73,25 @@ def measure(name: str, folder: Path, quality: str, device: str) -> None:
     scene = reconstruct(capture, options).to("cpu")
     seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     peak = peak_memory_bytes() / 2**20
-    served = options.served(capture)
+    cost = f"seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={scene.count} peak_mb={peak:.0f}"
+    sizes = [capture.limited(size) for size in longest_px] or [options.served(capture)]
+    for photos in (size.select(held_out(len(size), EVERY)) for size in sizes):
+        print(f"capture={name} quality={quality} device={device} {compare(scene, photos)} {cost}", flush=True)
+
+
+def compare(scene: Gaussians, photos: PosedImages) -> str:
+    """The part of the line that says how close the renders come to the photos."""
     rows: list[tuple[float, ...]] = []
-    for i in torch.nonzero(held_out(len(served), EVERY)).flatten().tolist():
-        truth = served.image(i)
-        picture = render(scene, served.cameras[i]).color[0].clamp(0, 1)
+    for i in range(len(photos)):
+        truth = photos.image(i)
+        picture = render(scene, photos.cameras[i]).color[0].clamp(0, 1)
         fitted = fit_color(picture, truth)
         found = (psnr(picture, truth), psnr(fitted, truth), ssim(picture, truth), flip(picture, truth))
         rows.append(tuple(float(value) for value in found))
     decibel, of_fitted, similarity, visible = (sum(column) / len(rows) for column in zip(*rows, strict=True))
-    print(
-        f"capture={name} quality={quality} device={device} views={len(rows)} "
-        f"psnr={decibel:.2f} psnr_fit={of_fitted:.2f} "
-        f"ssim={similarity:.3f} flip={visible:.4f} "
-        f"seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={scene.count} peak_mb={peak:.0f}",
-        flush=True,
+    return (
+        f"views={len(rows)} longest_px={int(photos.cameras.sizes.max())} psnr={decibel:.2f} psnr_fit={of_fitted:.2f} "
+        f"ssim={similarity:.3f} flip={visible:.4f}"
     )
 
 
@@ -93,11 +100,12 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--quality", nargs="+", default=["draft", "standard"])
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--longest-px", nargs="+", type=int, default=[], help="compare at these sizes")
     parser.add_argument("--work", type=Path, default=Path("captures"), help="where posed captures are kept")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one:
-        measure(args.one, args.folder, args.quality[0], args.device)
+        measure(args.one, args.folder, args.quality[0], args.device, args.longest_px)
         return 0
     failed = 0
     for capture in find_captures(args.folder):
@@ -109,7 +117,8 @@ def main() -> int:
             continue
         for quality in args.quality:
             words = ["--quality", quality, "--device", args.device, "--one", name_of(capture)]
-            command = [sys.executable, __file__, str(folder), *words]
+            sizes = ["--longest-px", *map(str, args.longest_px)] if args.longest_px else []
+            command = [sys.executable, __file__, str(folder), *words, *sizes]
             failed += subprocess.run(command, check=False).returncode != 0
     return 1 if failed else 0
 
