@@ -45,7 +45,7 @@ class _Preset:
 _PRESETS: dict[str, _Preset] = {
     "draft": _Preset(1_000, 25_000, 640),
     "standard": _Preset(4_000, 100_000, 960, beyond_draft=True),
-    "high": _Preset(10_000, 200_000, 960, beyond_draft=True),
+    "high": _Preset(10_000, 100_000, 960, beyond_draft=True),
     # as published: 3DGS-MCMC's settings, and the usual size of images
     "full": _Preset(30_000, 1_000_000, 1600, EVERY_PIXEL, density="mcmc"),
 }
@@ -56,7 +56,7 @@ class ReconstructOptions:
     """Length, size and seed of a reconstruction; None takes the value of the quality."""
 
     quality: Quality = "standard"
-    """`draft`: 1000 steps, 25k Gaussians; `standard`: 4000, 100k; `high`: 10000, 200k, for a CPU over lunch; `full`:
+    """`draft`: 1000 steps, 25k Gaussians; `standard`: 4000, 100k; `high`: 10000, 100k; `full`:
     30000, 1M, 3DGS-MCMC as published (GPU)."""
     iterations: int | None = None
     """Steps, one view each; every schedule scales with it."""
