@@ -23,7 +23,6 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as cli.py does; read when torch and numba load
 
-
 from splatgraft.core.flip import flip
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import fit_color, psnr, ssim
@@ -100,7 +99,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--quality", nargs="+", default=["draft", "standard"])
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
-    parser.add_argument("--longest-px", nargs="+", type=int, default=[], help="compare at these sizes")
+    parser.add_argument("--longest-px", nargs="*", type=int, default=[], help="compare at these sizes")
     parser.add_argument("--work", type=Path, default=Path("captures"), help="where posed captures are kept")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -117,7 +116,7 @@ def main() -> int:
             continue
         for quality in args.quality:
             words = ["--quality", quality, "--device", args.device, "--one", name_of(capture)]
-            sizes = ["--longest-px", *map(str, args.longest_px)] if args.longest_px else []
+            sizes = ["--longest-px", *map(str, args.longest_px)]
             command = [sys.executable, __file__, str(folder), *words, *sizes]
             failed += subprocess.run(command, check=False).returncode != 0
     return 1 if failed else 0
