@@ -2,7 +2,6 @@
 # make dev: also what the checks need; make test: all checks; make test-fast: those that take a minute;
 # make blender: Blender as a Python module in .venv-blender, for `splatgraft synth --blender-python`;
 # make exam NUMBER=...: the light transfer measured on new scenes drawn from a number that no exam has used;
-# make train-light SCENES=...: networks that correct the light, from scenes rendered for it;
 # make browser: Chromium, for the editor's tests.
 SHELL := /bin/bash
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -52,13 +51,6 @@ blender: .venv-blender/.installed
 exam: install blender
 	@test -n "$(NUMBER)" || { echo "make: expected NUMBER=..., a number that no exam has used, found none"; exit 1; }
 	$(BIN)/python benchmarks/exam $(NUMBER)
-
-# the correction of the light, from nothing: SCENES=100 are rendered (five minutes of a core each; a stopped run goes on)
-.PHONY: train-light
-SCENES ?= 100
-train-light: install blender
-	$(BIN)/splatgraft synth lights build/lights --scenes $(SCENES) --blender-python .venv-blender/bin/python
-	$(BIN)/splatgraft train light build/lights --out build/light
 
 # Debian's Chromium with software OpenGL, for the stories of the editor; apt is used by root alone
 browser:

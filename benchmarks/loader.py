@@ -33,13 +33,13 @@ from torch import Tensor
 
 import splatgraft
 from splatgraft.core.images import list_images, read_mask, read_rgb
-from splatgraft.training.latent_cache import LatentCache
-from splatgraft.training.loop_options import LoopOptions
-from splatgraft.training.pair_loader import PairLoader
-from splatgraft.training.sources.packed_pairs import PackedPairs, pack_pairs
-from splatgraft.training.sources.pair_source import Mixture, PairSource, Role, crop_to_size, split_mixture
-from splatgraft.training.sources.relit_pairs import RelitPairs, RelitSample, write_manifest, write_sample
-from splatgraft.workflow.training_data import DataOptions, open_training_data
+from splatgraft_paper.training.latent_cache import LatentCache
+from splatgraft_paper.training.loop_options import LoopOptions
+from splatgraft_paper.training.pair_loader import PairLoader
+from splatgraft_paper.training.sources.packed_pairs import PackedPairs, pack_pairs
+from splatgraft_paper.training.sources.pair_source import Mixture, PairSource, Role, crop_to_size, split_mixture
+from splatgraft_paper.training.sources.relit_pairs import RelitPairs, RelitSample, write_manifest, write_sample
+from splatgraft_paper.training.training_data import DataOptions, open_training_data
 
 PAPER_PAIRS_PER_SECOND = 50_000 * 4 / (2 * 24 * 3600) / 4
 """Of one H100: 50,000 steps of 4 pairs, about two days, four GPUs (paper, Sec. 5.3)."""

@@ -16,11 +16,11 @@ from PIL import Image
 
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats import write_capture
-from splatgraft.synthesis.benchmark import rendered_cameras, sparse_points
-from splatgraft.synthesis.cameras import capture_cameras
-from splatgraft.synthesis.jobs import Job, RenderSize, Take, render_job
-from splatgraft.synthesis.pairs import make_scene
-from splatgraft.synthesis.scene import Lamp, Scene
+from splatgraft_paper.synthesis.benchmark import rendered_cameras, sparse_points
+from splatgraft_paper.synthesis.cameras import capture_cameras
+from splatgraft_paper.synthesis.jobs import Job, RenderSize, Take, render_job
+from splatgraft_paper.synthesis.pairs import make_scene
+from splatgraft_paper.synthesis.scene import Lamp, Scene
 
 SEED = 71000
 VIEWS = 28

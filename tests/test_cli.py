@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splatgraft.cli import COMMANDS, GROUPS, main, module_of
+from splatgraft.cli import GROUPS, commands, main
 from splatgraft.runtime.optional_dependencies import OPTIONAL_DEPENDENCIES, extra_providing
 
 ROOT = Path(__file__).parents[1]
@@ -15,9 +15,9 @@ ROOT = Path(__file__).parents[1]
 def test_help_names_every_command_and_every_command_has_a_step(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     printed = capsys.readouterr().out
-    for command in COMMANDS:
+    for command in commands():
         assert f"  {command} " in printed
-        assert hasattr(importlib.import_module(module_of(command)), "COMMAND")
+        assert hasattr(importlib.import_module(commands()[command].module), "COMMAND")
 
 
 def test_every_file_in_commands_is_a_command() -> None:
@@ -25,13 +25,13 @@ def test_every_file_in_commands_is_a_command() -> None:
     # what `edit` imports once its page is served, as torch takes seconds, and its child processes
     parts = {"__init__.py", "edit_process.py", "edit_project.py", "edit_states.py", "export_job.py"}
     files = {path for path in folder.rglob("*.py") if path.name not in parts}
-    modules = {Path(importlib.import_module(module_of(command)).__file__ or "") for command in COMMANDS}
+    modules = {Path(importlib.import_module(commands()[command].module).__file__ or "") for command in commands()}
     assert files == modules
 
 
 def test_a_group_lists_its_commands_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:
-    for group in GROUPS:
-        inner = [command for command in COMMANDS if command.startswith(f"{group} ")]
+    for group in (*GROUPS, "paper", "paper synth"):
+        inner = [command for command in commands() if command.startswith(f"{group} ")]
         assert main([group, "--help"]) == 0
         printed = capsys.readouterr().out
         assert f"usage: splatgraft {group}" in printed
@@ -41,7 +41,7 @@ def test_a_group_lists_its_commands_and_refuses_others(capsys: pytest.CaptureFix
         assert main([group]) == 2
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", commands())
 def test_each_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as leaving:
         main([*command.split(), "--help"])

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from splatgraft.core.images import list_images, read_mask, read_rgb, resize, write_image
-from splatgraft.training.sources.relit_pairs import RelitSample, write_manifest, write_sample
+from splatgraft_paper.training.sources.relit_pairs import RelitSample, write_manifest, write_sample
 
 BANANAS = Path(__file__).parents[1] / "src" / "splatgraft" / "demo_captures" / "bananas"
 

@@ -32,7 +32,7 @@ from exam.summary import summarize_light, summarize_row, summary_markdown
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
-from splatgraft.synthesis.benchmark import SCENES
+from splatgraft_paper.synthesis.benchmark import SCENES
 
 _ROOT = Path(__file__).resolve().parents[2]
 

@@ -2,9 +2,9 @@
 
 import random
 
-from splatgraft.synthesis.benchmark import BenchmarkScene, BenchmarkSize, draw_scene
-from splatgraft.synthesis.jobs import RenderSize
-from splatgraft.synthesis.pairs import KINDS
+from splatgraft_paper.synthesis.benchmark import BenchmarkScene, BenchmarkSize, draw_scene
+from splatgraft_paper.synthesis.jobs import RenderSize
+from splatgraft_paper.synthesis.pairs import KINDS
 
 TRAINING_NUMBER = 0
 """Its scenes are for development; every other number is used for one exam only."""

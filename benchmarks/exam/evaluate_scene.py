@@ -12,8 +12,8 @@ from exam.rows import make_row
 from exam.scene_files import ExamScene, TrueView
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_image
-from splatgraft.evaluation.benchmark.view_metrics import measure_view
 from splatgraft.relighting import Relit
+from splatgraft_paper.benchmark.view_metrics import measure_view
 
 LIGHT_ROW = "transfer"
 """The row whose estimates of light and normals are measured."""

@@ -4,9 +4,9 @@ from pathlib import Path
 
 from exam.draw import SIZE
 from splatgraft.runtime.workers import run_tasks
-from splatgraft.synthesis.benchmark import BenchmarkScene, find_defect, gather, plan
-from splatgraft.synthesis.jobs import render_tasks
-from splatgraft.workflow.benchmark.true_light_file import TRUE_LIGHT_FILE, write_true_light
+from splatgraft_paper.benchmark.true_light_file import TRUE_LIGHT_FILE, write_true_light
+from splatgraft_paper.synthesis.benchmark import BenchmarkScene, find_defect, gather, plan
+from splatgraft_paper.synthesis.jobs import render_tasks
 
 
 def render_scene(which: BenchmarkScene, out: Path, blender_python: Path, *, jobs: int) -> Path:

@@ -21,11 +21,11 @@ from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.project.layout import PLACEMENT_FILE
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.relighting import Light, SourceScene
-from splatgraft.relighting.light.true_light import light_from_probe
 from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.benchmark.measure_method import true_view
-from splatgraft.workflow.benchmark.scene import HELD_OUT_EVERY, GroundTruthScene, compose_scene
+from splatgraft_paper.benchmark.measure_method import true_view
+from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY, GroundTruthScene, compose_scene
+from splatgraft_paper.benchmark.true_light import light_from_probe
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 import splatgraft
-from splatgraft.cli import COMMANDS, module_of
+from splatgraft.cli import commands
 from splatgraft.runtime.weights.catalogue import CATALOGUE
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,13 +48,13 @@ def _commands_page() -> Iterator[str]:
     yield "# Commands\n"
     yield "Made from the code of each command; `splatgraft COMMAND --help` prints the same.\n"
     yield "| command | purpose |\n| --- | --- |"
-    for name, purpose in COMMANDS.items():
+    for name, purpose in ((name, one.summary) for name, one in commands().items()):
         yield f"| [`{name}`](#{_anchor(name)}) | {purpose} |"
     yield (
         "\n`splatgraft COMMAND project.toml` runs the project up to that step. `--debug`, with any command, shows the"
         " traceback of an error. The exit code is 0 after success, 2 after an error in the input, 130 after Ctrl-C."
     )
-    for name, purpose in COMMANDS.items():
+    for name, purpose in ((name, one.summary) for name, one in commands().items()):
         yield f"\n## splatgraft {name} {{#{_anchor(name)}}}\n"
         yield from _parser_section(_parser(name), purpose)
 
@@ -105,7 +105,7 @@ def _weights_page() -> Iterator[str]:
 
 
 def _parser(name: str) -> Any:
-    module = importlib.import_module(module_of(name))
+    module = importlib.import_module(commands()[name].module)
     with warnings.catch_warnings():
         # tyro has no other public way to its options; constraints.txt pins its version
         warnings.simplefilter("ignore", DeprecationWarning)

@@ -4,6 +4,12 @@ import importlib
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+
+ENTRY_POINTS = "splatgraft.commands"
+"""Group of entry points by which other packages add commands."""
 
 _TABLE = (
     # command, module in splatgraft.commands, summary
@@ -26,37 +32,44 @@ _TABLE = (
     ("consolidate", "steps.consolidate", "fit the colours of the scene to the harmonised views"),
     ("evaluate", "steps.evaluate", "compare, picture and report"),
     ("export", "export", "write a scene or a result as a page, for another program, or as pictures"),
-    ("evaluate benchmark", "evaluate_benchmark", "measure methods on scenes with a known truth"),
-    ("evaluate paper", "evaluate_paper", "write the paper's tables from the authors' data set"),
-    ("synth pairs", "synth.pairs", "render training pairs with Blender"),
-    ("synth benchmark", "synth.benchmark", "render benchmark scenes with ground truth"),
-    ("synth check", "synth.check", "find damaged or empty pictures among rendered pairs or scenes"),
-    ("synth sheet", "synth.sheet", "one picture with all rendered scenes of a folder"),
-    ("synth generated", "synth.generated", "make training pairs of pictures that FLUX paints"),
-    ("synth orida", "synth.orida", "make training pairs of ORIDa's photographs"),
-    ("synth spheres", "synth.spheres", "make training pairs of balls in a second each, to learn training"),
-    ("synth lights", "synth.lights", "make examples for learning the light from captures"),
-    ("synth pack", "synth.pack", "pack training pairs into tar files, also for object storage"),
-    ("train flux", "train.flux", "train the paper's harmoniser on pairs"),
-    ("train compact", "train.compact", "train the compact harmoniser on rendered pairs"),
-    ("train light", "train.light", "train the correction of the estimated light"),
-    ("train removal", "train.removal", "train the object removal on pairs"),
-    ("train embed", "train.embed", "compute the empty prompt's embeddings once"),
     ("weights list", "weights.list", "say which networks there are, their licences, sizes, and what is fetched"),
     ("weights fetch", "weights.fetch", "fetch the weights of a network"),
     ("weights verify", "weights.verify", "compare fetched weights with their hashes"),
     ("doctor", "doctor", "say what is installed, what is missing and how to get it"),
 )
 
-COMMANDS = {command: summary for command, _, summary in _TABLE}
-"""The summary of each command."""
-
-GROUPS = {
-    "synth": "synthetic training pairs and benchmark scenes",
-    "weights": "weights of the networks of other people",
-    "train": "training of the harmonisers and of the object removal",
-}
+GROUPS = {"weights": "weights of the networks of other people"}
 """First words that are no commands by themselves, with what their commands have in common."""
+
+_RENAMED = {
+    "evaluate benchmark": "paper benchmark",
+    "evaluate paper": "paper tables",
+    "synth": "paper synth",
+    "train": "paper train",
+}
+"""Commands of version 0.1.0 that are understood for one more version."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command of the command line."""
+
+    module: str
+    """Full name of the module that defines `COMMAND`, the dataclass of its arguments."""
+    summary: str
+    """What it does, in a few words."""
+
+
+@cache
+def commands() -> Mapping[str, Command]:
+    """All commands by name: those of this package, and those that installed packages add (entry point `ENTRY_POINTS`).
+
+    Such a package gives rows (name, full module, summary), each name beginning with the entry point's.
+    """
+    found = {name: Command(f"splatgraft.commands.{module}", summary) for name, module, summary in _TABLE}
+    for entry in entry_points(group=ENTRY_POINTS):
+        found |= {name: Command(module, summary) for name, module, summary in entry.load()}
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
-        print(_help(_HEAD, COMMANDS) + _TAIL)
+        print(_help(_HEAD, {name: one.summary for name, one in commands().items()}) + _TAIL)
         return 0
     if words[0] == "--version":
         from splatgraft import __version__
@@ -97,20 +110,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    if words[:1] and words[0] in GROUPS and " ".join(words[:2]) not in COMMANDS:
-        return _group(words[0], words[1:])
-    if not words or words[0] not in {command.split()[0] for command in COMMANDS}:
-        found = words[0] if words else "nothing"
-        raise ValueError(f"splatgraft: expected a command among {', '.join(COMMANDS)}; found {found}")
-    length = 2 if " ".join(words[:2]) in COMMANDS else 1
+    words = _present_name(words)
+    table = commands()
+    lengths = (length for length in range(min(3, len(words)), 0, -1) if " ".join(words[:length]) in table)
+    length = next(lengths, 0)
+    if not length:
+        return _group(words)
     command, rest = " ".join(words[:length]), words[length:]
-    if ".steps." in module_of(command) and len(rest) == 1 and rest[0].endswith(".toml"):
+    if ".steps." in table[command].module and len(rest) == 1 and rest[0].endswith(".toml"):
         command, rest = "run", [rest[0], "--to", command]  # `reconstruct project.toml`: the project up to there
     import tyro
 
     from splatgraft.runtime.console import Console
 
-    console, module = Console(), importlib.import_module(module_of(command))
+    console, module = Console(), importlib.import_module(table[command].module)
     if hasattr(module, "current_arguments"):
         rest = module.current_arguments(rest, console.say)
     options = tyro.cli(
@@ -128,19 +141,35 @@ def _dispatch(words: list[str]) -> int:
     return 0
 
 
-def module_of(command: str) -> str:
-    """The module that defines `COMMAND` for a command, e.g. "evaluate benchmark"."""
-    return "splatgraft.commands." + {name: module for name, module, _ in _TABLE}[command]
+def _present_name(words: list[str]) -> list[str]:
+    """The words with a command of version 0.1.0 replaced by its present name, which is said."""
+    for old, new in _RENAMED.items():
+        length = len(old.split())
+        if " ".join(words[:length]) == old:
+            print(f"splatgraft {old} is now splatgraft {new}; the next version drops the old name", file=sys.stderr)
+            return [*new.split(), *words[length:]]
+    return words
 
 
-def _group(group: str, rest: list[str]) -> int:
-    inner = {name: summary for name, summary in COMMANDS.items() if name.split()[0] == group}
-    if rest[:1] in (["-h"], ["--help"]):
+def _group(words: list[str]) -> int:
+    """Help on the commands that begin with these words, or an error that lists them."""
+    wants_help = bool(words) and words[-1] in ("-h", "--help")
+    first = words[:-1] if wants_help else words
+    while first and not _below(first):
+        first = first[:-1]
+    inner = _below(first) if first else {name: one.summary for name, one in commands().items()}
+    if wants_help and first == words[:-1]:
+        group = " ".join(first)
         usage = f"usage: splatgraft {group} COMMAND [OPTIONS]; `splatgraft {group} COMMAND --help` says more"
-        print(_help(f"{usage}\n\n{GROUPS[group]}", inner))
+        print(_help("\n\n".join(filter(None, (usage, GROUPS.get(group)))), inner))
         return 0
-    found = f"{group} {rest[0]}" if rest else group
+    found = " ".join(words[: len(first) + 1]) or "nothing"
     raise ValueError(f"splatgraft: expected a command among {', '.join(inner)}; found {found}")
+
+
+def _below(first: Sequence[str]) -> dict[str, str]:
+    start = " ".join([*first, ""])
+    return {name: one.summary for name, one in commands().items() if name.startswith(start)}
 
 
 _HEAD = "usage: splatgraft COMMAND [OPTIONS]; `splatgraft COMMAND --help` says more"
@@ -151,7 +180,7 @@ _TAIL = """
 
 
 def _help(head: str, commands: Mapping[str, str]) -> str:
-    lines = [f"  {name:<18} {summary}" for name, summary in commands.items()]
+    lines = [f"  {name:<22} {summary}" for name, summary in commands.items()]
     return "\n".join([f"{head}\n\ncommands:", *lines])
 
 

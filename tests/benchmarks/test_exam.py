@@ -22,7 +22,7 @@ from splatgraft.evaluation import Truth
 from splatgraft.relighting import Light, LightSource, SourceScene
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.rendering import render
-from splatgraft.synthesis import benchmark, pairs
+from splatgraft_paper.synthesis import benchmark, pairs
 
 SUN = LightSource(direction=(0.0, 0.0, 1.0), irradiance=(3.0, 3.0, 3.0))
 LIGHT = Light(sources=(SUN,), ambient=fit_ambient(torch.tensor([0.5, 0.5, 0.5])))

@@ -6,11 +6,11 @@ import loader
 import pytest
 import torch
 
-from splatgraft.training.latent_cache import LatentCache
-from splatgraft.training.loop_options import LoopOptions
-from splatgraft.training.pair_loader import PairLoader
-from splatgraft.training.sources.packed_pairs import PackedPairs, pack_pairs
-from splatgraft.training.sources.pair_source import split_mixture
+from splatgraft_paper.training.latent_cache import LatentCache
+from splatgraft_paper.training.loop_options import LoopOptions
+from splatgraft_paper.training.pair_loader import PairLoader
+from splatgraft_paper.training.sources.packed_pairs import PackedPairs, pack_pairs
+from splatgraft_paper.training.sources.pair_source import split_mixture
 
 TOY = loader.Size(width=64, height=48, photographs=3, steps=3, batch=2, readers=(0, 2))
 

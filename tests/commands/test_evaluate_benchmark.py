@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from splatgraft.cli import main
-from splatgraft.commands.evaluate_benchmark import EvaluateBenchmark
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.benchmark.methods import Method
+from splatgraft_paper.benchmark.methods import Method
+from splatgraft_paper.commands.benchmark import EvaluateBenchmark
 
 SCENES = Path(__file__).parents[2] / "data" / "benchmark"
 QUICK = ReconstructOptions(quality="draft", device="cpu", iterations=300, budget=8000)

@@ -13,13 +13,13 @@ from random_lpips import write_random_lpips
 from shapes import ring, surfels
 
 from splatgraft.cli import main
-from splatgraft.commands.evaluate_paper import EvaluatePaper
 from splatgraft.core.gaussians import concatenate
 from splatgraft.core.image_metrics import psnr
 from splatgraft.core.images import read_rgb
 from splatgraft.formats import write_cameras, write_gaussians
 from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
+from splatgraft_paper.commands.tables import EvaluatePaper
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,12 @@ from paper_data import parts_of_view, put
 from syncom_data import COMPOSED, COMPOSITION, SCENE_FROM_OBJECT, write_syncom
 
 from splatgraft.cli import main
-from splatgraft.commands.evaluate_paper import EvaluatePaper
 from splatgraft.core.image_metrics import psnr
 from splatgraft.formats.placement import read_placement
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.paper.data_layout import as_toml, find_layout
+from splatgraft_paper.commands.tables import EvaluatePaper
+from splatgraft_paper.tables.data_layout import as_toml, find_layout
 
 QUICK = ReconstructOptions(quality="draft", device="cpu", iterations=100, budget=3000)
 

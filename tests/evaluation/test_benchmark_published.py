@@ -3,7 +3,7 @@
 import huggingface_hub
 import pytest
 
-from splatgraft.evaluation.benchmark.published_datasets import DOT3D, SYNCOM, download
+from splatgraft_paper.tables.published_datasets import DOT3D, SYNCOM, download
 
 
 def test_a_hub_that_cannot_be_reached_is_one_line(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
 from splatgraft.harmonization.flux.network import velocity
 from splatgraft.harmonization.flux.weights.placement import activation_bytes as tokens_bytes
 from splatgraft.harmonization.flux.weights.placement import choose_placement, decoder_bytes
-from splatgraft.training.memory_estimate import (
+from splatgraft_paper.training.memory_estimate import (
     MemoryOptions,
     TransformerSize,
     activation_bytes,

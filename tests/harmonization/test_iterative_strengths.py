@@ -95,7 +95,7 @@ def test_the_benchmark_s_updates_hand_each_strength_of_their_schedule_to_the_net
     from splatgraft.formats import write_cameras, write_gaussians
     from splatgraft.project.step import perform
     from splatgraft.runtime.console import Console
-    from splatgraft.workflow.benchmark.methods import UpdateIteratively
+    from splatgraft_paper.benchmark.methods import UpdateIteratively
 
     g = torch.Generator().manual_seed(0)
     n = 40

@@ -13,15 +13,10 @@ import pytest
 import torch
 from PIL import Image
 
-from splatgraft.harmonization import (
-    HarmonizerContext,
-    HarmonizerInputs,
-    ICLightOptions,
-    ImageEditingOptions,
-    make_harmonizer,
-)
-from splatgraft.harmonization.peers.image_editing import PROMPT
-from splatgraft.harmonization.peers.mv_colight import MVCoLight, network_input
+from splatgraft.harmonization import HarmonizerContext, HarmonizerInputs, make_harmonizer
+from splatgraft_paper.peers.image_editing import PROMPT
+from splatgraft_paper.peers.mv_colight import MVCoLight, network_input
+from splatgraft_paper.peers.options import ImageEditingOptions, method_options
 
 
 def view(h=40, w=60):
@@ -35,7 +30,6 @@ def view(h=40, w=60):
 
 MISSING = {
     "lbm": "harmonizer lbm: expected the package lbm",
-    "ic-light": "harmonizer ic-light: expected --weights iclight_sd15_fbc.safetensors",
     "mv-colight": "harmonizer mv-colight: expected --checkout with the code of",
     "image-editing": "--max-cost: expected at least 0.04 US dollars, found 0.00",
     "flux": "harmonizer flux: expected --weights FOLDER or a hub id",
@@ -45,7 +39,7 @@ MISSING = {
 @pytest.mark.parametrize("name", MISSING)
 def test_what_is_missing_is_one_line(name):
     with pytest.raises(ValueError, match=MISSING[name]) as error:
-        make_harmonizer(name)
+        make_harmonizer(method_options(name))
     assert "\n" not in str(error.value)
 
 
@@ -57,7 +51,7 @@ def test_lbm_is_asked_and_kept_inside_the_object(monkeypatch):
     inference.evaluate = lambda model, image, steps: Image.new("RGB", (8, 8), (255, 0, 0))
     monkeypatch.setitem(sys.modules, "lbm", package)
     monkeypatch.setitem(sys.modules, "lbm.inference", inference)
-    image = make_harmonizer("lbm").harmonize(view()).image
+    image = make_harmonizer(method_options("lbm")).harmonize(view()).image
     assert asked == [("jasperai/LBM_relighting", "cpu")]
     assert torch.equal(image[view().mask == 0], view().composite[view().mask == 0])
     assert torch.equal(image[15, 30], torch.tensor([1.0, 0.0, 0.0]))
@@ -175,104 +169,3 @@ def test_mv_colight_s_squares_leave_no_seam(other_python):
     assert float(row[-1]) < 0.3
     # the change of a factor of two is spread over half a square: 32 of these pixels
     assert float((row[1:] - row[:-1]).abs().max()) < 0.03
-
-
-def ic_light_files(folder):
-    from tiny_models import TEXT, removal_folder
-
-    from splatgraft.harmonization.flux.weights.tensor_file import read_tensors, write_tensors
-
-    base = removal_folder(folder / "base")
-    weights = read_tensors(base / "unet" / "diffusion_pytorch_model.safetensors")
-    g = torch.Generator().manual_seed(0)
-    weights["conv_in.weight"] = torch.cat([weights["conv_in.weight"]] * 3, 1)
-    difference = {name: 0.01 * torch.randn(tensor.shape, generator=g) for name, tensor in weights.items()}
-    write_tensors(folder / "iclight_sd15_fbc.safetensors", difference)
-    prompts = {name: torch.randn(5, TEXT, generator=g) for name in ("positive", "negative")}
-    write_tensors(base / "ic_light_prompt.safetensors", prompts)
-    return ICLightOptions(weights=str(folder / "iclight_sd15_fbc.safetensors"), base=str(base)), difference, prompts
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_ic_light_adds_its_difference_to_the_base(tmp_path):
-    pytest.importorskip("diffusers")
-    from splatgraft.harmonization.flux.weights.tensor_file import write_tensors
-
-    options, difference, _ = ic_light_files(tmp_path)
-    image = make_harmonizer(options).harmonize(view()).image
-    assert image.shape == (40, 60, 3)
-    assert bool(image.isfinite().all())
-    write_tensors(
-        tmp_path / "iclight_sd15_fbc.safetensors", {n: t for n, t in difference.items() if n != "conv_in.weight"}
-    )
-    with pytest.raises(ValueError, match=r"iclight_sd15_fbc.safetensors: expected conv_in.weight of .*, found none"):
-        make_harmonizer(options)
-    (tmp_path / "base" / "ic_light_prompt.safetensors").unlink()
-    with pytest.raises(ValueError, match=r"ic_light_prompt.safetensors: expected IC-Light's prompt .*train embed"):
-        make_harmonizer(options)
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_ic_light_samples_with_the_settings_of_its_authors(tmp_path):
-    pytest.importorskip("diffusers")
-    from splatgraft.harmonization.peers.ic_light import PUBLISHED
-
-    # gradio_demo_bg.py at commit 0351326f: the scheduler's arguments, and the defaults of its sliders
-    published = {"num_train_timesteps": 1000, "beta_start": 0.00085, "beta_end": 0.012, "steps_offset": 1}
-    published |= {"algorithm_type": "sde-dpmsolver++", "use_karras_sigmas": True, "beta_schedule": "linear"}
-    found = PUBLISHED.scheduler().config
-    assert {name: found[name] for name in published} == published
-    assert (PUBLISHED.steps, PUBLISHED.guidance) == (20, 7.0)
-    options, _, prompts = ic_light_files(tmp_path)
-    harmonizer = make_harmonizer(options)
-    unet, seen = harmonizer._unet, []
-
-    class Watched(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.inner = unet
-
-        def forward(self, sample, step, prompts, return_dict):
-            seen.append((sample.clone(), prompts))
-            return self.inner(sample, step, prompts, return_dict=return_dict)
-
-    harmonizer._unet = Watched()
-    harmonizer.harmonize(view())
-    assert len(seen) == 20
-    sample, told = seen[0]
-    assert sample.shape[:2] == (2, 12)
-    assert torch.equal(sample[0], sample[1])  # both halves of the guidance see the same latents and conditions
-    assert torch.equal(told, torch.stack([prompts["negative"], prompts["positive"]]))
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_ic_light_s_sampling_is_that_of_the_stock_pipeline_with_its_hook(tmp_path):
-    diffusers = pytest.importorskip("diffusers")
-    pytest.importorskip("transformers")
-    from splatgraft.harmonization.peers.ic_light import PUBLISHED
-
-    options, _, prompts = ic_light_files(tmp_path)
-    ours = make_harmonizer(options)
-    unet = ours._unet
-    g = torch.Generator().manual_seed(5)
-    condition, start = torch.randn(1, 8, 8, 8, generator=g), torch.randn(1, 4, 8, 8, generator=g)
-    wanted_steps = ours._sample(condition, start)
-    forward = unet.forward
-
-    def hooked(sample, step, encoder_hidden_states, **named):
-        joined = torch.cat([sample, condition.expand(len(sample), -1, -1, -1)], 1)
-        return forward(joined, step, encoder_hidden_states, return_dict=False)
-
-    unet.forward = hooked
-    unet.register_to_config(in_channels=4)
-    stock = diffusers.StableDiffusionPipeline(
-        vae=ours._autoencoder.network, text_encoder=None, tokenizer=None, unet=unet, scheduler=PUBLISHED.scheduler(),
-        safety_checker=None, requires_safety_checker=False, feature_extractor=None, image_encoder=None,
-    )  # fmt: skip
-    stock.set_progress_bar_config(disable=True)
-    made = stock(
-        prompt_embeds=prompts["positive"][None], negative_prompt_embeds=prompts["negative"][None], latents=start,
-        height=64, width=64, num_inference_steps=20, guidance_scale=7.0, output_type="latent",
-        generator=torch.Generator().manual_seed(0),
-    ).images  # fmt: skip
-    assert torch.allclose(made, wanted_steps, atol=1e-3)  # 20 steps that each amplify the rounding by up to 7

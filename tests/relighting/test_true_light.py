@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from splatgraft.core.directions import even_directions
-from splatgraft.relighting.light.true_light import light_from_probe
+from splatgraft_paper.benchmark.true_light import light_from_probe
 
 H, W = 64, 128
 SUN = torch.nn.functional.normalize(torch.tensor([0.4, 0.5, 0.76]), dim=0)

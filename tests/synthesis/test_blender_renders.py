@@ -21,12 +21,11 @@ import torch
 
 from splatgraft.core.images import linear_from_srgb, read_rgb, read_straight_rgb
 from splatgraft.formats import read_capture
-from splatgraft.relighting.light.true_light import light_from_probe
 from splatgraft.runtime.workers import Task, run_tasks
-from splatgraft.synthesis import benchmark, objects, pairs
-from splatgraft.synthesis.jobs import Job, RenderSize, Take, check_blender, render_job
-from splatgraft.synthesis.light_mixtures import GroupLight, mixed_light, mixed_picture
-from splatgraft.synthesis.scene import Camera, Lamp, Material, Part, Place, Scene, World
+from splatgraft_paper.benchmark.true_light import light_from_probe
+from splatgraft_paper.synthesis import benchmark, objects, pairs
+from splatgraft_paper.synthesis.jobs import Job, RenderSize, Take, check_blender, render_job
+from splatgraft_paper.synthesis.scene import Camera, Lamp, Material, Part, Place, Scene, World
 
 PYTHON = Path(os.environ.get("SPLATGRAFT_BLENDER_PYTHON", "no-blender"))
 pytestmark = pytest.mark.skipif(
@@ -159,7 +158,7 @@ def test_a_scene_lit_from_the_left_has_its_shadow_on_the_right(tmp_path):
 def test_a_killed_job_goes_on_where_it_was_and_ends_the_same(tmp_path):
     job = pairs.plan(pairs.PairPlan(objects=1, lights=1, size=RenderSize(64, 48, 2)), 5)
     whole = rendered(job, tmp_path / "whole")
-    command = "import sys, pickle, splatgraft.synthesis.jobs as j; j.render_job(*pickle.load(sys.stdin.buffer))"
+    command = "import sys, pickle, splatgraft_paper.synthesis.jobs as j; j.render_job(*pickle.load(sys.stdin.buffer))"
     out = tmp_path / "killed"
     worker = subprocess.Popen([sys.executable, "-c", command], stdin=subprocess.PIPE, start_new_session=True)
     assert worker.stdin is not None
@@ -247,44 +246,6 @@ def test_a_sun_behind_a_wall_is_no_light_at_the_place_though_an_object_stands_ar
         suns.append(json.loads((out / "light" / "suns.json").read_text()))
     assert len(suns[0]) == 1
     assert suns[1] == []
-
-
-def test_light_groups_sum_to_the_render_with_all_lamps_and_a_mixture_to_one_with_other_lamps(tmp_path):
-    sun = Lamp("sun", (1.0, 0.9, 0.8), 3.0, direction=(1, 0, -1), size=0.01)
-    lamp = Lamp("area", (0.5, 0.7, 1.0), 60.0, location=(0, -1.5, 1.5), direction=(0, 1, -1), size=0.5)
-    both = floor_scene(lamps=[sun, lamp])
-    dimmed = floor_scene(lamps=[replace(sun, power=0.75), lamp])
-    things, camera = {"ball": (ball((0, 0, 0.3), 0.25),)}, Camera((0, -3, 1.6), (0, 0, 0.2))
-    size = RenderSize(96, 64, 64)
-
-    def job(scene, *passes):
-        takes = (
-            Take("with", scene=True, object="ball", passes=("color", *passes)),
-            Take("light", scene=True, probe=(0.0, 0.0, 0.3), passes=("color", *passes)),
-        )
-        return Job(scene, things, (camera,), takes, size)
-
-    parts = rendered(job(both, "groups"), tmp_path / "parts")
-    assert json.loads((parts / "light_groups.json").read_text()) == ["world", "lamp00", "lamp01"]
-    exposures = {}
-    for name, scene, sun_gain in (("both", both, 1.0), ("dimmed", dimmed, 0.25)):
-        whole = rendered(job(scene), tmp_path / name)
-        exposures[name] = [json.loads((at / "exposure.json").read_text())["scene"] for at in (parts, whole)]
-        gains = torch.tensor([[1.0], [sun_gain], [1.0]]).expand(3, 3) * exposures[name][1] / exposures[name][0]
-        groups = torch.from_numpy(np.load(parts / "with" / "0000_groups.npy"))
-        assert groups.shape == (3, 64, 96, 3)
-        # 64 samples, denoised one by one or together: noise of about one grey level in the mean
-        away = (mixed_picture(gains, groups) - read_rgb(whole / "with" / "0000.png")).abs()
-        assert float(away.mean()) < 0.01
-        light = GroupLight(
-            torch.from_numpy(np.load(parts / "light" / "0000.npy")),
-            tuple(json.loads((parts / "light" / "suns.json").read_text())),
-        )
-        panorama, suns = mixed_light(gains, light, ["world", "lamp00", "lamp01"])
-        wanted = torch.from_numpy(np.load(whole / "light" / "0000.npy"))
-        assert torch.allclose(panorama.mean((0, 1)).float(), wanted.mean((0, 1)), rtol=0.03)
-        true_suns = json.loads((whole / "light" / "suns.json").read_text())
-        assert suns[0]["irradiance"] == pytest.approx(true_suns[0]["irradiance"], rel=1e-4)
 
 
 def test_a_sun_lamp_is_listed_and_its_disc_is_not_in_the_panorama(tmp_path):

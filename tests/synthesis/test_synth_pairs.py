@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splatgraft.core.images import write_image
-from splatgraft.synthesis import pairs
+from splatgraft_paper.synthesis import pairs
 
 
 def write_sample(folder, seed=0):

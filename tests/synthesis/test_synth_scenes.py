@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from splatgraft.synthesis import benchmark, cameras, objects, pairs
-from splatgraft.synthesis.jobs import RenderSize, copy_shared_takes
+from splatgraft_paper.synthesis import benchmark, cameras, objects, pairs
+from splatgraft_paper.synthesis.jobs import RenderSize, copy_shared_takes
 
 
 @pytest.mark.parametrize("kind", pairs.KINDS)

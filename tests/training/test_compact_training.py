@@ -18,13 +18,13 @@ from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
 from splatgraft.harmonization.compact.weights import read_weights
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
 from splatgraft.relighting.shading.irradiance import KNOWN_LIGHTS, shade_ratio
-from splatgraft.synthesis.pairs import write_manifest
-from splatgraft.training.compact import priors
-from splatgraft.training.compact.augmentation import augment
-from splatgraft.training.compact.light_perturbation import perturb_light
-from splatgraft.training.compact.loop import CompactLoopOptions, CompactTraining, train_compact
-from splatgraft.training.compact.loss import compact_loss, region_errors
-from splatgraft.training.compact.pairs import CompactPairs, HeldOutOptions
+from splatgraft_paper.synthesis.pairs import write_manifest
+from splatgraft_paper.training.compact import priors
+from splatgraft_paper.training.compact.augmentation import augment
+from splatgraft_paper.training.compact.light_perturbation import perturb_light
+from splatgraft_paper.training.compact.loop import CompactLoopOptions, CompactTraining, train_compact
+from splatgraft_paper.training.compact.loss import compact_loss, region_errors
+from splatgraft_paper.training.compact.pairs import CompactPairs, HeldOutOptions
 
 TINY = CompactSize(widths=(8, 8, 16, 16), blocks=(1, 1, 1, 1), heads=2)
 QUICK = CompactLoopOptions(

@@ -10,13 +10,13 @@ import pytest
 import torch
 import yaml
 
-from splatgraft.training.sources.diffusion_renderer import (
+from splatgraft_paper.training.sources.diffusion_renderer import (
     DiffusionRenderer,
     RenderSize,
     forward_arguments,
     inverse_arguments,
 )
-from splatgraft.training.sources.relighters import RelightingInput
+from splatgraft_paper.training.sources.relighters import RelightingInput
 
 TABLES = json.loads((Path(__file__).parent / "diffusion_renderer_options.json").read_text())
 INVERSE, FORWARD = Path("/data/in"), Path("/data/buffers")

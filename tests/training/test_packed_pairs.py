@@ -7,9 +7,9 @@ import pytest
 import torch
 from tiny_pairs import relit_folder, rendered_folder
 
-from splatgraft.training.sources.packed_pairs import PackedPairs, pack_pairs
-from splatgraft.training.sources.relit_pairs import RelitPairs
-from splatgraft.training.sources.rendered_pairs import RenderedPairs
+from splatgraft_paper.training.sources.packed_pairs import PackedPairs, pack_pairs
+from splatgraft_paper.training.sources.relit_pairs import RelitPairs
+from splatgraft_paper.training.sources.rendered_pairs import RenderedPairs
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from tiny_models import quiet
 from tiny_pairs import relit_folder, rendered_folder
 from tiny_training import QUICK, training
 
-from splatgraft.training.sources.relit_pairs import RelitPairs
-from splatgraft.training.sources.rendered_pairs import RenderedPairs
+from splatgraft_paper.training.sources.relit_pairs import RelitPairs
+from splatgraft_paper.training.sources.rendered_pairs import RenderedPairs
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 
@@ -179,8 +179,8 @@ def test_the_first_layer_is_repeated_as_the_paper_says_or_starts_blind_to_condit
 
 
 def test_a_step_is_adam_of_the_clipped_gradient(tmp_path):
-    from splatgraft.training.processes import Processes
-    from splatgraft.training.trained_network import TrainedNetwork
+    from splatgraft_paper.training.processes import Processes
+    from splatgraft_paper.training.trained_network import TrainedNetwork
 
     layer = torch.nn.Linear(6, 3)
     loop = replace(QUICK, rate=3e-5, clip=1.0)
@@ -205,7 +205,7 @@ def test_a_step_is_adam_of_the_clipped_gradient(tmp_path):
 def test_object_removal_learns_the_velocity_of_stable_diffusion_2(tmp_path):
     from tiny_models import removal_folder
 
-    from splatgraft.training.removal_objective import RemovalObjective
+    from splatgraft_paper.training.removal_objective import RemovalObjective
 
     objective = RemovalObjective(str(removal_folder(tmp_path / "base")), lambda words: None)
     generator = torch.Generator().manual_seed(5)

@@ -3,7 +3,7 @@
 import pytest
 
 from splatgraft.cli import main
-from splatgraft.workflow.training_recipe import Recipe, TrainingCost
+from splatgraft_paper.training.training_recipe import Recipe, TrainingCost
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
 SOURCES = {"pairs": (1900, 51_000), "generated": (1600, 6500), "orida": (2000, 8000)}

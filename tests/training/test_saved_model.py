@@ -11,12 +11,12 @@ from tiny_models import quiet, removal_folder
 from tiny_pairs import rendered_folder
 from tiny_training import QUICK, measuring, silent, training
 
-from splatgraft.training import trainer
-from splatgraft.training.latent_cache import LatentCache
-from splatgraft.training.removal_objective import RemovalObjective
-from splatgraft.training.sources.pair_source import split_mixture
-from splatgraft.training.sources.rendered_pairs import RenderedPairs
-from splatgraft.training.trainer import TrainingRun, train
+from splatgraft_paper.training import trainer
+from splatgraft_paper.training.latent_cache import LatentCache
+from splatgraft_paper.training.removal_objective import RemovalObjective
+from splatgraft_paper.training.sources.pair_source import split_mixture
+from splatgraft_paper.training.sources.rendered_pairs import RenderedPairs
+from splatgraft_paper.training.trainer import TrainingRun, train
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 AVERAGED = replace(QUICK, ema=0.9, steps=4, validate_every=4)

@@ -18,8 +18,8 @@ from safetensors.torch import load_file
 from tiny_models import flux_folder, quiet
 from tiny_pairs import relit_folder
 
-from splatgraft.training.checkpoints import list_states
-from splatgraft.training.training_log import LOG_FILE, read_losses
+from splatgraft_paper.training.checkpoints import list_states
+from splatgraft_paper.training.training_log import LOG_FILE, read_losses
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 PROGRAM = Path(__file__).with_name("tiny_training.py")

@@ -14,16 +14,16 @@ pytest.importorskip("safetensors")
 
 from tiny_pairs import relit_folder, rendered_folder, shipped_samples
 
-from splatgraft.commands.synth.orida import OridaPairs
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft.runtime.console import Console
-from splatgraft.training.sources.generate import Lighting, SamplePlan, UnrelitSample, generate
-from splatgraft.training.sources.orida import Photograph, choose_balanced, read_orida
-from splatgraft.training.sources.pair_source import crop_to_size, sample_seed, split_mixture
-from splatgraft.training.sources.prompts import ANGLES, ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
-from splatgraft.training.sources.relighters import RelightingInput, SilhouetteRelighter, inflated_normals
-from splatgraft.training.sources.relit_pairs import RelitPairs
-from splatgraft.training.sources.rendered_pairs import RenderedPairs
+from splatgraft_paper.commands.synth.orida import OridaPairs
+from splatgraft_paper.training.sources.generate import Lighting, SamplePlan, UnrelitSample, generate
+from splatgraft_paper.training.sources.orida import Photograph, choose_balanced, read_orida
+from splatgraft_paper.training.sources.pair_source import crop_to_size, sample_seed, split_mixture
+from splatgraft_paper.training.sources.prompts import ANGLES, ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
+from splatgraft_paper.training.sources.relighters import RelightingInput, SilhouetteRelighter, inflated_normals
+from splatgraft_paper.training.sources.relit_pairs import RelitPairs
+from splatgraft_paper.training.sources.rendered_pairs import RenderedPairs
 
 
 def environment(folder: Path, name: str, bright: str) -> Path:

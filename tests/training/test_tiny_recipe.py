@@ -9,9 +9,9 @@ pytest.importorskip("diffusers")
 from tiny_models import quiet
 
 from splatgraft.harmonization.flux.weights.folder import FluxFolder
-from splatgraft.synthesis.spheres import render_spheres
-from splatgraft.training.flux_objective import FluxObjective, FluxTraining
-from splatgraft.training.tiny_base import TinyBaseOptions, write_tiny_base
+from splatgraft_paper.synthesis.spheres import render_spheres
+from splatgraft_paper.training.flux_objective import FluxObjective, FluxTraining
+from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 

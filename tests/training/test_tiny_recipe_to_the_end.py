@@ -16,8 +16,8 @@ from splatgraft.core.image_metrics import psnr
 from splatgraft.harmonization import make_harmonizer
 from splatgraft.harmonization.interface import HarmonizerInputs
 from splatgraft.harmonization.options import FluxOptions, HarmonizerContext
-from splatgraft.training.sources.relit_pairs import RelitPairs
-from splatgraft.training.tiny_base import TinyBaseOptions, write_tiny_base
+from splatgraft_paper.training.sources.relit_pairs import RelitPairs
+from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
 pytestmark = [*quiet, pytest.mark.slow, pytest.mark.filterwarnings("ignore::UserWarning")]
 

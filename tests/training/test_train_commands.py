@@ -16,8 +16,8 @@ from tiny_models import flux_folder, quiet, removal_folder
 from tiny_pairs import relit_folder, rendered_folder, shipped_samples
 
 from splatgraft.cli import main
-from splatgraft.training.sources.relit_pairs import RelitPairs
-from splatgraft.training.training_log import read_losses
+from splatgraft_paper.training.sources.relit_pairs import RelitPairs
+from splatgraft_paper.training.training_log import read_losses
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 SMALL = ["--size", "32x32", "--batch", "2", "--precision", "no", "--cpu", "--steps", "3", "--validation-pairs", "1"]

@@ -18,14 +18,14 @@ from tiny_training import QUICK, silent, training
 from splatgraft.core.images import read_rgb
 from splatgraft.harmonization import FluxOptions, HarmonizerInputs, make_harmonizer
 from splatgraft.harmonization.flux.weights.tensor_file import write_tensors
-from splatgraft.training.flux_objective import FluxObjective, FluxTraining
-from splatgraft.training.latent_cache import LatentCache
-from splatgraft.training.removal_objective import RemovalObjective
-from splatgraft.training.sources.pair_source import crop_pair_to_size, split_mixture
-from splatgraft.training.sources.relit_pairs import RelitPairs
-from splatgraft.training.sources.rendered_pairs import RenderedPairs
-from splatgraft.training.trainer import TrainingRun, train
-from splatgraft.training.training_log import LOG_FILE, read_losses
+from splatgraft_paper.training.flux_objective import FluxObjective, FluxTraining
+from splatgraft_paper.training.latent_cache import LatentCache
+from splatgraft_paper.training.removal_objective import RemovalObjective
+from splatgraft_paper.training.sources.pair_source import crop_pair_to_size, split_mixture
+from splatgraft_paper.training.sources.relit_pairs import RelitPairs
+from splatgraft_paper.training.sources.rendered_pairs import RenderedPairs
+from splatgraft_paper.training.trainer import TrainingRun, train
+from splatgraft_paper.training.training_log import LOG_FILE, read_losses
 
 pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 ROLES = RemovalObjective.roles

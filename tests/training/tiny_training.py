@@ -17,12 +17,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from tiny_models import flux_folder
 from tiny_pairs import relit_folder
 
-from splatgraft.training.flux_objective import FluxObjective, FluxTraining
-from splatgraft.training.latent_cache import LatentCache
-from splatgraft.training.loop_options import LoopOptions
-from splatgraft.training.sources.pair_source import split_mixture
-from splatgraft.training.sources.relit_pairs import RelitPairs
-from splatgraft.training.trainer import TrainingRun, train
+from splatgraft_paper.training.flux_objective import FluxObjective, FluxTraining
+from splatgraft_paper.training.latent_cache import LatentCache
+from splatgraft_paper.training.loop_options import LoopOptions
+from splatgraft_paper.training.sources.pair_source import split_mixture
+from splatgraft_paper.training.sources.relit_pairs import RelitPairs
+from splatgraft_paper.training.trainer import TrainingRun, train
 
 QUICK = LoopOptions(
     steps=6, batch=2, rate=1e-3, precision="no", save_every=2, validate_every=3, validation_pairs=2, cpu=True
@@ -46,7 +46,7 @@ def training(tmp_path, name, loop=QUICK, *, pairs=2, progress=silent, say=silent
 
 def measuring(measured):
     """Replaces the loop's validation by one that also keeps the weights that the network had at that time."""
-    from splatgraft.training import trainer
+    from splatgraft_paper.training import trainer
 
     plain = trainer.validate
 
@@ -77,7 +77,7 @@ def _run(folder, name, given):
     import torch.distributed as dist
     from safetensors.torch import save_file
 
-    from splatgraft.training import trainer
+    from splatgraft_paper.training import trainer
 
     measured = {}
     plain = measuring(measured)

@@ -15,12 +15,7 @@ from splatgraft.harmonization.options import (
     FluxOptions,
     HarmonizerContext,
     HarmonizerOptions,
-    ICLightOptions,
-    ImageEditingOptions,
-    LbmOptions,
-    MVCoLightOptions,
     NoneOptions,
-    ReinhardOptions,
 )
 
 __all__ = [
@@ -34,13 +29,8 @@ __all__ = [
     "HarmonizerContext",
     "HarmonizerInputs",
     "HarmonizerOptions",
-    "ICLightOptions",
-    "ImageEditingOptions",
-    "LbmOptions",
-    "MVCoLightOptions",
     "NoisyStartHarmonizer",
     "NoneOptions",
-    "ReinhardOptions",
     "harmonize",
     "harmonizer_options",
     "make_harmonizer",

@@ -13,28 +13,16 @@ from splatgraft.harmonization.options import (
     FluxOptions,
     HarmonizerContext,
     HarmonizerOptions,
-    ICLightOptions,
-    ImageEditingOptions,
-    LbmOptions,
-    MVCoLightOptions,
     NoneOptions,
-    ReinhardOptions,
 )
-from splatgraft.harmonization.peers.factory import make_ic_light, make_image_editing, make_lbm, make_mv_colight
-from splatgraft.harmonization.reinhard import Reinhard
 
 HARMONIZERS: dict[str, type[HarmonizerOptions]] = {kind.name: kind for kind in get_args(HarmonizerOptions)}
 """Name of a method to its options."""
 
 _FACTORIES: dict[type, Callable[..., Harmonizer]] = {
     NoneOptions: lambda options, context: IdentityHarmonizer(),
-    ReinhardOptions: lambda options, context: Reinhard(),
     CompactOptions: make_compact,
     FluxOptions: make_flux,
-    LbmOptions: make_lbm,
-    ICLightOptions: make_ic_light,
-    MVCoLightOptions: make_mv_colight,
-    ImageEditingOptions: make_image_editing,
 }
 """Options to the factory function, which imports its heavy libraries only when it is called."""
 
@@ -51,7 +39,8 @@ def make_harmonizer(method: str | HarmonizerOptions, context: HarmonizerContext 
             missing.
     """
     options = harmonizer_options(method) if isinstance(method, str) else method
-    return _FACTORIES[type(options)](options, context)
+    make = getattr(options, "make", None)  # options of other packages make their harmoniser themselves
+    return make(context) if make else _FACTORIES[type(options)](options, context)
 
 
 def harmonizer_options(name: str, *, weights: str | None = None) -> HarmonizerOptions:
@@ -67,6 +56,6 @@ def harmonizer_options(name: str, *, weights: str | None = None) -> HarmonizerOp
     if name not in HARMONIZERS:
         raise ValueError(f"harmonizer: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
     options = HARMONIZERS[name]()
-    if weights is None or isinstance(options, NoneOptions | ReinhardOptions):
+    if weights is None or isinstance(options, NoneOptions):
         return options
     return replace(options, weights=weights)

@@ -16,13 +16,6 @@ class NoneOptions:
 
 
 @dataclass(frozen=True)
-class ReinhardOptions:
-    """Match the object's colour statistics to its surroundings (Reinhard et al. 2001); a baseline."""
-
-    name: ClassVar[str] = "reinhard"
-
-
-@dataclass(frozen=True)
 class CompactOptions:
     """Correct the light transfer with the shipped network of 2.4 M parameters; runs on any CPU."""
 
@@ -64,64 +57,8 @@ class FluxOptions:
     """Compile the network first; worth it from about twenty views on."""
 
 
-@dataclass(frozen=True)
-class LbmOptions:
-    """LBM relighting (Chadebec et al. 2025), run through your own installation of its package."""
-
-    name: ClassVar[str] = "lbm"
-
-    weights: str | None = None
-    """Folder or hub id of the weights; the published ones where not given."""
-
-
-@dataclass(frozen=True)
-class ICLightOptions:
-    """IC-Light, foreground and background (Zhang et al. 2024)."""
-
-    name: ClassVar[str] = "ic-light"
-
-    weights: str | None = None
-    """The file iclight_sd15_fbc.safetensors; must be given."""
-    base: str | None = None
-    """Folder or hub id of the Stable Diffusion 1.5 model that the weights change."""
-    seed: int = 0
-    """Of the noise; the same for all views."""
-
-
-@dataclass(frozen=True)
-class MVCoLightOptions:
-    """MV-CoLight's network for single pictures (Ren et al. 2025), run in your own checkout of its code."""
-
-    name: ClassVar[str] = "mv-colight"
-
-    weights: str | None = None
-    """Folder with config.py and model_step_N.pt; must be given."""
-    checkout: Path | None = None
-    """Folder of its code; must be given."""
-
-
-@dataclass(frozen=True)
-class ImageEditingOptions:
-    """An image-editing service over HTTP with the paper's prompt (Sec. 7); your pictures leave this machine."""
-
-    name: ClassVar[str] = "image-editing"
-
-    weights: str | None = None
-    """Address of the service; the paper's where not given."""
-    max_cost: float = 0.0
-    """US dollars that may be spent at most."""
-
-
-HarmonizerOptions = (
-    NoneOptions
-    | ReinhardOptions
-    | CompactOptions
-    | FluxOptions
-    | LbmOptions
-    | ICLightOptions
-    | MVCoLightOptions
-    | ImageEditingOptions
-)
+HarmonizerOptions = NoneOptions | CompactOptions | FluxOptions
+"""Options of the methods that `harmonize` offers; other packages bring classes with a method `make(context)`."""
 
 
 def _ignore(sentence: str) -> None:

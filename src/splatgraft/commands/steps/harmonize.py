@@ -16,12 +16,7 @@ from splatgraft.harmonization import (
     HARMONIZERS,
     CompactOptions,
     FluxOptions,
-    ICLightOptions,
-    ImageEditingOptions,
-    LbmOptions,
-    MVCoLightOptions,
     NoneOptions,
-    ReinhardOptions,
 )
 from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
 
@@ -38,13 +33,8 @@ class Harmonize:
     """Folder for images/, and confidence/ where the method estimates its reliability per pixel."""
     method: (
         Annotated[NoneOptions, subcommand("none")]
-        | Annotated[ReinhardOptions, subcommand("reinhard")]
         | Annotated[CompactOptions, subcommand("compact")]
         | Annotated[FluxOptions, subcommand("flux")]
-        | Annotated[LbmOptions, subcommand("lbm")]
-        | Annotated[ICLightOptions, subcommand("ic-light")]
-        | Annotated[MVCoLightOptions, subcommand("mv-colight")]
-        | Annotated[ImageEditingOptions, subcommand("image-editing")]
     ) = field(default_factory=NoneOptions)
     """The image model; its options are further keys of the table, or options of the sub-command."""
     device: Device = "auto"

@@ -1,1 +1,0 @@
-"""Benchmark measurements: per-view metrics, statistics of image sets, tables, and published data sets."""

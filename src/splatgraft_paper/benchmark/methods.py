@@ -1,0 +1,314 @@
+"""Methods of the benchmark: a light transfer, a harmoniser and a consolidation, or pictures of another program."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+from splatgraft.commands.steps.consolidate import Consolidate
+from splatgraft.commands.steps.harmonize import Harmonize
+from splatgraft.commands.steps.relight import Relight
+from splatgraft.commands.steps.render import Render
+from splatgraft.consolidation import (
+    ConsolidateOptions,
+    DescentOptions,
+    geometric_schedule,
+    iterative_update,
+    linear_schedule,
+)
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.fitting import l1_dssim
+from splatgraft.fitting.perceptual_losses import lpips_and_l1, lpips_vgg, windowed_fourier
+from splatgraft.folders.composite_folder import placement_files, read_composite
+from splatgraft.folders.selection_file import read_selection
+from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
+from splatgraft.harmonization import (
+    HarmonizerContext,
+    NoisyStartHarmonizer,
+    make_harmonizer,
+    render_views,
+)
+from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
+from splatgraft.project.step import Context, Device, Inputs, choose_device
+from splatgraft.relighting import SourceScene, relight
+from splatgraft.relighting.light.light import light_to_json
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.lazy_sequence import LazySequence
+from splatgraft_paper.benchmark.scene import ComposedScene, perform_if_stale
+from splatgraft_paper.benchmark.transplat import RelightByIrradianceRatio
+from splatgraft_paper.benchmark.true_light_file import read_true_light
+from splatgraft_paper.peers.options import method_options
+
+Prior = Literal["off", "gain", "transplat", "transfer", "true-light"]
+Loss = Literal["fourier", "l1-dssim", "lpips", "paper"]
+Schedule = Literal["once", "linear", "geometric"]
+_NAMES = {"copy-paste": "off", "reinhard": "off+reinhard", "flux": "off+flux"}
+_GRAMMAR = "PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], NAME=FOLDER, or " + ", ".join(_NAMES)
+
+
+@dataclass(frozen=True)
+class Method:
+    """One method, as the command line names it."""
+
+    name: str
+    prior: Prior = "off"
+    """The light transfer in 3D: none, exposure alone, TranSplat's, the physical one, or that with the true light."""
+    harmonizer: str | None = None
+    """The image model; without one, the prior is the result."""
+    loss: Loss = "fourier"
+    """Of the consolidation; `paper` is the paper's: 10,000 steps of Adam on LPIPS and L1."""
+    schedule: Schedule = "once"
+    """Whether views are harmonised again from the consolidated scene (paper, Iterative Dataset Update)."""
+    pictures: Path | None = None
+    """Folder of another program's results: SCENE/VIEW.png, named as the views of the ground truth, or numbered."""
+
+    @staticmethod
+    def parse(text: str) -> "Method":
+        """Parse a name such as `transfer+compact/l1-dssim@linear` or `lbm=results/lbm`.
+
+        Raises:
+            ValueError: The text names no method.
+        """
+        if "=" in text:
+            name, folder = text.split("=", 1)
+            if not name or not Path(folder).is_dir():
+                raise ValueError(f"--methods: expected NAME=FOLDER with an existing folder, found {text}")
+            return Method(name=name, pictures=Path(folder))
+        rest, _, schedule = _NAMES.get(text, text).partition("@")
+        rest, _, loss = rest.partition("/")
+        prior, _, harmonizer = rest.partition("+")
+        loss, schedule = loss or "fourier", schedule or "once"
+        if prior not in get_args(Prior) or loss not in get_args(Loss) or schedule not in get_args(Schedule):
+            raise ValueError(
+                f"--methods: expected {_GRAMMAR} with PRIOR of {', '.join(get_args(Prior))}, LOSS of "
+                f"{', '.join(get_args(Loss))}, SCHEDULE of {', '.join(get_args(Schedule))}; found {text}"
+            )
+        if not harmonizer and (loss, schedule) != ("fourier", "once"):
+            raise ValueError(f"--methods: expected a harmonizer where a loss or a schedule is named, found {text}")
+        return Method(text, prior, harmonizer or None, loss, schedule)  # pyright: ignore[reportArgumentType]
+
+    @property
+    def folder_name(self) -> str:
+        """The name without the characters that a folder's name cannot hold."""
+        return self.name.replace("/", "-")
+
+
+@dataclass(frozen=True)
+class RelightWithTrueLight:
+    """The physical transfer with the true light instead of an estimate: an upper bound for the light estimate."""
+
+    target: Path
+    """The target scene, a .ply."""
+    placement: Path
+    """Of the composite."""
+    cameras: Path
+    """The target's."""
+    surroundings: Path
+    """The source without the object."""
+    object_cameras: Path
+    """The source's."""
+    light: Path
+    """light.json."""
+    out: Path
+    """Folder for scene.ply."""
+
+    def inputs(self) -> Inputs:
+        """All files that are read."""
+        scenes = (self.target, self.surroundings)
+        cameras = (self.cameras, self.object_cameras)
+        return {"scenes": scenes, "placement": placement_files(self.placement), "rest": (*cameras, self.light)}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the relit composite."""
+        source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
+        composite = read_composite(self.target, self.placement)
+        relit = relight(
+            composite,
+            read_cameras(self.cameras),
+            sources=[source],
+            light=read_true_light(self.light),
+        )
+        write_gaussians(folder / SCENE_FILE, relit.bake()[0])
+        if relit.light is not None:
+            (folder / LIGHT_FILE).write_text(light_to_json(relit.light))
+        for sentence in relit.report:
+            context.console.say(sentence)
+
+
+@dataclass(frozen=True)
+class UpdateIteratively:
+    """Harmonise and consolidate five times, each time from renders of the current scene (Iterative Dataset Update).
+
+    The strengths of the schedule are the noise levels that a diffusion model starts from, on renders of the current
+    scene, conditioned on the composite; a harmoniser without noise takes these renders as its prior, and this is said.
+    """
+
+    composite: Path
+    """Folder of the copy-paste result."""
+    prior: Path
+    """The initial scene, a .ply."""
+    cameras: Path
+    """The cameras that methods may use."""
+    out: Path
+    """Folder for scene.ply."""
+    harmonizer: str = "reinhard"
+    loss: Loss = "fourier"
+    """Of the consolidation."""
+    schedule: Schedule = "linear"
+    weights: Path | None = None
+    """Folder of LPIPS's weights."""
+    model: str | None = None
+    """The harmoniser's own weights: folder, file or hub id."""
+    iterations: int = 10_000
+    """Steps of each consolidation with the paper's loss."""
+    device: Device = "auto"
+
+    def inputs(self) -> Inputs:
+        """Scenes and cameras."""
+        return {"scenes": (self.composite / SCENE_FILE, self.prior), "cameras": (self.cameras,)}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the updated scene."""
+        device = choose_device(self.device, context.console)
+        composite, prior = (read_gaussians(path).to(device) for path in (self.composite / SCENE_FILE, self.prior))
+        is_object = read_selection(self.composite / "is_object.npy", composite.count, self.composite / SCENE_FILE).to(
+            device
+        )
+        cameras = read_cameras(self.cameras).to(device)
+        options = method_options(self.harmonizer, weights=self.model)
+        strengths = linear_schedule() if self.schedule == "linear" else geometric_schedule()
+        say = context.console.say
+        harmonizer = make_harmonizer(options, HarmonizerContext(device=device, say=say, strengths=strengths))
+        if not isinstance(harmonizer, NoisyStartHarmonizer):
+            say(f"{self.harmonizer}: no noise; each of {len(strengths)} updates begins at renders of the scene so far")
+
+        def harmonize_at(scene: Gaussians, strength: float) -> LazySequence:
+            views = render_views(composite, is_object, cameras, prior=scene)
+            if isinstance(harmonizer, NoisyStartHarmonizer):
+                images = [harmonizer.harmonize_from([view], strength)[0].image.to(device) for view in views]
+            else:
+                images = [harmonizer.harmonize(view).image.to(device) for view in views]
+            return LazySequence(len(images), lambda index: images[index])
+
+        consolidation = self._consolidation()
+        scene = iterative_update(prior, cameras, harmonize_at, strengths, consolidation, progress=context.progress)
+        write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
+
+    def _consolidation(self) -> ConsolidateOptions:
+        if self.loss == "paper":
+            descent = DescentOptions(iterations=self.iterations)
+            return ConsolidateOptions(method="adam", loss=lpips_and_l1(self.weights), reference=descent)
+        loss = {"fourier": windowed_fourier, "l1-dssim": l1_dssim}.get(self.loss)
+        return ConsolidateOptions(loss=loss or lpips_vgg(self.weights))
+
+
+@dataclass(frozen=True)
+class MethodSettings:
+    """What all methods of a run share."""
+
+    weights: Path | None = None
+    """Folder of LPIPS's weights."""
+    model: str | None = None
+    """Weights of the harmoniser: folder, file or hub id."""
+    device: Device = "auto"
+    """Where to compute."""
+    iterations: int = 10_000
+    """Steps of the paper's consolidation."""
+
+
+def run_method(
+    method: Method,
+    scene: ComposedScene,
+    settings: MethodSettings,
+    console: Console,
+) -> tuple[Path, dict[str, float]]:
+    """Run the stale steps of a method on a scene.
+
+    Args:
+        method: The method.
+        scene: The composite and its cameras.
+        settings: Weights, device, length of the paper's consolidation.
+        console: Takes progress and messages.
+
+    Returns:
+        The resulting scene, a .ply, and the seconds of each of the method's own steps.
+
+    Raises:
+        ValueError: The method cannot run here, with the reason.
+    """
+    seconds: dict[str, float] = {}
+    prior = scene.composite / SCENE_FILE
+    if method.prior != "off":
+        prior, seconds["relight"] = _relit_scene(method.prior, scene, console)
+    if method.harmonizer is None:
+        return prior, seconds
+    options = method_options(method.harmonizer, weights=settings.model)
+    result = scene.work / "methods" / method.folder_name / "result"
+    if method.schedule != "once":
+        update = UpdateIteratively(
+            scene.composite,
+            prior,
+            scene.cameras,
+            result,
+            harmonizer=method.harmonizer,
+            loss=method.loss,
+            schedule=method.schedule,
+            weights=settings.weights,
+            model=settings.model,
+            iterations=settings.iterations,
+            device=settings.device,
+        )
+        seconds["update"] = perform_if_stale(update, console)
+        return result / SCENE_FILE, seconds
+    views = scene.work / "views" / method.prior
+    composite = scene.composite / SCENE_FILE
+    # a prior without a transfer has no light, and a failed transfer found none
+    light = path if (path := prior.parent / LIGHT_FILE).is_file() else None
+    render = Render(
+        composite, scene.cameras, views, is_object=scene.is_object, prior=prior, light=light, device=settings.device
+    )
+    seconds["render"] = perform_if_stale(render, console)
+    harmonized = scene.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
+    seconds["harmonize"] = perform_if_stale(Harmonize(views, harmonized, options, device=settings.device), console)
+    consolidate = Consolidate(prior, views, harmonized, result, lpips_weights=settings.weights, device=settings.device)
+    if method.loss == "paper":
+        consolidate = replace(consolidate, loss="lpips-l1", method="adam", iterations=settings.iterations)
+    else:
+        consolidate = replace(consolidate, loss=method.loss)
+    seconds["consolidate"] = perform_if_stale(consolidate, console)
+    return result / SCENE_FILE, seconds
+
+
+def _relit_scene(prior: Prior, scene: ComposedScene, console: Console) -> tuple[Path, float]:
+    out = scene.work / "priors" / prior
+    placement = scene.composite / PLACEMENT_FILE
+    if prior == "true-light":
+        if scene.light is None or scene.surroundings is None or scene.source_cameras is None:
+            raise ValueError(f"{scene.name}: expected a true light and the object's capture, found none")
+        with_true_light = RelightWithTrueLight(
+            scene.target,
+            placement,
+            scene.cameras,
+            light=scene.light,
+            out=out,
+            surroundings=scene.surroundings,
+            object_cameras=scene.source_cameras,
+        )
+        return out / SCENE_FILE, perform_if_stale(with_true_light, console)
+    if prior == "transplat":
+        if scene.surroundings is None or scene.source_cameras is None:
+            raise ValueError(
+                f"{scene.name}: expected the object's capture, by which the old light is known, found none"
+            )
+        ratio = RelightByIrradianceRatio(scene.target, placement, scene.surroundings, scene.source_cameras, out)
+        return out / SCENE_FILE, perform_if_stale(ratio, console)
+    kind = "gain" if prior == "gain" else "transfer"
+    step = Relight(
+        scene.target,
+        placement,
+        scene.cameras,
+        out,
+        light=kind,
+        surroundings=scene.surroundings,
+        object_cameras=scene.source_cameras,
+    )
+    return out / SCENE_FILE, perform_if_stale(step, console)

@@ -1,0 +1,69 @@
+"""The command `evaluate benchmark`: methods are measured on scenes with ground truth."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from splatgraft.project.folder_lock import locked
+from splatgraft.project.step import Positional
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.workers import Task, run_tasks
+from splatgraft_paper.benchmark.methods import Method
+from splatgraft_paper.benchmark.report import collect_results, write_benchmark_report
+from splatgraft_paper.benchmark.run import BenchmarkRun, measure_scene, unmeasurable_metrics
+from splatgraft_paper.benchmark.scene import GroundTruthScene
+
+
+@dataclass(frozen=True)
+class EvaluateBenchmark:
+    """Measure methods on scenes with ground truth; finished results are kept."""
+
+    scenes: Positional
+    """Folder of scenes that `synth benchmark` made; `evaluate paper` reads the authors' data set."""
+    out: Path = Path("benchmark")
+    """Folder for index.html, benchmark.json, benchmark.md and all results."""
+    methods: tuple[str, ...] = ("copy-paste", "reinhard", "gain", "transfer", "true-light")
+    """PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], such as off+flux, transfer+compact/l1-dssim, transfer+compact@geometric;
+    or NAME=FOLDER for pictures of another program, FOLDER/SCENE/VIEW.png."""
+    only: tuple[str, ...] = ()
+    """Names of scenes; all where none is given."""
+    weights: Path | None = None
+    """Folder with the weights of LPIPS and Inception; torch hub's cache where not given."""
+    harmonizer_weights: str | None = None
+    """Weights of the image model that the methods name: folder, file or hub id, as `harmonize --weights` takes them."""
+    at_once: int = 1
+    """Scenes at a time on this machine."""
+    ray: str | None = None
+    """Address of a Ray cluster whose machines all see both folders; `local` for one of this machine's cores."""
+    options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(quality="draft", device="auto"))
+
+    def execute(self, console: Console) -> int:
+        """Run what is missing and write the report; 1 where a scene or a method failed."""
+        methods = tuple(Method.parse(text) for text in self.methods)
+        run = BenchmarkRun(self.out, self._scenes(), methods, self.options, self.weights, self.harmonizer_weights)
+        missing = unmeasurable_metrics(self.weights)
+        for name, reason in missing.items():
+            console.say(f"{name}: not measured: {reason}")
+        with locked(self.out):
+            tasks = [Task(scene.name, partial(measure_scene, run, scene, "lpips" not in missing))
+                     for scene in run.scenes]  # fmt: skip
+            failures = run_tasks(tasks, at_once=self.at_once, ray_address=self.ray)
+            found = collect_results(run, missing, failures)
+            write_benchmark_report(run, found)
+        for line in found.not_run:
+            console.say(line)
+        console.result(self.out / "index.html")
+        return 1 if found.not_run else 0
+
+    def _scenes(self) -> tuple[GroundTruthScene, ...]:
+        found = [GroundTruthScene.from_folder(path.parent) for path in sorted(self.scenes.glob("*/ground_truth"))]
+        if not found:
+            raise ValueError(f"{self.scenes}: expected scenes with ground_truth/, found none")
+        names = [scene.name for scene in found]
+        if unknown := [name for name in self.only if name not in names]:
+            raise ValueError(f"--only: expected names among {', '.join(names)}; found {unknown[0]}")
+        return tuple(scene for scene in found if not self.only or scene.name in self.only)
+
+
+COMMAND = EvaluateBenchmark

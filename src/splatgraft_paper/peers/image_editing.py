@@ -1,0 +1,107 @@
+"""An image-editing service over HTTP with the paper's prompt (Sec. 7); used only on request, with a limit on its cost.
+
+The protocol is that of Google's `generateContent` (the paper's Nano Banana is gemini-2.5-flash-image).
+"""
+
+import base64
+import io
+import json
+import urllib.error
+import urllib.request
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from splatgraft.core.images import resize
+from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
+from splatgraft.harmonization.options import HarmonizerContext
+from splatgraft_paper.peers.options import ImageEditingOptions
+
+KEY_VARIABLE = "SPLATGRAFT_IMAGE_EDITING_KEY"
+DOLLARS_PER_VIEW = 0.04
+"""Price of one image by gemini-2.5-flash-image at the time of writing; other services differ."""
+_URL = "https://generativelanguage.googleapis.com/v1beta/models/gemini-2.5-flash-image:generateContent"
+_TIMEOUT_SECONDS = 180
+
+PROMPT = (
+    "I copy-pasted an object from one photograph to the other. I will give you the photograph and the mask of the "
+    "copied object, white is the object and black is the background. Edit the photograph such that the copied object "
+    "looks realistically composited in the environment. Create realistic contact shadows, ambient occlusion, global "
+    "illumination, accurate lighting match, seamless blending etc. This is crucial: Do not change anything else other "
+    "than the composited object."
+)
+"""The paper's prompt, verbatim."""
+
+
+@dataclass(frozen=True)
+class ImageEditing:
+    """An image-editing service; one request per view."""
+
+    url: str
+    key: str
+
+    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+        """Send composite and mask to the service and resize the returned image to the view's size.
+
+        Raises:
+            ValueError: the service fails or returns no image.
+        """
+        mask = (view.mask > 0.5).float()[..., None].expand(-1, -1, 3)
+        parts: list[Any] = [{"text": PROMPT}]
+        for picture in (view.composite, mask):
+            parts.append({"inline_data": {"mime_type": "image/png", "data": _png(picture)}})
+        answer = self._request({"contents": [{"parts": parts}]})
+        try:
+            made = next(
+                find_part["inlineData"]["data"]
+                for candidate in answer["candidates"]
+                for find_part in candidate["content"]["parts"]
+                if "inlineData" in find_part
+            )
+            image = Image.open(io.BytesIO(base64.b64decode(made))).convert("RGB")
+        except (KeyError, TypeError, StopIteration, OSError, ValueError) as error:
+            found = " ".join(json.dumps(answer).split())[:160]
+            raise ValueError(f"{self.url}: expected a picture in the answer, found {found}") from error
+        height, width = view.mask.shape
+        return Harmonized(resize(torch.from_numpy(np.array(image)).float() / 255, width, height))
+
+    def _request(self, content: dict[str, Any]) -> Any:
+        headers = {"Content-Type": "application/json", "x-goog-api-key": self.key}
+        request = urllib.request.Request(self.url, json.dumps(content).encode(), headers)
+        try:
+            with urllib.request.urlopen(request, timeout=_TIMEOUT_SECONDS) as response:
+                return json.load(response)
+        except urllib.error.HTTPError as error:
+            found = " ".join(error.read().decode(errors="replace").split())[:160]
+            raise ValueError(f"{self.url}: expected an answer, found status {error.code}: {found}") from error
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{self.url}: expected an answer, found {error}") from error
+
+
+def connect_image_editing(options: ImageEditingOptions, context: HarmonizerContext) -> ImageEditing:
+    """The service at `options.weights` (a URL), or the paper's.
+
+    Raises:
+        ValueError: the key is missing, or the expected cost exceeds `options.max_cost`.
+    """
+    url = options.weights or _URL
+    if not url.startswith(("https://", "http://127.0.0.1", "http://localhost")):
+        raise ValueError(f"harmonizer image-editing: expected --weights https://..., found {url}")
+    cost = context.views * DOLLARS_PER_VIEW
+    context.say(f"image-editing: {context.views} views to {url}, about {cost:.2f} US dollars; your images are uploaded")
+    if cost > options.max_cost:
+        raise ValueError(f"--max-cost: expected at least {cost:.2f} US dollars, found {options.max_cost:.2f}")
+    if not context.key:
+        raise ValueError(f"harmonizer image-editing: expected a key in {KEY_VARIABLE}, found none")
+    return ImageEditing(url, context.key)
+
+
+def _png(picture: Float[Tensor, "h w 3"]) -> str:
+    content = io.BytesIO()
+    Image.fromarray((picture * 255).round().to(torch.uint8).numpy()).save(content, "PNG")
+    return base64.b64encode(content.getvalue()).decode()

@@ -1,0 +1,132 @@
+"""MV-CoLight's single-view network (Ren et al. 2025), run in the user's own checkout and Python environment.
+
+A small program is run there and exchanges arrays through files. The input is prepared as in the authors' data set
+classes: the shorter side becomes 256 pixels and a square is cut out. They keep the one in the middle; here several
+squares cover the view and their changes are blended. Untested with the real code and weights.
+"""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.images import resize
+from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
+from splatgraft.runtime.child_process import last_line, run_logged
+from splatgraft_paper.peers.options import MVCoLightOptions
+
+SIDE = 256
+"""Pixels: the size that the network was trained at."""
+RATIO_OFFSET = 0.02
+"""sRGB, added to both sides of the network's output over its input, against noise in the dark. Set by hand."""
+
+# runs in the other project's Python, in its folder, as `python - MODEL_FOLDER INPUT.npy OUTPUT.npy`
+_PROGRAM = """
+import glob, os, sys
+import numpy as np, torch
+from easydict import EasyDict
+from omegaconf import OmegaConf
+sys.path.insert(0, os.getcwd())
+import models
+from registry import MODELS, build_module
+folder, given, out = sys.argv[1:]
+config = EasyDict(OmegaConf.to_container(OmegaConf.load(os.path.join(folder, "config.py")), resolve=True))
+config.model.num_in_ch = 7
+device = "cuda" if torch.cuda.is_available() else "cpu"
+network = build_module(config.model, MODELS).to(device).eval()
+newest = max(glob.glob(os.path.join(folder, "model_step_*.pt")), key=lambda name: int(name.split("_")[-1][:-3]))
+network.load_state_dict(torch.load(newest, map_location=device)["model_state_dict"])
+with torch.no_grad():
+    made = [network(square.to(device)[None, None]) for square in torch.from_numpy(np.load(given))]
+np.save(out, np.stack([one.reshape(3, *one.shape[-2:]).float().cpu().numpy() for one in made]))
+"""
+
+
+class MVCoLight:
+    """The network, in a new process for each view."""
+
+    def __init__(self, checkout: Path, weights: Path, python: Path) -> None:
+        """Use the code in `checkout` and the weights in `weights`, run by the interpreter `python`."""
+        self._checkout, self._weights, self._python = checkout, weights, python
+
+    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+        """Apply the network's change, as a ratio at its own size, to the composite.
+
+        Raises:
+            ValueError: the external program fails.
+        """
+        height, width = view.mask.shape
+        small = network_input(view)
+        with tempfile.TemporaryDirectory() as name:
+            given, out = Path(name) / "input.npy", Path(name) / "output.npy"
+            np.save(given, small.numpy())
+            command = [str(self._python), "-", str(self._weights), str(given), str(out)]
+            log = Path(name) / "log"
+            # standard output stays out of the log, whose last line is to be that of the error
+            code = run_logged(command, log, folder=self._checkout, stdin=_PROGRAM, on_line=lambda _: None)
+            if code != 0 or not out.is_file():
+                last = last_line(log) or "no output"
+                raise ValueError(f"{self._checkout}: expected MV-CoLight to make a picture, found {last[:200]}")
+            made = torch.from_numpy(np.load(out)).clamp(0, 1)
+        ratio = (made + RATIO_OFFSET) / (small[:, :3] + RATIO_OFFSET)
+        return Harmonized((view.composite * resize(_joined(ratio, height, width), width, height)).clamp(0, 1))
+
+
+def network_input(view: HarmonizerInputs) -> Float[Tensor, "k 7 256 256"]:
+    """Squares of composite, background and depth divided by its maximum, the shorter side at the network's size."""
+    depth = view.depth / view.depth.max().clamp_min(1e-6)
+    rows, columns = _reduced(*view.mask.shape)
+    # one by one: OpenCV shrinks at most four channels
+    parts = [resize(picture, columns, rows) for picture in (view.composite, view.background, depth[..., None])]
+    small = torch.cat(parts, -1).permute(2, 0, 1)
+    squares = [small[:, y : y + SIDE, x : x + SIDE] for y in _starts(rows) for x in _starts(columns)]
+    return torch.stack(squares).contiguous()
+
+
+def _reduced(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of the view whose shorter side is `SIDE`."""
+    scale = SIDE / min(height, width)
+    return max(SIDE, round(height * scale)), max(SIDE, round(width * scale))
+
+
+def _starts(length: int) -> list[int]:
+    """First pixels of evenly spaced squares that cover a side, neighbours overlapping where there are several."""
+    count = 1 if length == SIDE else -(-length // SIDE) if length % SIDE else length // SIDE + 1
+    return [round(i * (length - SIDE) / max(count - 1, 1)) for i in range(count)]
+
+
+def _joined(squares: Float[Tensor, "k 3 256 256"], height: int, width: int) -> Float[Tensor, "i j 3"]:
+    """The squares laid over each other, each with the weight of a tent."""
+    rows, columns = _reduced(height, width)
+    tent = torch.minimum(torch.arange(SIDE) + 1, SIDE - torch.arange(SIDE)).float()
+    weight = torch.minimum(tent[:, None], tent[None, :])
+    total, weights = torch.zeros(3, rows, columns), torch.zeros(rows, columns)
+    places = [(y, x) for y in _starts(rows) for x in _starts(columns)]
+    for (y, x), square in zip(places, squares, strict=True):
+        total[:, y : y + SIDE, x : x + SIDE] += weight * square
+        weights[y : y + SIDE, x : x + SIDE] += weight
+    return (total / weights).permute(1, 2, 0)
+
+
+def load_mv_colight(options: MVCoLightOptions) -> MVCoLight:
+    """The adaptor, its folders found.
+
+    Raises:
+        ValueError: one is missing.
+    """
+    checkout, weights = options.checkout, Path(options.weights or "")
+    if checkout is None or not (checkout / "registry.py").is_file():
+        raise ValueError(
+            "harmonizer mv-colight: expected --checkout with the code of github.com/InternRobotics/MV-CoLight, found "
+            f"{checkout or 'none'}"
+        )
+    if options.weights is None or not (weights / "config.py").is_file() or not list(weights.glob("model_step_*.pt")):
+        raise ValueError(
+            "harmonizer mv-colight: expected --weights FOLDER with config.py and model_step_N.pt, found "
+            f"{options.weights or 'none'}"
+        )
+    interpreter = checkout / ".venv" / "bin" / "python"
+    return MVCoLight(checkout, weights.resolve(), interpreter if interpreter.is_file() else Path("python"))

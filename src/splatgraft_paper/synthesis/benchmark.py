@@ -1,0 +1,334 @@
+"""Nine benchmark scenes with ground truth (paper, Sec. 7): six indoor, three outdoor.
+
+Each scene is rendered by two jobs and then laid out as captures in `<out>/<scene>/`: `source/` (the object on a
+pedestal in another light), `target/` (the scene without it), `ground_truth/` (the scene with it, from the target's
+cameras), all with transforms.json; `placement.json`; `probe.npy` and `suns.json`, the true light at the object's place.
+Source and target have the object at the same coordinates, rotated about the vertical by the pose's angle, so that the
+placement is known exactly.
+"""
+
+import json
+import math
+import random
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core import images
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.core.similarity import Similarity
+from splatgraft.formats import read_capture, write_capture
+from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
+from splatgraft_paper.synthesis import furniture, objects
+from splatgraft_paper.synthesis.cameras import capture_cameras
+from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take
+from splatgraft_paper.synthesis.outdoors import SUPPLIED_MAPS
+from splatgraft_paper.synthesis.pairs import make_scene
+from splatgraft_paper.synthesis.palette import Palette
+from splatgraft_paper.synthesis.scene import Material, Part, Place, Scene, World
+
+_OBJECT_POINTS = 40_000
+"""Sampled points on the object, from which its true normals follow."""
+_SURFACE_RADIUS = 8.0
+"""Metres around the object's middle within which its surface is sampled: all of it."""
+POSES_DEG = (0.0, 120.0, 240.0)
+"""P0, P1, P2: the object's rotations in the illumination-consistency scenes (paper, Table 2)."""
+
+
+@dataclass(frozen=True)
+class BenchmarkScene:
+    """The seeds of one benchmark scene."""
+
+    name: str
+    kind: str
+    seed: int
+    """Of the scene; differs from all seeds of training pairs."""
+    object_seed: int
+    pose_deg: float = 0.0
+    """The object's rotation about the vertical between source and target."""
+
+
+SCENES: tuple[BenchmarkScene, ...] = (
+    BenchmarkScene("living_room_a", "living_room", 9_000_001, 11),
+    BenchmarkScene("kitchen", "kitchen", 9_000_002, 12),
+    BenchmarkScene("office", "office", 9_000_003, 13),
+    BenchmarkScene("bathroom", "bathroom", 9_000_004, 14),
+    BenchmarkScene("bedroom", "bedroom", 9_000_005, 15),
+    BenchmarkScene("living_room_b", "living_room", 9_000_006, 16),
+    BenchmarkScene("terrace", "terrace", 9_000_007, 17),
+    BenchmarkScene("garden", "garden", 9_000_008, 18),
+    BenchmarkScene("square", "square", 9_000_009, 19),
+)
+ROTATIONS: tuple[BenchmarkScene, ...] = tuple(
+    replace(scene, name=f"{scene.name}_p{i}", pose_deg=angle)
+    for scene in (SCENES[0], SCENES[3], SCENES[7])
+    for i, angle in enumerate(POSES_DEG)
+)
+
+
+def scenes_with_shared_renders(which: BenchmarkScene) -> tuple[BenchmarkScene, ...]:
+    """List the other scenes with the same seeds: only the object's rotation differs, and they share renders."""
+    return tuple(
+        other
+        for other in (*SCENES, *ROTATIONS)
+        if (other.seed, other.object_seed) == (which.seed, which.object_seed) and other != which
+    )
+
+
+@dataclass(frozen=True)
+class BenchmarkSize:
+    """Size and number of the benchmark's views."""
+
+    render: RenderSize
+    views: int
+
+    @staticmethod
+    def named(name: str) -> "BenchmarkSize":
+        """Look up a size: `small` (352x248, 40 views) or `paper` (704x496, 200 views).
+
+        Raises:
+            ValueError: the name is neither.
+        """
+        if name == "small":
+            return BenchmarkSize(RenderSize.small(), 40)
+        if name == "paper":
+            return BenchmarkSize(RenderSize(), 200)
+        raise ValueError(f"benchmark size: expected small or paper, found '{name}'")
+
+
+def pedestal_scene(seed: int, place: Place) -> Scene:
+    """Make the scene where the object is captured: a pedestal among furniture under an environment map."""
+    rng = random.Random(f"stage-{seed}")
+    palette = Palette(rng)
+    x, y, z = place.location
+    top = max(0.5, 3.2 * place.radius)
+    pedestal_material = replace(palette.stone(), roughness=0.7, scale=2.0)
+    pedestal = Part("cylinder", (top, top, 0.4), (x, y, z - 0.2), pedestal_material, bevel=0.02)
+    ground = furniture.box((14, 14, 0.1), (x, y, z - 0.45), Material("tiles", (0.3, 0.29, 0.27), (0.2, 0.2, 0.2), 0.7))
+    parts = [pedestal, ground]
+    for i in range(5):
+        angle = 2 * math.pi * (i + rng.random()) / 5
+        made = (
+            furniture.cabinet(rng, palette, 0.8, rng.uniform(0.4, 0.9)) if i % 2 else furniture.plant(rng, palette, 1.0)
+        )
+        parts += furniture.placed(
+            made, (x + 2.6 * math.cos(angle), y + 2.6 * math.sin(angle), z - 0.4), angle - math.pi / 2
+        )
+    world = World("environment", path=rng.choice(SUPPLIED_MAPS[:6]), rotation=rng.uniform(0, 6.283))
+    return Scene(
+        name=f"stage_{seed}",
+        kind="stage",
+        parts=tuple(parts),
+        lamps=(),
+        world=world,
+        places=(place,),
+        bounds=((x - 3, y - 3, z - 0.2), (x + 3, y + 3, z + 3)),
+        obstacles=(((x - top / 2, y - top / 2, z - 0.45), (x + top / 2, y + top / 2, z + 0.12)),),
+        notes={"world": world.path},
+    )
+
+
+def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
+    """Plan the job in the target scene (target, ground truth, light) and that on the pedestal (source, light, surface).
+
+    Raises:
+        ValueError: the scene leaves no room for the cameras.
+    """
+    scene = make_scene(which.kind, which.seed)
+    place = scene.places[0]
+    parts = objects.make(which.object_seed, place)
+    height = max(part.location[2] + part.size[2] / 2 for part in parts)
+    yaw = random.Random(f"yaw-{which.seed}").uniform(0, 6.283)
+    source_parts = objects.standing_at(parts, place.location, yaw)
+    target_parts = objects.standing_at(parts, place.location, yaw + math.radians(which.pose_deg))
+    object_passes: tuple[str, ...] = ("color", "mask", "depth")
+    middle = (place.location[0], place.location[1], place.location[2] + height / 2)
+    provenance = {"scene": which.name, "pose_deg": str(which.pose_deg), "licence": "own render"}
+    target = Job(
+        scene=scene,
+        objects={"object": target_parts},
+        cameras=capture_cameras(scene, place, height, size.views, which.seed),
+        takes=(
+            Take("target", scene=True, passes=("color", "depth")),
+            Take("ground_truth", scene=True, object="object", passes=object_passes),
+            Take("light", scene=True, probe=middle),
+        ),
+        size=size.render,
+        provenance=provenance,
+    )
+    pedestal = pedestal_scene(which.object_seed, place)
+    source = Job(
+        scene=pedestal,
+        objects={"object": source_parts},
+        cameras=capture_cameras(pedestal, place, height, size.views, which.object_seed),
+        takes=(
+            Take("source", scene=True, object="object", passes=object_passes),
+            Take("old_light", scene=True, probe=middle),
+            Take(
+                "surface",
+                scene=False,
+                object="object",
+                surface=SurfaceSampling(_OBJECT_POINTS, middle, _SURFACE_RADIUS),
+            ),
+        ),
+        size=size.render,
+        provenance=provenance,
+    )
+    return target, source
+
+
+def draw_scene(rng: random.Random, name: str, kind: str, seeds: tuple[int, int], size: BenchmarkSize) -> BenchmarkScene:
+    """Draw the seeds of a scene and its object; those whose scene has no room for the cameras are drawn again.
+
+    Args:
+        rng: Is advanced.
+        name: Of the scene.
+        kind: Of the scene.
+        seeds: First seed and the one behind the last.
+        size: Number of views.
+    """
+    while True:
+        scene = BenchmarkScene(name, kind, rng.randrange(*seeds), rng.randrange(*seeds))
+        try:
+            plan(scene, size)
+        except ValueError:
+            continue
+        return scene
+
+
+def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
+    """Read the cameras of a rendered job and convert them from OpenGL to OpenCV axes."""
+    found = json.loads((out / "cameras.json").read_text())
+    poses = torch.tensor(found["poses"], dtype=torch.float64)
+    poses[:, :3, 1:3] *= -1
+    width, height = found["width"], found["height"]
+    focal = [0.5 * width / math.tan(0.5 * angle) for angle in found["field_of_view"]]
+    intrinsics = torch.stack([torch.tensor([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]) for f in focal])
+    sizes = torch.tensor([[width, height]]).repeat(len(names), 1)
+    return Cameras(world_from_camera=poses.float(), intrinsics=intrinsics.float(), sizes=sizes, names=names)
+
+
+def sparse_points(
+    folder: Path, cameras: Cameras, *, count: int = 20_000, noise: float = 0.002, seed: int = 0
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    """Sample noisy surface points, as structure from motion would reconstruct, by lifting random pixels by their depth.
+
+    Args:
+        folder: a rendered take with depth.
+        cameras: of the take.
+        count: number of points over all cameras, at most.
+        noise: standard deviation of the depth, as a share of it.
+        seed: of the sampling.
+
+    Returns:
+        Positions in metres and sRGB colours; the sky has no points.
+    """
+    generator = np.random.default_rng(seed)
+    points, colors = [], []
+    for i in range(len(cameras)):
+        depth = np.load(folder / f"{i:04d}_depth.npy", allow_pickle=False).astype(np.float32)
+        rows, columns = np.nonzero(depth > 0)
+        if not len(rows):
+            continue
+        pick = generator.choice(len(rows), min(count // len(cameras), len(rows)), replace=False)
+        u, v = columns[pick], rows[pick]
+        z = depth[v, u] * (1 + noise * generator.standard_normal(len(pick)).astype(np.float32))
+        k = cameras.intrinsics[i].numpy()
+        in_camera = np.stack([(u + 0.5 - k[0, 2]) / k[0, 0] * z, (v + 0.5 - k[1, 2]) / k[1, 1] * z, z], -1)
+        pose = cameras.world_from_camera[i].numpy()
+        points.append(in_camera @ pose[:3, :3].T + pose[:3, 3])
+        colors.append(images.read_rgb(folder / f"{i:04d}.png").numpy()[v, u])
+    return torch.from_numpy(np.concatenate(points)).float(), torch.from_numpy(np.concatenate(colors)).float()
+
+
+def gather_capture(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
+    """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply.
+
+    Args:
+        rendered: Folder of the job.
+        take: Its name, with color, and depth where `points` is set.
+        out: Receives the capture.
+        passes: Names of folders: images, masks, depth.
+        points: Whether sparse points are made of the depths.
+    """
+    count = len(json.loads((rendered / "cameras.json").read_text())["poses"])
+    stems = tuple(f"{i:04d}" for i in range(count))
+    for folder, suffix, ending in _PASS_FILES:
+        if folder in passes:
+            (out / folder).mkdir(parents=True, exist_ok=True)
+            for stem in stems:
+                shutil.copyfile(rendered / take / f"{stem}{suffix}", out / folder / f"{stem}{ending}")
+    cameras = rendered_cameras(rendered, tuple(f"{stem}.png" for stem in stems))
+    found, colors = sparse_points(rendered / take, cameras) if points else (torch.zeros(0, 3), torch.zeros(0, 3))
+    image_paths = tuple(out / "images" / f"{stem}.png" for stem in stems)
+    mask_paths = tuple(out / "masks" / f"{stem}.png" for stem in stems) if "masks" in passes else ()
+    write_capture(out, PosedImages(image_paths, cameras, found, colors, mask_paths))
+
+
+_CLIPPED, _MAX_CLIPPED = 0.995, 0.6
+"""sRGB value from which a channel counts as clipped, and largest share of them in a sound picture; set by hand."""
+_MIN_MEAN, _MIN_DEVIATION = 0.02, 0.01
+"""Smallest mean and deviation of a sound picture, sRGB; set by hand."""
+_MIN_COVERED, _MAX_COVERED = 0.001, 0.7
+"""Share of a picture that the object covers; set by hand."""
+_PASS_FILES = (("images", ".png", ".png"), ("masks", "_mask.png", ".png"), ("depth", "_depth.npy", ".npy"))
+
+
+def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out: Path) -> None:
+    """Write one rendered scene as captures, with its placement, its true lights and the object's true surface."""
+    gather_capture(source_render, "source", out / "source", passes=("images", "masks"), points=True)
+    gather_capture(target_render, "target", out / "target", passes=("images",), points=True)
+    gather_capture(
+        target_render, "ground_truth", out / "ground_truth", passes=("images", "masks", "depth"), points=False
+    )
+    scene = make_scene(which.kind, which.seed)
+    angle = math.radians(which.pose_deg)
+    c, s = math.cos(angle), math.sin(angle)
+    rotation = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    center = torch.tensor(scene.places[0].location)
+    moved = Similarity(scale=1.0, rotation=rotation, translation=center - rotation @ center)
+    write_placement(out / "placement.json", Placement((ObjectPlacement(moved),)))
+    shutil.copyfile(target_render / "light" / "0000.npy", out / "probe.npy")
+    shutil.copyfile(target_render / "light" / "suns.json", out / "suns.json")
+    (out / "old_light").mkdir(exist_ok=True)
+    for name in ("0000.npy", "suns.json"):
+        shutil.copyfile(source_render / "old_light" / name, out / "old_light" / name)
+    shutil.copyfile(source_render / "surface" / "0000.npy", out / "surface.npy")
+    record = {"kind": which.kind, "pose_deg": which.pose_deg, "seed": which.seed, **scene.notes}
+    (out / "scene.json").write_text(json.dumps(record, indent=1) + "\n")
+
+
+def find_defect(folder: Path) -> str | None:
+    """Describe the first defect of a scene in one line, or None: a missing, broken, black, clipped or empty picture."""
+    try:
+        truth, target = read_capture(folder / "ground_truth"), read_capture(folder / "target")
+        source = read_capture(folder / "source")
+        for capture, masked in ((truth, True), (target, False), (source, True)):
+            for index in range(len(capture)):
+                defect = _find_view_defect(capture, index, masked=masked)
+                if defect:
+                    return defect
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def _find_view_defect(capture: PosedImages, index: int, *, masked: bool) -> str | None:
+    path, image = capture.image_paths[index], capture.image(index)
+    mean, deviation, clipped = float(image.mean()), float(image.std()), float((image > _CLIPPED).float().mean())
+    if mean < _MIN_MEAN or deviation < _MIN_DEVIATION or clipped > _MAX_CLIPPED:
+        return (
+            f"{path}: expected a lit picture, found mean {mean:.3f}, deviation {deviation:.3f}, {clipped:.0%} clipped"
+        )
+    mask = capture.mask(index) if masked else None
+    if masked and mask is None:
+        return f"{path}: expected a mask beside it, found none"
+    if mask is not None and not _MIN_COVERED <= float(mask.mean()) <= _MAX_COVERED:
+        return f"{capture.mask_paths[index]}: expected a mask of 0.1% to 70%, found {float(mask.mean()):.2%}"
+    return None

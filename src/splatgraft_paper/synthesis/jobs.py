@@ -1,0 +1,190 @@
+"""Render jobs: their description, and rendering them in a Blender process."""
+
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from splatgraft.runtime.child_process import run_logged
+from splatgraft.runtime.workers import Task
+from splatgraft_paper.synthesis.scene import Camera, Part, Scene, Vector, World
+
+Pass = Literal["color", "depth", "normal", "albedo", "mask", "groups"]
+"""`groups` is the linear light of every lamp alone and of the world, at the exposure of the pictures: NNNN_groups.npy
+(g, h, w, 3), in the order of light_groups.json. Where any take has it, probes have a first axis of groups too."""
+_WORKER = Path(__file__).parent / "blender" / "worker.py"
+
+
+@dataclass(frozen=True)
+class RenderSize:
+    """Size and sampling of pictures."""
+
+    width: int = 704
+    height: int = 496
+    samples: int = 128
+    """Light paths per pixel."""
+
+    @staticmethod
+    def small() -> "RenderSize":
+        """A quarter of the paper's pixels, with 16 samples."""
+        return RenderSize(width=352, height=248, samples=16)
+
+
+@dataclass(frozen=True)
+class SurfaceSampling:
+    """Sampling of points on surfaces, uniform by area, within a sphere; metres."""
+
+    count: int
+    center: Vector
+    radius: float
+
+
+@dataclass(frozen=True)
+class Take:
+    """One set of pictures of a job, from all or some of its cameras."""
+
+    name: str
+    """Of its folder."""
+    scene: bool
+    """Whether the scene is rendered; without it the background is transparent."""
+    object: str = ""
+    """The object that is rendered; none where empty."""
+    passes: tuple[Pass, ...] = ("color",)
+    exposure_group: str = "scene"
+    """Takes of one group share one exposure, computed from the first of them."""
+    world: World | None = None
+    """Replaces the scene's world."""
+    cameras: tuple[int, ...] | None = None
+    """Indices of cameras; all where None."""
+    stops: float = 0.0
+    """Added to the group's exposure, photographic stops."""
+    probe: Vector | None = None
+    """Instead of pictures: the light at this point, `0000.npy` (64, 128, 3) and `suns.json`.
+
+    The panorama is linear light at the exposure of the pictures: row 0 is straight up, the middle column +x, and
+    columns run to the right as seen from inside. Suns are left out of it and listed in `suns.json`."""
+    surface: SurfaceSampling | None = None
+    """Instead of pictures: points on the object, or on the scene where no object is named, `0000.npy` (n, 6): position
+    and outward normal, world axes."""
+
+    @property
+    def is_pictures(self) -> bool:
+        """Whether the take is rendered from cameras."""
+        return self.probe is None and self.surface is None
+
+
+@dataclass(frozen=True)
+class Job:
+    """The description of what one Blender process renders."""
+
+    scene: Scene
+    objects: dict[str, tuple[Part, ...]]
+    cameras: tuple[Camera, ...]
+    takes: tuple[Take, ...]
+    size: RenderSize
+    seed: int = 0
+    provenance: dict[str, str] = field(default_factory=dict)
+    """Seeds, kinds and licences, written beside the pictures."""
+
+    def files(self, out: Path) -> Iterator[Path]:
+        """List the files that mark finished pictures, one per take and camera."""
+        for take in self.takes:
+            all_cameras = range(len(self.cameras)) if take.is_pictures else (0,)
+            for i in all_cameras if take.cameras is None else take.cameras:
+                yield out / take.name / f"{i:04d}.done"
+
+    def is_done(self, out: Path) -> bool:
+        """Whether everything is rendered."""
+        return all(path.exists() for path in self.files(out))
+
+
+def _description(job: Job, out: Path) -> str:
+    takes = [{key: value for key, value in asdict(take).items() if value is not None} for take in job.takes]
+    scene = json.loads(job.scene.to_json())
+    objects = {key: [asdict(part) for part in parts] for key, parts in job.objects.items()}
+    cameras = [asdict(camera) for camera in job.cameras]
+    found = {"out": str(out), "scene": scene, "objects": objects, "cameras": cameras, "takes": takes, "seed": job.seed}
+    return json.dumps({**found, **asdict(job.size), "provenance": job.provenance}, indent=1)
+
+
+def render_job(job: Job, out: Path, blender_python: Path) -> None:
+    """Render what is missing in `out`; can be interrupted and repeated.
+
+    Args:
+        job: what to render.
+        out: receives the pictures, job.json and render.log.
+        blender_python: a Python with bpy.
+
+    Raises:
+        ValueError: Blender fails; the message has its last error line.
+    """
+    if job.is_done(out):
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    description = out / "job.json"
+    description.write_text(_description(job, out.resolve()))
+    log = out / "render.log"
+    code = run_logged([str(blender_python), str(_WORKER), str(description)], log)
+    if not job.is_done(out):
+        tail = log.read_text(errors="replace").strip().splitlines()
+        said = next(
+            (line for line in reversed(tail) if "Error" in line and "freed" not in line), tail[-1] if tail else ""
+        )
+        raise ValueError(f"{log}: expected Blender to render every picture, found exit code {code}: {said}")
+
+
+def copy_shared_takes(job: Job, out: Path, other: Job, other_out: Path) -> None:
+    """Copy from `other_out` the complete takes that `job` would render identically; existing files of `out` stay.
+
+    The first take determines the exposure: unless it is shared, nothing is copied.
+    """
+    same_setup = (other.scene, other.cameras, other.size, other.seed) == (job.scene, job.cameras, job.size, job.seed)
+    shared = [
+        take
+        for take in job.takes
+        if same_setup
+        and take in other.takes
+        and job.objects.get(take.object) == other.objects.get(take.object)
+        and replace(other, takes=(take,)).is_done(other_out)
+    ]
+    if job.takes[0] not in shared:
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ("cameras.json", "exposure.json"):
+        shutil.copyfile(other_out / name, out / name)
+    for take in shared:
+        # .done files last: after an interruption, pictures without one are rendered again
+        for path in sorted((other_out / take.name).iterdir(), key=lambda path: path.suffix == ".done"):
+            (out / take.name).mkdir(exist_ok=True)
+            if not (out / take.name / path.name).exists():
+                shutil.copyfile(path, out / take.name / path.name)
+
+
+def check_blender(blender_python: Path) -> str:
+    """Return Blender's version in that interpreter.
+
+    Raises:
+        ValueError: it has no bpy.
+    """
+    command = [str(blender_python), "-c", "import bpy; print('version', bpy.app.version_string)"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise ValueError(f"{blender_python}: expected a Python with bpy, found {error.strerror}") from error
+    found = [line for line in done.stdout.splitlines() if line.startswith("version ")]
+    if done.returncode or not found:
+        last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+        raise ValueError(
+            f"{blender_python}: expected a Python with bpy (pip install 'splatgraft[blender]' in a Python 3.11), "
+            f"found {last}"
+        )
+    return found[-1].removeprefix("version ")
+
+
+def render_tasks(jobs: Sequence[tuple[Job, Path]], blender_python: Path) -> list[Task]:
+    """Make one task per job, for `run_tasks`."""
+    return [Task(out.name, partial(render_job, job, out, blender_python)) for job, out in jobs]

@@ -1,0 +1,306 @@
+"""Training pairs (paper, Sec. 5.1 and 5.2): planned as render jobs, and read as composite and target.
+
+One folder per scene and camera arc, `<out>/<scene>_<arc>/`:
+
+    job.json, cameras.json, exposure.json    what was rendered, poses (OpenGL axes), exposures
+    background/0000.png ...                  the scene without any object, 8-bit sRGB, one file per camera
+    object0/0000.png, _mask, _depth, _normal, _albedo    with object 0: the consistent target and its passes
+    object0_light0/0000.png                  object 0 alone under another environment map, RGBA, straight alpha
+    object0_light0_probe/0000.npy, suns.json    that light around the object, linear (64, 128, 3), and its suns
+    place_probe/0000.npy, suns.json          the scene's light at the objects' place, at the exposure of its pictures
+    scene_surface/0000.npy, object0_surface/    points on surfaces, (n, 6): position and outward normal
+
+`mask` is soft coverage (cryptomatte); `depth` is a float16 .npy along the optical axis in metres, 0 for the sky;
+`normal` is 0.5 + 0.5 n in world axes; `albedo` is the diffuse colour, sRGB.
+"""
+
+import json
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.images import read_rgb, read_straight_rgb
+from splatgraft_paper.synthesis import objects
+from splatgraft_paper.synthesis.cameras import camera_arc
+from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take
+from splatgraft_paper.synthesis.outdoors import OUTDOORS, SUPPLIED_MAPS, outdoor
+from splatgraft_paper.synthesis.rooms import INTERIORS, interior
+from splatgraft_paper.synthesis.scene import Scene, World
+
+_OBJECT_POINTS, _SCENE_POINTS = 12_000, 100_000
+"""Sampled points per object and per scene."""
+_SURFACE_RADIUS = 8.0
+"""Metres around the object within which surface points are sampled."""
+KINDS: tuple[str, ...] = (*INTERIORS, *OUTDOORS)
+
+
+def make_scene(kind: str, seed: int) -> Scene:
+    """Make the scene of a kind and a seed.
+
+    Raises:
+        ValueError: the kind is unknown.
+    """
+    if kind in INTERIORS:
+        return interior(seed, kind)
+    if kind in OUTDOORS:
+        return outdoor(seed, kind)
+    raise ValueError(f"scene kind: expected one of {', '.join(KINDS)}, found '{kind}'")
+
+
+@dataclass(frozen=True)
+class PairPlan:
+    """Options of a set of pairs; there are scenes x 5 cameras x objects x lights pairs."""
+
+    scenes: int = 60
+    objects: int = 2
+    """Per scene; the background is rendered once for all."""
+    lights: int = 3
+    """Environment maps per object."""
+    seed: int = 0
+    size: RenderSize = field(default_factory=RenderSize)
+    kinds: tuple[str, ...] = KINDS
+    maps: tuple[str, ...] = SUPPLIED_MAPS
+    """Environment maps: files, or names of those that come with Blender."""
+    models: tuple[str, ...] = ()
+    """Model files, used for about half of the objects."""
+
+
+def plan(options: PairPlan, number: int) -> Job:
+    """Plan the job of scene `number`, determined by it and the seed.
+
+    Raises:
+        ValueError: the scene leaves no room for an arc of cameras.
+    """
+    rng = random.Random(f"pairs-{options.seed}-{number}")
+    kind = options.kinds[number % len(options.kinds)]
+    scene = make_scene(kind, options.seed * 100_003 + number)
+    place = scene.places[0]
+    things, heights = {}, []
+    for i in range(options.objects):
+        if options.models and rng.random() < 0.5:
+            parts = objects.from_file(Path(rng.choice(options.models)), place)
+        else:
+            parts = objects.make(rng.randrange(2**31), place)
+        heights.append(max(part.location[2] + part.size[2] / 2 for part in parts))
+        things[f"object{i}"] = objects.standing_at(parts, place.location, rng.uniform(0, 6.283))
+    middle = (place.location[0], place.location[1], place.location[2] + 0.5 * max(heights))
+    takes = [Take("background", scene=True)]
+    for name in things:
+        takes.append(Take(name, scene=True, object=name, passes=("color", "mask", "depth", "normal", "albedo")))
+        for light in range(options.lights):
+            world = World("environment", path=rng.choice(options.maps), rotation=rng.uniform(0, 6.283))
+            alone = f"{name}_light{light}"
+            takes.append(Take(alone, scene=False, object=name, world=world, exposure_group=alone))
+            takes.append(Take(f"{alone}_probe", scene=False, world=world, exposure_group=alone, probe=middle))
+        takes.append(
+            Take(
+                f"{name}_surface",
+                scene=False,
+                object=name,
+                surface=SurfaceSampling(_OBJECT_POINTS, middle, _SURFACE_RADIUS),
+            )
+        )
+    takes.append(Take("place_probe", scene=True, probe=middle))
+    takes.append(Take("scene_surface", scene=True, surface=SurfaceSampling(_SCENE_POINTS, middle, _SURFACE_RADIUS)))
+    cameras = camera_arc(scene, place, max(heights), number)
+    provenance = {"kind": kind, "seed": str(options.seed), "number": str(number), "licence": "own render"}
+    return Job(scene, things, cameras, tuple(takes), options.size, number, provenance)
+
+
+def job_folder_name(job: Job) -> str:
+    """Name of the job's folder."""
+    return f"{job.scene.name}_{job.seed:05d}"
+
+
+@dataclass(frozen=True)
+class PairSample:
+    """One training pair on disk, by folder, camera, object and light."""
+
+    folder: Path
+    camera: int
+    object: str
+    light: str
+
+    def path(self, take: str, kind: str = "") -> Path:
+        """Path of a take's pass for this camera."""
+        suffix = ".npy" if kind == "depth" else ".png"
+        return self.folder / take / f"{self.camera:04d}{'_' + kind if kind else ''}{suffix}"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One training pair in memory, sRGB in [0, 1]."""
+
+    composite: Float[Tensor, "h w 3"]
+    """The object in the light of another place, pasted onto the background (paper, Eq. 2)."""
+    target: Float[Tensor, "h w 3"]
+    """The scene rendered with the object."""
+    background: Float[Tensor, "h w 3"]
+    mask: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    """Metres along the optical axis, 0 for the sky."""
+    normal: Float[Tensor, "h w 3"]
+    """Unit, world axes."""
+    albedo: Float[Tensor, "h w 3"]
+
+
+def match_statistics(
+    relit: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """Shift and scale the relit object to the mean and deviation per channel of the object in the scene (Sec. 5.2).
+
+    Args:
+        relit: the object in another light, sRGB.
+        target: the object in the scene, sRGB.
+        mask: weights of the statistics, in [0, 1].
+    """
+    weight = mask[..., None] / mask.sum().clamp_min(1e-6)
+
+    def moments(image: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        mean = (image * weight).sum((0, 1))
+        return mean, ((image - mean) ** 2 * weight).sum((0, 1)).sqrt()
+
+    (relit_mean, relit_deviation), (mean, deviation) = moments(relit), moments(target)
+    return ((relit - relit_mean) / relit_deviation.clamp_min(1e-4) * deviation + mean).clamp(0, 1)
+
+
+def composite(
+    relit: Float[Tensor, "h w 3"], background: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """M * relit + (1 - M) * background (paper, Eq. 2).
+
+    Args:
+        relit: colours of the object, not multiplied by its coverage.
+        background: the scene without the object.
+        mask: M, coverage in [0, 1].
+    """
+    return mask[..., None] * relit + (1 - mask[..., None]) * background
+
+
+def load_pair(sample: PairSample) -> Pair:
+    """Read one pair and compute its composite.
+
+    Raises:
+        ValueError: a file is missing or broken.
+    """
+    target, background = read_rgb(sample.path(sample.object)), read_rgb(sample.path("background"))
+    mask = read_rgb(sample.path(sample.object, "mask"))[..., 0]
+    relit = read_straight_rgb(sample.path(f"{sample.object}_{sample.light}"))
+    depth_path = sample.path(sample.object, "depth")
+    try:
+        depth = torch.from_numpy(np.load(depth_path, allow_pickle=False).astype(np.float32))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{depth_path}: expected a float16 array, found {error}") from error
+    normal = read_rgb(sample.path(sample.object, "normal")) * 2 - 1
+    return Pair(
+        composite=composite(match_statistics(relit, target, mask), background, mask),
+        target=target,
+        background=background,
+        mask=mask,
+        depth=depth,
+        normal=torch.nn.functional.normalize(normal, dim=-1),
+        albedo=read_rgb(sample.path(sample.object, "albedo")),
+    )
+
+
+def samples_in(folder: Path) -> list[PairSample]:
+    """List all pairs of a rendered folder by its job.json.
+
+    Raises:
+        ValueError: job.json is missing or broken.
+    """
+    path = folder / "job.json"
+    try:
+        job = json.loads(path.read_text())
+        takes, cameras = [take["name"] for take in job["takes"]], len(job["cameras"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected the description of a render job, found {error}") from error
+    alone = [take.split("_") for take in takes if "_light" in take and not take.endswith("_probe")]
+    return [PairSample(folder, i, name, light) for i in range(cameras) for name, light in alone]
+
+
+def find_defect(sample: PairSample) -> str | None:
+    """Describe the first defect of a pair in one line, or None: a missing, broken, empty, black or clipped picture."""
+    try:
+        pair = load_pair(sample)
+        relit = read_straight_rgb(sample.path(f"{sample.object}_{sample.light}"))
+    except ValueError as error:
+        return str(error)
+    luma, inside = pair.target.mean(-1), pair.mask > 0.5
+    covered, clipped = float(inside.float().mean()), float((luma > 0.995).float().mean())
+    mean, deviation = float(luma.mean()), float(luma.std())
+    far = torch.nn.functional.max_pool2d(pair.mask[None, None], 31, 1, 15)[0, 0] < 0.01
+    difference = float((pair.target - pair.background)[far].abs().median()) if bool(far.any()) else 0.0
+    lit = float(relit[inside].mean()) if covered else 0.0
+    target = sample.path(sample.object)
+    # thresholds set by hand on rendered pairs
+    checks = (
+        (0.002 <= covered <= 0.7, sample.path(sample.object, "mask"), "a mask of 0.2% to 70%", f"{covered:.2%}"),
+        (mean > 0.02 and deviation > 0.01, target, "a lit picture", f"mean {mean:.3f}, deviation {deviation:.3f}"),
+        (clipped <= 0.4, target, "at most 40% clipped", f"{clipped:.0%}"),
+        (lit > 0.01, sample.path(f"{sample.object}_{sample.light}"), "a lit object", f"mean {lit:.3f}"),
+        (
+            difference <= 0.08,
+            sample.path("background"),
+            "the target's scene",
+            f"a median difference of {difference:.3f}",
+        ),
+    )
+    return next(
+        (f"{path}: expected {expected}, found {found}" for sound, path, expected, found in checks if not sound), None
+    )
+
+
+def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
+    """Check every pair and write manifest.jsonl.
+
+    Args:
+        out: folder of the manifest.
+        folders: rendered folders in it.
+
+    Returns:
+        The number of sound pairs, and the defects of the others.
+    """
+    defects, lines = [], []
+    for folder in folders:
+        provenance = json.loads((folder / "job.json").read_text()).get("provenance", {})
+        for sample in samples_in(folder):
+            defect = find_defect(sample)
+            if defect:
+                defects.append(defect)
+                continue
+            entry = {"folder": folder.name, "camera": sample.camera, "object": sample.object, "light": sample.light}
+            lines.append(json.dumps({**entry, **provenance}))
+    partial = out / "manifest.jsonl.partial"
+    partial.write_text("\n".join(lines) + "\n" if lines else "")
+    partial.replace(out / "manifest.jsonl")
+    return len(lines), defects
+
+
+def read_manifest(out: Path) -> list[PairSample]:
+    """Read the sound pairs of a folder.
+
+    Raises:
+        ValueError: the manifest is missing or a line is broken.
+    """
+    path = out / "manifest.jsonl"
+    if not path.is_file():
+        raise ValueError(
+            f"{path}: expected the manifest of rendered pairs, found none (splatgraft synth pairs makes one)"
+        )
+    samples = []
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        try:
+            entry = json.loads(line)
+            samples.append(PairSample(out / entry["folder"], int(entry["camera"]), entry["object"], entry["light"]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{path}, line {number}: expected folder, camera, object and light, found {line[:80]}"
+            ) from error
+    return samples

@@ -1,0 +1,143 @@
+"""The measurement of one method's pictures of one scene of a data set, from files alone: no scene is rendered."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.images import read_mask, read_rgb
+from splatgraft.fitting.perceptual_losses import lpips_vgg
+from splatgraft.project.layout import METRICS_FILE
+from splatgraft.project.step import Context, Inputs
+from splatgraft_paper.benchmark.picture_metrics import KnownView, measure_picture
+from splatgraft_paper.tables.picture_folders import held_out_stems, match_views, pictures
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class MeasurePictures:
+    """Compare a method's pictures of one scene with what is known of their views."""
+
+    pictures: Path
+    """The method's pictures."""
+    out: Path
+    """Folder for metrics.json."""
+    truth: Path | None = None
+    """Pictures with the object really in the scene."""
+    masks: Path | None = None
+    """Masks of the object."""
+    background: Path | None = None
+    """Pictures without the object."""
+    composite: Path | None = None
+    """Pictures with the object pasted in."""
+    weights: Path | None = None
+    """Folder of LPIPS's weights."""
+    lpips: bool = False
+    """Whether LPIPS is measured."""
+    held_out_every: int = 8
+    """Every n-th view from the first is measured."""
+    all_views: bool = False
+    """Measure all views, not only the held-out ones."""
+
+    def inputs(self) -> Inputs:
+        """The pictures of the measured views."""
+        chosen = self.views()
+        return {role: tuple(files[stem] for stem in chosen.matched) for role, files in chosen.files.items()}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Measure each view."""
+        chosen = self.views()
+        perceptual = lpips_vgg(self.weights) if self.lpips else None
+        rows: dict[str, dict[str, float | None]] = {}
+        sizes: set[Size] = set()
+        for done, stem in enumerate(chosen.matched, 1):
+            image = read_rgb(chosen.files["pictures"][stem])
+            sizes.add((image.shape[1], image.shape[0]))
+            known = _known(chosen.files, stem, (image.shape[1], image.shape[0]))
+            values = measure_picture(image, known, perceptual)
+            rows[stem] = {name: value if math.isfinite(value) else None for name, value in values.items()}
+            context.progress(done, len(chosen.matched), stem)
+        record = {"values": _means(rows), "views": rows, "protocol": self._protocol(chosen, sizes)}
+        (folder / METRICS_FILE).write_text(json.dumps(record, indent=1, allow_nan=False))
+
+    def views(self) -> "ChosenViews":
+        """The views to measure and their files by role.
+
+        Raises:
+            ValueError: No picture of the method belongs to a view that is to be measured.
+        """
+        reference = self.truth or self.composite
+        found = pictures(self.pictures)
+        wanted = list(found if reference is None else pictures(reference))
+        matched, how = match_views(wanted, found, self.held_out_every)
+        held_out = held_out_stems(wanted, self.held_out_every)
+        stems = [stem for stem in (wanted if self.all_views else held_out) if stem in matched]
+        if not stems:
+            raise ValueError(f"{self.pictures}: expected pictures of the views in {reference}, found {how}")
+        files = {"pictures": matched}
+        for role in ("truth", "masks", "background", "composite"):
+            folder: Path | None = getattr(self, role)
+            if folder is not None:
+                files[role], _ = match_views(wanted, pictures(folder), self.held_out_every)
+                if lost := [stem for stem in stems if stem not in files[role]]:
+                    raise ValueError(f"{folder}: expected a picture of view {lost[0]} for the {role}, found none")
+        return ChosenViews(files, stems, how, len(wanted), len(held_out))
+
+    def _protocol(self, chosen: "ChosenViews", sizes: set[Size]) -> dict[str, object]:
+        """What a reader needs to know to compare the numbers."""
+        every = self.held_out_every
+        views = "all" if self.all_views or every == 1 else f"held out: every {every}th from the first"
+        return {
+            "views": views,
+            "view_count": len(chosen.matched),
+            "views_of_the_scene": chosen.of_scene,
+            "held_out_views_of_the_scene": chosen.held_out,
+            "matched": chosen.how,
+            "resolution": sorted(f"{width}x{height}" for width, height in sizes),
+            "truth": self.truth is not None,
+            "masks": self.masks is not None,
+            "background": self.background is not None,
+        }
+
+
+@dataclass(frozen=True)
+class ChosenViews:
+    """The views of a scene that are measured."""
+
+    files: Mapping[str, Mapping[str, Path]]
+    """Role to files by view."""
+    matched: list[str]
+    """Names of the views, in their order."""
+    how: str
+    """How pictures were matched to views."""
+    of_scene: int
+    held_out: int
+
+
+def _known(files: Mapping[str, Mapping[str, Path]], stem: str, size: Size) -> KnownView:
+    def read(role: str) -> Float[Tensor, "h w 3"] | None:
+        return _of_size(read_rgb(files[role][stem]), files[role][stem], size) if role in files else None
+
+    mask = _of_size(read_mask(files["masks"][stem]), files["masks"][stem], size) if "masks" in files else None
+    return KnownView(read("truth"), mask, read("background"), read("composite"))
+
+
+def _of_size(image: Tensor, path: Path, size: Size) -> Tensor:
+    """Nothing is resampled: a number of a resampled picture is another number."""
+    if (image.shape[1], image.shape[0]) != size:
+        found = f"{image.shape[1]}x{image.shape[0]}"
+        raise ValueError(f"{path}: expected {size[0]}x{size[1]} pixels as the method's picture, found {found}")
+    return image
+
+
+def _means(rows: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
+    out: dict[str, float | None] = {}
+    for name in next(iter(rows.values())):
+        values = [value for row in rows.values() if (value := row[name]) is not None]
+        out[name] = sum(values) / len(values) if values else None
+    return out

@@ -1,0 +1,146 @@
+"""Our methods on a scene of the data set: pictures of its held-out views, from placed scenes or from captures.
+
+An object that is already placed (a trained .ply beside that of the scene) needs no placement of ours; from raw captures
+both are reconstructed and the object is put where placement.json says.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from splatgraft.commands.steps.compose import Compose
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.images import write_image
+from splatgraft.core.similarity import Similarity
+from splatgraft.folders.capture_files import camera_files
+from splatgraft.formats import read_cameras, read_gaussians, read_scene, write_cameras, write_gaussians
+from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
+from splatgraft.project.layout import OBJECT_FILE, PLACEMENT_FILE
+from splatgraft.project.step import Context, Device, Inputs, choose_device
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.rendering import render
+from splatgraft.runtime.console import Console
+from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_method
+from splatgraft_paper.benchmark.scene import ComposedScene, GroundTruthScene, compose_scene, perform_if_stale
+from splatgraft_paper.tables.paper_scene import LAYOUT_FILE, PaperScene
+from splatgraft_paper.tables.picture_folders import held_out_stems
+from splatgraft_paper.tables.syncom_scene import convert_syncom
+
+
+@dataclass(frozen=True)
+class OurRun:
+    """How our methods are run."""
+
+    out: Path
+    """Folder of all results."""
+    options: ReconstructOptions
+    """Of captures that are reconstructed."""
+    methods: MethodSettings = field(default_factory=MethodSettings)
+    held_out_every: int = 8
+
+    @property
+    def device(self) -> Device:
+        """Where to compute."""
+        return self.methods.device
+
+
+@dataclass(frozen=True)
+class RenderPictures:
+    """Render a scene from some of its cameras."""
+
+    scene: Path
+    """A .ply."""
+    cameras: Path
+    """A capture folder or its file."""
+    out: Path
+    """Folder for VIEW.png."""
+    stems: tuple[str, ...] = ()
+    """Names of the views."""
+    device: Device = "auto"
+
+    def inputs(self) -> Inputs:
+        """The scene and the cameras."""
+        return {"scene": (self.scene,), "cameras": camera_files(self.cameras)}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Make the pictures."""
+        device = choose_device(self.device, context.console)
+        scene, cameras = read_gaussians(self.scene).to(device), read_cameras(self.cameras)
+        wanted = [index for index, name in enumerate(cameras.names) if Path(name).stem in self.stems]
+        for done, index in enumerate(wanted, 1):
+            image = render(scene, cameras[index].to(device)).color[0]
+            write_image(folder / f"{Path(cameras.names[index]).stem}.png", image.cpu().clamp(0, 1))
+            context.progress(done, len(wanted), cameras.names[index])
+
+
+def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Console) -> tuple[Path, dict[str, float]]:
+    """Run a method on a scene as far as it is stale.
+
+    Returns:
+        The folder with its pictures of the held-out views, and seconds by step.
+
+    Raises:
+        ValueError: The scene lacks what is needed, or the method cannot run here, with the reason.
+    """
+    work = run.out / "scenes" / scene.name
+    if scene.kind == "syncom":
+        converted = convert_syncom(scene, work / "given")
+        cameras_from = converted.cameras
+        composed = compose_scene(converted.truth, work, run.options, device=run.device, console=console)
+    else:
+        cameras_from = _cameras_path(scene)
+        composed = _composed(scene, work, run, console)
+    result, seconds = run_method(method, composed, run.methods, console)
+    names = [Path(name).stem for name in read_cameras(cameras_from).names]
+    stems = tuple(held_out_stems(names, run.held_out_every))
+    out = work / "pictures" / method.folder_name
+    perform_if_stale(RenderPictures(result, cameras_from, out, stems=stems, device=run.device), console)
+    return out, {**composed.seconds, **seconds}
+
+
+def _cameras_path(scene: PaperScene) -> Path:
+    path = scene.files.get("cameras") or scene.files.get("target_capture")
+    if path is None:
+        raise ValueError(f"{scene.name}: expected cameras (transforms.json or a COLMAP model), found none; "
+                         f"name them in {LAYOUT_FILE}")  # fmt: skip
+    return path
+
+
+def _composed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> ComposedScene:
+    files = scene.files
+    if "target_scene" in files and "object_scene" in files:
+        return _placed(scene, work, run, console)
+    if {"source_capture", "target_capture", "placement"} <= set(files) and "truth" in scene.folders:
+        captures = (files["source_capture"], files["target_capture"])
+        truth = GroundTruthScene(scene.name, *captures, scene.folders["truth"], files["placement"])
+        return compose_scene(truth, work, run.options, device=run.device, console=console)
+    raise ValueError(
+        f"{scene.name}: expected the trained scene and the placed object (target_scene, object_scene), or both "
+        f"captures and a placement.json, found {', '.join(sorted(files)) or 'neither'}; name them in {LAYOUT_FILE}"
+    )
+
+
+def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> ComposedScene:
+    """Take over an object that already stands where it belongs: the placement is the identity."""
+    cameras = read_cameras(_cameras_path(scene))
+    composed = ComposedScene(scene.name, work, from_capture=False)
+    object_file = work / "object" / OBJECT_FILE
+    placement = work / "given_placement" / PLACEMENT_FILE
+    for path in (composed.cameras, composed.target, object_file, placement):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_cameras(composed.cameras, _without(cameras, run.held_out_every))
+    for key, path in (("target_scene", composed.target), ("object_scene", object_file)):
+        given = read_scene(scene.files[key])
+        for note in given.notes:
+            console.say(f"{scene.files[key]}: {note}")
+        write_gaussians(path, given.gaussians)
+    write_placement(placement, Placement((ObjectPlacement(Similarity.identity()),)))
+    perform_if_stale(Compose(composed.target, object_file, composed.composite, placement=placement), console)
+    return composed
+
+
+def _without(cameras: Cameras, every: int) -> Cameras:
+    """The cameras whose views are not held out."""
+    held = set(held_out_stems([Path(name).stem for name in cameras.names], every))
+    return cameras[torch.tensor([Path(name).stem not in held for name in cameras.names])]
