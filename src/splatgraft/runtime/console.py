@@ -10,6 +10,7 @@ import rich.console
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
+from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress
 
 _LINES = 10
@@ -54,6 +55,14 @@ class Console:
         """
         self.say(f"warning: {sentence}{self._help}")
         self._warned.append(ConsoleWarning(sentence, picture, minor))
+
+    def tell(self, *notes: Note) -> None:
+        """Show notes; warnings also go into step.json and to the top of the report."""
+        for note in notes:
+            if note.level == "said":
+                self.say(note.text)
+            else:
+                self.warn(f"{note.text} {note.remedy}".rstrip(), picture=note.picture, minor=note.level == "minor")
 
     def warn_at_length(self, sentences: Sequence[str], *, minor: bool = False) -> None:
         """Warn with the first sentence, where there is one, and print the others, which explain it."""
