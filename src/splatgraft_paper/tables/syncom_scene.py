@@ -5,10 +5,10 @@ from pathlib import Path
 
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats import read_capture, write_cameras, write_capture
-from splatgraft.formats.captures import syncom_json
 from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.layout import PLACEMENT_FILE
 from splatgraft_paper.benchmark.scene import GroundTruthScene
+from splatgraft_paper.tables import syncom_json
 from splatgraft_paper.tables.paper_scene import LAYOUT_FILE, PaperScene
 from splatgraft_paper.tables.syncom_folders import object_of
 

@@ -9,7 +9,7 @@ from paper_data import TERRACE, put
 from syncom_data import SCENE_FROM_OBJECT, write_cameras_json, write_syncom
 
 from splatgraft.formats import read_cameras
-from splatgraft.formats.captures import syncom_json
+from splatgraft_paper.tables import syncom_json
 
 
 @pytest.fixture(scope="module")
