@@ -16,7 +16,7 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 from splatgraft.fitting import adam
 from splatgraft.rendering.cpu_basis import basis_at
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 _PART = 512
 """Gaussians of one task of a kernel."""
@@ -131,7 +131,7 @@ class _Colors(torch.autograd.Function):
         return None, out
 
 
-@numba.njit(cache=True)
+@kernel
 @no_type_check
 def _basis_towards(mean, center, k, out):
     x, y, z = float(mean[0]) - center[0], float(mean[1]) - center[1], float(mean[2]) - center[2]
@@ -140,7 +140,7 @@ def _basis_towards(mean, center, k, out):
 
 
 @serialized
-@numba.njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _fill_colors(means, center, shown, sh, out):
     n, k = shown.shape[0], sh.shape[1]
@@ -158,7 +158,7 @@ def _fill_colors(means, center, shown, sh, out):
 
 
 @serialized
-@numba.njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _add_transpose(means, center, shown, colors, out):
     n, k = shown.shape[0], out.shape[1]
@@ -173,7 +173,7 @@ def _add_transpose(means, center, shown, colors, out):
 
 
 @serialized
-@numba.njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _write_transpose(means, center, shown, colors, out):
     n, k = shown.shape[0], out.shape[1]
@@ -188,7 +188,7 @@ def _write_transpose(means, center, shown, colors, out):
 
 
 @serialized
-@numba.njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _add_squares(means, center, shown, weights, out):
     n, k = shown.shape[0], out.shape[1]
@@ -204,7 +204,7 @@ def _add_squares(means, center, shown, weights, out):
 
 
 @serialized
-@numba.njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _descend(seen, colors, rows, steps, rates):
     """`_write_transpose` and `adam.update_row` without a gradient in memory; returns the rows that are not finite."""

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
@@ -117,7 +117,7 @@ def _step_numba(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bo
     return _update_rows(values, gradients, (firsts, seconds), (steps.numpy(), visible.numpy()), numbers) == 0
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=_FAST, error_model="numpy")
 @no_type_check
 def bias_corrections(step):
     """Factors on the first and the second moment after the update number `step`, counted from 1."""
@@ -129,7 +129,7 @@ def bias_corrections(step):
 
 
 # divisions follow numpy, since a check for zero would be a branch in the loop
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=_FAST, error_model="numpy")
 @no_type_check
 def update_row(value, gradient, moments, corrections, rate):
     """Update one Gaussian's row of a field in place; returns 1 and changes nothing where a number is not finite."""
@@ -151,7 +151,7 @@ def update_row(value, gradient, moments, corrections, rate):
     return bad
 
 
-@numba.njit(cache=True)
+@kernel
 @no_type_check
 def _update_part(value, gradient, moments, part, rate):
     """Update the rows that `part` = (first, last, steps, visible) names; returns how many have no finite gradient."""
@@ -169,7 +169,7 @@ def _update_part(value, gradient, moments, part, rate):
 
 
 @serialized
-@numba.njit(parallel=True, cache=True)
+@kernel(parallel=True)
 @no_type_check
 def _update_rows(values, gradients, moments, counts, rates):
     """All fields in one launch; `counts` = (steps, visible)."""

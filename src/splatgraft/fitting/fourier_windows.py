@@ -15,7 +15,7 @@ from numba import float32
 from torch import Tensor
 
 from splatgraft.rendering.cpu_simd import broadcast, load, store
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 SIZE = 16
 _HOP, _ROWS = SIZE // 2, SIZE // 2 + 1
@@ -62,7 +62,7 @@ class _Distance(torch.autograd.Function):
         return torch.from_numpy(ctx.gradient) * (grad / ctx.count), None, None
 
 
-@numba.njit(cache=True)
+@kernel
 @no_type_check
 def _transform(picture, place, factors, tables, work, spectrum):
     """Fill `spectrum` with real, then imaginary parts of rows 0 to 8 of a window's spectrum.
@@ -96,7 +96,7 @@ def _transform(picture, place, factors, tables, work, spectrum):
         store(spectrum, _HALF + row * SIZE, imaginary)
 
 
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=_FAST, error_model="numpy")
 @no_type_check
 def _differ(spectrum, wanted, shares):
     """Sum of the differences of magnitudes; `spectrum` becomes the gradient of that sum."""
@@ -112,7 +112,7 @@ def _differ(spectrum, wanted, shares):
     return added
 
 
-@numba.njit(cache=True)
+@kernel
 @no_type_check
 def _add_back(spectrum, place, factors, tables, work, gradient):
     """Add the transpose of `_transform` at `spectrum` to a window of `gradient`; `work` holds the rows along x."""
@@ -140,7 +140,7 @@ def _add_back(spectrum, place, factors, tables, work, gradient):
 
 
 @serialized
-@numba.njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _compare(image, target, factors, tables, gradient, sums):
     """Fill `sums (c, rows of windows)`, and add to `gradient` where it is not empty."""

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.image_metrics import ssim
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 _TAPS = np.exp(-((np.arange(6, dtype=np.float64) - 5) ** 2) / (2 * 1.5**2))
 _T0, _T1, _T2, _T3, _T4, _T5 = (np.float32(tap) for tap in _TAPS / (2 * _TAPS.sum() - _TAPS[5]))
@@ -51,7 +51,7 @@ class _FusedL1Dssim(torch.autograd.Function):
         return upstream * ctx.saved_tensors[0], None, None
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@kernel(fastmath=_FAST)
 @no_type_check
 def _across(out, row):
     """out[j] = the same channel of eleven neighbours, row[j], row[j + 3], ... weighted by the window."""
@@ -66,14 +66,14 @@ def _across(out, row):
         )
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@kernel(fastmath=_FAST)
 @no_type_check
 def _add_rows(out, first, second, tap):
     for j in range(len(out)):
         out[j] += tap * (first[j] + second[j])
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@kernel(fastmath=_FAST)
 @no_type_check
 def _down(out, ring, k, top):
     """out = plane k of the eleven rows from `top` on, weighted by the window; row r lies at r modulo 11 of `ring`."""
@@ -87,7 +87,7 @@ def _down(out, ring, k, top):
 
 
 # divisions follow numpy, since a check for zero would be a branch in the loop; denominators are at least C1 and C2
-@numba.njit(cache=True, fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=_FAST, error_model="numpy")
 @no_type_check
 def _similarity(work):
     """SSIM and its derivatives; planes of `_BLOCK`: in mean x, mean y, mean x^2 + y^2, mean xy, out by x, x^2, xy."""
@@ -106,7 +106,7 @@ def _similarity(work):
     return total
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@kernel(fastmath=_FAST)
 @no_type_check
 def _moments_of_row(out, x, y):
     """Horizontally filtered x, y, x^2 + y^2 and xy to out[0..3]."""
@@ -121,7 +121,7 @@ def _moments_of_row(out, x, y):
     _across(out[3], scratch)
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@kernel(fastmath=_FAST)
 @no_type_check
 def _derivatives_of_row(out, filtered, top):
     """SSIM of one row and, horizontally spread, its derivatives to out[0..2]; returns the sum of SSIM."""
@@ -145,7 +145,7 @@ def _derivatives_of_row(out, filtered, top):
     return total
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@kernel(fastmath=_FAST)
 @no_type_check
 def _gradient_of_row(out, spread, row, pair, scales):
     """The derivatives spread vertically and joined with those of L1; returns the sum of |x - y|."""
@@ -168,7 +168,7 @@ def _gradient_of_row(out, spread, row, pair, scales):
 
 
 @serialized
-@numba.njit(parallel=True, cache=True, fastmath=_FAST)
+@kernel(parallel=True, fastmath=_FAST)
 @no_type_check
 def _loss_and_gradient(x, y, weight):
     """Loss and its gradient for images as rows of three interleaved channels.

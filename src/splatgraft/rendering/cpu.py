@@ -13,7 +13,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import cpu_blend, cpu_normal_matrix, cpu_project, cpu_rows, cpu_tiles
 from splatgraft.rendering.channels import CHANNEL_COUNTS, assemble_render
 from splatgraft.rendering.interface import Output, Render, RenderOptions
-from splatgraft.runtime.kernel_lock import KERNEL_LOCK
+from splatgraft.runtime.kernels import KERNEL_LOCK
 
 
 def render(

@@ -5,11 +5,9 @@ The same functions as in `core.spherical_harmonics`, which torch evaluates; a te
 
 from typing import no_type_check
 
-from numba import njit
+from splatgraft.runtime.kernels import kernel
 
-from splatgraft.core import spherical_harmonics
-
-C0 = spherical_harmonics.C0
+C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C20, C22, C24 = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
 C30, C31, C32, C33, C35 = (
@@ -21,7 +19,7 @@ C30, C31, C32, C33, C35 = (
 )
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def basis_at(x, y, z, k, out):
     """Fill the first k of `out (16,)` at the unit direction x, y, z."""
@@ -43,7 +41,7 @@ def basis_at(x, y, z, k, out):
             out[15] = -C30 * x * (xx - 3 * yy)
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def basis_and_slope(x, y, z, k, out, slope):
     """`basis_at`, and the partial derivatives in x, y, z in the first k rows of `slope (16, 3)`."""

@@ -9,7 +9,7 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import float32, njit, prange
+from numba import float32, prange
 
 from splatgraft.rendering.cpu_project import CA, CB, CC, LOG_OPACITY, MIN_ALPHA, MX, MY, REACH_Y
 from splatgraft.rendering.cpu_simd import (
@@ -25,6 +25,7 @@ from splatgraft.rendering.cpu_simd import (
     where_below,
 )
 from splatgraft.rendering.cpu_tiles import TILE
+from splatgraft.runtime.kernels import kernel
 
 PIXELS = TILE * TILE
 BATCH = 32
@@ -42,7 +43,7 @@ LOWEST = float32(math.log(MIN_ALPHA) / 16)
 E0, E1, E2, E3, E4 = (float32(x) for x in (0.99999994, 0.9999898, 0.49976337, 0.16472879, 0.035080757))
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def splat_shape(splats, s, x0, y0):
     """Centre in the tile, the quadratic's a, b, c and constant over 16, first and one past the last row."""
@@ -55,7 +56,7 @@ def splat_shape(splats, s, x0, y0):
     return mx, my, a, b, c, SIXTEENTH * splats[s, LOG_OPACITY], top, bottom
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def kept_rows(rows, k, top, bottom):
     """First and one past the last row of entry k: those of `rows (e, 2)`, or `top` and `bottom` where it is empty."""
@@ -64,7 +65,7 @@ def kept_rows(rows, k, top, bottom):
     return top, bottom
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def alpha_row(across, dx, along, down):
     """A row of alpha before the cap, 0 below 1/255, of the exponent `across` + `along` dx + `down` (all over 16)."""
@@ -77,7 +78,7 @@ def alpha_row(across, dx, along, down):
     return where_at_least(x, LOWEST, e)
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def saturated(work, least):
     """Whether the transmittance of all pixels of the tile is below `least`."""
@@ -87,7 +88,7 @@ def saturated(work, least):
     return largest(most) < least
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _blend_rgb(splats, entries, rows, values, x0, y0, work, least):
     """Planes of `work`: transmittance, red, green, blue."""
@@ -111,7 +112,7 @@ def _blend_rgb(splats, entries, rows, values, x0, y0, work, least):
             break
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _blend_any(splats, entries, rows, values, x0, y0, work, least):
     """Planes of `work`: transmittance, then the channels."""
@@ -134,7 +135,7 @@ def _blend_any(splats, entries, rows, values, x0, y0, work, least):
             break
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def open_tile(tile, width, planes):
     """Corner of the tile, and its planes: transmittance 1, the others 0."""
@@ -144,7 +145,7 @@ def open_tile(tile, width, planes):
     return (tile % tiles_x) * TILE, (tile // tiles_x) * TILE, work
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def blend(splats, start, entries, rows, values, image, alpha, least):
     """Fill `image (c, h, w)` with blended `values (m, c)` over black, and `alpha (h, w)`.
@@ -168,7 +169,7 @@ def blend(splats, start, entries, rows, values, image, alpha, least):
                     image[c, y, x] = work[(c + 1) * PIXELS + at]
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def read_tile(image, x0, y0, work, plane):
     """Copy the tile at x0, y0 of `image (h, w)` into a plane, which stays 0 outside the image."""
@@ -177,7 +178,7 @@ def read_tile(image, x0, y0, work, plane):
             work[plane * PIXELS + (y - y0) * TILE + x - x0] = image[y, x]
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _transpose_rgb(splats, entries, rows, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, red, green, blue."""
@@ -203,7 +204,7 @@ def _transpose_rgb(splats, entries, rows, slots, x0, y0, work, sums, least):
     return entries.shape[0]
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _transpose_any(splats, entries, rows, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, the channels of the image, one for sums (at most 256 channels in rows)."""
@@ -231,7 +232,7 @@ def _transpose_any(splats, entries, rows, slots, x0, y0, work, sums, least):
     return entries.shape[0]
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def blend_transpose(splats, start, entries, rows, slots, image, sums, least):
     """Fill `sums (e, c)`: for every entry, the sum over its pixels of weight times `image (c, h, w)`.
@@ -253,7 +254,7 @@ def blend_transpose(splats, start, entries, rows, slots, image, sums, least):
             sums[places[k]] = ZERO
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _write_moments(sums, slot, dx, s0, sy, syy):
     """Moments of an entry from its sums by column: of the exponent's gradient, times dy, times dy squared."""
@@ -262,14 +263,14 @@ def _write_moments(sums, slot, dx, s0, sy, syy):
     sums[slot, 3], sums[slot, 4], sums[slot, 5] = total(sx * dx), total(sy * dx), total(syy)
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _exponent_gradient(uncapped, alpha, before, value, left):
     """Gradient of the loss by the exponent for a row: 0 where alpha is capped."""
     return where_below(uncapped, MAX_ALPHA, alpha * (before * value - left / (ONE - alpha)))
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, rest, gradients of alpha, red, green, blue."""
@@ -307,7 +308,7 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
     return entries.shape[0]
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, rest, gradients of alpha and of the channels."""
@@ -345,7 +346,7 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
     return entries.shape[0]
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def blend_backward(splats, start, entries, slots, values, image, alpha, grad_image, grad_alpha, sums, least):
     """Fill `sums (e, 6 + c)`: for every entry its moments for `project_backward`, and its values' gradients."""
@@ -371,7 +372,7 @@ def blend_backward(splats, start, entries, slots, values, image, alpha, grad_ima
             sums[places[k]] = ZERO
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def gather(values, order, out):
     """Fill `out (m, c)` with the rows `order (m,)` of `values (n, c)`."""
@@ -381,7 +382,7 @@ def gather(values, order, out):
                 out[s, c] = values[order[s], c]
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def sum_slots(sums, first, order, out):
     """Set `out (n, c)` at `order (m,)` to the sums over each splat's slots, in a fixed order."""

@@ -6,14 +6,15 @@ All pixels of a tile are drawn by the tile's own list, so that W^T W needs no im
 from typing import no_type_check
 
 import numpy as np
-from numba import float32, njit, prange
+from numba import float32, prange
 
 from splatgraft.rendering.cpu_blend import MAX_ALPHA, PIXELS, ZERO, alpha_row, open_tile, read_tile, splat_shape
 from splatgraft.rendering.cpu_simd import broadcast, lanes, load, smaller, store, total
 from splatgraft.rendering.cpu_tiles import TILE
+from splatgraft.runtime.kernels import kernel
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _count(rows):
     """Rows of all entries together, at least 1."""
@@ -23,7 +24,7 @@ def _count(rows):
     return max(count, 1)
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _blend_and_keep(splats, entries, rows, values, x0, y0, work, weights):
     """Fill the planes transmittance, red, green, blue of `work`, and append every row of weights to `weights`."""
@@ -47,7 +48,7 @@ def _blend_and_keep(splats, entries, rows, values, x0, y0, work, weights):
             kept += TILE
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def blend_and_transpose(splats, start, entries, rows, slots, values, pixel_weights, sums):
     """Fill `sums (e, 3)` with `blend_transpose` of the image of `values (m, 3)` times `pixel_weights (h, w)`.
@@ -78,7 +79,7 @@ def blend_and_transpose(splats, start, entries, rows, slots, values, pixel_weigh
             sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(red), total(green), total(blue)
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _blend_one_and_keep(splats, entries, rows, values, x0, y0, work, weights):
     """As `_blend_and_keep` for one channel: planes transmittance and value."""
@@ -100,7 +101,7 @@ def _blend_one_and_keep(splats, entries, rows, values, x0, y0, work, weights):
             kept += TILE
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def transpose_residual(splats, start, entries, rows, slots, values, target, sums):
     """Fill `sums (e, 1)` with `blend_transpose` of `target (h, w)` less the image of `values (m,)`."""

@@ -8,9 +8,10 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import float32, njit, prange
+from numba import float32, prange
 
 from splatgraft.rendering.cpu_basis import basis_and_slope, basis_at
+from splatgraft.runtime.kernels import kernel
 
 MIN_ALPHA = 1.0 / 255.0
 BLOCK = 256
@@ -24,7 +25,7 @@ COLUMNS = 8
 FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR, WIDTH, HEIGHT, LOW_PASS = range(15, 27)
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _rotation(quaternion, out):
     """Fill the 3x3 matrix of a wxyz quaternion, the identity for one of length 0. Returns one over the length."""
@@ -37,7 +38,7 @@ def _rotation(quaternion, out):
     return inverse
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _view_axes(log_scales, rotation, camera, out):
     """Fill V = W R S, the Gaussian's scaled axes in the camera, as columns."""
@@ -48,7 +49,7 @@ def _view_axes(log_scales, rotation, camera, out):
             out[i, j] = s * c
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _normal_axis(log_scales, rotation, offset):
     """Index of the shortest axis, and the sign that turns it to the camera; `offset` is centre minus camera."""
@@ -60,7 +61,7 @@ def _normal_axis(log_scales, rotation, offset):
     return axis, -1.0 if along > 0 else 1.0
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _camera_point(mean, camera, offset):
     x, y, z = float(mean[0]), float(mean[1]), float(mean[2])
@@ -73,7 +74,7 @@ def _camera_point(mean, camera, offset):
     )
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _jacobian(x, y, z, camera):
     """Non-zero entries J00, J02, J11, J12, and whether the point is inside the clamping bounds in x and in y."""
@@ -84,7 +85,7 @@ def _jacobian(x, y, z, camera):
     return fx, -fx * held_u, fy, -fy * held_v, held_u == u, held_v == v
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def project(means, log_scales, quaternions, opacity_logits, camera, antialiased, splats, depths):
     """Fill `splats (n, 8)` and `depths (n,)`; a splat outside the image or too transparent has log opacity -inf."""
@@ -126,7 +127,7 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
             depths[g] = z
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def shade(means, sh, drawn, camera, colors):
     """Fill `colors (n, 3)` as the camera sees them where `drawn (n,)`."""
@@ -146,7 +147,7 @@ def shade(means, sh, drawn, camera, colors):
                 colors[g, c] = max(value, ZERO)
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def normals(means, log_scales, quaternions, drawn, camera, out):
     """Fill `out (n, 3)` with world-frame normals towards the camera where `drawn (n,)`."""
@@ -161,7 +162,7 @@ def normals(means, log_scales, quaternions, drawn, camera, out):
             out[g, i] = sign * rotation[i, axis]
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def shade_backward(means, sh, drawn, camera, totals, at, grad_means, grad_sh):
     """Add the gradients of `shade`, which are columns from `at` of `totals (n, ..)`, to `grad_means` and `grad_sh`."""
@@ -196,7 +197,7 @@ def shade_backward(means, sh, drawn, camera, totals, at, grad_means, grad_sh):
             grad_means[g, 2] += (dz - radial * z) * inverse
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _add_quaternion_gradient(quaternion, inverse, d, out):
     """Gradient of a rotation matrix (3x3 `d`) to the raw wxyz quaternion, through its normalisation."""
@@ -212,7 +213,7 @@ def _add_quaternion_gradient(quaternion, inverse, d, out):
     out[3] += (gz - along * z) * inverse
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def project_backward(
     means, log_scales, quaternions, opacity_logits, drawn, camera, antialiased, totals, depth_at, normal_at,

@@ -5,7 +5,7 @@ Behind an opaque surface a splat's weights are all but 0 in most rows that it re
 
 from typing import no_type_check
 
-from numba import float32, njit, prange
+from numba import float32, prange
 
 from splatgraft.rendering.cpu_blend import (
     BATCH,
@@ -20,9 +20,10 @@ from splatgraft.rendering.cpu_blend import (
 )
 from splatgraft.rendering.cpu_simd import lanes, load, smaller, store, total
 from splatgraft.rendering.cpu_tiles import TILE
+from splatgraft.runtime.kernels import kernel
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def find_rows(splats, start, entries, size, least_weight, rows):
     """Fill `rows (e, 2)`: first and one past the last row of each entry with more weight than a bound.

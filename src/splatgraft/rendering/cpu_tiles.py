@@ -4,15 +4,16 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from splatgraft.rendering.cpu_project import CA, CB, CC, COLUMNS, LOG_OPACITY, MX, MY, REACH_X, REACH_Y
+from splatgraft.runtime.kernels import kernel
 
 TILE = 16
 _DIGIT_BITS = 11
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def depth_order(splats, depths):
     """Indices of the splats with a finite log opacity, nearest first; equal depths stay in index order."""
@@ -43,7 +44,7 @@ def depth_order(splats, depths):
     return order
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _tile_span(splat, row, tiles_x):
     """First and one past the last tile of tile row `row` that the ellipse alpha >= 1/255 meets."""
@@ -64,7 +65,7 @@ def _tile_span(splat, row, tiles_x):
     return int(max(min(first, 1e6), 0.0)), int(max(min(last + 1.0, float(tiles_x)), 0.0))
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _tile_rows(splat, tiles_y):
     """First and one past the last tile row that the ellipse can meet."""
@@ -74,7 +75,7 @@ def _tile_rows(splat, tiles_y):
     return int(max(min(top, 1e6), 0.0)), int(max(min(bottom + 1.0, float(tiles_y)), 0.0))
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _spans(packed, first_row, tiles_x, tiles_y):
     """The tiles of every splat, row by row, as first and one past the last; a splat's rows begin at `first_row`."""
@@ -88,7 +89,7 @@ def _spans(packed, first_row, tiles_x, tiles_y):
     return spans
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def bin_splats(splats, order, width, height):
     """Sorted splats, their tile lists, and the position of each splat's entries.

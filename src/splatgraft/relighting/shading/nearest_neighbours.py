@@ -5,10 +5,10 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 _LEAF = 8
 """Points per lowest box."""
@@ -41,7 +41,7 @@ def _morton_codes(points: np.ndarray) -> np.ndarray:
     return cell[:, 0] | (cell[:, 1] << np.uint64(1)) | (cell[:, 2] << np.uint64(2))
 
 
-@njit(cache=True)
+@kernel
 @no_type_check
 def _boxes(points):
     """Low and high corners of a complete binary tree of boxes, root at 1, children of b at 2 b and 2 b + 1."""
@@ -64,7 +64,7 @@ def _boxes(points):
     return boxes
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 @no_type_check
 def _gap(box, x, y, z):
     """Squared distance from a point to a box; 0 inside."""
@@ -75,7 +75,7 @@ def _gap(box, x, y, z):
 
 
 @serialized
-@njit(cache=True, parallel=True, fastmath=True)
+@kernel(parallel=True, fastmath=True)
 @no_type_check
 def _search(points, order, boxes, found):  # noqa: PLR0912  (one kernel: descent and insertion)
     n, k = len(points), found.shape[1]

@@ -11,14 +11,14 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.shading.nearest_neighbours import nearest_neighbours
 from splatgraft.relighting.shadows.camera_visibility import seen_from, spread_over
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 # set by hand
 _NEIGHBOURS = 16
@@ -92,7 +92,7 @@ def _towards_cameras(
 
 
 @serialized
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _add_directions(means, center, seen, total):
     """Add the unit vectors to a camera: for visible Gaussians (first plane), and for all (second plane)."""
@@ -105,7 +105,7 @@ def _add_directions(means, center, seen, total):
             total[plane, i, 2] += z / length
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 @no_type_check
 def _shortest_axis(xx, xy, xz, yy, yz, zz):
     """Unit eigenvector of the smallest eigenvalue of a symmetric matrix, and 1 - sqrt(smallest / middle)."""
@@ -138,7 +138,7 @@ def _shortest_axis(xx, xy, xz, yy, yz, zz):
 
 
 @serialized
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _estimate(cloud, neighbours, towards, out):
     means, covariances, opacities = cloud
@@ -175,7 +175,7 @@ def _estimate(cloud, neighbours, towards, out):
 
 
 @serialized
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _smoothed(normals, neighbours):
     """Average over neighbours, weighted by confidence; a short average lowers the confidence."""

@@ -5,13 +5,13 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Bool
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import render
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 # set by hand
 _WIDTH = 128
@@ -48,7 +48,7 @@ def seen_from(gaussians: Gaussians, camera: Cameras, *, among: Gaussians) -> Boo
 
 
 @serialized
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _compare_depths(means, widths, camera, surface, out):
     pose, intrinsics = camera

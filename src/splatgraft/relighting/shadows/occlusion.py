@@ -11,12 +11,12 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from splatgraft.relighting.shadows.light_sampling import LightSamples
 from splatgraft.relighting.shadows.shadow_maps import FAR, DepthMaps
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 # compiled into the kernel; all set by hand
 _COARSEST = 4
@@ -137,7 +137,7 @@ def occluded_irradiance(
     return without, with_object, bounce
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 @no_type_check
 def _soft_cosine(cosine, edge):
     """Mean of max(0, cos) over a cone whose radius has the sine `edge`; as `shading.irradiance.soft_cosine`."""
@@ -149,7 +149,7 @@ def _soft_cosine(cosine, edge):
 
 
 @serialized
-@njit(cache=True, parallel=True, fastmath=True)
+@kernel(parallel=True, fastmath=True)
 @no_type_check
 def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one kernel: search, filter, sums)
     frames, nearness, irradiance, softness, points, normals, sample_visibility = arrays

@@ -10,14 +10,14 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering.cpu_simd import LANES, lanes, largest, load, smaller, store, where_at_least, where_below
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 FAR = np.float32(1e30)
 """Depth of a texel where less than half of the light is blocked."""
@@ -181,7 +181,7 @@ def _array(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32)
 
 
-@njit(cache=True, fastmath=True)
+@kernel(fastmath=True)
 @no_type_check
 def _project(frame, geometry, view, limits, splats):  # noqa: PLR0915  (one kernel: culling, sorting, projection)
     """Write the splats that touch a map into the rows of `splats`, sorted by depth, and return their number."""
@@ -254,7 +254,7 @@ def _project(frame, geometry, view, limits, splats):  # noqa: PLR0915  (one kern
     return count
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@kernel(fastmath=True, inline="always")
 @no_type_check
 def _blend(splat, at, dv, du, maps):
     """Blend one splat over a row of pixels; the last value returned is whether all of them are finished."""
@@ -279,7 +279,7 @@ def _blend(splat, at, dv, du, maps):
 
 
 @serialized
-@njit(cache=True, parallel=True, fastmath=True)
+@kernel(parallel=True, fastmath=True)
 @no_type_check
 def _splat(geometry, rgb, view, limits, maps, threads):
     frames, center, radius = view
@@ -323,7 +323,7 @@ def _splat(geometry, rgb, view, limits, maps, threads):
 
 
 @serialized
-@njit(cache=True, parallel=True, fastmath=True)
+@kernel(parallel=True, fastmath=True)
 @no_type_check
 def _filter_visibility(points, normals, view, maps, bias, out):
     frames, center, radius = view

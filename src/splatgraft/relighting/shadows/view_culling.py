@@ -5,11 +5,11 @@ from typing import no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.runtime.kernel_lock import serialized
+from splatgraft.runtime.kernels import kernel, serialized
 
 _REACH = np.float32(3)
 """Standard deviations by which a Gaussian's centre may lie outside the picture."""
@@ -38,7 +38,7 @@ def gaussians_in_view(
 
 
 @serialized
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 @no_type_check
 def _drawn_widths(means, widths, pose, intrinsics, size, drawn):
     """Fill `drawn` with standard deviations in pixels; -1 for what lies outside the picture."""

@@ -1,0 +1,59 @@
+"""The cache of numba kernels: a kernel sees changes of the kernels that it inlines from other files."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from splatgraft.runtime import kernels
+
+INNER = """
+import numba
+from tiny.runtime.kernels import kernel
+
+@kernel
+def inner(x):
+    return x + {added}
+
+@numba.njit(cache=True)
+def plain_inner(x):
+    return x + {added}
+"""
+OUTER = """
+import numba
+from tiny.inner import inner, plain_inner
+from tiny.runtime.kernels import kernel
+
+@kernel
+def outer(x):
+    return inner(x)
+
+@numba.njit(cache=True)
+def plain_outer(x):
+    return plain_inner(x)
+
+print(outer(1), sum(outer.stats.cache_hits.values()), plain_outer(1))
+"""
+
+
+@pytest.mark.parametrize("read_only", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_an_edit_of_an_inlined_kernel_is_seen(tmp_path, read_only):
+    """By `kernel`, from where a package is installed; not by numba alone, for which it exists."""
+    package = tmp_path / "tiny"
+    (package / "runtime").mkdir(parents=True)
+    (package / "runtime" / "kernels.py").write_text(Path(kernels.__file__).read_text())
+    (package / "outer.py").write_text(OUTER)
+    if read_only:
+        # a file where the folder of the cache would be, since the tests may run as root
+        (package / "__pycache__").touch()
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "home")}
+    found = []
+    for added in (10, 10, 20):
+        (package / "inner.py").write_text(INNER.format(added=added))
+        found.append(subprocess.check_output([sys.executable, "-m", "tiny.outer"], env=environment, text=True).split())
+    results, from_cache, of_numba_alone = zip(*found, strict=True)
+    assert results == ("11", "11", "21")
+    assert from_cache == ("0", "1", "0")
+    assert of_numba_alone == ("11", "11", "11")
