@@ -1,5 +1,6 @@
 # make install: the package in .venv; make demo: a whole transfer on shipped captures;
-# make dev: also what the checks need; make test: all checks; make test-fast: those that take a minute;
+# make dev: also what the checks need; make test: all checks but the long ones, 8 minutes on two idle cores;
+# make test-all: the long ones too, and shapes checked at every call; make test-fast: pytest alone without a browser;
 # make blender: Blender as a Python module in .venv-blender, for `splatgraft synth --blender-python`;
 # make exam NUMBER=...: the light transfer measured on new scenes drawn from a number that no exam has used;
 # make browser: Chromium, for the editor's tests.
@@ -11,7 +12,7 @@ DEV_STAMP := .venv/.installed-dev
 # threads of torch and numba that spin while they wait take the cores from each other
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: install dev demo test test-fast blender browser clean
+.PHONY: install dev demo test test-all test-fast blender browser clean
 .DEFAULT_GOAL := install
 
 # the package alone: what `make demo` needs
@@ -63,17 +64,22 @@ browser:
 test:
 	.ci/run
 
-# the inner loop: no browser, no training
-test-fast: dev
-	$(BIN)/python -m pytest -q -m "not browser and not slow"
+test-all:
+	.ci/run --all
 
-# the documentation site in build/site; strict: a broken link, a missing page or an unexplained message ends it
-.PHONY: docs
-docs: dev
-	@$(BIN)/python -c 'import mkdocs, mkdocstrings' 2>/dev/null || \
-	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+# the inner loop
+test-fast: dev
+	$(BIN)/python -m pytest -q -n 2 --dist loadscope -m "not browser and not long"
+
+# the documentation site in build/site; strict: a broken link or a missing page ends it
+.PHONY: docs docs-tools
+docs: dev docs-tools
 	NO_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --quiet --strict
 	@echo "build/site/index.html"
+
+docs-tools: dev
+	@$(BIN)/python -c 'import mkdocs, mkdocstrings' 2>/dev/null || \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 
 clean:
 	rm -rf demo build .pytest_cache .ruff_cache .hypothesis

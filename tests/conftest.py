@@ -1,48 +1,63 @@
-"""Puts this folder on the path, so that every test can import the tiny models; marks browser tests and slow tests.
+"""One thread a worker, Hypothesis without limits of time, and one finished project that tests copy.
 
 No test may fail because the machine is slow or busy: time limits (pyproject.toml) are there against hangs alone.
 """
 
+import os
+
+# before torch and numba are imported, which read them then; two workers share two cores
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = os.environ["NUMBA_NUM_THREADS"] = "1"
+
+import shutil
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 # both are limits on the machine's speed
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
-SLOW = (
-    "benchmarks/test_gpu.py",
-    "capture/test_colmap_process.py",
-    "capture/test_pose_photos.py",
-    "commands",
-    "consolidation/test_consolidate.py",
-    "editor/test_behind_a_proxy.py",
-    "editor/test_editor_session.py",
-    "editor/test_front_server.py",
-    "editor/test_project_list.py",
-    "editor/test_scenes_without_photos.py",
-    "editor/test_server_and_windows.py",
-    "editor/test_sharing.py",
-    "exports/test_page_in_browser.py",
-    "exports/test_parts_and_pictures.py",
-    "exports/test_playcanvas_reads.py",
-    "harmonization/test_flux_views.py",
-    "reconstruction/test_training.py",
-    "relighting/test_edges.py",
-    "relighting/test_threads.py",
-    "relighting/test_transfer.py",
-    "synthesis",
-    "training",
-)
-"""Folders and files of tests that train, run whole steps or start servers."""
-
-
 _THREAD_SECONDS = 60.0
 """Longest wait for all threads: that of a page which no test closed never ends."""
+
+
+@pytest.fixture(scope="session")
+def finished_project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of tiny_project.py's project with the results of all steps, made once for all workers.
+
+    Read it, never write into it: `copy_project` gives a copy. Beside it, in `../photos/source` and `../photos/target`,
+    are the captures that its project.toml names.
+    """
+    root = tmp_path_factory.getbasetemp()
+    root = (root.parent if "PYTEST_XDIST_WORKER" in os.environ else root) / "tiny_transfer"
+    done = root / "done"
+    with FileLock(root.with_suffix(".lock")):
+        if not done.exists():
+            from tiny_project import finish_project
+
+            shutil.rmtree(root, ignore_errors=True)
+            root.mkdir()
+            finish_project(root)
+            done.touch()
+    return root / "project"
+
+
+@pytest.fixture
+def copy_project(finished_project: Path, tmp_path: Path) -> Callable[[], Path]:
+    """A function that copies `finished_project` with its captures into `tmp_path` and gives the copy's folder.
+
+    Every step of the copy is up to date. For a copy that a module's tests share, call `copy_of` of tiny_project.py in a
+    fixture of the module: `copy_of(finished_project, tmp_path_factory.mktemp("shared"))`.
+    """
+    from tiny_project import copy_of
+
+    return lambda: copy_of(finished_project, tmp_path)
 
 
 def pytest_sessionfinish() -> None:
@@ -54,14 +69,7 @@ def pytest_sessionfinish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests that use a browser, and slow tests."""
-    here = Path(__file__).parent
-    missing = [name for name in SLOW if not (here / name).exists()]
-    if missing:
-        raise pytest.UsageError(f"{__file__}: expected the slow tests {', '.join(missing)}, found no such file")
-    slow = tuple(here / name for name in SLOW)
+    """Mark the tests that use a browser."""
     for item in items:
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.browser)
-        if any(item.path.is_relative_to(path) for path in slow):
-            item.add_marker(pytest.mark.slow)

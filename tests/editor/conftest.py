@@ -1,14 +1,10 @@
-"""Puts the folders on the path whose tiny projects the editor's tests use, and provides a browser."""
+"""Provides a browser."""
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-for name in ("commands", "exports"):
-    sys.path.append(str(Path(__file__).parents[1] / name))
 
 
 @pytest.fixture(scope="module")

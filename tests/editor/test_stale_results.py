@@ -41,7 +41,7 @@ def test_the_first_stale_step_is_named(project: Path) -> None:
     assert why(project="project.toml: expected TOML") == "project.toml: expected TOML"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) -> None:
     assert main(["run", str(project), "--to", "consolidate"]) == 0
     page, close = page_of(project)

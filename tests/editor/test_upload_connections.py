@@ -300,7 +300,7 @@ def test_what_cannot_be_stored_is_refused_before_its_bytes_are_sent(
     assert not (project.parent / "uploads" / "page.html").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the peak of a process's memory from /proc")
 def test_a_large_upload_takes_no_memory(editor: Editor, project: Path, window: tuple[Client, str]) -> None:
     file = ChosenFile(bytes(300 * MIB), name="large.mp4")

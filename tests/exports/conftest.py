@@ -3,5 +3,5 @@
 import sys
 from pathlib import Path
 
-for name in ("commands", "editor", "formats"):
+for name in ("editor", "formats"):
     sys.path.append(str(Path(__file__).parents[1] / name))

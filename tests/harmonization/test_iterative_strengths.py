@@ -87,7 +87,7 @@ def test_a_level_that_was_not_prepared_is_one_line(folder):
         schnell_levels(4, start=0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_benchmark_s_updates_hand_each_strength_of_their_schedule_to_the_network(folder, tmp_path, monkeypatch):
     from splatgraft.core.cameras import Cameras
     from splatgraft.core.gaussians import Gaussians

@@ -19,7 +19,7 @@ from splatgraft.harmonization.options import FluxOptions, HarmonizerContext
 from splatgraft_paper.training.sources.relit_pairs import RelitPairs
 from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
-pytestmark = [*quiet, pytest.mark.slow, pytest.mark.filterwarnings("ignore::UserWarning")]
+pytestmark = [*quiet, pytest.mark.long, pytest.mark.filterwarnings("ignore::UserWarning")]
 
 BASE = TinyBaseOptions(heads=3, double_blocks=1, single_blocks=2, autoencoder_widths=(32, 32), autoencoder_steps=3000)
 LOOP = ["--size", "32x32", "--steps", "2000", "--rate", "2e-3", "--ema", "0.99", "--validate-every", "1000"]

@@ -1,10 +1,13 @@
 """A project so small that every step takes a second: a ball on a plane, photographed by our own renderer."""
 
+import shutil
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
+from splatgraft.cli import main
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import write_image
@@ -95,3 +98,23 @@ def write_project(root: Path, options: str = OPTIONS) -> Path:
     captures = '[source]\ncapture = "../photos/source"\n[target]\ncapture = "../photos/target"\n'
     path.write_text(captures + options)
     return path
+
+
+def finish_project(root: Path) -> Path:
+    """Two captures and a project with all results; gives its folder."""
+    path = write_project(root)
+    assert main(["run", str(path)]) == 0
+    return path.parent
+
+
+def copy_of(project: Path, root: Path) -> Path:
+    """Copy a project and the captures beside it, its steps as up to date as they are; gives its folder in `root`."""
+    for name in ("photos", project.name):
+        shutil.copytree(project.parent / name, root / name)
+    return root / project.name
+
+
+if __name__ == "__main__":
+    # compiles most kernels in a fresh clone, which two workers would both do
+    with tempfile.TemporaryDirectory() as folder:
+        finish_project(Path(folder))
