@@ -116,7 +116,7 @@ def test_generated_images_become_pairs(tmp_path, monkeypatch, capsys):
         "splatgraft.harmonization.flux.weights.diffusers_library.text_to_image_pipeline",
         lambda base, **settings: Pipeline(),
     )
-    monkeypatch.setattr("splatgraft.segmentation.birefnet.load_birefnet", lambda weights: Masks())
+    monkeypatch.setattr("splatgraft.segmentation.onnx_networks.load_birefnet", lambda weights: Masks())
     base = removal_folder(tmp_path / "base")
     trained = ["train", "removal", str(tmp_path / "removal"), "--base", str(base), "--pairs"]
     assert main([*trained, str(rendered_folder(tmp_path / "rendered")), *SMALL, "--steps", "1"]) == 0

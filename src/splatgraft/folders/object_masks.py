@@ -19,7 +19,6 @@ from splatgraft.runtime.progress import Progress, silent
 from splatgraft.segmentation import (
     Box,
     CutViews,
-    FirstGuess,
     ObjectRegion,
     ViewCutter,
     cut_object,
@@ -120,10 +119,10 @@ def cut_masks(
         pictures.append((small.image(index) * 255).round().to(torch.uint8))
     images = LazySequence(len(small), lambda index: pictures[index].float() / 255)
     views = CutViews(images, cameras, prompts)
-    guess = FirstGuess(seed.selection, seed.region.allows(scene.means))
-    cut = cut_object(views, scene, guess, request.cutter, progress=progress)
+    allowed = seed.region.allows(scene.means)
+    masks, _ = cut_object(views, scene, share=seed.selection, allowed=allowed, cutter=request.cutter, progress=progress)
     sizes = capture.cameras.sizes.tolist()
-    grown = ((resize(mask, *sizes[index]) > 0.5).float() for index, mask in enumerate(cut.masks))
+    grown = ((resize(mask, *sizes[index]) > 0.5).float() for index, mask in enumerate(masks))
     return replace(_written(capture, grown, folder), region=seed.region)
 
 

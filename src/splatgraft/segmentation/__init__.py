@@ -1,35 +1,38 @@
 """Segment: from object masks of a capture's images to the Gaussians of the object."""
 
-from splatgraft.segmentation.birefnet import BiRefNet, load_birefnet
-from splatgraft.segmentation.box import Box
-from splatgraft.segmentation.cut_object import CutMasks, CutOptions, CutViews, FirstGuess, cut_object
-from splatgraft.segmentation.grabcut import GrabCut
+from splatgraft.segmentation.cut_object import (
+    MIN_AGREEMENT,
+    Agreement,
+    CutViews,
+    Evidence,
+    ViewCutter,
+    cut_object,
+    measure_agreement,
+)
+from splatgraft.segmentation.grabcut import grabcut_mask
 from splatgraft.segmentation.lift import LiftOptions, lift_masks
-from splatgraft.segmentation.mask_agreement import LEAST_AGREEMENT, Agreement, measure_agreement
-from splatgraft.segmentation.object_region import ObjectRegion, default_box
-from splatgraft.segmentation.sam2 import Sam2, load_sam2
-from splatgraft.segmentation.seed_selection import Seed, seed_selection
+from splatgraft.segmentation.object_region import ObjectRegion, Seed, default_box, seed_selection
+from splatgraft.segmentation.onnx_networks import load_birefnet, load_sam2
 from splatgraft.segmentation.segment import Segmentation, segment
-from splatgraft.segmentation.selection import Keep, SelectOptions, select_object
+from splatgraft.segmentation.selection import (
+    Box,
+    Keep,
+    SelectOptions,
+    add_correction,
+    apply_corrections,
+    select_object,
+)
 from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
-from splatgraft.segmentation.user_corrections import add_correction, apply_corrections
-from splatgraft.segmentation.view_cutter import Evidence, ViewCutter
 
 __all__ = [
-    "LEAST_AGREEMENT",
+    "MIN_AGREEMENT",
     "Agreement",
-    "BiRefNet",
     "Box",
-    "CutMasks",
-    "CutOptions",
     "CutViews",
     "Evidence",
-    "FirstGuess",
-    "GrabCut",
     "Keep",
     "LiftOptions",
     "ObjectRegion",
-    "Sam2",
     "Seed",
     "Segmentation",
     "SelectOptions",
@@ -39,6 +42,7 @@ __all__ = [
     "apply_corrections",
     "cut_object",
     "default_box",
+    "grabcut_mask",
     "lift_masks",
     "load_birefnet",
     "load_sam2",

@@ -1,6 +1,9 @@
-"""Object masks of posed pictures that agree in 3D: cut, lifted to the Gaussians, rendered, and cut again."""
+"""Object masks of posed pictures that agree in 3D: cut, lifted to the Gaussians, rendered, and cut again.
 
-from collections.abc import Mapping, Sequence
+How well the masks agree in the end is measured against the selection of Gaussians, rendered into each picture.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -12,24 +15,36 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.prompts import ViewPrompt
 from splatgraft.rendering import RenderOptions, view_operator
 from splatgraft.runtime.progress import Progress, silent
-from splatgraft.segmentation.lift import blended_share
-from splatgraft.segmentation.mask_agreement import overlap
-from splatgraft.segmentation.view_cutter import Evidence, ViewCutter
+from splatgraft.segmentation.lift import share_inside, weight_inside
 
-LEAST_PIXELS = 12
+MIN_AGREEMENT = 0.7
+"""Mean IoU below which the object is doubtful: almost a third of what masks and selection cover differs. An outline
+that misses by 2% of the object's diameter all around gives 0.92; thin parts in a short reconstruction give 0.8."""
+_MIN_VIEW_AGREEMENT = 0.5
+"""IoU below which the mask of one picture is doubtful: it has less in common with the object than not."""
+_MIN_PIXELS = 12
 """Pixels of the selection below which a picture does not show the object."""
+_ROUNDS = 2
+"""Most rounds before the last, which cuts every picture; set by hand."""
+_VOTING = 32
+"""Most pictures, evenly spaced, that are cut in the rounds before the last; set by hand."""
+_SETTLED = 0.97
+"""Mean IoU of the masks with those of the round before from which another round would change nothing that shows."""
 
 
 @dataclass(frozen=True)
-class CutOptions:
-    """When the masks agree; values set by hand."""
+class Evidence:
+    """What is known of the object in one picture before it is cut."""
 
-    rounds: int = 2
-    """Most rounds before the last, which cuts every picture."""
-    voting: int = 32
-    """Most pictures, evenly spaced, that are cut in the rounds before the last."""
-    settled: float = 0.97
-    """Mean IoU of the masks with those of the round before from which another round would change nothing that shows."""
+    lifted: Float[Tensor, "h w"]
+    """Share of each pixel that belongs to the object by the 3D selection, in [0, 1]; not 0 everywhere."""
+    prompt: ViewPrompt = field(default_factory=ViewPrompt)
+    """What the user says, pixels of the picture."""
+
+
+ViewCutter = Callable[[Tensor, Evidence], Tensor]
+"""From a picture (h, w, 3), sRGB in [0, 1], and what is known of the object in it, to the object's mask (h, w), 0 or
+1: `grabcut_mask`, or the method `cut` of a loaded `Sam2`."""
 
 
 @dataclass(frozen=True)
@@ -45,36 +60,39 @@ class CutViews:
 
 
 @dataclass(frozen=True)
-class FirstGuess:
-    """What is known of the object in 3D before a picture is cut."""
+class Agreement:
+    """Intersection over union of each picture's mask and the rendered selection."""
 
-    share: Float[Tensor, "n"] | Bool[Tensor, "n"]
-    """Of each Gaussian that is the object's, in [0, 1]."""
-    allowed: Bool[Tensor, "n"] | None = None
-    """Which Gaussians may be the object's whatever the pictures say; None for all."""
+    names: tuple[str, ...]
+    """Of the pictures."""
+    iou: Float[Tensor, "v"]
+    """In [0, 1]; nan where neither mask nor selection shows in the picture."""
 
+    @property
+    def mean(self) -> float:
+        """Mean over the pictures that show the object; 0 where none does."""
+        return float(self.iou.nanmean().nan_to_num(0.0))
 
-@dataclass(frozen=True)
-class CutMasks:
-    """The masks, and how the rounds went."""
+    @property
+    def doubtful(self) -> list[int]:
+        """Pictures whose mask is doubtful, the worst first."""
+        return [int(i) for i in self.iou.nan_to_num(1.0).argsort() if float(self.iou[i]) < _MIN_VIEW_AGREEMENT]
 
-    masks: tuple[Float[Tensor, "_ _"], ...]
-    """0 or 1, one per picture."""
-    feature: Float[Tensor, "n"]
-    """Share of each Gaussian in the masks, in [0, 1]."""
-    change: tuple[float, ...] = field(default=())
-    """Mean IoU of the masks of each round with those of the round before."""
+    def as_json(self) -> dict[str, object]:
+        """The mean, and the value of each picture that shows the object."""
+        views = {n: round(float(v), 4) for n, v in zip(self.names, self.iou, strict=True) if not bool(v.isnan())}
+        return {"mean_iou": round(self.mean, 4), "views": views}
 
 
 def cut_object(
     views: CutViews,
     scene: Gaussians,
-    guess: FirstGuess,
-    cutter: ViewCutter,
     *,
-    options: CutOptions = CutOptions(),
+    share: Float[Tensor, "n"] | Bool[Tensor, "n"],
+    cutter: ViewCutter,
+    allowed: Bool[Tensor, "n"] | None = None,
     progress: Progress = silent,
-) -> CutMasks:
+) -> tuple[list[Float[Tensor, "_ _"]], Float[Tensor, "n"]]:
     """Cut the object out of every picture, in rounds, until the masks no longer change.
 
     Each round renders the 3D selection into every picture, cuts the picture, and lifts all masks together to a new
@@ -84,32 +102,35 @@ def cut_object(
     Args:
         views: The pictures.
         scene: n Gaussians.
-        guess: First selection, and what may be added to it.
+        share: First selection: the share of each Gaussian that is the object's, in [0, 1].
         cutter: The algorithm for one picture.
-        options: When to stop.
+        allowed: Which Gaussians may be the object's whatever the pictures say; None for all.
         progress: Called per picture.
+
+    Returns:
+        A mask per picture, 0 or 1, and the share of each Gaussian in the masks, in [0, 1].
 
     Raises:
         ValueError: Where fewer than two pictures show the selection.
     """
     count = len(views.images)
-    voting = sorted({round(i) for i in torch.linspace(0, count - 1, min(count, options.voting)).tolist()})
-    feature, changes = guess.share.float().to(scene.device), []
-    allowed = torch.ones_like(feature) if guess.allowed is None else guess.allowed.float().to(scene.device)
+    voting = sorted({round(i) for i in torch.linspace(0, count - 1, min(count, _VOTING)).tolist()})
+    feature = share.float().to(scene.device)
+    may_be = torch.ones_like(feature) if allowed is None else allowed.float().to(scene.device)
     masks: dict[int, Tensor] = {}
 
     def cut_and_lift(chosen: Sequence[int], what: str) -> tuple[dict[int, Tensor], Tensor]:
-        made, lifted = _round(views, scene, feature, chosen, cutter, _told(progress, what))
-        return made, lifted * allowed
+        def told(done: int, total: int, _: str) -> None:
+            progress(done, total, f"cutting masks, {what}")
 
-    for round_ in range(options.rounds):
+        made, lifted = _cut_and_lift(views, scene, feature, chosen, cutter, told)
+        return made, lifted * may_be
+
+    for round_ in range(_ROUNDS):
         before = masks
         masks, feature = cut_and_lift(voting, f"round {round_ + 1}")
-        if before:
-            same = torch.tensor([overlap(masks[i], before[i]) for i in voting])
-            changes.append(float(same.nanmean()))
-            if changes[-1] > options.settled:
-                break
+        if before and float(torch.tensor([_iou(masks[i], before[i]) for i in voting]).nanmean()) > _SETTLED:
+            break
     if len(voting) < count:
         masks, feature = cut_and_lift(range(count), "every picture")
     progress(count, count, "masks cut")
@@ -118,14 +139,10 @@ def cut_object(
             "object: expected at least two pictures that show what was found at its place, found fewer; give its "
             "--box, or --prompts with clicks in two or three pictures"
         )
-    return CutMasks(tuple(masks[i] for i in range(count)), feature, tuple(changes))
+    return [masks[i] for i in range(count)], feature
 
 
-def _told(progress: Progress, what: str) -> Progress:
-    return lambda done, total, _: progress(done, total, f"cutting masks, {what}")
-
-
-def _round(
+def _cut_and_lift(
     views: CutViews,
     scene: Gaussians,
     feature: Float[Tensor, "n"],
@@ -140,8 +157,41 @@ def _round(
         operator = view_operator(scene, views.cameras[index], RenderOptions())
         evidence = Evidence(operator.blend(feature[:, None])[..., 0].cpu(), views.prompts.get(index, ViewPrompt()))
         # a picture in which neither the selection nor a click shows has no object
-        shows = int((evidence.lifted > 0.5).sum()) >= LEAST_PIXELS or len(evidence.prompt.inside)
-        masks[index] = cutter.cut(views.images[index], evidence) if shows else torch.zeros_like(evidence.lifted)
-        inside = masks[index].to(scene.device)
-        total += operator.blend_transpose(torch.stack([inside, torch.ones_like(inside)], -1))
-    return masks, blended_share(total)
+        shows = int((evidence.lifted > 0.5).sum()) >= _MIN_PIXELS or len(evidence.prompt.inside)
+        masks[index] = cutter(views.images[index], evidence) if shows else torch.zeros_like(evidence.lifted)
+        total += weight_inside(operator, masks[index].to(scene.device))
+    return masks, share_inside(total)
+
+
+def measure_agreement(
+    masks: Sequence[Float[Tensor, "_ _"]],
+    scene: Gaussians,
+    cameras: Cameras,
+    selection: Bool[Tensor, "n"],
+    *,
+    progress: Progress = silent,
+) -> Agreement:
+    """Compare the masks with the selected Gaussians, rendered in front of and behind all others.
+
+    Args:
+        masks: One per camera, of its size, in [0, 1].
+        scene: n Gaussians.
+        cameras: Of the masks.
+        selection: The object's Gaussians.
+        progress: Called per picture.
+    """
+    feature = selection[:, None].float().to(scene.device)
+    values = []
+    for index, (mask, camera) in enumerate(zip(masks, cameras, strict=True)):
+        progress(index, len(masks), "comparing masks with the selection")
+        shown = view_operator(scene, camera, RenderOptions()).blend(feature)[..., 0]
+        values.append(_iou(mask.to(shown), shown))
+    progress(len(masks), len(masks), "comparing masks with the selection")
+    return Agreement(cameras.names, torch.tensor(values))
+
+
+def _iou(first: Float[Tensor, "h w"], second: Float[Tensor, "h w"]) -> float:
+    """Intersection over union of two masks at one half; nan where both are empty."""
+    a, b = first > 0.5, second > 0.5
+    either = int((a | b).sum())
+    return int((a & b).sum()) / either if either else float("nan")

@@ -31,9 +31,9 @@ class LiftOptions:
     iterations: int = 10_000
     """Steps of `bce`, one view each."""
     learning_rate: float = 0.05
-    """Of Adam in `bce`, logits per step."""
+    """Learning rate of Adam in `bce`, logits per step."""
     seed: int = 0
-    """Of the order of views in `bce`."""
+    """Seed of the order of views in `bce`."""
 
 
 def lift_masks(
@@ -63,61 +63,36 @@ def lift_masks(
     Raises:
         ValueError: There is not one mask per camera, or one has another size.
     """
-    _check(cameras, masks)
-    if options.method == "closed_form":
-        return _closed_form(gaussians, cameras, masks, progress)
-    operators = [view_operator(gaussians, camera, RenderOptions()) for camera in cameras]
-    inside, seen = _sums(gaussians, operators, masks)
-    return _trained(_ratio(inside, seen), operators, masks, options, progress).where(seen > _SEEN, 0.0)
-
-
-def _check(cameras: Cameras, masks: Sequence[Tensor]) -> None:
-    if len(masks) != len(cameras):
+    if not masks or len(masks) != len(cameras):
         raise ValueError(f"masks: expected one for each of {len(cameras)} cameras, found {len(masks)}")
-    if not masks:
-        raise ValueError("masks: expected at least one, found none")
-    for name, size, mask in zip(cameras.names, cameras.sizes.tolist(), masks, strict=True):
-        if [mask.shape[1], mask.shape[0]] != size:
-            raise ValueError(
-                f"mask of {name}: expected {size[0]}x{size[1]} pixels, found {mask.shape[1]}x{mask.shape[0]}"
-            )
-
-
-def _closed_form(
-    gaussians: Gaussians, cameras: Cameras, masks: Sequence[Tensor], progress: Progress
-) -> Float[Tensor, "n"]:
     total = torch.zeros(gaussians.count, 2, device=gaussians.device)
+    operators: list[ViewOperator] = []
     for index, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
         progress(index, len(masks), "lifting masks")
-        # one view's tile lists at a time, so that memory does not grow with the number of views
-        total += _sums_of_view(view_operator(gaussians, camera, RenderOptions()), mask.to(gaussians.device))
+        if mask.shape != (camera.height, camera.width):
+            raise ValueError(
+                f"mask of {camera.names[0]}: expected {camera.width}x{camera.height} pixels, found "
+                f"{mask.shape[1]}x{mask.shape[0]}"
+            )
+        operator = view_operator(gaussians, camera, RenderOptions())
+        total += weight_inside(operator, mask.to(gaussians.device))
+        if options.method == "bce":  # else one view's tile lists at a time: memory does not grow with the views
+            operators.append(operator)
     progress(len(masks), len(masks), "lifting masks")
-    return blended_share(total)
+    share = share_inside(total)
+    if options.method == "closed_form":
+        return share
+    return _trained(share, operators, masks, options, progress).where(total[:, 1] > _SEEN, 0.0)
 
 
-def blended_share(total: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """Share of each Gaussian's blending weight, summed over views, that lies inside the masks; 0 where unseen.
-
-    Args:
-        total: Weight inside the masks and in all, pixels.
-    """
-    return _ratio(total[:, 0], total[:, 1])
-
-
-def _sums_of_view(operator: ViewOperator, mask: Float[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
-    """Blending weight of each Gaussian inside the mask and in the whole view."""
+def weight_inside(operator: ViewOperator, mask: Float[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
+    """Blending weight of each Gaussian inside the mask and in the whole view, pixels."""
     return operator.blend_transpose(torch.stack([mask, torch.ones_like(mask)], -1))
 
 
-def _sums(
-    gaussians: Gaussians, operators: Sequence[ViewOperator], masks: Sequence[Tensor]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    parts = [_sums_of_view(op, mask.to(gaussians.device)) for op, mask in zip(operators, masks, strict=True)]
-    inside, seen = torch.stack(parts).sum(0).unbind(1)
-    return inside, seen
-
-
-def _ratio(inside: Float[Tensor, "n"], seen: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+def share_inside(total: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+    """Share of each Gaussian's blending weight, summed over views, that lies inside the masks; 0 where unseen."""
+    inside, seen = total[:, 0], total[:, 1]
     return (inside / seen.clamp_min(_SEEN)).clamp(0, 1).where(seen > _SEEN, 0.0)
 
 
@@ -134,8 +109,7 @@ def _trained(
     generator = torch.Generator().manual_seed(options.seed)
     order: list[int] = []
     for step in range(options.iterations):
-        if not order:
-            order = torch.randperm(len(targets), generator=generator).tolist()
+        order = order or torch.randperm(len(targets), generator=generator).tolist()
         view = order.pop()
         loss = torch.nn.functional.binary_cross_entropy_with_logits(operators[view].blend(logits), targets[view])
         optimizer.zero_grad(set_to_none=True)

@@ -1,64 +1,76 @@
-"""The part of space in which an object is looked for: a 3D box above what carries the object, a table or a wall.
+"""Where an object is looked for, and the first selection of its Gaussians there.
 
-The box is guessed around the largest group of surface points near the point where the cameras' optical axes meet (least
-squares), or around the groups that a user pointed at.
+The region is a 3D box above what carries the object, a table or a wall: guessed around the largest group of surface
+points near the point where the cameras' optical axes meet (least squares), or around the groups that a user pointed at.
+Points that a user gave in pictures are moved to the surface by the rendered depth; each Gaussian of the region then
+belongs to the side, object or background, from which it is reached over the shorter way, where a way over a change of
+colour is longer (geodesic segmentation; Bai and Sapiro 2007, here on the graph of neighbouring Gaussians).
+All constants are set by hand.
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up, focus_point
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.planes import LevelPlane, LevelPlaneOptions, dominant_level_plane
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.segmentation.box import Box
+from splatgraft.core.prompts import ViewPrompt
+from splatgraft.core.spherical_harmonics import rgb_from_dc
+from splatgraft.rendering import surface_points
+from splatgraft.segmentation.selection import Box
 
-
-@dataclass(frozen=True)
-class RegionOptions:
-    """How the region is found; values set by hand."""
-
-    whole_views: float = 0.75
-    """Share of the images that show the sphere around the middle whole."""
-    far_radius: float = 0.25
-    """Radius of that sphere over the median distance of the cameras, where they show none whole."""
-    support: LevelPlaneOptions = field(default_factory=lambda: LevelPlaneOptions(thickness=0.03, inlier_share=0.12))
-    """Of the plane near the middle: noise of a reconstruction over the distances of a table instead of a room."""
-    facing_deg: float = 60.0
-    """Largest angle between the normal of a wall and the mean direction to the cameras."""
-    cameras_in_front: float = 0.95
-    """Least share of the cameras in front of the support."""
-    above_support: float = 1.5
-    """Least height of a point above the support, over the support's thickness."""
-    least_points: int = 20
-    """Fewer points give a cube around the middle."""
-    cube: float = 0.5
-    """Half the edge of that cube, over the sphere's radius."""
-    spheres: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0)
-    """Radii in which the group is looked for, over that of the sphere, until one holds all of it."""
-    rim: float = 0.05
-    """Outermost part of a sphere whose points may go on beyond it, over its radius."""
-    group_step: float = 0.15
-    """Largest distance between neighbours of one group of points, over the sphere's radius."""
-    most_points: int = 20_000
-    """Points that are grouped; of more, as many are drawn."""
-    trim: float = 0.01
-    """Share of points beyond either end of the box along each axis."""
-    margin: float = 0.2
-    """Added at each end, over the longest edge: parts without texture have no points."""
-    reach: float = 0.1
-    """Largest distance of a Gaussian of the object from the group of points, over the box's longest edge."""
-    beyond: float = 1.2
-    """Edges of the box that nothing of the object lies beyond, over those of the box."""
-    level_normal_z: float = 0.99
-    """Least z of the support's normal at which the box ends above the support."""
+_WHOLE_VIEWS = 0.75
+"""Share of the images that show the sphere around the middle whole."""
+_FAR_RADIUS = 0.25
+"""Radius of that sphere over the median distance of the cameras, where they show none whole."""
+_SUPPORT = LevelPlaneOptions(thickness=0.03, inlier_share=0.12)
+"""Plane near the middle: noise of a reconstruction over the distances of a table instead of a room."""
+_WALL = replace(_SUPPORT, tilt_deg=60.0)
+"""A plane whose normal is at most this far from the mean direction to the cameras."""
+_CAMERAS_IN_FRONT = 0.95
+"""Least share of the cameras in front of the support."""
+_ABOVE_SUPPORT = 1.5
+"""Least height of a point above the support, over the support's thickness."""
+_MIN_POINTS = 20
+"""Fewer points give a cube around the middle."""
+_CUBE = 0.5
+"""Half the edge of that cube, over the sphere's radius."""
+_SPHERES = (1.0, 1.5, 2.0, 3.0)
+"""Radii in which the group is looked for, over that of the sphere, until one holds all of it."""
+_RIM = 0.05
+"""Outermost part of a sphere whose points may go on beyond it, over its radius."""
+_GROUP_STEP = 0.15
+"""Largest distance between neighbours of one group of points, over the sphere's radius."""
+_MAX_POINTS = 20_000
+"""Points that are grouped; of more, as many are drawn."""
+_TRIM = 0.01
+"""Share of points beyond either end of the box along each axis."""
+_MARGIN = 0.2
+"""Added at each end, over the longest edge: parts without texture have no points."""
+_REACH = 0.1
+"""Largest distance of a Gaussian of the object from the group of points, over the box's longest edge."""
+_BEYOND = 1.2
+"""Edges of the box that nothing of the object lies beyond, over those of the box."""
+_LEVEL_NORMAL_Z = 0.99
+"""Least z of the support's normal at which the box ends above the support."""
+_MIN_OPACITY = 0.3
+"""Opacity above which a Gaussian is a surface point."""
+_COLOR_STEP = 2.0
+"""Difference of colour at which a way is twice as long, over the median one of neighbours: texture and noise."""
+_NEIGHBOURS = 10
+"""Nearest Gaussians to which a way leads."""
+_TOUCHED = 6
+"""Gaussians nearest to a point that the user gave which have its side for certain."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +81,6 @@ class ObjectRegion:
     """Contains the object, world units."""
     support: LevelPlane | None
     """The surface that carries the object; None where none is clear."""
-    least_height: float
-    """Least height above the support of a point of the object, world units."""
     reason: str
     """How the box was found, for messages."""
     is_whole: bool = True
@@ -78,19 +88,73 @@ class ObjectRegion:
     group: Float[Tensor, "k 3"] | None = None
     """Surface points that belong together and are likely the object's; None where the box says it all."""
 
-    def contains(self, points: Float[Tensor, "n 3"], *, options: RegionOptions = RegionOptions()) -> Bool[Tensor, "n"]:
+    def contains(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Which points lie in the box, above the support, and near the group: what else is in the box is not it."""
-        inside = self.box.contains(points) & points_above(points, self.support, self.least_height)
+        inside = self.box.contains(points) & _above(points, self.support, _ABOVE_SUPPORT)
         if self.group is None:
             return inside
-        reach = options.reach * float((self.box.upper - self.box.lower).max())
+        reach = _REACH * float((self.box.upper - self.box.lower).max())
         apart, _ = KDTree(self.group.cpu().numpy()).query(points.cpu().numpy(), distance_upper_bound=reach)
         return inside & torch.from_numpy(np.isfinite(apart)).to(inside.device)
 
-    def allows(self, points: Float[Tensor, "n 3"], *, options: RegionOptions = RegionOptions()) -> Bool[Tensor, "n"]:
+    def allows(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Which points may be the object's whatever the pictures say: not behind the support, nor far from the box."""
-        inside = points_above(points, self.support, 0.0)
-        return inside & self.box.grown(options.beyond).contains(points) if self.is_whole else inside
+        inside = _above(points, self.support, 0.0)
+        return inside & self.box.grown(_BEYOND).contains(points) if self.is_whole else inside
+
+
+@dataclass(frozen=True)
+class Seed:
+    """The first selection, and where it was looked for."""
+
+    selection: Bool[Tensor, "n"]
+    """Which Gaussians are likely the object's."""
+    region: ObjectRegion
+    """Where they were looked for."""
+
+
+def seed_selection(
+    scene: Gaussians,
+    cameras: Cameras,
+    *,
+    box: Box | None = None,
+    prompts: Mapping[int, ViewPrompt] | None = None,
+    known: Bool[Tensor, "n"] | None = None,
+) -> Seed:
+    """Select what is likely the object.
+
+    Args:
+        scene: n Gaussians.
+        cameras: Of the capture, on the device of `scene`.
+        box: Around the object, world units; guessed where None.
+        prompts: What the user says, by index of the camera, pixels of its picture.
+        known: Gaussians that masks of some pictures give to the object; None where there are no masks.
+
+    Raises:
+        ValueError: Where nothing tells where the object is, or nothing is there.
+    """
+    prompts = prompts or {}
+    opaque = scene.opacities > _MIN_OPACITY
+    inside, outside = (_points_on_surface(scene, cameras, prompts, which) for which in ("inside", "outside"))
+    framed = _framed(scene.means, cameras, prompts)
+    if box is not None:
+        region = region_of_box(cameras, scene.means[opaque], box)
+    else:
+        pointed_at = inside if len(inside) else None
+        if known is not None and bool((known & opaque).any()):
+            pointed_at = torch.cat([inside, scene.means[known & opaque]])
+        region = guess_region(cameras, scene.means[opaque & framed], pointed_at)
+    selection = region.contains(scene.means) & framed
+    if known is not None:
+        selection = selection & known
+    if any(len(prompt.inside) for prompt in prompts.values()) and len(inside):
+        selection = selection & _nearer_inside(scene, region, inside, outside)
+    if not bool((selection & opaque).any()):
+        raise ValueError(
+            f"object: expected something solid in {region.reason}, found nothing; give its --box, or --prompts with "
+            "clicks in two or three pictures"
+        )
+    return Seed(selection, region)
 
 
 def default_box(capture: PosedImages) -> Box:
@@ -106,11 +170,7 @@ def default_box(capture: PosedImages) -> Box:
 
 
 def guess_region(
-    cameras: Cameras,
-    points: Float[Tensor, "m 3"],
-    *,
-    pointed_at: Float[Tensor, "k 3"] | None = None,
-    options: RegionOptions = RegionOptions(),
+    cameras: Cameras, points: Float[Tensor, "m 3"], pointed_at: Float[Tensor, "k 3"] | None = None
 ) -> ObjectRegion:
     """The region of the object that the cameras look at, or that a user pointed at.
 
@@ -118,66 +178,57 @@ def guess_region(
         cameras: Of the capture.
         points: Surface points, world units; may be empty.
         pointed_at: Points on the object, world units; None where nobody pointed.
-        options: Which points count, and the margin.
 
     Raises:
         ValueError: Where nobody pointed and the cameras do not look at one place.
     """
     middle = focus_point(cameras) if pointed_at is None else pointed_at.median(0).values.to(cameras.centers)
     source = "the cameras look at" if pointed_at is None else "the points name"
-    points = _drawn(points.to(middle), options.most_points)
-    radius = _visible_radius(cameras, middle, options)
+    points = _drawn(points.to(middle))
+    radius = _visible_radius(cameras, middle)
     if pointed_at is not None:
-        radius = max(radius, 1.5 * float((pointed_at.to(middle) - middle).norm(dim=1).max()))
-    search = _Search(cameras, points, middle, radius, pointed_at, options)
-    found = search.group(radius)
-    if found.points is not None and found.sphere > radius:
+        pointed_at = pointed_at.to(middle)
+        radius = max(radius, 1.5 * float((pointed_at - middle).norm(dim=1).max()))
+    support = _find_support(cameras, points, middle, radius)
+    found = _find_group(points, middle, radius, support, pointed_at)
+    if found is not None and found[1] > radius:
         # the support again, of a sphere as large as the group: a small part of a plane says little of its tilt
-        found = search.group(found.sphere)
-    support, least_height, kept = found.support, found.least_height, found.points
-    if kept is None:
-        half = options.cube * radius
+        support = _find_support(cameras, points, middle, found[1])
+        found = _find_group(points, middle, radius, support, pointed_at)
+    if found is None:
+        half = _CUBE * radius
         why = f"a cube where {source} one place, as hardly any surface points are known there"
-        return ObjectRegion(Box(middle - half, middle + half), support, least_height, why)
-    lower, upper = kept.quantile(torch.tensor([options.trim, 1 - options.trim]).to(kept), 0)
-    margin = options.margin * (upper - lower).max() + 1e-6
+        return ObjectRegion(Box(middle - half, middle + half), support, why)
+    group, _, is_whole = found
+    lower, upper = group.quantile(torch.tensor([_TRIM, 1 - _TRIM]).to(group), 0)
+    margin = _MARGIN * (upper - lower).max() + 1e-6
     lower, upper = lower - margin, upper + margin
-    if support is not None and float(support.normal[2]) > options.level_normal_z:
+    if support is not None and float(support.normal[2]) > _LEVEL_NORMAL_Z:
         # the support stays outside, also where the box is used without the plane
         lower[2] = torch.maximum(lower[2], torch.as_tensor(support.offset + support.thickness).to(lower))
-    why = f"the group of surface points that {source}"
-    return ObjectRegion(Box(lower, upper), support, least_height, why, found.is_whole, kept)
+    return ObjectRegion(Box(lower, upper), support, f"the group of surface points that {source}", is_whole, group)
 
 
-def region_of_box(
-    cameras: Cameras, points: Float[Tensor, "m 3"], box: Box, *, options: RegionOptions = RegionOptions()
-) -> ObjectRegion:
+def region_of_box(cameras: Cameras, points: Float[Tensor, "m 3"], box: Box) -> ObjectRegion:
     """The region of a box that a user gave, without the support that it may cut.
 
     Args:
         cameras: Of the capture.
         points: Surface points, world units.
         box: As given.
-        options: What counts as a support.
     """
     middle, radius = (box.lower + box.upper) / 2, 0.75 * float((box.upper - box.lower).norm())
-    support = find_support(cameras, _drawn(points, options.most_points), middle, radius=radius, options=options)
+    support = _find_support(cameras, _drawn(points), middle, radius)
     if support is not None:
         heights = support.height(box.corners)
         # a plane in the upper half of the box is the object's own top
         if float(heights.max()) < -float(heights.min()):
             support = None
-    least_height = 0.0 if support is None else options.above_support * support.thickness
-    return ObjectRegion(box, support, least_height, "the box that was given")
+    return ObjectRegion(box, support, "the box that was given")
 
 
-def find_support(
-    cameras: Cameras,
-    points: Float[Tensor, "m 3"],
-    middle: Float[Tensor, "3"],
-    *,
-    radius: float,
-    options: RegionOptions = RegionOptions(),
+def _find_support(
+    cameras: Cameras, points: Float[Tensor, "m 3"], middle: Float[Tensor, "3"], radius: float
 ) -> LevelPlane | None:
     """The largest plane near `middle` on which an object there can stand or hang; None where none is clear.
 
@@ -185,85 +236,69 @@ def find_support(
     """
     near = points[(points - middle.to(points)).norm(dim=1) < radius]
     towards = torch.nn.functional.normalize((cameras.centers - middle.to(cameras.centers)).mean(0), dim=0)
-    facing = replace(options.support, tilt_deg=options.facing_deg)
-    for direction, wanted in ((estimate_up(cameras), options.support), (towards, facing)):
+    for direction, wanted in ((estimate_up(cameras), _SUPPORT), (towards, _WALL)):
         plane = dominant_level_plane(near, direction.to(near), options=wanted)
         if plane is None or float(plane.height(middle)) < -0.5 * radius:
             continue
-        if float((plane.height(cameras.centers) > 0).float().mean()) >= options.cameras_in_front:
+        if float((plane.height(cameras.centers) > 0).float().mean()) >= _CAMERAS_IN_FRONT:
             return plane
     return None
 
 
-def _drawn(points: Float[Tensor, "m 3"], most: int) -> Float[Tensor, "k 3"]:
-    if len(points) <= most:
+def _drawn(points: Float[Tensor, "m 3"]) -> Float[Tensor, "k 3"]:
+    if len(points) <= _MAX_POINTS:
         return points
-    return points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:most].to(points.device)]
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))
+    return points[order[:_MAX_POINTS].to(points.device)]
 
 
-def _visible_radius(cameras: Cameras, middle: Float[Tensor, "3"], options: RegionOptions) -> float:
-    """Radius of the largest sphere around `middle` that the share `whole_views` of the images shows whole."""
+def _visible_radius(cameras: Cameras, middle: Float[Tensor, "3"]) -> float:
+    """Radius of the largest sphere around `middle` that most of the images show whole."""
     local = (cameras.camera_from_world[:, :3, :3] @ middle + cameras.camera_from_world[:, :3, 3])[:, :, None]
     pixel = (cameras.intrinsics @ local)[:, :, 0]
     pixel, depth = pixel[:, :2] / pixel[:, 2:], pixel[:, 2]
     room = torch.minimum(pixel, cameras.sizes.to(pixel) - pixel) / cameras.intrinsics[:, [0, 1], [0, 1]]
     radii = (room.amin(1) * depth)[depth > 0].clamp_min(0)
-    radius = float(radii.quantile(1 - options.whole_views)) if len(radii) else 0.0
-    least = options.far_radius * float((cameras.centers - middle).norm(dim=1).median())
+    radius = float(radii.quantile(1 - _WHOLE_VIEWS)) if len(radii) else 0.0
+    least = _FAR_RADIUS * float((cameras.centers - middle).norm(dim=1).median())
     return radius if radius > 0.1 * least else least
 
 
-def points_above(points: Float[Tensor, "*n 3"], support: LevelPlane | None, least_height: float) -> Bool[Tensor, "*n"]:
-    """Which points lie more than `least_height`, world units, above the support; all where there is none."""
+def _above(points: Float[Tensor, "*n 3"], support: LevelPlane | None, thicknesses: float) -> Bool[Tensor, "*n"]:
+    """Which points lie more than so many thicknesses of the support above it; all where there is none."""
     if support is None:
         return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
-    return support.height(points) > least_height
+    return support.height(points) > thicknesses * support.thickness
 
 
-@dataclass(frozen=True)
-class _Group:
-    """Surface points that belong together, above their support."""
+def _find_group(
+    points: Float[Tensor, "m 3"],
+    middle: Float[Tensor, "3"],
+    radius: float,
+    support: LevelPlane | None,
+    pointed_at: Float[Tensor, "k 3"] | None,
+) -> tuple[Float[Tensor, "k 3"], float, bool] | None:
+    """The group of points around the middle and above the support, from the smallest sphere that holds all of it.
 
-    points: Float[Tensor, "k 3"] | None
-    sphere: float
-    is_whole: bool
-    support: LevelPlane | None
-    least_height: float
-
-
-@dataclass(frozen=True)
-class _Search:
-    """What a group is searched with."""
-
-    cameras: Cameras
-    points: Float[Tensor, "m 3"]
-    middle: Float[Tensor, "3"]
-    radius: float
-    pointed_at: Float[Tensor, "k 3"] | None
-    options: RegionOptions
-
-    def group(self, support_radius: float) -> _Group:
-        """The group around the middle, from the smallest sphere that holds all of it."""
-        options, middle = self.options, self.middle
-        support = find_support(self.cameras, self.points, middle, radius=support_radius, options=options)
-        least_height = 0.0 if support is None else options.above_support * support.thickness
-        points = self.points[points_above(self.points, support, least_height)]
-        pointed_at = None if self.pointed_at is None else self.pointed_at.to(points)
-        first = _Group(None, self.radius, False, support, least_height)
-        for factor in options.spheres:
-            sphere = factor * self.radius
-            near = points[(points - middle).norm(dim=1) < sphere]
-            if len(near) < options.least_points:
-                continue
-            chosen = near[_group(near, options.group_step * self.radius, pointed_at, middle)]
-            first = replace(first, points=chosen, sphere=sphere) if first.points is None else first
-            reaching = (chosen - middle).norm(dim=1) > (1 - options.rim) * sphere
-            if float(reaching.float().mean()) < options.trim:
-                return _Group(chosen, sphere, True, support, least_height)
-        return first
+    Returns:
+        The points, the radius of the sphere, and whether they end within it; where no sphere holds all of it, the
+        group of the smallest sphere. None where hardly any points are known.
+    """
+    points, first = points[_above(points, support, _ABOVE_SUPPORT)], None
+    for factor in _SPHERES:
+        sphere = factor * radius
+        near = points[(points - middle).norm(dim=1) < sphere]
+        if len(near) < _MIN_POINTS:
+            continue
+        chosen = near[_connected(near, _GROUP_STEP * radius, pointed_at, middle)]
+        first = first or (chosen, sphere, False)
+        reaching = (chosen - middle).norm(dim=1) > (1 - _RIM) * sphere
+        if float(reaching.float().mean()) < _TRIM:
+            return chosen, sphere, True
+    return first
 
 
-def _group(
+def _connected(
     points: Float[Tensor, "m 3"], reach: float, pointed_at: Float[Tensor, "k 3"] | None, middle: Float[Tensor, "3"]
 ) -> Bool[Tensor, "m"]:
     """The set of points connected by distances below `reach` that counts most near `middle`, or was pointed at."""
@@ -277,3 +312,68 @@ def _group(
     distance = (points - middle).norm(dim=1)
     weight = torch.exp(-0.5 * (distance / distance.median()) ** 2).double().cpu().numpy()
     return torch.from_numpy(label == np.bincount(label, weights=weight).argmax())
+
+
+def _points_on_surface(
+    scene: Gaussians, cameras: Cameras, prompts: Mapping[int, ViewPrompt], which: str
+) -> Float[Tensor, "k 3"]:
+    """The points `inside` or `outside` on the surface that their picture shows; a rectangle alone gives its centre."""
+    found = [torch.zeros(0, 3, device=scene.device)]
+    for index, prompt in prompts.items():
+        pixels = prompt.inside if which == "inside" else prompt.outside
+        if which == "inside" and not len(pixels) and prompt.box is not None:
+            left, top, right, bottom = prompt.box
+            pixels = torch.tensor([[(left + right) / 2, (top + bottom) / 2]])
+        if len(pixels):
+            found.append(surface_points(scene, cameras[index], pixels))
+    return torch.cat(found)
+
+
+def _framed(points: Float[Tensor, "n 3"], cameras: Cameras, prompts: Mapping[int, ViewPrompt]) -> Bool[Tensor, "n"]:
+    """Which points lie in the user's rectangle in every picture that has one."""
+    inside = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    for index, prompt in prompts.items():
+        if prompt.box is not None:
+            camera = cameras[index]
+            pose = camera.camera_from_world[0].to(points)
+            local = points @ pose[:3, :3].T + pose[:3, 3]
+            pixels = (local @ camera.intrinsics[0].to(points).T)[:, :2] / local[:, 2:].clamp_min(1e-9)
+            corners = torch.tensor(prompt.box).to(points)
+            inside &= ((pixels >= corners[:2]) & (pixels <= corners[2:])).all(1) & (local[:, 2] > 0)
+    return inside
+
+
+def _nearer_inside(
+    scene: Gaussians, region: ObjectRegion, inside: Float[Tensor, "k 3"], outside: Float[Tensor, "m 3"]
+) -> Bool[Tensor, "n"]:
+    """Which Gaussians are nearer to the points on the object than to those beside it and to the region's outside."""
+    around = torch.nonzero(region.box.grown(1.5).contains(scene.means)).flatten()
+    near = scene.select(around)
+    means = near.means.detach().double().cpu().numpy()
+    if len(means) <= _NEIGHBOURS:
+        return torch.ones(scene.count, dtype=torch.bool, device=scene.device)
+    tree = KDTree(means)
+    distance, neighbour = tree.query(means, k=_NEIGHBOURS + 1)
+    colors = rgb_from_dc(near.sh[:, 0]).detach().double().cpu().numpy()
+    change = np.linalg.norm(colors[:, None] - colors[neighbour], axis=-1)
+    step = _COLOR_STEP * max(float(np.median(change[:, 1:])), 1e-3)
+    cost = distance * (1 + change / step) + 1e-12
+    rows = np.broadcast_to(np.arange(len(means))[:, None], cost.shape)
+    graph = coo_array((cost.ravel(), (rows.ravel(), np.asarray(neighbour).ravel())), shape=(len(means),) * 2).tocsr()
+
+    def touched(points: Tensor) -> np.ndarray:
+        if not len(points):
+            return np.zeros(0, np.int64)
+        return np.unique(np.asarray(tree.query(points.cpu().numpy(), k=_TOUCHED)[1]))
+
+    def way_from(sources: np.ndarray) -> np.ndarray:
+        if not len(sources):
+            return np.full(len(means), np.inf)
+        return dijkstra(graph, directed=False, indices=sources, min_only=True)
+
+    beyond = np.flatnonzero(~region.contains(near.means).cpu().numpy())
+    from_object, from_rest = way_from(touched(inside)), way_from(np.union1d(touched(outside), beyond))
+    chosen = torch.zeros(scene.count, dtype=torch.bool, device=scene.device)
+    nearer = (from_object <= from_rest) & np.isfinite(from_object)
+    chosen[around] = torch.from_numpy(nearer).to(scene.device)
+    return chosen

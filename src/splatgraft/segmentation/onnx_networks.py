@@ -1,61 +1,222 @@
-"""Networks in .onnx files, opened by onnxruntime."""
+"""Object masks by networks in .onnx files, run by onnxruntime: BiRefNet of single images, SAM 2 guided by prompts.
+
+BiRefNet (Zheng et al. 2024) finds the foreground. SAM 2 (Ravi et al. 2024) is two networks with the interface of its
+public exports (samexporter's export_sam2.py, on the hub as vietanhdev/segment-anything-2-onnx-models): the encoder
+takes `image` and gives `image_embed`, `high_res_feats_0`, `high_res_feats_1`; the decoder takes these, `point_coords`
+in pixels of the encoder's picture, `point_labels` (0 beside the object, 1 on it, 2 and 3 corners of a box),
+`mask_input`, `has_mask_input`, and gives `masks` (logits) and `iou_predictions`. Some decoders also take
+`orig_im_size`.
+"""
 
 import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-IMAGENET_MEAN = torch.tensor([0.485, 0.456, 0.406])
-"""Of sRGB in [0, 1]; subtracted before the networks see a picture."""
-IMAGENET_STD = torch.tensor([0.229, 0.224, 0.225])
-"""Of sRGB in [0, 1]; divided by before the networks see a picture."""
+from splatgraft.core.images import resize
+from splatgraft.runtime.weights.catalogue import ModelWeights
+from splatgraft.runtime.weights.hub import fetch
+from splatgraft.runtime.weights.store import folder_of, is_stored
+from splatgraft.segmentation.cut_object import Evidence
 
-
+BIREFNET_REPOSITORY = "onnx-community/BiRefNet-ONNX"
+_BIREFNET_FILE = "onnx/model.onnx"
+_BIREFNET_SIDE = 1024
+"""Width and height, pixels, at which BiRefNet was trained; taken where the network leaves its side free."""
+_AT_ONCE_ON_CUDA = 4
+"""Images in one pass of BiRefNet; about 3 GB each at 1024 pixels, by its largest activations. An estimate."""
+_SAM2_FEATURES = ("image_embed", "high_res_feats_0", "high_res_feats_1")
+_SAM2_PROMPTS = ("point_coords", "point_labels", "mask_input", "has_mask_input")
+_SAM2_MASK_STRIDE = 4
+"""Side of the encoder's picture over that of `mask_input`."""
+_SAM2_MARGIN = 0.05
+"""Added around the box of the 3D selection at each side, over its width and height; set by hand."""
+_IMAGENET_MEAN = torch.tensor([0.485, 0.456, 0.406])
+_IMAGENET_STD = torch.tensor([0.229, 0.224, 0.225])
+"""Of sRGB in [0, 1]."""
 _CUDA = "CUDAExecutionProvider"
 
 
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+@dataclass(frozen=True)
+class BiRefNet:
+    """A loaded network that finds the foreground of images."""
+
+    session: Any
+    """An onnxruntime.InferenceSession with one input (n, 3, side, side) and logits or probabilities out."""
+    side: int
+    """Width and height of the network's input, pixels."""
+    at_once: int = 1
+    """Images that it takes in one pass."""
+
+    @property
+    def place(self) -> str:
+        """Where it computes, for messages."""
+        cores = self.session.get_session_options().intra_op_num_threads
+        return "CUDA" if _runs_on_cuda(self.session) else f"{cores} cores"
+
+    def mask(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+        """Share of each pixel that is foreground, in [0, 1]."""
+        return next(self.masks([image]))
+
+    def masks(self, images: Iterable[Float[Tensor, "_ _ 3"]]) -> Iterator[Float[Tensor, "_ _"]]:
+        """Share of each pixel that is foreground, in [0, 1], of each image in order; `at_once` images are held."""
+        waiting: list[Tensor] = []
+        for image in images:
+            waiting.append(image)
+            if len(waiting) == self.at_once:
+                yield from self._pass(waiting)
+                waiting = []
+        if waiting:
+            yield from self._pass(waiting)
+
+    def _pass(self, images: list[Tensor]) -> Iterator[Tensor]:
+        squares = torch.stack([_square(image, self.side) for image in images])
+        # the last output is the finest where a network gives several
+        made = self.session.run(None, {self.session.get_inputs()[0].name: squares.numpy()})[-1]
+        made = torch.from_numpy(np.asarray(made, np.float32))
+        for image, found in zip(images, made.reshape(len(images), *made.shape[-2:]), strict=True):
+            shares = found.sigmoid() if float(found.min()) < 0 or float(found.max()) > 1 else found
+            yield resize(shares, image.shape[1], image.shape[0])
 
 
-def runs_on_cuda(session: Any) -> bool:
-    """Whether an onnxruntime session computes on CUDA; it may not, though asked, where CUDA's libraries are missing."""
-    return session.get_providers()[0] == _CUDA
+@dataclass(frozen=True)
+class Sam2:
+    """A loaded SAM 2: an encoder of pictures and a decoder of prompts."""
+
+    encoder: Any
+    """An onnxruntime.InferenceSession."""
+    decoder: Any
+    """An onnxruntime.InferenceSession."""
+    side: int
+    """Width and height of the encoder's picture, pixels."""
+
+    def cut(self, image: Float[Tensor, "h w 3"], evidence: Evidence) -> Float[Tensor, "h w"]:
+        """The object's mask, 0 or 1: of the networks' proposals the one that they predict to be the best."""
+        height, width = image.shape[:2]
+        names = [output.name for output in self.encoder.get_outputs()]
+        given = {self.encoder.get_inputs()[0].name: _square(image, self.side)[None].numpy()}
+        features = dict(zip(names, self.encoder.run(None, given), strict=True))
+        points, labels = _points(evidence)
+        factor = np.array([self.side / width, self.side / height], np.float32)
+        small = self.side // _SAM2_MASK_STRIDE
+        wanted = {name: features[name] for name in _SAM2_FEATURES} | {
+            "point_coords": (points * factor)[None].astype(np.float32),
+            "point_labels": labels[None].astype(np.float32),
+            "mask_input": np.zeros((1, 1, small, small), np.float32),
+            "has_mask_input": np.zeros(1, np.float32),
+            "orig_im_size": np.array([height, width], np.float32),
+        }
+        inputs = {entry.name: wanted[entry.name] for entry in self.decoder.get_inputs()}
+        outputs = [output.name for output in self.decoder.get_outputs()]
+        found = dict(zip(outputs, self.decoder.run(None, inputs), strict=True))
+        best = int(np.asarray(found["iou_predictions"]).reshape(-1).argmax())
+        logits = np.asarray(found["masks"], np.float32)
+        logits = torch.from_numpy(logits.reshape(-1, *logits.shape[-2:])[best].copy())
+        return (resize(logits, width, height) > 0).float()
 
 
-def require(module: str, method: str) -> None:
-    """Check that an optional package is there.
-
-    Raises:
-        ValueError: It is not installed.
-    """
-    if find_spec(module) is None:
-        raise ValueError(
-            f"masks by {method}: expected {module} (pip install 'splatgraft[birefnet]'), found none; or use grabcut"
-        )
-
-
-def open_network(path: Path, *, method: str, threads: int | None = None) -> Any:
-    """An onnxruntime.InferenceSession on CUDA where onnxruntime has it (the package onnxruntime-gpu), else on the CPU.
+def load_birefnet(weights: Path | str = BIREFNET_REPOSITORY, *, threads: int | None = None) -> BiRefNet:
+    """Load the network.
 
     Args:
-        path: The .onnx file.
-        method: What makes the masks, for messages.
+        weights: An .onnx file, or a repository on the Hugging Face hub, downloaded once; none of its code runs.
+        threads: CPU threads, where it runs on the CPU; all cores that this process may use where not given.
+
+    Raises:
+        ValueError: Where a package is missing, or the file is no such network.
+    """
+    path = weights if isinstance(weights, Path) else _from_hub(weights)
+    session = _opened(path, "birefnet", threads)
+    shape = session.get_inputs()[0].shape
+    if len(shape) != 4 or shape[1] not in (3, "channels", "num_channels"):
+        raise ValueError(f"{path}: expected an input of shape (1, 3, side, side), found {shape}")
+    # a free side or batch is written as a name
+    at_once = 1 if isinstance(shape[0], int) or not _runs_on_cuda(session) else _AT_ONCE_ON_CUDA
+    return BiRefNet(session, shape[2] if isinstance(shape[2], int) else _BIREFNET_SIDE, at_once)
+
+
+def load_sam2(encoder: Path, decoder: Path, *, threads: int | None = None) -> Sam2:
+    """Load the networks.
+
+    Args:
+        encoder: An .onnx file of the image encoder.
+        decoder: An .onnx file of the prompt decoder that belongs to it.
         threads: CPU threads; all cores that this process may use where not given.
 
     Raises:
-        ValueError: Where onnxruntime is missing, or the file is no network.
+        ValueError: Where onnxruntime is missing, or a file is no such network.
     """
-    require("onnxruntime", method)
+    encodes, decodes = (_opened(path, "sam2", threads) for path in (encoder, decoder))
+    shape = encodes.get_inputs()[0].shape
+    if len(shape) != 4 or shape[1] != 3 or not isinstance(shape[2], int) or shape[2] != shape[3]:
+        raise ValueError(f"{encoder}: expected an input of shape (1, 3, side, side), found {shape}")
+    given = [entry.name for entry in decodes.get_inputs()]
+    for path, kind, names, found in (
+        (encoder, "outputs", _SAM2_FEATURES, [entry.name for entry in encodes.get_outputs()]),
+        (decoder, "inputs", (*_SAM2_FEATURES, *_SAM2_PROMPTS), given),
+        (decoder, "outputs", ("masks", "iou_predictions"), [entry.name for entry in decodes.get_outputs()]),
+    ):
+        if not set(names) <= set(found):
+            raise ValueError(f"{path}: expected the {kind} {', '.join(names)}, found {', '.join(found)}")
+    if unknown := sorted(set(given) - {*_SAM2_FEATURES, *_SAM2_PROMPTS, "orig_im_size"}):
+        raise ValueError(f"{decoder}: expected the inputs of SAM 2's decoder, found also {', '.join(unknown)}")
+    return Sam2(encodes, decodes, shape[2])
+
+
+def _square(image: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "3 s s"]:
+    """The image as the networks see it."""
+    return ((resize(image, side, side) - _IMAGENET_MEAN) / _IMAGENET_STD).permute(2, 0, 1).contiguous()
+
+
+def _points(evidence: Evidence) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
+    """Points and labels, pixels of the picture: what the user says, else the 3D selection's box and middle."""
+    prompt, shown = evidence.prompt, (evidence.lifted > 0.5).numpy()
+    inside, box = prompt.inside.numpy(), prompt.box
+    if shown.any():
+        if not len(inside):
+            depth = cv2.distanceTransform(np.pad(shown.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
+            row, column = np.unravel_index(int(depth.argmax()), depth.shape)
+            inside = np.array([[column + 0.5, row + 0.5]])
+        if box is None:
+            rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
+            x, y = _SAM2_MARGIN * len(columns), _SAM2_MARGIN * len(rows)
+            box = (columns[0] - x, rows[0] - y, columns[-1] + 1 + x, rows[-1] + 1 + y)
+    corners = np.zeros((0, 2)) if box is None else np.array(box).reshape(2, 2)
+    corners = corners.clip(0, np.array(shown.shape[::-1]))
+    points = np.concatenate([inside, prompt.outside.numpy(), corners])
+    labels = [1.0] * len(inside) + [0.0] * len(prompt.outside) + [2.0, 3.0][: len(corners)]
+    return points, np.array(labels)
+
+
+def _from_hub(repository: str) -> Path:
+    folder = folder_of(repository)
+    model = ModelWeights(repository, "masks", repository, files=(_BIREFNET_FILE,))
+    if not is_stored(folder, model):
+        _require("huggingface_hub", "birefnet")
+        try:
+            fetch(model, folder, say=lambda sentence: None)
+        except ValueError as error:  # network, repository or file is missing
+            raise ValueError(f"{error}; or give the path of an .onnx file, or use grabcut") from error
+    return folder / _BIREFNET_FILE
+
+
+def _opened(path: Path, method: str, threads: int | None) -> Any:
+    """An InferenceSession on CUDA where onnxruntime has it (the package onnxruntime-gpu), else on the CPU."""
+    _require("onnxruntime", method)
     import onnxruntime
 
     if not path.is_file():
         raise ValueError(f"{path}: expected an .onnx file, found none")
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads or usable_cores()
+    options.intra_op_num_threads = threads or _usable_cores()
     options.log_severity_level = 3
     there = onnxruntime.get_available_providers()
     providers = [provider for provider in (_CUDA, "CPUExecutionProvider") if provider in there]
@@ -63,3 +224,19 @@ def open_network(path: Path, *, method: str, threads: int | None = None) -> Any:
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # onnxruntime's own exceptions share no public base class
         raise ValueError(f"{path}: expected an ONNX network, found {str(error).splitlines()[0]}") from error
+
+
+def _require(module: str, method: str) -> None:
+    if find_spec(module) is None:
+        raise ValueError(
+            f"masks by {method}: expected {module} (pip install 'splatgraft[birefnet]'), found none; or use grabcut"
+        )
+
+
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _runs_on_cuda(session: Any) -> bool:
+    """Whether a session computes on CUDA; it may not, though asked, where CUDA's libraries are missing."""
+    return session.get_providers()[0] == _CUDA

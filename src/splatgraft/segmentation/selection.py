@@ -1,20 +1,54 @@
-"""Selects the Gaussians of an object: by mask value, 3D box and connected component."""
+"""Selects the Gaussians of an object: by mask value, 3D box and connected component, and as the user corrects it."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.segmentation.box import Box
 
 Keep = Literal["substantial", "largest", "all"]
+
+_SUBSTANTIAL = 0.05
+"""Least summed opacity of a substantial component over the largest one's; set by hand."""
+_NEIGHBOURS = 16
+"""Nearest Gaussians that are tested for contact with each Gaussian."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """All points between two corners."""
+
+    lower: Float[Tensor, "3"]
+    """Least x, y, z, world units."""
+    upper: Float[Tensor, "3"]
+    """Greatest x, y, z, world units."""
+
+    def __post_init__(self) -> None:
+        """Raises: ValueError where the corners are not in order."""
+        if not bool((self.lower < self.upper).all()):
+            raise ValueError(f"box: expected lower < upper, found {self.lower.tolist()} and {self.upper.tolist()}")
+
+    def contains(self, points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
+        """Which points lie inside."""
+        return ((points >= self.lower.to(points)) & (points <= self.upper.to(points))).all(-1)
+
+    def grown(self, factor: float) -> "Box":
+        """The box with edges `factor` times as long and the same centre."""
+        centre, half = (self.lower + self.upper) / 2, (self.upper - self.lower) / 2 * factor
+        return Box(centre - half, centre + half)
+
+    @property
+    def corners(self) -> Float[Tensor, "8 3"]:
+        """The eight corners."""
+        choice = torch.cartesian_prod(*[torch.arange(2)] * 3).bool()
+        return torch.where(choice, self.upper, self.lower)
 
 
 @dataclass(frozen=True)
@@ -26,11 +60,8 @@ class SelectOptions:
     box: Box | None = None
     """Where centres must lie, world units."""
     keep: Keep = "substantial"
-    """Which connected components stay: those of at least `substantial`, the largest one, or all."""
-    substantial: float = 0.05
-    """Summed opacity of a component over the largest one's; set by hand."""
-    neighbours: int = 16
-    """Nearest Gaussians that are tested for contact with each Gaussian."""
+    """Which connected components stay: those of at least a twentieth of the largest one's summed opacity, the largest
+    one, or all."""
 
 
 def select_object(
@@ -61,26 +92,22 @@ def select_object(
             raise ValueError("object: expected some of its Gaussians inside the box, found all outside")
     if options.keep == "all":
         return chosen
-    opacity = component_opacity(gaussians.select(chosen), options.neighbours)
-    least = opacity.max() * (options.substantial if options.keep == "substantial" else 1)
+    opacity = _component_opacity(gaussians.select(chosen))
+    least = opacity.max() * (_SUBSTANTIAL if options.keep == "substantial" else 1)
     kept = torch.zeros_like(chosen)
     kept[torch.nonzero(chosen)[:, 0][opacity >= least]] = True
     return kept
 
 
-def component_opacity(gaussians: Gaussians, neighbours: int = 16) -> Float[Tensor, "n"]:
-    """For each Gaussian the sum of opacities of its connected component; two touch if their 2-sigma spheres do.
-
-    Only the `neighbours` nearest of each are tested for contact.
-    """
+def _component_opacity(gaussians: Gaussians) -> Float[Tensor, "n"]:
+    """For each Gaussian the sum of opacities of its connected component; two touch if their 2-sigma spheres do."""
     n = gaussians.count
-    if n <= 1:
+    if n == 1:
         return gaussians.opacities.detach()
     means = gaussians.means.detach().double().cpu().numpy()
     # the median scale: a needle is long along one axis only
-    radii = 2 * gaussians.scales.detach().double().cpu().numpy().clip(1e-12)
-    radii = np.median(radii, axis=1)
-    distance, neighbour = KDTree(means).query(means, k=min(neighbours + 1, n))
+    radii = np.median(2 * gaussians.scales.detach().double().cpu().numpy().clip(1e-12), axis=1)
+    distance, neighbour = KDTree(means).query(means, k=min(_NEIGHBOURS + 1, n))
     neighbour = np.asarray(neighbour)
     near = distance <= radii[:, None] + radii[neighbour]
     rows = np.broadcast_to(np.arange(n)[:, None], near.shape)[near]
@@ -88,3 +115,32 @@ def component_opacity(gaussians: Gaussians, neighbours: int = 16) -> Float[Tenso
     _, label = connected_components(graph, directed=False)
     opacity = np.bincount(label, weights=gaussians.opacities.detach().double().cpu().numpy())
     return torch.from_numpy(opacity[label]).to(gaussians.means)
+
+
+def apply_corrections(lifted: Bool[Tensor, "n"], corrections: Int8[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
+    """The selection with the user's corrections.
+
+    Args:
+        lifted: The selection from the masks.
+        corrections: 1 adds a Gaussian, -1 removes it, 0 leaves it; None changes nothing.
+
+    Raises:
+        ValueError: Where there is not one correction per Gaussian.
+    """
+    if corrections is None:
+        return lifted
+    if len(corrections) != len(lifted):
+        raise ValueError(
+            f"corrections: expected one for each of {len(lifted)} Gaussians, found {len(corrections)}; "
+            "the scene is another one now"
+        )
+    corrections = corrections.to(lifted.device)
+    return (lifted | (corrections > 0)) & ~(corrections < 0)
+
+
+def add_correction(
+    corrections: Int8[Tensor, "n"] | None, touched: Bool[Tensor, "n"], *, add: bool
+) -> Int8[Tensor, "n"]:
+    """The corrections after one more stroke over the `touched` Gaussians; the last stroke over a Gaussian counts."""
+    before = torch.zeros(len(touched), dtype=torch.int8) if corrections is None else corrections
+    return torch.where(touched, torch.tensor(1 if add else -1, dtype=torch.int8), before)

@@ -6,7 +6,7 @@ scene. Only an opaque object inside its mask matches the photographs over every 
 
 A reconstruction spends most of its Gaussians on the surroundings, which stay behind. So where the object has fewer than
 its size in the photographs asks for, those are split that have the largest gradient (3DGS, Sec. 5). What no photograph
-shows, inside and behind, has colours by chance; it gets those of what is next to it.
+shows, inside and behind, has colours by chance; it gets those of what is next to it. All constants are set by hand.
 """
 
 from collections.abc import Sequence
@@ -23,44 +23,41 @@ from splatgraft.core.splitting import PIECES, split_along
 from splatgraft.rendering import RenderOptions, render, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
+_MAX_SHARE = 0.5
+"""Most Gaussians that it is split to, over those of the scene, whose number was chosen for the machine and time."""
+_DENSIFICATIONS = 8
+"""How many times Gaussians are split, evenly spaced."""
+_DENSIFIED = 0.6
+"""Share of the steps after which none is split."""
+_DEAD_OPACITY = 0.02
+"""Opacity below which a Gaussian is removed when others are split."""
+_HIDDEN = 0.1
+"""Pixels in which a Gaussian shows, over the square of its width, below which its colour is not known; over the median
+one."""
+_NEIGHBOURS = 8
+"""Gaussians of known colour whose mean is taken then."""
+_OPACITY_RATE, _COLOR_RATE, _SCALE_RATE = 0.05, 0.0025, 0.005
+"""Learning rates of Adam: logits, band 0 (a twentieth for the others, as 3DGS), and natural logarithms per step."""
+_POSITION_RATE = 2e-4
+"""Learning rate of Adam, per step, over the object's radius."""
+_ROTATION_RATIO = 0.2
+"""Learning rate of the quaternions over that of the scales."""
+_OCCLUDER_DISTANCE = 0.25
+"""Distance in front of the object, over its extent, from which something else occludes it."""
+_MARGIN_PX = 12
+"""Border of the image windows around the object."""
+
 
 @dataclass(frozen=True)
 class SolidifyOptions:
-    """Length and learning rates of the fit; values set by hand."""
+    """Length and detail of the fit."""
 
     iterations: int = 800
     """Steps, one view each."""
     pixels_per_gaussian: float = 6.0
     """Pixels of the object in the median view for each Gaussian that it should have; 0 splits none."""
-    most_share: float = 0.5
-    """Most Gaussians that it is split to, over those of the scene, whose number was chosen for the machine and time."""
-    densifications: int = 8
-    """How many times Gaussians are split, evenly spaced."""
-    densified: float = 0.6
-    """Share of the steps after which none is split."""
-    dead_opacity: float = 0.02
-    """Opacity below which a Gaussian is removed when others are split."""
-    hidden: float = 0.1
-    """Pixels in which a Gaussian shows, over the square of its width, below which its colour is not known; over the
-    median one. 0 keeps all colours."""
-    neighbours: int = 8
-    """Gaussians of known colour whose mean is taken then."""
-    opacity_rate: float = 0.05
-    """Of Adam, logits per step."""
-    color_rate: float = 0.0025
-    """Of Adam, band 0 per step; a twentieth for the others (as 3DGS)."""
-    scale_rate: float = 0.005
-    """Of Adam, natural logarithm per step."""
-    position_rate: float = 2e-4
-    """Of Adam, per step, over the object's radius."""
-    rotation_ratio: float = 0.2
-    """Learning rate of the quaternions over that of the scales."""
-    occluder_distance: float = 0.25
-    """Distance in front of the object, over its extent, from which something else occludes it."""
-    margin_px: int = 12
-    """Border of the image windows around the object."""
     seed: int = 0
-    """Of the views and backgrounds drawn."""
+    """Seed of the views and backgrounds drawn."""
 
 
 @dataclass(frozen=True)
@@ -105,14 +102,17 @@ def solidify_object(
     views = [
         view
         for camera, (image, mask) in zip(cameras, photographs, strict=True)
-        if (view := _cropped_view(scene, selection, camera, image, mask, options)) is not None
+        if (view := _cropped_view(scene, selection, camera, image, mask)) is not None
     ]
     if not views:
         raise ValueError("object: expected a mask with some of it inside, found all empty")
-    wanted = min(_wanted_count(views, options), int(options.most_share * scene.count))
-    first, stop = chosen.count, options.densified * options.iterations
-    every = max(1, int(stop / options.densifications))
-    fit = _Fit(chosen, options)
+    wanted = 0
+    if options.pixels_per_gaussian > 0:
+        pixels = torch.tensor([float(view.mask.sum()) for view in views])
+        wanted = min(int(float(pixels.median()) / options.pixels_per_gaussian), int(_MAX_SHARE * scene.count))
+    first, stop = chosen.count, _DENSIFIED * options.iterations
+    every = max(1, int(stop / _DENSIFICATIONS))
+    fit = _Fit(chosen)
     generator = torch.Generator().manual_seed(options.seed)
     for step in range(options.iterations):
         view = views[int(torch.randint(len(views), (1,), generator=generator))]
@@ -121,31 +121,31 @@ def solidify_object(
             progress(step, options.iterations, f"making the object solid, loss {loss:.4f}")
         if wanted > first and 0 < step <= stop and step % every == 0:
             allowed = int(first + (wanted - first) * step / stop)
-            fit = _Fit(_with_splits(fit.gaussians, fit.scores, allowed, options), options)
+            fit = _Fit(_with_splits(fit.gaussians, fit.scores, allowed))
     progress(options.iterations, options.iterations, "the object is solid")
-    return _with_known_colors(fit.gaussians, views, options)
+    return _with_known_colors(fit.gaussians, views)
 
 
 class _Fit:
     """Gaussians that are fitted, and their scores since the start."""
 
-    def __init__(self, gaussians: Gaussians, options: SolidifyOptions) -> None:
+    def __init__(self, gaussians: Gaussians) -> None:
         self._start = gaussians
         radius = float((gaussians.means - gaussians.means.mean(0)).norm(dim=1).quantile(0.9))
         self._base = gaussians.sh[:, :1].detach().clone().requires_grad_()
         self._higher = gaussians.sh[:, 1:].detach().clone().requires_grad_()
         rates = {
-            "means": options.position_rate * radius,
-            "log_scales": options.scale_rate,
-            "quaternions": options.rotation_ratio * options.scale_rate,
-            "opacity_logits": options.opacity_rate,
+            "means": _POSITION_RATE * radius,
+            "log_scales": _SCALE_RATE,
+            "quaternions": _ROTATION_RATIO * _SCALE_RATE,
+            "opacity_logits": _OPACITY_RATE,
         }
         self._leaves = {name: getattr(gaussians, name).detach().clone().requires_grad_() for name in rates}
         self._optimizer = torch.optim.Adam(
             [
                 *({"params": [self._leaves[name]], "lr": rate} for name, rate in rates.items()),
-                {"params": [self._base], "lr": options.color_rate},
-                {"params": [self._higher], "lr": options.color_rate / 20},
+                {"params": [self._base], "lr": _COLOR_RATE},
+                {"params": [self._higher], "lr": _COLOR_RATE / 20},
             ],
             eps=1e-15,
         )
@@ -172,18 +172,10 @@ class _Fit:
         return replace(self._start, **leaves, sh=torch.cat([self._base, self._higher], 1).detach())
 
 
-def _wanted_count(views: Sequence[_CroppedView], options: SolidifyOptions) -> int:
-    """Gaussians that the object's size in the median view asks for."""
-    if options.pixels_per_gaussian <= 0:
-        return 0
-    pixels = torch.tensor([float(view.mask.sum()) for view in views])
-    return int(float(pixels.median()) / options.pixels_per_gaussian)
-
-
-def _with_splits(gaussians: Gaussians, scores: Float[Tensor, "n"], allowed: int, options: SolidifyOptions) -> Gaussians:
+def _with_splits(gaussians: Gaussians, scores: Float[Tensor, "n"], allowed: int) -> Gaussians:
     """At most `allowed` Gaussians: those with the highest scores split along their longest axis, transparent ones left
     out."""
-    alive = gaussians.opacities > options.dead_opacity
+    alive = gaussians.opacities > _DEAD_OPACITY
     count = int(alive.sum())
     parents = min((allowed - count) // (PIECES - 1), count)
     if parents <= 0:
@@ -195,7 +187,7 @@ def _with_splits(gaussians: Gaussians, scores: Float[Tensor, "n"], allowed: int,
     return concatenate([gaussians.select(alive & ~chosen), pieces])
 
 
-def _with_known_colors(gaussians: Gaussians, views: Sequence[_CroppedView], options: SolidifyOptions) -> Gaussians:
+def _with_known_colors(gaussians: Gaussians, views: Sequence[_CroppedView]) -> Gaussians:
     """The Gaussians that hardly show in any view with the mean colour of the nearest that do, from all sides alike."""
     shown = torch.zeros(gaussians.count, device=gaussians.device)
     for view in views:
@@ -203,12 +195,12 @@ def _with_known_colors(gaussians: Gaussians, views: Sequence[_CroppedView], opti
         shown += view_operator(gaussians, view.camera, RenderOptions()).blend_transpose(ones)[:, 0]
     widths = gaussians.scales.sort(1, descending=True).values[:, :2]
     known = shown / (widths.prod(1) * gaussians.opacities).clamp_min(1e-20)
-    hidden = known < options.hidden * known.median()
+    hidden = known < _HIDDEN * known.median()
     count = gaussians.count - int(hidden.sum())
-    if count == gaussians.count or count <= options.neighbours:
+    if count == gaussians.count or count <= _NEIGHBOURS:
         return gaussians
     tree = KDTree(gaussians.means[~hidden].cpu().numpy())
-    _, nearest = tree.query(gaussians.means[hidden].cpu().numpy(), k=options.neighbours)
+    _, nearest = tree.query(gaussians.means[hidden].cpu().numpy(), k=_NEIGHBOURS)
     sh = gaussians.sh.clone()
     sh[hidden] = 0
     sh[hidden, 0] = gaussians.sh[~hidden, 0][torch.from_numpy(nearest).to(sh.device)].mean(1)
@@ -221,23 +213,22 @@ def _cropped_view(
     camera: Cameras,
     image: Float[Tensor, "h w 3"],
     mask: Float[Tensor, "h w"],
-    options: SolidifyOptions,
 ) -> _CroppedView | None:
     """The view cropped to where the object shows; None where the mask is empty."""
     chosen = scene.select(selection)
     object_alone = render(chosen, camera, outputs=frozenset({"depth"}))
     rest = render(scene.select(~selection), camera, outputs=frozenset({"depth"}))
     extent = float((chosen.means.quantile(0.95, dim=0) - chosen.means.quantile(0.05, dim=0)).norm())
-    in_front = rest.depth[0] < object_alone.depth[0] - options.occluder_distance * extent
+    in_front = rest.depth[0] < object_alone.depth[0] - _OCCLUDER_DISTANCE * extent
     occluded = in_front & (rest.alpha[0] > 0.5)
     hidden = occluded & (object_alone.alpha[0] > 0.5) & (mask.to(occluded.device) < 0.5)
     shown = (mask > 0.5) | ((object_alone.alpha[0] > 0.05) & ~hidden).to(mask.device)
     if not bool((mask > 0.5).any()):
         return None
     rows, columns = torch.nonzero(shown.any(1))[:, 0], torch.nonzero(shown.any(0))[:, 0]
-    top, left = max(int(rows[0]) - options.margin_px, 0), max(int(columns[0]) - options.margin_px, 0)
-    bottom = min(int(rows[-1]) + 1 + options.margin_px, image.shape[0])
-    right = min(int(columns[-1]) + 1 + options.margin_px, image.shape[1])
+    top, left = max(int(rows[0]) - _MARGIN_PX, 0), max(int(columns[0]) - _MARGIN_PX, 0)
+    bottom = min(int(rows[-1]) + 1 + _MARGIN_PX, image.shape[0])
+    right = min(int(columns[-1]) + 1 + _MARGIN_PX, image.shape[1])
     device = scene.device
     return _CroppedView(
         camera=camera.cropped([(left, top, right, bottom)]),

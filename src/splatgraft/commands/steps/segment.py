@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
@@ -35,17 +35,18 @@ from splatgraft.project.layout import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_
 from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
 from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.lazy_sequence import LazySequence
+from splatgraft.runtime.note import Note
 from splatgraft.segmentation import (
-    LEAST_AGREEMENT,
+    MIN_AGREEMENT,
     Agreement,
     Box,
-    GrabCut,
     Keep,
     LiftOptions,
     SelectOptions,
     SolidifyOptions,
     ViewCutter,
     apply_corrections,
+    grabcut_mask,
     lift_masks,
     load_sam2,
     measure_agreement,
@@ -124,7 +125,9 @@ class Segment:
         capture = read_capture(self.capture)
         masked, feature = None, None
         if self._source(capture) == "box":
-            feature = _in_box(scene, box)
+            if box is None:
+                raise ValueError("--mask-source box: expected --box beside it, found none")
+            feature = box.contains(scene.means).float()
         else:
             masked = self._masked_views(capture, scene, folder, box, context)
             cameras = masked.views.cameras.to(device)
@@ -176,18 +179,17 @@ class Segment:
         size = " x ".join(f"{x:.3g}" for x in (region.box.upper - region.box.lower).tolist())
         context.console.say(f"the object was looked for in {region.reason}, a box of {size}")
         if not region.is_whole:
-            context.console.warn(
-                "what stands there goes on beyond that box, so a part of something may have been cut; give clicks in "
-                "two or three images (--prompts), or --box"
-            )
+            text = "what stands there goes on beyond that box, so a part of something may have been cut."
+            remedy = "Give clicks in two or three images (--prompts), or --box"
+            context.console.tell(Note(text, "warning", remedy))
         return masked
 
     def _cutter(self, source: MaskSource) -> ViewCutter:
         if source == "grabcut":
-            return GrabCut()
+            return grabcut_mask
         if self.sam2_encoder is None or self.sam2_decoder is None:
             raise ValueError("--mask-source sam2: expected --sam2-encoder and --sam2-decoder beside it, found not both")
-        return load_sam2(self.sam2_encoder, self.sam2_decoder)
+        return load_sam2(self.sam2_encoder, self.sam2_decoder).cut
 
     def _compare(
         self, masked: MaskedViews, scene: Gaussians, selection: Bool[Tensor, "n"], folder: Path, context: Context
@@ -204,12 +206,7 @@ class Segment:
         others = [round(i) for i in torch.linspace(0, len(sizes) - 1, min(_PICTURED, len(sizes))).tolist()]
         chosen = [*doubtful, *(i for i in dict.fromkeys(others) if i not in doubtful)][:_PICTURED]
         write_mask_sheet(folder / SHEET_FILE, masked, chosen, scene=scene, selection=selection)
-        sheet = self.out / SHEET_FILE
-        context.console.say(
-            f"the masks agree with the object by {agreement.mean:.2f} (mean IoU over the images; 1 is perfect): {sheet}"
-        )
-        if (doubt := _doubt(agreement, sheet)) is not None:
-            context.console.warn(doubt, picture=folder / SHEET_FILE)
+        context.console.tell(*_agreement_notes(agreement, self.out / SHEET_FILE, folder / SHEET_FILE))
 
 
 def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tensor, Tensor]]]:
@@ -220,24 +217,28 @@ def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tenso
     return views, read
 
 
-def _doubt(agreement: Agreement, sheet: Path) -> str | None:
-    """What is wrong with the agreement; names the picture."""
-    names = [Path(agreement.names[index]).name for index in agreement.doubtful]
-    if agreement.mean < LEAST_AGREEMENT:
-        return (
-            f"the masks of the images do not agree on one object (mean IoU {agreement.mean:.2f}, expected at least "
-            f"{LEAST_AGREEMENT}); look at {sheet}, then give clicks in two or three images (--prompts) or --box"
+def _agreement_notes(agreement: Agreement, sheet: Path, picture: Path) -> list[Note]:
+    """How well the masks agree, and what is wrong with that.
+
+    Args:
+        agreement: Of masks and selection.
+        sheet: Where the picture will lie.
+        picture: Where it lies while the step runs.
+    """
+    mean, names = agreement.mean, [Path(agreement.names[index]).name for index in agreement.doubtful]
+    notes = [Note(f"the masks agree with the object by {mean:.2f} (mean IoU over the images; 1 is perfect): {sheet}")]
+    if mean < MIN_AGREEMENT:
+        text = (
+            f"the masks of the images do not agree on one object (mean IoU {mean:.2f}, expected at least "
+            f"{MIN_AGREEMENT})."
         )
-    if not names:
-        return None
-    shown = ", ".join(names[:_PICTURED]) + (" ..." if len(names) > _PICTURED else "")
-    return f"{len(names)} of {len(agreement.names)} masks are unlike the object ({shown}): {sheet}"
-
-
-def _in_box(scene: Gaussians, box: Box | None) -> Float[Tensor, "n"]:
-    if box is None:
-        raise ValueError("--mask-source box: expected --box beside it, found none")
-    return box.contains(scene.means).float()
+        remedy = f"Look at {sheet}, then give clicks in two or three images (--prompts) or --box"
+        notes.append(Note(text, "warning", remedy, picture))
+    elif names:
+        shown = ", ".join(names[:_PICTURED]) + (" ..." if len(names) > _PICTURED else "")
+        text = f"{len(names)} of {len(agreement.names)} masks are unlike the object ({shown}): {sheet}"
+        notes.append(Note(text, "warning", picture=picture))
+    return notes
 
 
 COMMAND = Segment

@@ -43,7 +43,7 @@ class GeneratedPairs:
     def execute(self, console: Console) -> int:
         """Make the missing samples."""
         from splatgraft.harmonization.flux.weights.diffusers_library import text_to_image_pipeline
-        from splatgraft.segmentation.birefnet import DEFAULT_REPOSITORY, load_birefnet
+        from splatgraft.segmentation.onnx_networks import BIREFNET_REPOSITORY, load_birefnet
         from splatgraft_paper.training.sources.object_removal import ObjectRemover
         from splatgraft_paper.training.sources.text_to_image import TextToImage
 
@@ -52,7 +52,7 @@ class GeneratedPairs:
         device = choose_device(self.device, console)
         remover = ObjectRemover(self.removal, device, console.say, seed=self.seed)
         path = Path(self.masks or "")
-        masks = load_birefnet(path if self.masks and path.is_file() else self.masks or DEFAULT_REPOSITORY)
+        masks = load_birefnet(path if self.masks and path.is_file() else self.masks or BIREFNET_REPOSITORY)
         painter = TextToImage(
             text_to_image_pipeline(self.base, torch_dtype=torch.bfloat16), device, (width, height), console.say
         )
