@@ -22,11 +22,7 @@ from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.project.record import read_record
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
-from splatgraft.relighting.light.learned.ensemble import LightEnsemble, SeenPlaces, write_ensemble
-from splatgraft.relighting.light.learned.network import LightNetwork, network_inputs
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
-from splatgraft.relighting.light.place_description import MAPS, NUMBERS, PlaceDescription
-from splatgraft.relighting.light.radiance_correction import RatioShares
 from splatgraft.workflow.flow import read_flow
 from splatgraft.workflow.time_estimate import estimate_step_times
 
@@ -232,27 +228,6 @@ def test_the_light_after_a_move_equals_the_step_s_result(session: Session) -> No
     assert not relighting.can_refine(session.state)
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     assert torch.equal(read_gaussians(session.files.relit).sh, relit.sh)
-
-
-def test_networks_that_correct_the_light_count_in_the_preview_too(session: Session) -> None:
-    relighting, plain = session.relighting, session.relighting.scene(session.placed_state())
-    file, networks = session.files.file, session.files.file.parent / "light.safetensors"
-    last = (network := LightNetwork().eval().requires_grad_(False)).whole[-1]
-    assert isinstance(last, torch.nn.Linear)
-    # twice as bright
-    last.weight.zero_()
-    last.bias.copy_(torch.tensor([1.04, 0, 0, -9, 0, 0, 0]))
-    inputs = network_inputs(PlaceDescription(torch.zeros(len(MAPS), 12, 24), torch.zeros(len(NUMBERS))))
-    unknown = SeenPlaces(torch.zeros(len(inputs)), torch.zeros(len(inputs), len(inputs)), 1.0)
-    write_ensemble(networks, LightEnsemble((network,), unknown, RatioShares(0.8, 0.5)), {})
-    file.write_text(with_keys(file.read_text(), "relight", {"light_networks": networks.name}))
-    assert session.reload()
-    assert not relighting.is_relit(session.placed_state())
-    relit = relighting.scene(session.placed_state())
-    assert main(["run", str(file), "--to", "relight"]) == 0
-    written = read_gaussians(session.files.relit)
-    assert torch.equal(written.sh, relit.sh)
-    assert written.sh.shape != plain.sh.shape or not torch.equal(written.sh, plain.sh)
 
 
 @pytest.mark.parametrize(("seconds", "wanted"), [(0.3, 480), (0.28, 480), (1.2, 240), (0.02, 800), (60.0, 192)])

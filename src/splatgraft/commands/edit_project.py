@@ -79,7 +79,6 @@ class FlowProject:
             rendered_views=(_rendered_views(flow, "source"), _rendered_views(flow, "target")),
             light_mode=relight.light,
             relight_options=relight.options,
-            light_networks=relight.light_networks,
             place_options=compose.options,
         )
 

@@ -16,9 +16,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
-from splatgraft.relighting.light.learned.ensemble import LightEnsemble
-from splatgraft.relighting.light.learned.learned_light import fit_learned_light
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.shading.depth_normals import fuse_normals
 from splatgraft.relighting.shading.irradiance import irradiance
@@ -42,9 +40,8 @@ class SourceScene:
     """In the object's own frame."""
     cameras: Cameras
     """Of the capture, in the same frame."""
-    light: Light | LightEnsemble | None = None
-    """At the object's place, in the same frame, where it is known; otherwise it is estimated, and corrected by networks
-    where there are any."""
+    light: Light | None = None
+    """At the object's place, in the same frame, where it is known; otherwise it is estimated."""
     normals: Float[Tensor, "n 3"] | None = None
     """Unit, of the object's Gaussians, outward, in the same frame, where they are known; otherwise estimated."""
 
@@ -115,7 +112,7 @@ def prepare_object(
     maps = object_shadow_maps(gaussians, sphere, samples)
     source_lighting, notes = None, None
     if source is not None:
-        found = source.light if isinstance(source.light, Light) else _source_light(placed, source, index, cache)
+        found = source.light or _source_light(placed, source, index, cache)
         if isinstance(found, NoLight):
             notes = found.reason
         else:
@@ -207,8 +204,7 @@ def _source_light(placed: PlacedObject, source: SourceScene, index: int, cache: 
 
     def estimate() -> EstimatedLight | NoLight:
         # the object's shadow in its capture is evidence too
-        networks = source.light if isinstance(source.light, LightEnsemble) else None
         place = bounding_sphere(gaussians)
-        return fit_learned_light(source.gaussians, place, source.cameras, networks, object_gaussians=gaussians)
+        return fit_light(source.gaussians, place, source.cameras, object_gaussians=gaussians)
 
     return cache.get(f"source light {index}", (gaussians, source), estimate)

@@ -13,9 +13,7 @@ from torch import Tensor
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
-from splatgraft.relighting.light.learned.ensemble import LightEnsemble
-from splatgraft.relighting.light.learned.learned_light import fit_learned_light
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.source_distance import with_source_distances
 from splatgraft.relighting.light.sun_visibility import observed_sun_visibility
@@ -77,7 +75,7 @@ def prepare_scene(
     *,
     spheres: Sequence[BoundingSphere],
     reach: float,
-    light: Light | LightEnsemble | None,
+    light: Light | None,
     cache: Memo,
 ) -> PreparedScene | NoLight:
     """Prepare a scene for objects.
@@ -87,15 +85,14 @@ def prepare_scene(
         cameras: Of its capture.
         spheres: Of the objects, at least one.
         reach: Object radii to which shadows are computed.
-        light: At the objects' place, its sources seen from there; None to estimate it, or networks that correct the
-            estimate.
+        light: At the objects' place, its sources seen from there; None to estimate it.
         cache: Reused where the scene is the same and the place has moved little.
     """
     center = torch.stack([sphere.center for sphere in spheres]).mean(0)
     place = BoundingSphere(center, max(sphere.radius for sphere in spheres))
     region = _region(scene, place, reach, cache)
-    if light is None or isinstance(light, LightEnsemble):
-        estimate = _estimated_light(scene, cameras, place, region, light, cache)
+    if light is None:
+        estimate = _estimated_light(scene, cameras, place, region, cache)
         if isinstance(estimate, NoLight):
             return estimate
         known = estimate.light
@@ -169,19 +166,18 @@ def _estimated_light(
     cameras: Cameras,
     place: BoundingSphere,
     region: BoundingSphere,
-    networks: LightEnsemble | None,
     cache: Memo,
 ) -> EstimatedLight | NoLight:
     """The light at `place`; after a move within the region the sources are kept and the ambient light is new.
 
     Shadow maps and the object's own shading are cached with the sources.
     """
-    cached: EstimatedLight | None = cache.peek("light", (scene, region, networks))
+    cached: EstimatedLight | None = cache.peek("light", (scene, region))
     if cached is not None:
         return cached.at(scene, cameras, place)
-    found = fit_learned_light(scene, place, cameras, networks)
+    found = fit_light(scene, place, cameras)
     if not isinstance(found, NoLight):
-        cache.put("light", (scene, region, networks), found)
+        cache.put("light", (scene, region), found)
     return found
 
 

@@ -5,9 +5,7 @@ from dataclasses import dataclass, replace
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
-from splatgraft.relighting.light.learned.learned_light import fit_learned_light
-from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.estimate import NoLight, estimate_light
 from splatgraft.relighting.prepared_object import SourceScene
 from splatgraft.relighting.shading.gain import apply_gain
 from splatgraft.relighting.shading.normals import estimate_normals, raised
@@ -49,10 +47,7 @@ def remove_object_shadow(
         estimated.
     """
     scene, sphere = source.gaussians, bounding_sphere(object_gaussians)
-    light = source.light
-    if not isinstance(light, Light):
-        found = fit_learned_light(scene, sphere, source.cameras, light, object_gaussians=object_gaussians)
-        light = found.light if isinstance(found, EstimatedLight) else found
+    light = source.light or estimate_light(scene, sphere, source.cameras, object_gaussians=object_gaussians)
     if isinstance(light, NoLight):
         return scene, (f"{light.reason} The old place stays as it is.",)
     samples = sample_light(light)

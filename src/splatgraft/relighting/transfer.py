@@ -5,7 +5,7 @@ multiplied by ratios of irradiance. No training, no rendered views.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import zip_longest
 
 import torch
@@ -19,10 +19,8 @@ from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.spherical_harmonics import MAX_DEGREE, coefficient_count
 from splatgraft.relighting.layers import Relit, unchanged
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
-from splatgraft.relighting.light.learned.ensemble import LightEnsemble
+from splatgraft.relighting.light.estimate import NoLight
 from splatgraft.relighting.light.light import Light
-from splatgraft.relighting.light.radiance_correction import belief
 from splatgraft.relighting.prepared_object import PreparedObject, SourceScene, prepare_object
 from splatgraft.relighting.prepared_scene import PreparedScene, prepare_scene
 from splatgraft.relighting.shading.gloss import gloss_bands
@@ -90,7 +88,7 @@ def relight(
     cameras: Cameras,
     *,
     sources: Sequence[SourceScene | None] = (),
-    light: Light | LightEnsemble | None = None,
+    light: Light | None = None,
     options: RelightOptions = RelightOptions(),
     cache: Memo | None = None,
 ) -> Relit:
@@ -103,8 +101,7 @@ def relight(
         cameras: The target's cameras; from them follows the up direction.
         sources: For every object the scene that it was taken from, without the object, whose light is divided out;
             None, or no sources at all, where it is not known: the object then keeps its mean brightness.
-        light: The light at the place of the objects; estimated from the target where not given. Networks
-            correct the estimate.
+        light: The light at the place of the objects; estimated from the target where not given.
         options: How far shadows reach and how many Gaussians may be added.
         cache: Intermediate results, which later calls with the same objects at other places use again. After a short
             move they include the sources of the light and the region of the shadow maps: a call without them differs.
@@ -135,7 +132,6 @@ def relight(
             baked, is_object, objects=in_target, report=(f"{scene.reason} The object is pasted as it is.",)
         )
     report = [scene.light.describe(estimate_up(cameras)) + (", as given." if scene.estimate is None else ".")]
-    report += [] if scene.estimate is None else _correction_note(scene.estimate)
     objects = []
     for number, one, source in placed:
         prepared = prepare_object(one, source, cameras, light=scene.light, index=number - 1, cache=cache)
@@ -145,19 +141,6 @@ def relight(
             report.append(unknown_light(number))
         objects.append(_lit_object(prepared, scene))
     return _assembled(scene, objects, cameras.spread(options.fitted_views), options=options, baked=baked, report=report)
-
-
-def _correction_note(estimate: EstimatedLight) -> list[str]:
-    """A sentence on what networks changed; none where there are no networks."""
-    correction = estimate.correction
-    if correction is None:
-        return []
-    plain = estimate.hidden.radiance(estimate.evidence, estimate.tint)
-    stops = float((estimate.radiance.mean() / plain.mean().clamp_min(1e-9)).log2())
-    note = f"Networks changed the new place's light by {stops:+.1f} stops, give or take {correction.level_sd:.1f}"
-    if correction.distance > 1:
-        note += f"; the place is unlike those that they learned from ({correction.distance:.1f} times as far as most)"
-    return [f"{note}."]
 
 
 def unknown_light(number: int) -> str:
@@ -176,7 +159,7 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
     source = prepared.source_lighting
     if source is None:
         return _LitObject(prepared, visibility, received, unknown_origin_ratio(received, opacities), None)
-    settings = _shade_settings(scene.estimate, source.estimate)
+    settings = KNOWN_LIGHTS if scene.estimate is None and source.estimate is None else ShadeSettings()
     shade = shade_ratio(received, source.irradiance, opacities, settings=settings)
     if not bool(source.materials.glossy.any()):
         return _LitObject(prepared, visibility, received, shade, None)
@@ -184,23 +167,6 @@ def _lit_object(prepared: PreparedObject, scene: PreparedScene) -> _LitObject:
     reflected = reflected_light(scene.light, scene.samples, shares).scaled(scale)
     gloss = gloss_bands(prepared.gaussians, normals.vectors, source.materials, reflected, shade=shade)
     return _LitObject(prepared, visibility, received, shade, gloss)
-
-
-def _shade_settings(new: EstimatedLight | None, old: EstimatedLight | None) -> ShadeSettings:
-    """By what is known of the two lights; None for one that was told."""
-    if new is None and old is None:
-        return KNOWN_LIGHTS
-    plain = ShadeSettings()
-    corrections = [one.correction for one in (new, old) if one is not None and one.correction is not None]
-    if len(corrections) < sum(one is not None for one in (new, old)):
-        return plain
-    believed = min(belief(one.distance) for one in corrections)
-    shares = corrections[0].shares
-    return replace(
-        plain,
-        level_share=plain.level_share + believed * (shares.level - plain.level_share),
-        tint_share=plain.tint_share + believed * (shares.tint - plain.tint_share),
-    )
 
 
 def _assembled(

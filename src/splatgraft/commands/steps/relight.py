@@ -22,7 +22,6 @@ from splatgraft.relighting.gain_transfer import PASTED, relight_by_gain
 from splatgraft.relighting.layers import LayerWeights, Relit
 from splatgraft.relighting.level_check import LevelLine, describe_level
 from splatgraft.relighting.light.confidence import light_confidence
-from splatgraft.relighting.light.learned.ensemble import LightEnsemble, read_ensemble
 from splatgraft.relighting.light.light import Light, light_from_json, light_to_json
 from splatgraft.relighting.light.light_picture import draw_light
 from splatgraft.relighting.transfer import RelightOptions, SourceScene, relight, unknown_light
@@ -56,9 +55,6 @@ class Relight:
     captured (the paper's configuration)."""
     given_light: Path | None = None
     """A light.json that replaces the estimate: one that an earlier run wrote, changed or not."""
-    light_networks: Path | None = None
-    """light.safetensors of `splatgraft train light`: networks that correct the light where it is estimated. None come
-    with the program."""
     options: RelightOptions = field(default_factory=RelightOptions)
     weights: LayerWeights = field(default_factory=LayerWeights)
 
@@ -67,7 +63,7 @@ class Relight:
         source = () if self.surroundings is None else (self.surroundings,)
         source += () if self.object_cameras is None else camera_files(self.object_cameras)
         placement = placement_files(self.placement)
-        light = tuple(path for path in (self.given_light, self.light_networks) if path is not None)
+        light = () if self.given_light is None else (self.given_light,)
         scenes = {"target": (self.target,), "placement": placement}
         return scenes | {"cameras": camera_files(self.cameras), "source": source, "light": light}
 
@@ -115,9 +111,9 @@ class Relight:
             return (LevelLine(f"The photos' exposure was not compared with the light: {error}.", is_doubtful=True),)
         return () if target is None or source is None else describe_level(relit, target=target, source=source)
 
-    def _given(self) -> Light | LightEnsemble | None:
+    def _given(self) -> Light | None:
         if self.given_light is None:
-            return None if self.light_networks is None else read_ensemble(self.light_networks)
+            return None
         if not self.given_light.is_file():
             raise ValueError(f"{self.given_light}: expected a light.json, found no such file")
         return light_from_json(self.given_light.read_text(), name=str(self.given_light))
@@ -127,8 +123,7 @@ class Relight:
         if self.surroundings is not None:
             if self.object_cameras is None:
                 raise ValueError("--surroundings: expected --object-cameras beside it, found none")
-            networks = None if self.light_networks is None else read_ensemble(self.light_networks)
-            source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras), networks)
+            source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
         paths = [item.object_path for item in read_placement(self.placement).objects]
         taken = self.taken or (paths[0] if paths else None)
         if taken is None:

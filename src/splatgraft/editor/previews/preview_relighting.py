@@ -23,7 +23,6 @@ from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.scene_cache import SceneCache
 from splatgraft.relighting import Light, Relit, SourceScene, relight
 from splatgraft.relighting.gain_transfer import relight_by_gain
-from splatgraft.relighting.light.learned.ensemble import LightEnsemble
 from splatgraft.relighting.prepared_scene import REGION
 from splatgraft.runtime.memo import Memo
 
@@ -162,11 +161,7 @@ class PreviewRelighting:
 
     def _inputs(self, state: EditState) -> tuple[Any, ...]:
         options = repr(self._scenes.files.relight_options)
-        return (self.composite(state), self._light(state), options)
-
-    def _light(self, state: EditState) -> Light | LightEnsemble | None:
-        """The light that is told, or networks that correct the estimate; None where it is only estimated."""
-        return self._scenes.light_networks() if state.light is None else state.light
+        return (self.composite(state), state.light, options)
 
     def _relight(self, state: EditState) -> Relit:
         if self.can_refine(state):
@@ -178,9 +173,7 @@ class PreviewRelighting:
         return relit
 
     def _refine(self, state: EditState) -> Relit:
-        return self._relight_composite(
-            self.composite(state), self._scenes.source_scenes(state), light=self._light(state)
-        )
+        return self._relight_composite(self.composite(state), self._scenes.source_scenes(state), light=state.light)
 
     def _draft(self, state: EditState) -> Relit:
         composite, sources = self.composite(state), self._scenes.source_scenes(state)
@@ -188,12 +181,12 @@ class PreviewRelighting:
             # analysing the source scene takes half of the time of the first result
             sources = [None] * len(sources)
         if not _is_large(composite):
-            return self._relight_composite(composite, sources, light=self._light(state), is_draft=True)
+            return self._relight_composite(composite, sources, light=state.light, is_draft=True)
         target = self._coarse_target(composite)
         objects = [self._coarse_object(i, one.gaussians) for i, one in enumerate(composite.objects)]
         coarse = coarse_composite(composite, target, objects)
         coarse_sources = [None if source is None else self._coarse_source(source) for source in sources]
-        relit = self._relight_composite(coarse, coarse_sources, light=self._light(state), is_draft=True)
+        relit = self._relight_composite(coarse, coarse_sources, light=state.light, is_draft=True)
         return upsample_light(relit, composite, [target, *objects])
 
     def _relight_composite(
@@ -201,7 +194,7 @@ class PreviewRelighting:
         composite: Composite,
         sources: Sequence[SourceScene | None],
         *,
-        light: Light | LightEnsemble | None,
+        light: Light | None,
         is_draft: bool = False,
     ) -> Relit:
         cameras, options = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.files.relight_options

@@ -72,8 +72,6 @@ class ProjectFiles:
     """`light` of [relight]: the physical transfer, a gain of the object alone, or nothing."""
     relight_options: RelightOptions
     """`options` of [relight]."""
-    light_networks: Path | None
-    """`light_networks` of [relight]: networks that correct the light where it is estimated."""
     place_options: PlaceOptions
     """Placement options of [compose], for objects without a placement."""
 

@@ -21,7 +21,6 @@ from splatgraft.editor.session.scene_sample import SceneSample, read_sample, sam
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.formats.placement import ObjectPlacement, read_erased
 from splatgraft.relighting import SourceScene
-from splatgraft.relighting.light.learned.ensemble import LightEnsemble, read_ensemble
 from splatgraft.runtime.memo import Memo
 
 _LARGE_BYTES = 12_000_000
@@ -102,15 +101,6 @@ class SceneCache:
         """
         return self._read("capture", path, lambda path: read_capture(path.parent))
 
-    def light_networks(self) -> LightEnsemble | None:
-        """The networks that correct the light where it is estimated; None where project.toml names none.
-
-        Raises:
-            ValueError: If the file is missing or invalid.
-        """
-        path = self.files.light_networks
-        return None if path is None else self._read("networks", path, read_ensemble)
-
     def segmented(self) -> Bool[Tensor, "n"] | None:
         """Flags of the source's Gaussians in the last result of `segment`; None where there is none."""
         if not self.files.selection.is_file() or not self.files.source_scene.is_file():
@@ -184,7 +174,7 @@ class SceneCache:
         if not any(own) or not self.files.surroundings.is_file():
             return [None] * len(own)
         paths = (self.files.surroundings, self.files.source_cameras)
-        inputs = (self.gaussians(paths[0]), self.cameras(paths[1]), self.light_networks())
+        inputs = (self.gaussians(paths[0]), self.cameras(paths[1]))
         source = self.derive("source", inputs, lambda: SourceScene(*inputs))
         return [source if flag else None for flag in own]
 

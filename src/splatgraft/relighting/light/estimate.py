@@ -15,7 +15,6 @@ from splatgraft.relighting.light.highlight_evidence import HighlightSettings, fi
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.light_from_radiance import RadianceSourceSettings, ambient_of, split_peaks
 from splatgraft.relighting.light.panorama import Panorama, cube_cameras, render_panorama
-from splatgraft.relighting.light.radiance_correction import RadianceCorrection
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem, seen_sky
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, SearchSettings, search_radiance
 from splatgraft.relighting.light.shading_evidence import (
@@ -105,25 +104,6 @@ class EstimatedLight:
     """Around the place: what is in it is near."""
     place: BoundingSphere
     """Where the sources were estimated."""
-    correction: RadianceCorrection | None = None
-    """What a network changed; None where the estimate stands as it is."""
-
-    @property
-    def radiance(self) -> Float[Tensor, "k 3"]:
-        """Linear rgb from all `DIRECTIONS`, corrected where there is a correction."""
-        radiance = self.hidden.radiance(self.evidence, self.tint)
-        return radiance if self.correction is None else self.correction.apply(radiance)
-
-    def corrected(self, correction: RadianceCorrection, scene: Gaussians, place: BoundingSphere) -> "EstimatedLight":
-        """With its sources and ambient light from the corrected radiance.
-
-        Args:
-            correction: Of the radiance.
-            scene: All Gaussians, without the object, as the estimate's.
-            place: Of the estimate.
-        """
-        changed = replace(self, correction=correction)
-        return replace(changed, light=_light_of(changed.radiance, self.evidence, self.region, _usable(scene), place))
 
     def at(
         self,
@@ -142,9 +122,9 @@ class EstimatedLight:
             return panorama
         around = surroundings_at(scene, cameras, place.center, nearest=settings.nearest * place.radius)
         evidence = replace(self.evidence, around=around)
-        moved = replace(self, evidence=evidence)
-        _, rest = split_peaks(moved.radiance, evidence, within=math.inf)
-        return replace(moved, light=replace(self.light, ambient=ambient_of(rest), **_seen_shares(evidence)))
+        _, rest = split_peaks(self.hidden.radiance(evidence, self.tint), evidence, within=math.inf)
+        light = replace(self.light, ambient=ambient_of(rest), **_seen_shares(evidence))
+        return replace(self, evidence=evidence, light=light)
 
 
 def estimate_light(
@@ -207,22 +187,9 @@ def fit_light(
     sky = seen_sky(evidence.far, up, mean.clamp_min(1e-3))
     tint = sky / sky.mean().clamp_min(1e-6)
     radiance = hidden.radiance(evidence, tint)
-    light = _light_of(radiance, evidence, region, scene, place, settings=settings.peaks)
+    sources, rest = split_peaks(radiance, evidence, within=region.radius, settings=settings.peaks)
+    light = with_source_distances(Light(sources, ambient_of(rest), **_seen_shares(evidence)), scene, place)
     return EstimatedLight(light, hidden, evidence, tint, region, place)
-
-
-def _light_of(
-    radiance: Float[Tensor, "k 3"],
-    evidence: LightEvidence,
-    region: BoundingSphere,
-    scene: Gaussians,
-    place: BoundingSphere,
-    *,
-    settings: RadianceSourceSettings = RadianceSourceSettings(),
-) -> Light:
-    """Sources and ambient light of the radiance from all `DIRECTIONS`."""
-    sources, rest = split_peaks(radiance, evidence, within=region.radius, settings=settings)
-    return with_source_distances(Light(sources, ambient_of(rest), **_seen_shares(evidence)), scene, place)
 
 
 def _usable(scene: Gaussians) -> Gaussians:

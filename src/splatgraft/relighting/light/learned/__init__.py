@@ -1,1 +1,0 @@
-"""A learned correction of the estimated light at a place."""
