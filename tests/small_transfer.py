@@ -11,7 +11,7 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.exports.export_source import ExportSource
 from splatgraft.formats import read_cameras, write_gaussians
 from splatgraft.formats.metric_scale import MetricScale, write_scale
-from splatgraft.formats.scenes.scene_metadata import SceneMetadata
+from splatgraft.formats.scenes.scene_file import SceneMetadata
 
 
 def darkened(gaussians: Gaussians, factor: float) -> Gaussians:

@@ -2,6 +2,7 @@
 
 import json
 import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 from splatgraft.core.gaussians import Gaussians
 
 GOLDEN = Path(__file__).parent / "golden"
+TOOLS = GOLDEN / "tools"
 
 
 def random_gaussians(n: int = 40, degree: int = 3, seed: int = 0) -> Gaussians:
@@ -103,3 +105,29 @@ def write_transforms(folder: Path, content: dict, *, frames: int = 2, size: tupl
     path = folder / "transforms.json"
     path.write_text(json.dumps({"fl_x": 20.0, "frames": listed, **content}))
     return path
+
+
+def glb(content: dict, binary: bytes) -> bytes:
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    binary += bytes(-len(binary) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+
+def parts_of_glb(data: bytes) -> tuple[dict, bytes]:
+    """JSON and binary chunk."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def write_zip(path: Path, files: dict[str, bytes]) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return path
+
+
+def files_of_zip(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from format_files import random_gaussians
-from test_scenes_of_other_tools import TOOLS
+from format_files import TOOLS, random_gaussians
 
 from splatgraft import formats
 from splatgraft.cli import main

@@ -3,13 +3,13 @@
 import json
 import shutil
 import subprocess
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from format_files import random_gaussians
-from scene_writers import parts_of_glb
+from format_files import GOLDEN, TOOLS, equal, parts_of_glb, random_gaussians
 from test_scenes_of_other_tools import (
     BYTE,
     COMPRESSED,
@@ -19,15 +19,17 @@ from test_scenes_of_other_tools import (
     SOG,
     SPLAT,
     SPZ,
-    TOOLS,
     assert_within,
+    cameras,
 )
 
 from splatgraft import formats
 from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.formats.scenes.sog import nearest_codes, palette, scalar_codes
 from splatgraft.formats.scenes.spz import write_spz
+from splatgraft.rendering import render
 
-WRITTEN = Path(__file__).parent / "golden" / "written"
+WRITTEN = GOLDEN / "written"
 # one compressed chunk holds all 40; codes for 120 numbers are exact; bands are not rounded to 4 bits as others do
 FINE_SPZ = SPZ | {"means": 1e-6, "bands": 0.5 / 128}
 STEPS = {
@@ -86,14 +88,62 @@ def test_the_tool_where_it_is_installed(original, tmp_path, name):
     assert_within(formats.read_gaussians(tmp_path / "decoded.ply"), formats.read_gaussians(file), DECODED[name])
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog", ".spz", ".splat", ".glb"])
-def test_every_degree_and_several_chunks(tmp_path, suffix, degree):
-    g = random_gaussians(600, degree)
-    formats.write_gaussians(tmp_path / f"a{suffix}", g)
-    back = formats.read_gaussians(tmp_path / f"a{suffix}")
-    assert back.count == 600
-    assert back.sh_degree == (0 if suffix == ".splat" else degree)
+def test_every_degree_and_several_chunks(tmp_path, suffix):
+    for degree in range(4):
+        g = random_gaussians(600, degree)
+        formats.write_gaussians(tmp_path / f"a{suffix}", g)
+        back = formats.read_gaussians(tmp_path / f"a{suffix}")
+        assert back.count == 600
+        assert back.sh_degree == (0 if suffix == ".splat" else degree)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_spz_is_within_its_steps_and_stays_there(tmp_path, degree):
+    g = random_gaussians(300, degree)
+    formats.write_gaussians(tmp_path / "a.spz", g)
+    back = formats.read_gaussians(tmp_path / "a.spz")
+    extent = float(g.means.abs().max())
+    # half a step: 24 signed bits of at most twice the extent; 1/16 of log scale; 1/255; 1/(255 * 0.15); 1/128
+    assert (back.means - g.means).abs().max() <= extent * 2 / 2**23
+    assert (back.log_scales - g.log_scales).abs().max() <= 0.5 / 16 + 1e-6
+    assert (back.opacities - g.opacities).abs().max() <= 0.5 / 255 + 1e-6
+    assert (back.sh[:, :1] - g.sh[:, :1]).abs().max() <= 0.5 / 255 / 0.15 + 1e-6
+    inside = g.sh[:, 1:].abs() < 127 / 128
+    assert ((back.sh[:, 1:] - g.sh[:, 1:]).abs()[inside] <= 0.5 / 128 + 1e-6).all()
+    # three components each off by half of sqrt(1/2)/511, the fourth by up to their sum: angle below 2 * |difference|
+    dot = (torch.nn.functional.normalize(g.quaternions, dim=1) * back.quaternions).sum(1).abs()
+    assert torch.arccos(dot.clamp(max=1)).max() <= 5 * 0.5 * 0.7072 / 511
+    formats.write_gaussians(tmp_path / "b.spz", back)
+    again = formats.read_gaussians(tmp_path / "b.spz")
+    assert_within(back, again, dict.fromkeys(EXACT, 1e-6) | {"ellipsoids": 1.2e-5})  # float32 between the two
+
+
+def test_splat_is_within_its_steps(tmp_path):
+    g = random_gaussians(300, 0)
+    formats.write_gaussians(tmp_path / "a.splat", g)
+    assert (tmp_path / "a.splat").stat().st_size == 300 * 32
+    back = formats.read_gaussians(tmp_path / "a.splat")
+    assert torch.equal(back.means, g.means)
+    assert (back.log_scales - g.log_scales).abs().max() <= 2e-6  # exp then log in float32, of values up to 5
+    assert (back.opacities - g.opacities).abs().max() <= 0.5 / 255 + 1e-6
+    shown = (g.sh * 0.28209479177387814 + 0.5).clamp(0, 1)  # a byte holds displayed colours only
+    assert (back.sh * 0.28209479177387814 + 0.5 - shown).abs().max() <= 0.5 / 255 + 1e-6
+    q = torch.nn.functional.normalize(g.quaternions, dim=1)
+    assert (back.quaternions - q).abs().max() <= 1 / 128 + 1e-6  # half a step, a whole one at +1 where bytes end
+    formats.write_gaussians(tmp_path / "b.splat", back)
+    assert torch.equal(formats.read_gaussians(tmp_path / "b.splat").opacity_logits, back.opacity_logits)
+
+
+def test_opaque_and_clear_stay_finite(tmp_path):
+    g = random_gaussians(2, 0)
+    g.opacity_logits[:] = torch.tensor([-200.0, 200.0])
+    for suffix in (".splat", ".spz", ".sog", ".glb"):
+        formats.write_gaussians(tmp_path / f"a{suffix}", g)
+        back = formats.read_gaussians(tmp_path / f"a{suffix}").opacity_logits.sort().values
+        assert bool(back.isfinite().all())
+        assert back.sigmoid()[0] < 0.5 / 255
+        assert back.sigmoid()[1] > 1 - 0.5 / 255
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog"])
@@ -123,11 +173,23 @@ def test_comments_that_state_nothing(tmp_path, comment):
     assert found.metres_per_unit is None
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".glb", ".sog"])
-def test_no_gaussians_are_refused(tmp_path, suffix):
-    with pytest.raises(ValueError, match=f"a\\{suffix}: expected at least one Gaussian for a"):
-        formats.write_gaussians(tmp_path / f"a{suffix}", empty())
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".glb", ".sog", ".splat"])
+def test_what_a_format_cannot_hold_is_refused(tmp_path, suffix):
+    broken = random_gaussians(3, 0)
+    broken.means[1, 1] = float("nan")
+    for g, found in ((empty(), "at least one Gaussian"), (broken, "found 1 of 3 that are not")):
+        with pytest.raises(ValueError, match=rf"a\{suffix}: expected .*{found}"):
+            formats.write_gaussians(tmp_path / f"a{suffix}", g)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_spz_may_be_empty_and_has_bounds(tmp_path):
+    formats.write_gaussians(tmp_path / "a.spz", empty(1))
+    assert formats.read_gaussians(tmp_path / "a.spz").sh.shape == (0, 4, 3)
+    g = random_gaussians(3, 0)
+    g.means[0, 0] = 1e8
+    with pytest.raises(ValueError, match=r"a\.spz: expected positions within 8388607"):
+        formats.write_gaussians(tmp_path / "a.spz", g)
 
 
 def test_other_versions_of_spz_are_refused(tmp_path):
@@ -171,13 +233,78 @@ def test_the_glb_is_what_the_specification_asks_for(original, tmp_path):
 
 
 def test_the_pictures_stay(original, tmp_path):
-    from test_scenes_of_other_tools import cameras
-
-    from splatgraft.rendering import render
-
     expected = render(original, cameras()).color
     for name in ("scene.glb", "scene.spz", "scene.sog", "scene.compressed.ply"):
         found = formats.read_gaussians(write(tmp_path / name, original))
         error = (render(found, cameras()).color - expected).abs()
         assert float(error.mean()) < 0.005, name  # steps of a byte, and few Gaussians per pixel
     assert torch.isfinite(expected).all()
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_few_gaussians_of_sog_are_within_the_steps_of_the_format(tmp_path, degree):
+    g = random_gaussians(40, degree, seed=11)
+    formats.write_gaussians(tmp_path / "a.sog", g)
+    # fewer numbers than codes: exact, but for bands, whose 256 codes hold up to 40 * 45 values
+    steps = SOG | {"log_scales": 1e-5, "dc": 1e-5, "opacities": 0.51 / 255, "bands": 0.02}
+    assert_within(g, formats.read_gaussians(tmp_path / "a.sog"), steps)
+
+
+def test_the_same_scene_gives_the_same_bytes(tmp_path):
+    g = random_gaussians(2000, 3)
+    for name in ("a.sog", "b.sog"):
+        formats.write_gaussians(tmp_path / name, g)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+
+
+def test_meta_json_of_sog(tmp_path):
+    metadata = formats.SceneMetadata(up=(0.0, 0.0, 1.0), metres_per_unit=0.25)
+    formats.write_gaussians(tmp_path / "a.sog", random_gaussians(10, 2), metadata=metadata)
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+        meta = json.loads(archive.read("meta.json"))
+        assert {name for part in meta.values() if isinstance(part, dict) for name in part.get("files", [])} == {
+            entry for entry in archive.namelist() if entry != "meta.json"
+        }
+    assert (meta["version"], meta["count"], meta["shN"]["bands"]) == (2, 10, 2)
+    assert meta["splatgraft"] == {"up": [0, 0, 1], "metres_per_unit": 0.25}
+
+
+def test_scalar_codes_are_nearly_the_best():
+    """Against uniform steps: Lloyd's codes are fitted to where the values are."""
+    values = np.random.default_rng(0).normal(size=20_000) ** 3
+    codes = scalar_codes(values)
+    error = np.square(codes[nearest_codes(values, codes)] - values).mean()
+    steps = np.linspace(values.min(), values.max(), 256)
+    uniform = np.square(steps[nearest_codes(values, steps.astype(np.float32))] - values).mean()
+    assert error < 0.25 * uniform
+    # the nearest code is the nearest one
+    some = values[:500]
+    off = np.abs(some[:, None] - codes)
+    assert (np.abs(codes[nearest_codes(some, codes)] - some) <= off.min(1) + 1e-5).all()  # codes in float32
+
+
+def test_a_palette_keeps_to_its_size_and_beats_one_of_random_rows():
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(50, 9, generator=generator)[torch.randint(50, (9000,), generator=generator)]
+    rows = rows + 0.1 * torch.randn(9000, 9, generator=generator)
+    entries, labels = palette(rows, 1024)
+    assert len(entries) <= 1024
+    assert labels.max() < len(entries)
+    error = (entries[labels] - rows).square().mean()
+    some = rows[torch.randperm(9000, generator=generator)[:1024]]
+    assert error < (torch.cdist(rows, some).amin(1).square() / 9).mean()
+
+
+def test_a_small_scene_has_its_own_rows_as_palette():
+    rows = torch.randn(30, 9, generator=torch.Generator().manual_seed(0))
+    entries, labels = palette(rows, 1024)
+    assert torch.equal(entries[labels], rows)
+
+
+def test_suffixes_in_capitals_and_others(tmp_path):
+    g = random_gaussians(3, 1)
+    formats.write_gaussians(tmp_path / "A.PLY", g)
+    assert equal(formats.read_gaussians(tmp_path / "A.PLY"), g)
+    with pytest.raises(ValueError, match=r"a\.obj: expected a scene that ends in \.ply, .*found '\.obj'"):
+        formats.write_gaussians(tmp_path / "a.obj", g)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.formats.scenes.scene_metadata import SceneMetadata
+from splatgraft.formats.scenes.scene_file import SceneMetadata
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.exports.first_view import FirstView
-from splatgraft.formats.scenes.scene_metadata import SceneMetadata
-from splatgraft.formats.scenes.sog_writer import encode_sog
+from splatgraft.formats.scenes.scene_file import SceneMetadata
+from splatgraft.formats.scenes.sog import encode_sog
 from splatgraft.runtime.atomic_file import atomic_write
 
 _POLICY = (

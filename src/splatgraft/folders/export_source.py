@@ -11,7 +11,7 @@ from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import is_scene, read_cameras, read_gaussians, read_scene
 from splatgraft.formats.metric_scale import read_scale
 from splatgraft.formats.placement import read_placement
-from splatgraft.formats.scenes.scene_metadata import SceneMetadata
+from splatgraft.formats.scenes.scene_file import SceneMetadata
 from splatgraft.project.layout import (
     CAMERAS_FILE,
     IS_OBJECT_FILE,

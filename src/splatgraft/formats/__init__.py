@@ -7,21 +7,16 @@ from pathlib import Path
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures import cameras_json, colmap, transforms_json
-from splatgraft.formats.captures.points_ply import read_points, write_points
+from splatgraft.formats.captures import colmap, transforms_json
 from splatgraft.formats.scenes.axes import with_axes
-from splatgraft.formats.scenes.compressed_ply_writer import COMPRESSED_PLY, write_compressed_ply
-from splatgraft.formats.scenes.gaussian_glb import read_gaussian_glb
-from splatgraft.formats.scenes.gaussian_glb_writer import write_gaussian_glb
+from splatgraft.formats.scenes.compressed_ply import COMPRESSED_PLY, write_compressed_ply
+from splatgraft.formats.scenes.gaussian_glb import read_gaussian_glb, write_gaussian_glb
 from splatgraft.formats.scenes.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from splatgraft.formats.scenes.gaussian_usd import write_gaussian_usdz
 from splatgraft.formats.scenes.ksplat import read_ksplat
-from splatgraft.formats.scenes.plausible import with_plausible_conventions
-from splatgraft.formats.scenes.scene_file import SceneFile
-from splatgraft.formats.scenes.scene_metadata import SceneMetadata
-from splatgraft.formats.scenes.sog import read_sog
-from splatgraft.formats.scenes.sog_container import files_of, is_sog_folder
-from splatgraft.formats.scenes.sog_writer import write_sog
+from splatgraft.formats.scenes.ply import read_points, write_points
+from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
+from splatgraft.formats.scenes.sog import is_sog_folder, read_sog, sog_files, write_sog
 from splatgraft.formats.scenes.splat import read_splat, write_splat
 from splatgraft.formats.scenes.spz import read_spz, write_spz
 
@@ -81,7 +76,7 @@ def is_scene(path: Path) -> bool:
 
 def scene_files(path: Path) -> tuple[Path, ...]:
     """The files of a trained scene: itself, or the files of a folder of SOG pictures."""
-    return files_of(path) if is_sog_folder(path) else (path,)
+    return sog_files(path) if is_sog_folder(path) else (path,)
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
@@ -97,13 +92,11 @@ def read_gaussians(path: Path | str) -> Gaussians:
     Raises:
         ValueError: The suffix is another, or the file is not what its suffix says.
     """
-    path = Path(path)
-    with _readable(path):
-        return _read(path).gaussians
+    return _read(Path(path)).gaussians
 
 
 def read_scene(path: Path | str, *, axes: str | None = None) -> SceneFile:
-    """Read a trained scene of another program, with the conventions that its data show.
+    """Read a trained scene of another program, with what is known of its frame.
 
     Args:
         path: As for `read_gaussians`.
@@ -111,22 +104,29 @@ def read_scene(path: Path | str, *, axes: str | None = None) -> SceneFile:
             where None.
 
     Returns:
-        Its Gaussians; the file's up direction where it states one; notes for the user on what was found. Of a .ply
-        linear scales, linear opacities and quaternions xyzw are recognised.
+        Its Gaussians; the file's up direction where it states one; notes for the user on what was found.
 
     Raises:
         ValueError: The suffix is another, the file is not what its suffix says, or `axes` are none.
     """
-    path = Path(path)
-    with _readable(path):
-        scene = _read(path)
-        if path.suffix.lower() == ".ply":
-            scene = with_plausible_conventions(scene)
-        return scene if axes is None else with_axes(scene, axes)
+    scene = _read(Path(path))
+    return scene if axes is None else with_axes(scene, axes)
 
 
 def _read(path: Path) -> SceneFile:
-    return read_sog(path) if is_sog_folder(path) else _by_suffix(path, _READERS)(path)
+    with _readable(path):
+        read = read_sog if is_sog_folder(path) else _by_suffix(path, _READERS)
+        if not path.exists():
+            raise ValueError(f"{path}: expected a trained scene, found none")
+        try:
+            return read(path)
+        except OSError:
+            raise
+        except Exception as error:  # a damaged file makes its parser raise any kind of error
+            if isinstance(error, ValueError) and str(path) in str(error):
+                raise
+            found = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+            raise ValueError(f"{path}: expected a whole {path.suffix} scene, found {found}") from error
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians, *, metadata: SceneMetadata = SceneMetadata()) -> None:
@@ -212,8 +212,8 @@ def read_cameras(path: Path | str) -> Cameras:
     """
     path = Path(path)
     with _readable(path):
-        if cameras_json.is_cameras_json(path):
-            return cameras_json.read_cameras(path)
+        if transforms_json.is_cameras_json(path):
+            return transforms_json.read_cameras_json(path)
         transforms = _transforms_path(path)
         return transforms_json.read_cameras(transforms) if transforms else colmap.read_cameras(path)
 
@@ -228,7 +228,7 @@ def list_capture_images(path: Path) -> list[Path]:
         ValueError: There is no capture at `path`, or a file is broken.
     """
     with _readable(path):
-        if cameras_json.is_cameras_json(path):
+        if transforms_json.is_cameras_json(path):
             return []
         transforms = _transforms_path(path)
         return transforms_json.image_files(transforms) if transforms else colmap.image_files(path)

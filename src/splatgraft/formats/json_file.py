@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from splatgraft.formats.captures.view_record import MAX_SIDE
+from splatgraft.formats.captures.views import MAX_SIDE
 
 _LONGEST = 60
 """Characters of a value in an error message."""

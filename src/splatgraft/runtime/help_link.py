@@ -37,8 +37,6 @@ _SECTIONS = {
     "capture.virtual_cameras": "capture-scenes-without-photographs",
     "core.capture_orientation": "capture-scenes-without-photographs",
     "formats.captures.given_poses": "capture-photos-and-videos",
-    "formats.captures.metashape_xml": "capture-photos-and-videos",
-    "formats.captures.realityscan_csv": "capture-photos-and-videos",
     "formats.captures.colmap": "colmap-models",
     "core.distortion": "transformsjson-camerasjson-masks-points",
     "folders.object_masks": "transformsjson-camerasjson-masks-points",

@@ -19,8 +19,14 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import IMAGE_SUFFIXES
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.similarity import Similarity
-from splatgraft.formats.captures.assembly import cameras_of, posed_images_of, view_or_reason
-from splatgraft.formats.captures.view_record import ViewRecord, existing_file, rigid, turn_about
+from splatgraft.formats.captures.views import (
+    ViewRecord,
+    cameras_of,
+    existing_file,
+    posed_images_of,
+    rigid,
+    view_or_reason,
+)
 from splatgraft.formats.json_file import array, excerpt, load, text, whole_side
 
 CAMERAS_FILE = "cameras.json"
@@ -92,7 +98,7 @@ def _euler(path: Path, entry: dict[str, Any]) -> np.ndarray:
     angles, scale = array(path, given, "rotation", ((3,),)), array(path, given, "scale", ((3,),))
     rotation = np.eye(3)
     for axis, angle in enumerate(angles):
-        rotation = turn_about(axis, angle) @ rotation
+        rotation = _turn_about(axis, angle) @ rotation
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * scale
     matrix[:3, 3] = array(path, given, "location", ((3,),))
@@ -133,3 +139,12 @@ def _picture(folder: Path, name: str) -> Path:
         linear = ", only the linear .exr, which is not read" if (folder / f"{name}.exr").is_file() else ""
         raise ValueError(f"{folder / name}.png: expected an 8-bit picture, found none{linear}")
     return found
+
+
+def _turn_about(axis: int, radians: float) -> np.ndarray:
+    """The rotation (3, 3) by an angle, counterclockwise about a positive axis, x, y or z."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    turn = np.eye(3)
+    turn[i, i] = turn[j, j] = np.cos(radians)
+    turn[j, i], turn[i, j] = np.sin(radians), -np.sin(radians)
+    return turn

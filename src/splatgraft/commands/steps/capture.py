@@ -44,8 +44,7 @@ class Capture:
     out: Path = Path("capture")
     """Folder for transforms.json and points.ply."""
     poses: Path | None = None
-    """Poses that another program found for photos: a COLMAP folder, a transforms.json, Metashape's cameras as
-    XML or RealityScan's as CSV."""
+    """Poses that another program found for photos: a COLMAP folder or a transforms.json."""
     max_side: int = 1600
     """Longest side at which images are served from here on, pixels; larger ones are reduced once and stored in the
     result; 0 keeps all."""

@@ -1,10 +1,11 @@
 """Reads COLMAP reconstructions, text and binary: cameras, images and points3D, in the folders that COLMAP uses.
 
-Counts in binary files are not trusted: every record is checked against the bytes that are left.
+Of several models the one with the most registered images is read.
 """
 
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,20 +16,22 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures.assembly import cameras_of, fitted_to_file, posed_images_of
-from splatgraft.formats.captures.view_record import MAX_SIDE, ViewRecord, existing_file, rigid
+from splatgraft.formats.captures.views import (
+    MAX_SIDE,
+    ViewRecord,
+    cameras_of,
+    existing_file,
+    fitted_to_file,
+    posed_images_of,
+    rigid,
+)
 
-_MODELS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
+_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+)
+"""By number in binary files; those with a number of parameters below are read."""
 _PARAMETER_COUNTS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
-_OTHER_MODELS = {
-    5: "OPENCV_FISHEYE",
-    6: "FULL_OPENCV",
-    7: "FOV",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
-    10: "THIN_PRISM_FISHEYE",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE",
-}
 _MODEL_FOLDERS = ("sparse/*", "sparse", ".", "colmap/sparse/*", "colmap/sparse")
 
 
@@ -55,15 +58,14 @@ def is_colmap(folder: Path) -> bool:
 
 
 def read_capture(folder: Path) -> PosedImages:
-    """The model with the most registered images, ordered by image name, without those that are not usable.
+    """The largest model, ordered by image name, without images that are not usable.
 
     Raises: ValueError where no whole model is there, its camera model is not supported, or fewer than half of the
     images are usable.
     """
-    model, images = _largest_model(folder)
+    source, views, model = _views(folder)
     points, colors = _read_points(_file(model, "points3D"))
-    source = _file(model, "images")
-    return posed_images_of(_views(model, images, folder), source, folder=folder, points=points, colors=colors)
+    return posed_images_of(views, source, folder=folder, points=points, colors=colors)
 
 
 def read_views(folder: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
@@ -71,8 +73,8 @@ def read_views(folder: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Fl
 
     Raises: ValueError where no whole model is there, or its camera model is not supported.
     """
-    model, images = _largest_model(folder)
-    return _views(model, images, folder), *_read_points(_file(model, "points3D"))
+    _, views, model = _views(folder)
+    return views, *_read_points(_file(model, "points3D"))
 
 
 def read_cameras(folder: Path) -> Cameras:
@@ -80,9 +82,8 @@ def read_cameras(folder: Path) -> Cameras:
 
     Raises: ValueError where no whole model is there, or its camera model is not supported.
     """
-    model, images = _largest_model(folder)
-    source = _file(model, "images")
-    return cameras_of([fitted_to_file(view, source) for view in _views(model, images, folder)], source)[0]
+    source, views, _ = _views(folder)
+    return cameras_of([fitted_to_file(view, source) for view in views], source)[0]
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -90,7 +91,7 @@ def image_files(folder: Path) -> list[Path]:
 
     Raises: ValueError where no whole model is there.
     """
-    return [view.image_path for view in _views(*_largest_model(folder), folder) if view.image_path]
+    return [view.image_path for view in _views(folder)[1] if view.image_path]
 
 
 def _model_folders(folder: Path) -> list[Path]:
@@ -102,16 +103,6 @@ def _model_folders(folder: Path) -> list[Path]:
     return [path for path in found if any((path / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))]
 
 
-def _largest_model(folder: Path) -> tuple[Path, list[_Image]]:
-    models = [(path, _read_images(_file(path, "images"))) for path in _model_folders(folder)]
-    if not models:
-        raise ValueError(f"{folder}: expected a COLMAP model (cameras, images, points3D as .bin or .txt), found none")
-    best = max(models, key=lambda model: len(model[1]))  # the first of equals
-    if not best[1]:
-        raise ValueError(f"{_file(best[0], 'images')}: expected registered images, found none")
-    return best
-
-
 def _file(model: Path, stem: str) -> Path:
     for suffix in (".bin", ".txt"):
         if (model / f"{stem}{suffix}").is_file():
@@ -119,11 +110,17 @@ def _file(model: Path, stem: str) -> Path:
     raise ValueError(f"{model}: expected {stem}.bin or {stem}.txt, found neither")
 
 
-def _views(model: Path, images: list[_Image], folder: Path) -> list[ViewRecord]:
-    cameras = _read_cameras(_file(model, "cameras"))
-    source = _file(model, "images")
+def _views(folder: Path) -> tuple[Path, list[ViewRecord], Path]:
+    """The file of the largest model's images, these ordered by name, and the model's folder."""
+    models = [(path, _read_images(_file(path, "images"))) for path in _model_folders(folder)]
+    if not models:
+        raise ValueError(f"{folder}: expected a COLMAP model (cameras, images, points3D as .bin or .txt), found none")
+    model, images = max(models, key=lambda model: len(model[1]))  # the first of equals
+    source, cameras = _file(model, "images"), _read_cameras(_file(model, "cameras"))
+    if not images:
+        raise ValueError(f"{source}: expected registered images, found none")
     roots = [root / "images" for root in (folder, model, model.parent, model.parent.parent)]
-    roots = [root for root in roots if root.is_dir()] or [folder]
+    root = next((root for root in roots if root.is_dir()), folder)
     views = []
     for image in sorted(images, key=lambda image: image.name):
         camera = cameras.get(image.camera_id)
@@ -132,7 +129,7 @@ def _views(model: Path, images: list[_Image], folder: Path) -> list[ViewRecord]:
         views.append(
             ViewRecord(
                 name=image.name,
-                image_path=existing_file(roots[0] / image.name),
+                image_path=existing_file(root / image.name),
                 world_from_camera=_pose(image, source),
                 focal=camera.focal,
                 center=camera.center,
@@ -140,7 +137,7 @@ def _views(model: Path, images: list[_Image], folder: Path) -> list[ViewRecord]:
                 distortion=camera.distortion,
             )
         )
-    return views
+    return source, views, model
 
 
 def _pose(image: _Image, source: Path) -> np.ndarray:
@@ -184,14 +181,13 @@ def _camera(path: Path, model: str, size: tuple[int, int], numbers: tuple[float,
 def _read_cameras(path: Path) -> dict[int, _Camera]:
     if path.suffix == ".txt":
         return dict(_text_camera(path, line) for line in _lines(path) if line and not line.startswith("#"))
-    records = _Records(path)
     cameras = {}
-    for _ in range(records.count(24)):
-        camera_id, number, width, height = records.take("<IiQQ")
-        model = _MODELS.get(number) or _OTHER_MODELS.get(number, f"number {number}")
-        numbers = records.take(f"<{_PARAMETER_COUNTS.get(model, 0)}d")
-        cameras[camera_id] = _camera(path, model, (width, height), numbers)
-    records.finish()
+    with _records(path) as records:
+        for _ in range(records.take("<Q")[0]):
+            camera_id, number, width, height = records.take("<IiQQ")
+            model = _MODELS[number] if 0 <= number < len(_MODELS) else f"number {number}"
+            numbers = records.take(f"<{_PARAMETER_COUNTS.get(model, 0)}d")
+            cameras[camera_id] = _camera(path, model, (width, height), numbers)
     return cameras
 
 
@@ -207,15 +203,13 @@ def _text_camera(path: Path, line: str) -> tuple[int, _Camera]:
 def _read_images(path: Path) -> list[_Image]:
     if path.suffix == ".txt":
         return list(_text_images(path))
-    records = _Records(path)
     images = []
-    for _ in range(records.count(73)):
-        _, *pose, camera_id = records.take("<I7dI")
-        name = records.take_name()
-        (observations,) = records.take("<Q")
-        records.skip(observations * 24)
-        images.append(_Image(name, camera_id, tuple(pose[:4]), tuple(pose[4:])))
-    records.finish()
+    with _records(path) as records:
+        for _ in range(records.take("<Q")[0]):
+            _, *pose, camera_id = records.take("<I7dI")
+            name = records.take_name()
+            records.skip(records.take("<Q")[0] * 24)  # observations
+            images.append(_Image(name, camera_id, tuple(pose[:4]), tuple(pose[4:])))
     return images
 
 
@@ -242,14 +236,14 @@ def _read_points(path: Path) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]
     if path.suffix == ".txt":
         positions, colors = _text_points(path)
     else:
-        records = _Records(path)
-        count = records.count(51)
-        positions, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
-        for i in range(count):
-            _, x, y, z, red, green, blue, _, track = records.take("<Q3d3BdQ")
-            positions[i], colors[i] = (x, y, z), (red, green, blue)
-            records.skip(track * 8)
-        records.finish()
+        found = []
+        with _records(path) as records:
+            for _ in range(records.take("<Q")[0]):
+                _, *point, _, track = records.take("<Q3d3BdQ")
+                found.append(point)
+                records.skip(track * 8)
+        table = np.array(found, np.float64).reshape(-1, 6)
+        positions, colors = table[:, :3], table[:, 3:].astype(np.uint8)
     if not np.isfinite(positions).all() or np.abs(positions).max(initial=0) > 1e30:
         raise ValueError(f"{path}: expected finite points, found nan, infinity or more than 1e30")
     return torch.from_numpy(positions).float(), torch.from_numpy(colors).float() / 255
@@ -279,46 +273,37 @@ def _lines(path: Path) -> list[str]:
         raise ValueError(f"{path}: expected UTF-8 text, found {error.reason} at byte {error.start}") from None
 
 
+@dataclass
 class _Records:
-    """A binary file read from front to back; every step is checked against its length."""
+    """A binary file that is read from front to back."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._data = path.read_bytes()
-        self._at = 0
+    data: bytes
+    at: int = 0
 
     def take(self, layout: str) -> tuple:
-        size = struct.calcsize(layout)
-        self.skip(size)
-        return struct.unpack_from(layout, self._data, self._at - size)
+        values = struct.unpack_from(layout, self.data, self.at)
+        self.at += struct.calcsize(layout)
+        return values
 
     def skip(self, size: int) -> None:
-        if self._at + size > len(self._data):
-            left = len(self._data) - self._at
-            raise ValueError(f"{self._path}: expected {size} more bytes at byte {self._at}, found {left}")
-        self._at += size
-
-    def count(self, least: int) -> int:
-        """The number of records that follow, each of at least `least` bytes."""
-        (count,) = self.take("<Q")
-        if count * least > len(self._data) - self._at:
-            left = len(self._data) - self._at
-            raise ValueError(f"{self._path}: expected at least {count * least} bytes for {count} records, found {left}")
-        return count
+        self.at += size
 
     def take_name(self) -> str:
-        end = self._data.find(b"\0", self._at)
-        raw = self._data[self._at : end] if end >= 0 else b""
-        try:
-            name = raw.decode("utf-8")
-        except UnicodeDecodeError:
-            name = ""
-        if not name:
-            raise ValueError(f"{self._path}: expected an image name in UTF-8 at byte {self._at}, found {raw[:40]!r}")
-        self._at = end + 1
+        end = self.data.find(b"\0", self.at)
+        if end <= self.at:
+            raise struct.error("no image name")
+        name = self.data[self.at : end].decode("utf-8")
+        self.at = end + 1
         return name
 
-    def finish(self) -> None:
-        if self._at != len(self._data):
-            left = len(self._data) - self._at
-            raise ValueError(f"{self._path}: expected the end after {self._at} bytes, found {left} more")
+
+@contextmanager
+def _records(path: Path) -> Iterator[_Records]:
+    """The records of a file, which must be read to its end; counts in it are not trusted."""
+    records = _Records(path.read_bytes())
+    try:
+        yield records
+    except (struct.error, UnicodeDecodeError, OverflowError) as error:
+        raise ValueError(f"{path}: expected whole records at byte {records.at}, found {error}") from None
+    if records.at != len(records.data):
+        raise ValueError(f"{path}: expected the end after {records.at} bytes, found {len(records.data)}")

@@ -1,21 +1,17 @@
 """Photos and the poses that another program found for them, which lie somewhere else: joined by the photos' names."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.core.images import stored_size
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures import colmap, metashape_xml, realityscan_csv, transforms_json
-from splatgraft.formats.captures.assembly import fitted_to_file, posed_images_of
+from splatgraft.formats.captures import colmap, transforms_json
 from splatgraft.formats.captures.masks import PhotoFiles
-from splatgraft.formats.captures.view_record import ViewRecord
+from splatgraft.formats.captures.views import ViewRecord, fitted_to_file, posed_images_of
 
-_FEWEST = 3
+_MIN_PHOTOS = 3
 """Photos with a pose: below it nothing is seen from two sides and checked by a third."""
 
 
@@ -40,7 +36,7 @@ def pose_files(source: Path) -> tuple[Path, ...]:
         return (source,)
     if not source.is_dir():
         raise ValueError(f"{source}: expected a file or folder with poses, found nothing")
-    suffixes = {".json", ".ply", ".bin", ".txt", ".xml", ".csv"}
+    suffixes = {".json", ".ply", ".bin", ".txt"}
     return tuple(sorted(p for p in source.rglob("*") if p.is_file() and p.suffix in suffixes and p.name != "step.json"))
 
 
@@ -48,14 +44,13 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
     """The `photos` with the poses in `source`; a pose belongs to the photo with its name, whatever its suffix.
 
     Args:
-        source: A folder with a COLMAP model or a transforms.json, that file itself, Metashape's XML file, or
-            RealityScan's CSV file.
+        source: A folder with a COLMAP model or a transforms.json, or that file itself.
         photos: With their masks.
 
     Raises:
         ValueError: There is no such thing at `source`, it is broken, or fewer than three photos have a pose.
     """
-    views, points, colors = _read(source, photos.paths)
+    views, points, colors = _read(source)
     masks = photos.masks or (None,) * len(photos.paths)
     by_stem = {path.stem: (path, mask) for path, mask in zip(photos.paths, masks, strict=True)}
     known = {path.name: path.stem for path in photos.paths}
@@ -68,9 +63,9 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
         for view, stem in zip(views, stems, strict=True)
         if stem in by_stem
     ]
-    if len(fitted) < _FEWEST:
+    if len(fitted) < _MIN_PHOTOS:
         raise ValueError(
-            f"{source}: expected poses of at least {_FEWEST} photos of {photos.paths[0].parent}, found {len(fitted)}: "
+            f"{source}: expected poses of {_MIN_PHOTOS} photos of {photos.paths[0].parent}, found {len(fitted)}: "
             f"its first is named {views[0].name}, the first photo {photos.paths[0].name}"
         )
     return GivenPoses(
@@ -80,27 +75,17 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
     )
 
 
-def _read(
-    source: Path, photos: Sequence[Path]
-) -> tuple[Sequence[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    if source.suffix.lower() == ".xml":
-        return metashape_xml.read_views(source), torch.zeros(0, 3), torch.zeros(0, 3)
-    if source.suffix.lower() == ".csv":
-        sizes = {photo.stem: stored_size(photo) for photo in photos}
-        return realityscan_csv.read_views(source, sizes), torch.zeros(0, 3), torch.zeros(0, 3)
+def _read(source: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     transforms = next((f for f in (source, source / "transforms.json") if f.suffix == ".json" and f.is_file()), None)
     if transforms is not None:
         return transforms_json.read_views(transforms)
     folder = source.parent if source.is_file() else source
     if not colmap.is_colmap(folder):
-        raise ValueError(
-            f"{source}: expected poses (a COLMAP model, transforms.json, Metashape's XML or RealityScan's CSV), "
-            "found none of these"
-        )
+        raise ValueError(f"{source}: expected poses (a COLMAP model or transforms.json), found neither")
     return colmap.read_views(folder)
 
 
 def _stem(name: str, known: dict[str, str]) -> str:
-    """The stem of the photo; Metashape's labels and Blender's paths may lack the suffix."""
+    """The stem of the photo; Blender's paths may lack the suffix."""
     last = PureWindowsPath(name).name
     return known.get(last) or (last if last in known.values() else PureWindowsPath(last).stem)

@@ -2,12 +2,10 @@
 channel."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from splatgraft.core.images import IMAGE_SUFFIXES, has_transparency, list_images, read_alpha, same_shape, stored_size
-from splatgraft.core.posed_images import LeftOut
-from splatgraft.formats.captures.view_record import ViewRecord
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
 """Names under which photos lie in a capture: of COLMAP and nerfstudio, of 3DGS's convert.py, of RGB-D scanners."""
@@ -50,7 +48,7 @@ def find_photos(folder: Path) -> PhotoFiles:
         raise ValueError(f"{folder}: expected photos, in the folder itself or in images/, found {inside}")
     paths = _photos(photos)
     roots = [folder, photos, *([photos.parent] if photos.name in PHOTO_FOLDERS else [])]
-    masks = _masks_of({path: path.name for path in paths}, roots)
+    masks = masks_of({path: path.name for path in paths}, roots)
     return PhotoFiles(tuple(paths), tuple(masks.get(path) for path in paths) if masks else ())
 
 
@@ -64,30 +62,6 @@ def describe_masks(images: Sequence[Path], masks: Sequence[Path | None]) -> str:
     folders = sorted({f"{m.parent.name}/" for i, m in found.items() if m != i and not _is_beside(i, m)})
     places = [*(["alpha channels"] if inner else []), *(["NAME_mask beside NAME"] if beside else []), *folders]
     return f"{len(found)} of {len(images)} photos have masks, in {', '.join(places)}"
-
-
-def with_masks(views: list[ViewRecord], folder: Path) -> tuple[list[ViewRecord], list[LeftOut]]:
-    """The views with the masks in `folder`/masks or mask, or, without these, beside the images or in alpha channels.
-
-    0001.jpg finds 0001.png and 0001.jpg.png; cam/0001.jpg finds cam/0001.png. A mask that the view already has stays. A
-    mask that is missing, unreadable or of another shape is left out, with the reason.
-
-    Raises: ValueError where masks/ has no mask for any view, or two for one.
-    """
-    if not any(view.mask_path for view in views):
-        images = {view.image_path: view.name for view in views if view.image_path is not None}
-        masks = _masks_of(images, [folder])
-        views = [replace(view, mask_path=masks.get(view.image_path) if view.image_path else None) for view in views]
-    left_out: list[LeftOut] = []
-    for index, view in enumerate(views):
-        if view.mask_path is None or view.mask_path == view.image_path:
-            continue
-        try:
-            check_mask(view.mask_path, view.size)
-        except ValueError as error:
-            left_out.append(LeftOut(view.name, str(error), mask_only=True))
-            views[index] = replace(view, mask_path=None)
-    return views, left_out
 
 
 def check_mask(mask: Path, size: tuple[int, int]) -> None:
@@ -112,7 +86,7 @@ def _photos(folder: Path) -> list[Path]:
     ]
 
 
-def _masks_of(images: dict[Path, str], roots: Sequence[Path]) -> dict[Path, Path]:
+def masks_of(images: dict[Path, str], roots: Sequence[Path]) -> dict[Path, Path]:
     """Masks by image, from the first place that has any; `images` gives their names inside the capture."""
     for folder in (root / name for root in roots for name in _MASK_FOLDERS):
         if folder.is_dir():

@@ -1,4 +1,7 @@
-"""Reads and writes transforms.json: cameras and photographs with the keys of Blender and nerfstudio, OpenGL axes."""
+"""Reads and writes transforms.json: cameras and photographs with the keys of Blender and nerfstudio, OpenGL axes.
+
+Also reads cameras.json, which the original 3DGS code writes beside a scene.
+"""
 
 import json
 import math
@@ -16,11 +19,18 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import IMAGE_SUFFIXES, stored_size
-from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures.assembly import cameras_of, fitted_to_file, posed_images_of, view_or_reason
-from splatgraft.formats.captures.points_ply import read_points, write_points
-from splatgraft.formats.captures.view_record import ViewRecord, existing_file, rigid
+from splatgraft.core.posed_images import LeftOut, PosedImages
+from splatgraft.formats.captures.views import (
+    ViewRecord,
+    cameras_of,
+    existing_file,
+    fitted_to_file,
+    posed_images_of,
+    rigid,
+    view_or_reason,
+)
 from splatgraft.formats.json_file import array, excerpt, load, number, text, whole_side
+from splatgraft.formats.scenes.ply import read_points, write_points
 from splatgraft.runtime.atomic_file import atomic_write
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -33,11 +43,8 @@ def read_capture(path: Path) -> PosedImages:
 
     Raises: ValueError where the file or its points are missing or broken, or fewer than half of the frames are usable.
     """
-    images, meta = read_images(path), _load(path)
-    if meta.get("ply_file_path") is None:
-        return images
-    points, colors = read_points(path.parent / text(path, meta, "ply_file_path"))
-    return replace(images, points=points, point_colors=colors)
+    points, colors = _read_points(path, _load(path))
+    return replace(read_images(path), points=points, point_colors=colors)
 
 
 def read_images(path: Path) -> PosedImages:
@@ -45,11 +52,7 @@ def read_images(path: Path) -> PosedImages:
 
     Raises: ValueError as `read_capture`.
     """
-    none, meta = torch.zeros(0, 3), _load(path)
-    views = [
-        view_or_reason(_frame_name(index, frame), partial(_view, path, index, meta, frame))
-        for index, frame in enumerate(meta["frames"])
-    ]
+    views, none = _usable_views(path), torch.zeros(0, 3)
     return posed_images_of(views, path, folder=path.parent, points=none, colors=none)
 
 
@@ -59,9 +62,7 @@ def read_views(path: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Floa
     Raises: ValueError where the file or its points are broken.
     """
     meta = _load(path)
-    if meta.get("ply_file_path") is None:
-        return _views(path, meta), torch.zeros(0, 3), torch.zeros(0, 3)
-    return _views(path, meta), *read_points(path.parent / text(path, meta, "ply_file_path"))
+    return _views(path, meta), *_read_points(path, meta)
 
 
 def read_cameras(path: Path) -> Cameras:
@@ -77,9 +78,43 @@ def image_files(path: Path) -> list[Path]:
 
     Raises: ValueError where the file is missing or broken.
     """
-    meta = _load(path)
-    views = (view_or_reason("", partial(_view, path, index, meta, frame)) for index, frame in enumerate(meta["frames"]))
-    return [view.image_path for view in views if isinstance(view, ViewRecord) and view.image_path]
+    return [view.image_path for view in _usable_views(path) if isinstance(view, ViewRecord) and view.image_path]
+
+
+def is_cameras_json(path: Path) -> bool:
+    """Whether the file is a JSON list, as cameras.json of the original code is, and not an object."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return stream.read(64).lstrip().startswith(b"[")
+
+
+def read_cameras_json(path: Path) -> Cameras:
+    """The cameras of a cameras.json; OpenCV axes, principal points at the centre, as the file has none.
+
+    Raises: ValueError where the file is broken.
+    """
+    entries, views = load(path), []
+    for index, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise ValueError(f"{path}: expected camera {index} to be an object, found {type(entry).__name__}")
+        width, height = whole_side(path, entry, "width"), whole_side(path, entry, "height")
+        pose = np.eye(4)
+        pose[:3, :3] = array(path, entry, "rotation", ((3, 3),))
+        pose[:3, 3] = array(path, entry, "position", ((3,),))
+        views.append(
+            ViewRecord(
+                name=text(path, entry, "img_name"),
+                image_path=None,
+                world_from_camera=rigid(pose, f"{path}: camera {index}"),
+                focal=(number(path, entry, "fx"), number(path, entry, "fy")),
+                center=(width / 2, height / 2),
+                size=(width, height),
+            )
+        )
+    if not views:
+        raise ValueError(f"{path}: expected a list of cameras, found none")
+    return cameras_of(views, path)[0]
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -89,6 +124,20 @@ def _load(path: Path) -> dict[str, Any]:
     if not meta["frames"]:
         raise ValueError(f"{path}: expected at least one frame, found none")
     return meta
+
+
+def _read_points(path: Path, meta: dict[str, Any]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    if meta.get("ply_file_path") is None:
+        return torch.zeros(0, 3), torch.zeros(0, 3)
+    return read_points(path.parent / text(path, meta, "ply_file_path"))
+
+
+def _usable_views(path: Path) -> list[ViewRecord | LeftOut]:
+    meta = _load(path)
+    return [
+        view_or_reason(_frame_name(index, frame), partial(_view, path, index, meta, frame))
+        for index, frame in enumerate(meta["frames"])
+    ]
 
 
 def _views(path: Path, meta: dict[str, Any]) -> list[ViewRecord]:
@@ -114,7 +163,7 @@ def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> ViewRecor
     return ViewRecord(
         name=name,
         image_path=image_path,
-        mask_path=_mask_file(path, camera),
+        mask_path=None if camera.get("mask_path") is None else path.parent / text(path, camera, "mask_path"),
         world_from_camera=_pose(path, index, frame),
         focal=(fl_x, fl_y),
         center=(number(path, camera, "cx", width / 2), number(path, camera, "cy", height / 2)),
@@ -161,12 +210,6 @@ def _image_file(path: Path) -> Path | None:
     suffixes = ["", *sorted(IMAGE_SUFFIXES)] if path.suffix.lower() not in IMAGE_SUFFIXES else [""]
     candidates = [path.with_name(path.name + suffix) for suffix in suffixes]
     return next((found for found in map(existing_file, candidates) if found), None)
-
-
-def _mask_file(path: Path, camera: dict[str, Any]) -> Path | None:
-    if camera.get("mask_path") is None:
-        return None
-    return path.parent / text(path, camera, "mask_path")
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:

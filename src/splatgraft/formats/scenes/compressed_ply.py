@@ -1,8 +1,10 @@
-"""Reads SuperSplat's compressed .ply: chunks of 256 Gaussians, quantised between each chunk's bounds.
+"""Reads and writes SuperSplat's compressed .ply: chunks of 256 Gaussians, quantised between each chunk's bounds.
 
-Layout (PlayCanvas): element chunk with min/max of position, log scale and, in newer files, colour; element vertex with
-four packed uint32; optional element sh with 8-bit f_rest.
+Layout (PlayCanvas): element chunk with min and max of position, log scale and, in newer files, colour; element vertex
+with four packed uint32; optional element sh with 8-bit f_rest. Written ones are sorted along a Morton curve.
 """
+
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,82 +14,76 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes import ply
-from splatgraft.formats.scenes.quantized import logits_from_bytes
+from splatgraft.formats.scenes.quantization import (
+    from_smallest_three,
+    logits_from_bytes,
+    morton_order,
+    smallest_three,
+    writable,
+)
+from splatgraft.formats.scenes.scene_file import SceneMetadata
+from splatgraft.runtime.atomic_file import atomic_write
 
+COMPRESSED_PLY = ".compressed.ply"
 _CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_BOUNDS = ("{}_x {}_y {}_z", "{}_scale_x {}_scale_y {}_scale_z", "{}_r {}_g {}_b")
+_POSITION_BITS = (11, 10, 11)
+_LARGEST_LOG_SCALE = 20.0
 _HALF_SQRT2 = 0.5**0.5
 
 
 def is_compressed(header: ply.PlyHeader) -> bool:
     """Whether the file has SuperSplat's packed vertices."""
     vertex = header.element("vertex")
-    return vertex is not None and set(_PACKED) <= set(vertex.names)
+    return vertex is not None and set(_PACKED) <= set(vertex.types)
 
 
 def read_compressed_ply(header: ply.PlyHeader) -> Gaussians:
     """The scene in a compressed .ply.
 
-    Raises: ValueError where chunks, packed columns or f_rest are missing or do not fit each other.
+    Raises: ValueError where chunks or f_rest are missing or do not fit each other.
     """
-    path, vertex, chunk, sh = header.path, *(header.element(name) for name in ("vertex", "chunk", "sh"))
-    if vertex is None or chunk is None or chunk.count * _CHUNK < vertex.count:
+    vertex, chunk, sh = (header.element(name) for name in ("vertex", "chunk", "sh"))
+    assert vertex is not None
+    if chunk is None or chunk.count * _CHUNK < vertex.count:
         found = chunk.count if chunk else 0
-        raise ValueError(f"{path}: expected one chunk for {_CHUNK} packed Gaussians, found {found}")
-    if any(p.type != "u4" for p in vertex.properties if p.name in _PACKED):
-        raise ValueError(f"{path}: expected {', '.join(_PACKED)} as uint, found other types")
-    packed = [np.empty(vertex.count, np.int64) for _ in _PACKED]
-    for start, rows in ply.read_chunks(header, vertex):
-        for column, name in zip(packed, _PACKED, strict=True):
-            column[start : start + len(rows)] = rows[name]
-    position, rotation, scale, color = map(torch.from_numpy, packed)
+        raise ValueError(f"{header.path}: expected one chunk for {_CHUNK} packed Gaussians, found {found}")
+    columns = {name: np.empty(vertex.count, np.int64) for name in _PACKED}
+    ply.read_into(header, vertex, list(columns.items()))
+    position, rotation, scale, color = map(torch.from_numpy, columns.values())
     of_chunk = torch.arange(vertex.count) // _CHUNK
-    unit_rgb = torch.stack([color >> 24 & 255, color >> 16 & 255, color >> 8 & 255], 1).float() / 255
-    has_colors = {"min_r", "max_r"} <= set(chunk.names)
-    rgb = _between(header, chunk, "{}_r {}_g {}_b", unit_rgb, of_chunk) if has_colors else unit_rgb
+
+    def between(names: str, unit: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        low, high = (
+            torch.from_numpy(ply.read_columns(header, chunk, tuple(name.format(end) for name in names.split())))
+            for end in ("min", "max")
+        )
+        return torch.lerp(low[of_chunk], high[of_chunk], unit)
+
+    rgb = _unpacked(color >> 8, (8, 8, 8))
+    rgb = between(_BOUNDS[2], rgb) if "min_r" in chunk.types else rgb
     dc = spherical_harmonics.dc_from_rgb(rgb)[:, None]
     return Gaussians(
-        means=_between(header, chunk, "{}_x {}_y {}_z", _three(position), of_chunk),
-        log_scales=_between(header, chunk, "{}_scale_x {}_scale_y {}_scale_z", _three(scale), of_chunk),
-        quaternions=_quaternions(rotation),
+        means=between(_BOUNDS[0], _unpacked(position, _POSITION_BITS)),
+        log_scales=between(_BOUNDS[1], _unpacked(scale, _POSITION_BITS)),
+        quaternions=from_smallest_three(rotation >> 30, (_unpacked(rotation, (10, 10, 10)) - 0.5) / _HALF_SQRT2),
         opacity_logits=logits_from_bytes((color & 255).to(torch.uint8)),
         sh=dc if sh is None else torch.cat([dc, _bands(header, sh, vertex.count)], 1),
     )
 
 
-def _three(packed: Int64[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    """11, 10 and 11 bits, each to [0, 1]."""
-    return torch.stack([(packed >> 21) / 2047, (packed >> 11 & 1023) / 1023, (packed & 2047) / 2047], 1).float()
-
-
-def _quaternions(packed: Int64[Tensor, "n"]) -> Float[Tensor, "n 4"]:
-    """Index of the largest of w, x, y, z in two bits, then the others in order in 10 bits each."""
-    largest = packed[:, None] >> 30
-    three = packed[:, None] >> torch.tensor([20, 10, 0]) & 1023
-    values = (three.float() / 1023 - 0.5) / _HALF_SQRT2
-    axes = torch.arange(3) + (torch.arange(3) >= largest)
-    out = torch.zeros(len(packed), 4).scatter_(1, axes, values)
-    return out.scatter_(1, largest, (1 - values.square().sum(1, keepdim=True)).clamp_min(0).sqrt())
-
-
-def _between(
-    header: ply.PlyHeader, chunk: ply.Element, names: str, unit: Float[Tensor, "n 3"], of_chunk: Int64[Tensor, "n"]
-) -> Float[Tensor, "n 3"]:
-    """`unit` between each chunk's lower and upper bound; `names` says how the bounds are called."""
-    bounds = []
-    for end in ("min", "max"):
-        columns = tuple(name.format(end) for name in names.split())
-        missing = [name for name in columns if name not in chunk.names]
-        if missing:
-            raise ValueError(f"{header.path}: expected {', '.join(columns)} in element 'chunk', found no {missing[0]}")
-        bounds.append(torch.from_numpy(ply.read_columns(header, chunk, columns))[of_chunk])
-    return torch.lerp(bounds[0], bounds[1], unit)
+def _unpacked(packed: Int64[Tensor, "n"], bits: tuple[int, ...]) -> Float[Tensor, "n c"]:
+    """Values in [0, 1] that lie side by side, the last in the lowest bits."""
+    shifts = [sum(bits[i + 1 :]) for i in range(len(bits))]
+    parts = [(packed >> at & (1 << width) - 1) / ((1 << width) - 1) for at, width in zip(shifts, bits, strict=True)]
+    return torch.stack(parts, 1).float()
 
 
 def _bands(header: ply.PlyHeader, sh: ply.Element, count: int) -> Float[Tensor, "n k 3"]:
     """Bytes to [-4, 4], channel-major as in a plain .ply."""
-    names = tuple(f"f_rest_{i}" for i in range(len(sh.properties)))
-    if sh.count != count or len(names) not in (9, 24, 45) or set(names) != set(sh.names):
+    names = tuple(f"f_rest_{i}" for i in range(len(sh.types)))
+    if sh.count != count or len(names) not in (9, 24, 45) or set(names) != set(sh.types):
         raise ValueError(
             f"{header.path}: expected {count} rows of 9, 24 or 45 f_rest in element 'sh', "
             f"found {sh.count} rows of {len(names)}"
@@ -95,3 +91,47 @@ def _bands(header: ply.PlyHeader, sh: ply.Element, count: int) -> Float[Tensor, 
     values = torch.from_numpy(ply.read_columns(header, sh, names))
     unit = torch.where(values == 0, 0.0, torch.where(values == 255, 1.0, (values + 0.5) / 256))
     return ((unit - 0.5) * 8).reshape(count, 3, len(names) // 3).transpose(1, 2).contiguous()
+
+
+def write_compressed_ply(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
+    """Write positions and log scales in 11, 10 and 11 bits of each chunk's bounds, the rest in 8 to 10 bits.
+
+    Raises: ValueError where there are no Gaussians, or some are not finite.
+    """
+    g = writable(path, gaussians, "compressed .ply")
+    g = g.select(morton_order(g.means))
+    log_scales = g.log_scales.clamp(-_LARGEST_LOG_SCALE, _LARGEST_LOG_SCALE)
+    values = torch.cat([g.means, log_scales, spherical_harmonics.rgb_from_dc(g.sh[:, 0])], 1)
+    low, high = (torch.stack([bound(chunk, 0) for chunk in values.split(_CHUNK)]) for bound in (torch.amin, torch.amax))
+    of_chunk = torch.arange(g.count) // _CHUNK
+    unit = (values - low[of_chunk]) / (high - low)[of_chunk].clamp_min(1e-12)
+    largest, three = smallest_three(g.quaternions)
+    packed = [
+        _packed(unit[:, :3], _POSITION_BITS),
+        largest << 30 | _packed(three * _HALF_SQRT2 + 0.5, (10, 10, 10)),
+        _packed(unit[:, 3:6], _POSITION_BITS),
+        _packed(torch.cat([unit[:, 6:], g.opacities[:, None]], 1), (8, 8, 8, 8)),
+    ]
+    bounds = [name.format(end) for names in _BOUNDS for end in ("min", "max") for name in names.split()]
+    elements = [
+        ("chunk", len(low), [("float", name) for name in bounds]),
+        ("vertex", g.count, [("uint", name) for name in _PACKED]),
+    ]
+    bands = (g.sh[:, 1:].transpose(1, 2).flatten(1) / 8 + 0.5) * 256
+    if g.sh_degree:
+        elements.append(("sh", g.count, [("uchar", f"f_rest_{i}") for i in range(bands.shape[1])]))
+    rows = torch.cat([low[:, :3], high[:, :3], low[:, 3:6], high[:, 3:6], low[:, 6:], high[:, 6:]], 1)
+    with atomic_write(path) as stream:
+        ply.write_header(stream, *elements, metadata=metadata)
+        stream.write(rows.numpy().astype("<f4").tobytes())
+        stream.write(torch.stack(packed, 1).numpy().astype("<u4").tobytes())
+        stream.write(bands.floor().clamp(0, 255).to(torch.uint8).numpy().tobytes())
+
+
+def _packed(unit: Float[Tensor, "n c"], bits: tuple[int, ...]) -> Int64[Tensor, "n"]:
+    """Values of [0, 1] side by side, the last in the lowest bits."""
+    out = torch.zeros(len(unit), dtype=torch.int64)
+    for column, width in enumerate(bits):
+        most = (1 << width) - 1
+        out = out << width | (unit[:, column] * most).round().clamp(0, most).to(torch.int64)
+    return out

@@ -1,9 +1,13 @@
-"""Reads binary glTF with KHR_gaussian_splatting (ratified 2026), also in its .spz compression.
+"""Reads and writes binary glTF with KHR_gaussian_splatting (ratified 2026).
 
-Attributes of a POINTS primitive: ROTATION (xyzw), SCALE (linear), OPACITY (linear), SH_DEGREE_l_COEF_n. Transforms of
-nodes are applied. glTF's axes are left-up-front; they are turned to those of a .ply.
+Attributes of a POINTS primitive: ROTATION (xyzw), SCALE (linear), OPACITY (linear), SH_DEGREE_l_COEF_n; float32 where
+written, also normalised integers where read. Transforms of nodes are applied. glTF's unit is the metre and its axes are
+left-up-front; they are turned to and from those of a .ply, and a scene is as upright and as large as it is given.
 """
 
+import json
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,123 +17,231 @@ from jaxtyping import Float
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
-from splatgraft.formats.json_file import excerpt
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
-from splatgraft.formats.scenes.glb_container import Glb, read_glb
-from splatgraft.formats.scenes.quantized import logits_from_unit
-from splatgraft.formats.scenes.scene_file import SceneFile
-from splatgraft.formats.scenes.spz import decode_spz
+from splatgraft.formats.scenes.quantization import SMALLEST_SCALE, bytes_from_unit, writable
+from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
+from splatgraft.runtime.atomic_file import atomic_write
 
-SPLATTING = "KHR_gaussian_splatting"
-"""The extension's name, which stands before those of its attributes as well."""
-_COMPRESSIONS = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
-GLTF_AXES = "LUF"
+AXES = "LUF"
 """Left, up, front."""
-_SMALLEST_SCALE = 1e-30
-"""World units; replaces a scale of exactly 0, since the logarithm is stored."""
+_SPLATTING = "KHR_gaussian_splatting"
+"""The extension's name, which stands before those of its attributes as well."""
+_MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
+_FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_HEADER_BYTES = 28
+"""The file's header and those of the two chunks."""
 _RIGID = 1e-3
 """Largest deviation of a node's matrix from a uniformly scaled rotation, over its scale."""
-_MOST_COPIES = 16
-"""Gaussians over bytes of the file, at the size of one that is quantised: a mesh may be placed several times."""
+_MAX_DEPTH = 100
+"""Of nodes in nodes."""
+_OPACITY_STEP = 0.25 / 65535
+"""Opacities of 0 and 1 become finite logits, by a quarter step of 16 bits."""
 
 
 def read_gaussian_glb(path: Path) -> SceneFile:
     """The Gaussians of all primitives, placed by their nodes.
 
-    Raises: ValueError where the file is damaged or has no Gaussians, or a node distorts them.
+    Raises: ValueError where the file has no Gaussians, or a node distorts them.
     """
-    glb = read_glb(path)
+    content, binary = _parts(path)
     notes: list[str] = []
     parts: list[Gaussians] = []
-    for mesh, matrix in glb.nodes_with_meshes():
-        for primitive in _splats(glb, mesh):
-            part, said = _gaussians(glb, primitive)
-            notes += [note for note in said if note not in notes]
-            parts.append(_placed(path, part, matrix))
-            if sum(part.count for part in parts) > _MOST_COPIES * max(1000, len(glb.binary) // 20):
-                raise ValueError(f"{path}: expected Gaussians that are stored about once, found many copies")
+    for mesh, matrix in _placed_meshes(path, content):
+        for primitive in mesh["primitives"]:
+            if _SPLATTING in primitive.get("extensions", {}):
+                part, said = _gaussians(path, content, binary, primitive)
+                notes += [note for note in said if note not in notes]
+                parts.append(_placed(path, part, matrix))
     if not parts:
-        raise ValueError(f"{path}: expected Gaussians ({SPLATTING}), found a .glb without")
-    gaussians = change_axes(concatenate(parts), rdf_from(GLTF_AXES))
-    return SceneFile(gaussians, GLTF_AXES, notes=tuple(notes))
+        raise ValueError(f"{path}: expected Gaussians ({_SPLATTING}), found a .glb without")
+    return SceneFile(change_axes(concatenate(parts), rdf_from(AXES)), AXES, notes=tuple(notes))
 
 
-def _splats(glb: Glb, mesh: dict[str, Any]) -> list[dict[str, Any]]:
-    primitives = mesh.get("primitives")
-    found = []
-    for primitive in primitives if isinstance(primitives, list) else []:
-        extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
-        if isinstance(extensions, dict) and isinstance(extensions.get(SPLATTING), dict):
-            found.append(primitive)
-    return found
+def _parts(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The JSON and the buffer."""
+    data = path.read_bytes()
+    if struct.unpack_from("<II", data) != (_MAGIC, _VERSION):
+        raise ValueError(f"{path}: expected binary glTF of version 2, found {data[:8]!r}")
+    chunks: dict[int, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        length, kind = struct.unpack_from("<II", data, at)
+        chunks.setdefault(kind, data[at + 8 : at + 8 + length])
+        at += 8 + length
+    return json.loads(chunks[_JSON]), chunks.get(_BINARY, b"")
 
 
-def _gaussians(glb: Glb, primitive: dict[str, Any]) -> tuple[Gaussians, tuple[str, ...]]:
+def _placed_meshes(path: Path, content: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Float[np.ndarray, "4 4"]]]:
+    """Each mesh of the default scene and the transform that places it."""
+    waiting = [(index, np.eye(4), 0) for index in content["scenes"][content.get("scene", 0)]["nodes"]]
+    while waiting:
+        index, parent, depth = waiting.pop(0)
+        if depth > _MAX_DEPTH:
+            raise ValueError(f"{path}: expected nodes without cycles, found more than {_MAX_DEPTH} in one another")
+        node = content["nodes"][index]
+        matrix = parent @ _matrix(node)
+        if "mesh" in node:
+            yield content["meshes"][node["mesh"]], matrix
+        waiting = [(child, matrix, depth + 1) for child in node.get("children", [])] + waiting
+
+
+def _matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    """parent_from_node; column-major, or translation, rotation xyzw and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", [0, 0, 0, 1])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_from_quaternion(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
+    matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64)
+    matrix[:3, 3] = node.get("translation", [0, 0, 0])
+    return matrix
+
+
+def _gaussians(
+    path: Path, content: dict[str, Any], binary: bytes, primitive: dict[str, Any]
+) -> tuple[Gaussians, tuple[str, ...]]:
     """One primitive in glTF's axes, and what is said of it."""
-    extension = primitive["extensions"][SPLATTING]
+    extension, attributes = primitive["extensions"][_SPLATTING], primitive["attributes"]
     kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
     if kernel != "ellipse":
-        raise ValueError(f"{glb.path}: expected the kernel 'ellipse', found {excerpt(kernel)}")
-    notes = () if space == "srgb_rec709_display" else (f"its colours are {excerpt(space)}, and are taken for sRGB",)
-    compressions = extension.get("extensions")
-    for name in _COMPRESSIONS:
-        if isinstance(compressions, dict) and isinstance(compressions.get(name), dict):
-            data, _ = glb.view(compressions[name].get("bufferView"))
-            gaussians, _, said = decode_spz(glb.path, data)
-            return gaussians, (*notes, *said)
-    attributes = primitive.get("attributes")
-    if not isinstance(attributes, dict):
-        raise ValueError(f"{glb.path}: expected attributes of the Gaussians, found {excerpt(attributes)}")
-    means = _attribute(glb, attributes, "POSITION", "VEC3")
-    rotations = _attribute(glb, attributes, f"{SPLATTING}:ROTATION", "VEC4")
-    scales = _attribute(glb, attributes, f"{SPLATTING}:SCALE", "VEC3")
-    opacities = _attribute(glb, attributes, f"{SPLATTING}:OPACITY", "SCALAR")
-    sh = _harmonics(glb, attributes)
-    if len({len(values) for values in (means, rotations, scales, opacities, sh)}) > 1:
-        raise ValueError(f"{glb.path}: expected as many values of each attribute, found different numbers")
+        raise ValueError(f"{path}: expected the kernel 'ellipse', found {str(kernel)[:60]!r}")
+    notes = () if space == "srgb_rec709_display" else (f"its colours are {str(space)[:60]!r}, and are taken for sRGB",)
+
+    def values(name: str, kind: str) -> Float[np.ndarray, "n c"]:
+        if name not in attributes:
+            raise ValueError(f"{path}: expected the attribute {name}, found {', '.join(attributes)[:60]}")
+        return _accessor(path, content, binary, content["accessors"][attributes[name]], kind)
+
+    rotations, scales = values(f"{_SPLATTING}:ROTATION", "VEC4"), values(f"{_SPLATTING}:SCALE", "VEC3")
     if bool((scales < 0).any()):
         log_scales = scales
         notes = (*notes, "its scales are negative, thus logarithms, as before the extension was ratified")
     else:
-        log_scales = np.log(np.maximum(scales, _SMALLEST_SCALE))
+        log_scales = np.log(np.maximum(scales, SMALLEST_SCALE))
+    degree = sum(f"{_SPLATTING}:SH_DEGREE_{d}_COEF_0" in attributes for d in (1, 2, 3))
+    coefficients = [values(name, "VEC3") for name in _harmonics(degree)]
+    opacities = torch.from_numpy(values(f"{_SPLATTING}:OPACITY", "SCALAR")[:, 0].copy())
     gaussians = Gaussians(
-        means=torch.from_numpy(means),
+        means=torch.from_numpy(values("POSITION", "VEC3")),
         log_scales=torch.from_numpy(log_scales),
         quaternions=torch.from_numpy(np.ascontiguousarray(rotations[:, [3, 0, 1, 2]])),
-        opacity_logits=logits_from_unit(torch.from_numpy(opacities[:, 0].copy())),
-        sh=torch.from_numpy(sh),
+        opacity_logits=opacities.clamp(_OPACITY_STEP, 1 - _OPACITY_STEP).logit(),
+        sh=torch.from_numpy(np.stack(coefficients, 1)),
     )
+    if len({len(field) for field in vars(gaussians).values()}) > 1:
+        raise ValueError(f"{path}: expected as many values of each attribute, found different numbers")
     return gaussians, notes
 
 
-def _attribute(glb: Glb, attributes: dict[str, Any], name: str, kind: str) -> Float[np.ndarray, "n c"]:
-    if name not in attributes:
-        raise ValueError(f"{glb.path}: expected the attribute {name}, found {excerpt(sorted(attributes))}")
-    return glb.values(attributes[name], kind)
+def _harmonics(degree: int) -> list[str]:
+    """Names of the attributes of all bands up to a degree."""
+    return [f"{_SPLATTING}:SH_DEGREE_{d}_COEF_{i}" for d in range(degree + 1) for i in range(2 * d + 1)]
 
 
-def _harmonics(glb: Glb, attributes: dict[str, Any]) -> Float[np.ndarray, "n k 3"]:
-    """All bands that are there, from 0 up."""
-    coefficients = []
-    for degree in range(spherical_harmonics.MAX_DEGREE + 1):
-        names = [f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{i}" for i in range(2 * degree + 1)]
-        if degree and not any(name in attributes for name in names):
-            break
-        coefficients += [_attribute(glb, attributes, name, "VEC3") for name in names]
-    if len({len(values) for values in coefficients}) > 1:
-        raise ValueError(f"{glb.path}: expected as many values of each SH coefficient, found different numbers")
-    return np.stack(coefficients, 1)
+def _accessor(
+    path: Path, content: dict[str, Any], binary: bytes, accessor: dict[str, Any], kind: str
+) -> Float[np.ndarray, "n c"]:
+    """An accessor's values; integers become [0, 1] or [-1, 1] where it is normalised."""
+    view = content["bufferViews"][accessor["bufferView"]]
+    if accessor["type"] != kind or "sparse" in accessor or view["buffer"] != 0 or "uri" in content["buffers"][0]:
+        raise ValueError(f"{path}: expected a plain accessor of {kind} in the .glb itself, found another")
+    dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind], accessor["count"]
+    start = view.get("byteOffset", 0)
+    data = binary[start : start + view["byteLength"]]
+    strides = (view.get("byteStride", dtype.itemsize * width), dtype.itemsize)
+    values = (
+        np.ndarray((count, width), dtype, data, accessor.get("byteOffset", 0), strides)
+        if count
+        else np.empty((0, width))
+    )
+    out = values.astype(np.float32)
+    return np.maximum(out / np.iinfo(dtype).max, -1) if accessor.get("normalized") and dtype.kind in "iu" else out
 
 
 def _placed(path: Path, gaussians: Gaussians, matrix: Float[np.ndarray, "4 4"]) -> Gaussians:
     """The Gaussians in the frame of the scene."""
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
-    if not scale > 1e-9 or np.abs(linear / scale @ (linear / scale).T - np.eye(3)).max() > _RIGID:
+    if not scale > 1e-9 or not np.abs(linear / scale @ (linear / scale).T - np.eye(3)).max() < _RIGID:
         raise ValueError(f"{path}: expected nodes that rotate and scale uniformly, found another transform")
-    return Similarity(
-        scale=scale,
-        rotation=torch.from_numpy(linear / scale).float(),
-        translation=torch.from_numpy(matrix[:3, 3]).float(),
-    ).gaussians(gaussians)
+    rotation, translation = torch.from_numpy(linear / scale).float(), torch.from_numpy(matrix[:3, 3]).float()
+    return Similarity(scale, rotation, translation).gaussians(gaussians)
+
+
+def write_gaussian_glb(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
+    """Write all fields exactly but for the exponentials of scales and opacities.
+
+    Args:
+        path: The file.
+        gaussians: The scene.
+        metadata: Stands in the asset's extras.
+
+    Raises:
+        ValueError: There are no Gaussians, some are not finite, or the file would be larger than 4 GB.
+    """
+    arrays = _attributes(change_axes(writable(path, gaussians, ".glb"), rdf_from(AXES).T))
+    kinds = {width: kind for kind, width in _WIDTHS.items()}
+    views, accessors, at = [], [], 0
+    for values in arrays.values():
+        views.append({"buffer": 0, "byteOffset": at, "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
+        accessors.append(
+            {
+                "bufferView": len(accessors),
+                "componentType": _FLOAT if values.dtype == np.float32 else _BYTE,
+                "normalized": values.dtype != np.float32,
+                "count": len(values),
+                "type": kinds[values.shape[1]],
+            }
+        )
+        at += values.nbytes
+    # the specification asks for these of positions
+    accessors[0] |= {"min": arrays["POSITION"].min(0).tolist(), "max": arrays["POSITION"].max(0).tolist()}
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(arrays)},
+        "mode": _POINTS,
+        "extensions": {_SPLATTING: splats | {"sortingMethod": "cameraDistance"}},
+    }
+    extras = {"extras": metadata.known} if metadata.known else {}
+    content: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "splatgraft"} | extras,
+        "extensionsUsed": [_SPLATTING],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": at}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    total = _HEADER_BYTES + len(text) + at + -at % 4
+    if total >= 1 << 32:
+        raise ValueError(f"{path}: expected at most 4 GB for a .glb file, found {total / 1e9:.1f} GB")
+    with atomic_write(path) as stream:
+        stream.write(struct.pack("<5I", _MAGIC, _VERSION, total, len(text), _JSON) + text)
+        stream.write(struct.pack("<2I", at + -at % 4, _BINARY))
+        for values in arrays.values():
+            stream.write(values.tobytes())
+        stream.write(bytes(-at % 4))
+
+
+def _attributes(g: Gaussians) -> dict[str, np.ndarray]:
+    """Attribute to rows of float32, positions first; bytes of a colour for programs without the extension."""
+    unit = torch.nn.functional.normalize(g.quaternions, dim=1)
+    values = {
+        "POSITION": g.means,
+        f"{_SPLATTING}:ROTATION": unit[:, [1, 2, 3, 0]],
+        f"{_SPLATTING}:SCALE": g.scales,
+        f"{_SPLATTING}:OPACITY": g.opacities[:, None],
+        **{name: g.sh[:, i] for i, name in enumerate(_harmonics(g.sh_degree))},
+    }
+    arrays = {name: np.ascontiguousarray(value.numpy(), "<f4") for name, value in values.items()}
+    rgb = spherical_harmonics.rgb_from_dc(g.sh[:, 0])
+    arrays["COLOR_0"] = bytes_from_unit(torch.cat([rgb, g.opacities[:, None]], 1)).numpy()
+    return arrays

@@ -15,8 +15,8 @@ import torch
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
-from splatgraft.formats.scenes.quantized import writable
-from splatgraft.formats.scenes.scene_metadata import SceneMetadata
+from splatgraft.formats.scenes.quantization import writable
+from splatgraft.formats.scenes.scene_file import SceneMetadata
 
 _AXES = "RUB"
 _SIGMAS = 3.0

@@ -1,48 +1,38 @@
-"""The PLY container: header, elements, properties; binary of both byte orders and ascii.
+"""The PLY container (header, elements, properties; binary of both byte orders and ascii), and point clouds in it.
 
 Element counts of a header are checked against the size of the file before anything is allocated.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core import spherical_harmonics
+from splatgraft.formats.scenes.scene_file import SceneMetadata
+from splatgraft.runtime.atomic_file import atomic_write
 
 _MAX_HEADER_BYTES = 1 << 20
-_ROWS_PER_CHUNK = 1 << 12
+_ROWS_AT_ONCE = 1 << 12
 _TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float32": "f4",
-    "float64": "f8",
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
 }
 _FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-
-
-@dataclass(frozen=True)
-class Property:
-    """One column of an element."""
-
-    name: str
-    type: str
-    """numpy type code without byte order, such as f4."""
-    length_type: str | None = None
-    """Type of the length in front of each row's list; None for a single value."""
+_POSITION = ("x", "y", "z")
+_COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_GREY = 0.5
+_NUMBER = r"([+-]?[0-9]{1,12}(?:\.[0-9]{1,12})?(?:e[+-]?[0-9]{1,2})?)"
+_UP = re.compile(rf"up: {_NUMBER} {_NUMBER} {_NUMBER}")
+_METRES = re.compile(rf"metres_per_unit: {_NUMBER}")
 
 
 @dataclass(frozen=True)
@@ -51,21 +41,11 @@ class Element:
 
     name: str
     count: int
-    properties: tuple[Property, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Property names, in order."""
-        return tuple(p.name for p in self.properties)
-
-    @property
-    def has_lists(self) -> bool:
-        """Whether rows differ in length."""
-        return any(p.length_type for p in self.properties)
-
-    def dtype(self, order: str) -> np.dtype:
-        """The packed row."""
-        return np.dtype([(p.name, order + p.type) for p in self.properties])
+    """Number of rows."""
+    types: Mapping[str, str]
+    """numpy's type code without byte order, such as f4, by property, in order."""
+    has_lists: bool = False
+    """Whether rows differ in length; such an element is not read."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +58,8 @@ class PlyHeader:
     elements: tuple[Element, ...]
     data_start: int
     """Offset of the first byte after the header."""
-    comments: tuple[str, ...] = ()
-    """Texts of the comment lines, in order."""
+    metadata: SceneMetadata
+    """What comments of our own writer state."""
 
     def element(self, name: str) -> Element | None:
         """The element called `name`, or None."""
@@ -102,10 +82,22 @@ def read_header(path: Path) -> PlyHeader:
         raise ValueError(f"{path}: expected 'end_header' within the first {len(head)} bytes, found none")
     lines = head[: end.start()].decode("utf-8", "replace").splitlines()[1:]
     order, elements = _parse(path, lines)
-    comments = tuple(line[8:].strip() for line in lines if line.startswith("comment "))
-    header = PlyHeader(path=path, order=order, elements=elements, data_start=end.end(), comments=comments)
+    comments = [line[8:].strip() for line in lines if line.startswith("comment ")]
+    header = PlyHeader(path, order, elements, end.end(), _metadata(comments))
     _check_size(header)
     return header
+
+
+def _metadata(comments: list[str]) -> SceneMetadata:
+    up = metres = None
+    for comment in comments:
+        if found := _UP.fullmatch(comment):
+            x, y, z = map(float, found.groups())
+            length = (x * x + y * y + z * z) ** 0.5
+            up = (x / length, y / length, z / length) if length > 0 else None
+        elif found := _METRES.fullmatch(comment):
+            metres = float(found[1]) if float(found[1]) > 0 else None
+    return SceneMetadata(up, metres)
 
 
 def _parse(path: Path, lines: list[str]) -> tuple[str, tuple[Element, ...]]:
@@ -118,43 +110,29 @@ def _parse(path: Path, lines: list[str]) -> tuple[str, tuple[Element, ...]]:
             case ["format", name, "1.0"] if name in _FORMATS and order is None:
                 order = _FORMATS[name]
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,15}", count):
-                elements.append(Element(name=name, count=int(count), properties=()))
-            case ["property", kind, name] if kind in _TYPES and elements:
-                elements[-1] = _with_property(path, elements[-1], Property(name, _TYPES[kind]))
-            case ["property", "list", length, kind, name] if length in _TYPES and kind in _TYPES and elements:
-                added = Property(name, _TYPES[kind], _TYPES[length])
-                elements[-1] = _with_property(path, elements[-1], added)
+                elements.append(Element(name, int(count), {}))
+            case ["property", kind, name] if kind in _TYPES and elements and name not in elements[-1].types:
+                last = elements[-1]
+                elements[-1] = Element(last.name, last.count, {**last.types, name: _TYPES[kind]}, last.has_lists)
+            case ["property", "list", length, _, name] if length in _TYPES and elements:
+                last = elements[-1]
+                elements[-1] = Element(last.name, last.count, {**last.types, name: _TYPES[length]}, has_lists=True)
             case _:
                 raise ValueError(f"{path}: expected a PLY header line, found {line[:60]!r}")
     if order is None:
         raise ValueError(f"{path}: expected a 'format' line in the PLY header, found none")
-    names = [e.name for e in elements]
-    if len(set(names)) < len(names):
-        raise ValueError(f"{path}: expected PLY elements of different names, found {names[:20]}")
     return order, tuple(elements)
-
-
-def _with_property(path: Path, element: Element, added: Property) -> Element:
-    if added.name in element.names:
-        raise ValueError(f"{path}: expected each property of '{element.name}' once, found '{added.name}' twice")
-    if len(element.properties) >= 4096:
-        raise ValueError(f"{path}: expected at most 4096 properties of '{element.name}', found more")
-    return Element(element.name, element.count, (*element.properties, added))
 
 
 def _check_size(header: PlyHeader) -> None:
     """Each row of a list takes at least its length field; each ascii value a digit and a separator."""
-    available = header.path.stat().st_size - header.data_start
-    needed = 0
-    for element in header.elements:
-        if header.order == "":
-            row = 2 * len(element.properties)
-        else:
-            row = sum(np.dtype(p.length_type or p.type).itemsize for p in element.properties)
-        needed += element.count * row
-    open_ended = header.order == "" or any(e.has_lists for e in header.elements)
-    slack = 1 if header.order == "" else 0  # the last line may lack its line end
-    if available + slack < needed or (available > needed and not open_ended):
+    available, ascii_ = header.path.stat().st_size - header.data_start, header.order == ""
+    needed = sum(
+        e.count * sum(2 if ascii_ else np.dtype(kind).itemsize for kind in e.types.values()) for e in header.elements
+    )
+    open_ended = ascii_ or any(e.has_lists for e in header.elements)
+    # the last line may lack its line end
+    if available + ascii_ < needed or (available > needed and not open_ended):
         counts = ", ".join(f"{e.count} {e.name}" for e in header.elements)
         bound = "at least " if open_ended else ""
         raise ValueError(
@@ -162,89 +140,108 @@ def _check_size(header: PlyHeader) -> None:
         )
 
 
-def read_chunks(header: PlyHeader, element: Element) -> Iterator[tuple[int, np.ndarray]]:
-    """Row offset and a structured array, chunk by chunk, so that memory stays near what the caller keeps.
+def read_into(header: PlyHeader, element: Element, columns: Sequence[tuple[str, np.ndarray]]) -> None:
+    """Fill arrays, one per named property, a few rows at a time: memory stays near what the caller keeps.
 
-    Raises: ValueError where the element has list properties, or its data ends early or is no number.
+    Raises: ValueError where the element or one before it has list properties, or its data is no number.
     """
-    if element.has_lists:
-        lists = [p.name for p in element.properties if p.length_type]
-        raise ValueError(f"{header.path}: expected single values in element '{element.name}', found lists {lists}")
     before = header.elements[: header.elements.index(element)]
-    with header.path.open("rb") as stream:
-        stream.seek(header.data_start)
-        for other in before:
-            _skip(stream, header, other)
-        for start in range(0, element.count, _ROWS_PER_CHUNK):
-            count = min(_ROWS_PER_CHUNK, element.count - start)
-            read = _read_ascii if header.order == "" else _read_binary
-            yield start, read(stream, header, element, count)
+    if lists := [e.name for e in (*before, element) if e.has_lists]:
+        raise ValueError(f"{header.path}: expected single values before and in '{element.name}', found lists {lists}")
+    rows = (_ascii_rows if header.order == "" else _binary_rows)(header, element, before)
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is culled as such
+        for start in range(0, element.count, _ROWS_AT_ONCE):
+            part = rows[start : start + _ROWS_AT_ONCE]
+            for name, column in columns:
+                column[start : start + len(part)] = part[name]
 
 
 def read_columns(header: PlyHeader, element: Element, names: tuple[str, ...]) -> np.ndarray:
     """The properties `names` as float32, (count, len(names))."""
     out = np.empty((element.count, len(names)), np.float32)
-    for start, rows in read_chunks(header, element):
-        for column, name in enumerate(names):
-            with np.errstate(over="ignore"):  # a double beyond float32 is infinite, as its reader would find it
-                out[start : start + len(rows), column] = rows[name]
+    read_into(header, element, [(name, out[:, i]) for i, name in enumerate(names)])
     return out
 
 
-def _read_binary(stream: BinaryIO, header: PlyHeader, element: Element, count: int) -> np.ndarray:
-    dtype = element.dtype(header.order)
-    data = stream.read(count * dtype.itemsize)
-    if len(data) < count * dtype.itemsize:
-        raise ValueError(
-            f"{header.path}: expected {count * dtype.itemsize} more bytes of '{element.name}', found {len(data)}"
-        )
-    return np.frombuffer(data, dtype, count)
+def _binary_rows(header: PlyHeader, element: Element, before: Sequence[Element]) -> np.ndarray:
+    def row(e: Element) -> np.dtype:
+        return np.dtype([(name, header.order + kind) for name, kind in e.types.items()])
+
+    start = header.data_start + sum(e.count * row(e).itemsize for e in before)
+    if not element.count or not element.types:
+        return np.empty(0, row(element))
+    return np.memmap(header.path, row(element), "r", start, (element.count,))
 
 
-def _read_ascii(stream: BinaryIO, header: PlyHeader, element: Element, count: int) -> np.ndarray:
-    width = len(element.properties)
-    words = [word for _ in range(count) for word in stream.readline(_MAX_HEADER_BYTES).split()]
-    if len(words) != count * width:
-        raise ValueError(
-            f"{header.path}: expected {width} values in each line of '{element.name}', "
-            f"found {len(words)} in {count} lines"
-        )
+def _ascii_rows(header: PlyHeader, element: Element, before: Sequence[Element]) -> np.ndarray:
+    lines = header.path.read_bytes()[header.data_start :].splitlines()
+    start, width = sum(e.count for e in before), len(element.types)
+    words = b" ".join(lines[start : start + element.count]).split()
     try:
-        values = np.array(words, np.float64).reshape(count, width)
+        values = np.array(words, np.float64).reshape(element.count, width)
     except ValueError as error:
-        raise ValueError(f"{header.path}: expected numbers in element '{element.name}', found {error}") from None
-    return values.view([(name, "f8") for name in element.names])[:, 0]
-
-
-def _skip(stream: BinaryIO, header: PlyHeader, element: Element) -> None:
-    if header.order == "":
-        for _ in range(element.count):
-            if not stream.readline(_MAX_HEADER_BYTES):
-                break
-        return
-    if not element.has_lists:
-        stream.seek(element.count * element.dtype(header.order).itemsize, 1)
-        return
-    size = header.path.stat().st_size
-    for _ in range(element.count):
-        for prop in element.properties:
-            item = np.dtype(prop.type).itemsize
-            length = 1
-            if prop.length_type is not None:
-                kind = np.dtype(header.order + prop.length_type)
-                data = stream.read(kind.itemsize)
-                found = np.frombuffer(data, kind)[0] if len(data) == kind.itemsize else -1
-                length = int(found) if np.isfinite(found) else -1
-            if length < 0 or stream.tell() + length * item > size:
-                raise ValueError(f"{header.path}: expected whole lists in element '{element.name}', found a cut one")
-            stream.seek(length * item, 1)
+        raise ValueError(
+            f"{header.path}: expected {width} numbers in each line of '{element.name}', found {str(error)[:80]}"
+        ) from None
+    return np.ascontiguousarray(values).view([(name, "f8") for name in element.types])[:, 0]
 
 
 def write_header(
-    stream: BinaryIO, *elements: tuple[str, int, Sequence[tuple[str, str]]], comments: Sequence[str] = ()
+    stream: BinaryIO,
+    *elements: tuple[str, int, Sequence[tuple[str, str]]],
+    metadata: SceneMetadata = SceneMetadata(),
 ) -> None:
     """The header of a little-endian file of elements (name, number of rows, properties as (PLY type, name))."""
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if metadata.up is not None:
+        lines.append(f"comment up: {' '.join(f'{value:.6g}' for value in metadata.up)}")
+    if metadata.metres_per_unit is not None:
+        lines.append(f"comment metres_per_unit: {metadata.metres_per_unit:.9g}")
     for name, count, properties in elements:
         lines += [f"element {name} {count}", *(f"property {kind} {prop}" for kind, prop in properties)]
     stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
+
+
+def read_points(path: Path) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    """Read a coloured point cloud, or Gaussians as points with their mean colour.
+
+    Args:
+        path: A .ply.
+
+    Returns:
+        Positions, and sRGB in [0, 1]: mid grey where the file has no colours.
+
+    Raises:
+        ValueError: The file is no whole PLY with finite x, y, z.
+    """
+    header = read_header(path)
+    vertex = header.element("vertex")
+    if vertex is None or not set(_POSITION) <= set(vertex.types):
+        found = [e.name for e in header.elements] if vertex is None else ", ".join(vertex.types)[:80]
+        raise ValueError(f"{path}: expected an element 'vertex' with x, y, z, found {found}")
+    names = next((trio for trio in (*_COLOR_NAMES, _DC) if set(trio) <= set(vertex.types)), ())
+    table = torch.from_numpy(read_columns(header, vertex, (*_POSITION, *names)))
+    points, colors = table[:, :3].contiguous(), table[:, 3:].contiguous()
+    if not names:
+        colors = torch.full_like(points, _GREY)
+    elif names == _DC:
+        colors = spherical_harmonics.rgb_from_dc(colors).clamp(0, 1)
+    elif (kind := vertex.types[names[0]])[0] != "f":
+        colors = colors / np.iinfo(kind).max
+    if not bool(torch.isfinite(points).all()):
+        bad = int((~torch.isfinite(points).all(1)).sum())
+        raise ValueError(f"{path}: expected finite positions, found {bad} of {len(points)} points without")
+    if not bool(((colors >= 0) & (colors <= 1)).all()):
+        raise ValueError(f"{path}: expected colours as bytes, or as floats in [0, 1], found others")
+    return points, colors
+
+
+def write_points(path: Path, points: Float[Tensor, "m 3"], colors: Float[Tensor, "m 3"]) -> None:
+    """Write float32 positions and 8-bit colours, atomically."""
+    rows = np.empty(len(points), np.dtype([("position", "<f4", 3), ("color", "u1", 3)]))
+    rows["position"] = points.detach().cpu().numpy()
+    rows["color"] = (colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    with atomic_write(path) as stream:
+        properties = [("float", name) for name in _POSITION] + [("uchar", name) for name in _COLOR_NAMES[0]]
+        write_header(stream, ("vertex", len(rows), properties))
+        stream.write(rows.tobytes())

@@ -1,10 +1,25 @@
-"""The value `SceneFile`: a trained scene as a file holds it, and what was found or assumed of its conventions."""
+"""The values `SceneFile` and `SceneMetadata`: a trained scene as a file holds it, and what is known of its frame."""
 
 from dataclasses import dataclass
 
 from splatgraft.core.gaussians import Gaussians
 
 _WORDS = {"R": "right", "L": "left", "U": "up", "D": "down", "B": "back", "F": "front"}
+
+
+@dataclass(frozen=True)
+class SceneMetadata:
+    """Up direction and size of the world in which Gaussians are given, where they are known."""
+
+    up: tuple[float, float, float] | None = None
+    """Unit vector, in the frame of the Gaussians."""
+    metres_per_unit: float | None = None
+    """Above 0."""
+
+    @property
+    def known(self) -> dict[str, tuple[float, float, float] | float]:
+        """The fields that are known, by their names."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -20,7 +35,7 @@ class SceneFile:
     metres_per_unit: float | None = None
     """Size of a unit, where the file states it."""
     notes: tuple[str, ...] = ()
-    """For the user: conventions that differ from a .ply of the original code, and how they were found."""
+    """Sentences for the user: what is left out, and conventions that differ from a .ply of the original code."""
 
     def said(self) -> tuple[str, ...]:
         """Sentences for the user: number and degree, axes, and the notes."""

@@ -1,175 +1,316 @@
-"""Reads SOG scenes (PlayCanvas, versions 1 and 2): a picture per field, with one pixel per Gaussian.
+"""Reads and writes SOG scenes (PlayCanvas, version 2): lossless pictures with one pixel per Gaussian, and meta.json.
 
-Version 2 looks scales and colours up in code books of 256 values, version 1 spreads bytes between bounds. Bands above 0
-are rows of a palette that is a picture too. Positions are 16 bits of sign(x) log(1 + |x|). Axes are those of a .ply.
+A .sog is a zip of these files; a folder of them is read as well. Positions are 16 bits of sign(x) log(1 + |x|), scales
+and colours are looked up in code books of 256 values, and bands above 0 are rows of a palette that is a picture too.
+Axes are those of a .ply. Written Gaussians are sorted along a Morton curve, so that neighbours in the pictures are
+neighbours in space and compress well.
+
+Code books and palette are found by k-means (Lloyd 1982). A palette of thousands of entries is found in two levels, as a
+search over all entries for all Gaussians would take minutes: rows are first divided among coarse groups, then each
+group gets its share of the entries.
 """
 
+import io
+import json
 import math
+import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int64, UInt8
+from PIL import Image
+from torch import Tensor
 
-from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.formats.json_file import array, excerpt
-from splatgraft.formats.scenes.quantized import logits_from_bytes
-from splatgraft.formats.scenes.scene_file import SceneFile
-from splatgraft.formats.scenes.sog_container import open_sog, read_picture
+from splatgraft.core.k_means import k_means
+from splatgraft.formats.scenes.quantization import (
+    bytes_from_unit,
+    logits_from_bytes,
+    morton_order,
+    smallest_three,
+    writable,
+)
+from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
+from splatgraft.runtime.atomic_file import atomic_write
 
-_HALF_SQRT2 = 0.5**0.5
-_PALETTE_COLUMNS = 64
-"""Entries in a row of the palette."""
-_CODES = 256
-_LARGEST_TAG = 252
+_META_FILE = "meta.json"
+_OWN_KEY = "splatgraft"
+"""Where meta.json has the metadata of our own writer."""
+_SQRT2 = 2**0.5
+_FIRST_TAG = 252
 """Alpha of a quaternion whose largest component is w; x, y, z follow."""
+_PALETTE_COLUMNS = 64
+"""Entries in a row of the palette's picture."""
+_MIN_PALETTE, _MAX_PALETTE = 1 << 10, 1 << 16
+_GAUSSIANS_PER_ENTRY = 4
+"""Of the palette; by size and PSNR of the demo's scenes."""
+_MAX_PIXELS_PER_BYTE = 100
+"""Of a picture: random bytes have 0.3, a scene of few different Gaussians 50; smaller pictures may have more."""
+_FREE_PIXELS = 1 << 20
+_MAX_LOG_POSITION = 60.0
+_CODES = 256
+_SCALAR_ROUNDS = 100
+_COARSE_GROUPS = 256
+_COARSE_SAMPLE = 1 << 15
+"""Rows that the coarse groups are found from."""
+_ROUNDS = 5
+"""Of the coarse groups, and of the entries in each; more rounds changed the pictures of a demo by less than 0.1 dB."""
+_ROWS_AT_ONCE = 1 << 14
+_DATE = (1980, 1, 1, 0, 0, 0)
 
-Bytes = UInt8[np.ndarray, "n c"]
-Decode = Callable[[Bytes], Float[np.ndarray, "n c"]]
+
+def is_sog_folder(path: Path) -> bool:
+    """Whether `path` is a folder of SOG pictures, or its meta.json."""
+    meta = path / _META_FILE if path.is_dir() else path
+    if meta.name.lower() != _META_FILE or not meta.is_file():
+        return False
+    try:
+        content = json.loads(meta.read_bytes())
+    except (ValueError, RecursionError, OSError):
+        return False
+    return isinstance(content, dict) and {"means", "scales", "quats"} <= set(content)
 
 
-@dataclass(frozen=True)
-class _Sog:
-    """meta.json, its pictures, and the number of Gaussians."""
-
-    path: Path
-    meta: dict[str, Any]
-    load: Callable[[str], bytes]
-    count: int
-    version: int
-
-    def part(self, key: str) -> dict[str, Any]:
-        """A table of meta.json."""
-        part = self.meta.get(key)
-        if not isinstance(part, dict):
-            raise ValueError(f"{self.path}: expected a table '{key}' in meta.json, found {excerpt(part)}")
-        return part
-
-    def picture(self, key: str, index: int = 0) -> np.ndarray:
-        """A picture that a table names, (h, w, 4)."""
-        files = self.part(key).get("files")
-        if not isinstance(files, list) or len(files) <= index or not isinstance(files[index], str):
-            raise ValueError(f"{self.path}: expected {index + 1} or more files of '{key}', found {excerpt(files)}")
-        return read_picture(self.path, files[index], self.load(files[index]))
-
-    def bytes(self, key: str, index: int = 0) -> Bytes:
-        """The pixels of the Gaussians, in order."""
-        pixels = self.picture(key, index).reshape(-1, 4)
-        if len(pixels) < self.count:
-            raise ValueError(
-                f"{self.path}: expected a pixel for each of {self.count} Gaussians in the picture of '{key}', "
-                f"found {len(pixels)}"
-            )
-        return pixels[: self.count]
-
-    def numbers(self, key: str, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Finite numbers of a table."""
-        numbers = array(self.path, self.part(key), name, (shape,)).astype(np.float32)
-        if not np.isfinite(numbers).all():
-            raise ValueError(f"{self.path}: expected finite numbers for '{name}' of '{key}', found others")
-        return numbers
-
-    def decoder(self, key: str, channels: int) -> Decode:
-        """From bytes to values: a code book (version 2), or between bounds per channel, or for all (version 1)."""
-        if self.version == 2:
-            codes = self.numbers(key, "codebook", (_CODES,))
-            return lambda pixels: codes[pixels]
-        shape = () if key == "shN" else (channels,)
-        low, high = self.numbers(key, "mins", shape), self.numbers(key, "maxs", shape)
-        return lambda pixels: low + (high - low) * (pixels.astype(np.float32) / 255)
+def sog_files(path: Path) -> tuple[Path, ...]:
+    """All files of a folder with meta.json, or of that meta.json."""
+    folder = path if path.is_dir() else path.parent
+    return tuple(sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in (".json", ".webp", ".png")))
 
 
 def read_sog(path: Path) -> SceneFile:
     """The scene in a .sog, or in a folder with meta.json and pictures, or of that meta.json.
 
-    Raises: ValueError where a file is missing or damaged, or they do not fit each other.
+    Raises: ValueError where the version is another, or values do not fit each other.
     """
-    meta, load = open_sog(path)
-    version = meta.get("version", 1)
-    if version not in (1, 2) or isinstance(version, bool):
-        raise ValueError(f"{path}: expected SOG version 1 or 2, found {excerpt(version)}")
-    sog = _Sog(path, meta, load, _count(path, meta, version), version)
-    colors = sog.bytes("sh0")
-    if version == 2:
-        dc, logits = sog.decoder("sh0", 3)(colors[:, :3]), logits_from_bytes(torch.from_numpy(colors[:, 3].copy()))
-    else:
-        values = sog.decoder("sh0", 4)(colors)
-        dc, logits = values[:, :3], torch.from_numpy(values[:, 3].copy())
-    sh = np.concatenate([dc[:, None], _bands(sog)], 1) if "shN" in meta else dc[:, None]
+    load = _loader(path)
+    meta = json.loads(load(_META_FILE))
+    n = meta["count"]
+    if meta["version"] != 2 or not 0 <= n < 1 << 28:
+        raise ValueError(f"{path}: expected SOG version 2, found version {meta['version']} of {n} Gaussians")
+
+    def picture(key: str, index: int = 0) -> UInt8[np.ndarray, "h w 4"]:
+        name = meta[key]["files"][index]
+        return _read_picture(path, name, load(name))
+
+    def pixels(key: str, index: int = 0) -> UInt8[np.ndarray, "n 4"]:
+        found = picture(key, index).reshape(-1, 4)
+        if len(found) < n:
+            raise ValueError(f"{path}: expected pixels of {n} Gaussians in a picture of '{key}', found {len(found)}")
+        return found[:n]
+
+    def codes(key: str) -> Float[np.ndarray, "256"]:
+        return _finite(path, meta[key]["codebook"], (_CODES,))
+
+    low, high = (_finite(path, meta["means"][end], (3,)) for end in ("mins", "maxs"))
+    if max(np.abs(low).max(), np.abs(high).max()) > _MAX_LOG_POSITION:
+        raise ValueError(f"{path}: expected logarithms of positions up to {_MAX_LOG_POSITION:g}, found larger bounds")
+    fixed = pixels("means", 0)[:, :3].astype(np.float32) + 256 * pixels("means", 1)[:, :3].astype(np.float32)
+    logarithm = low + (high - low) * (fixed / 65535)
+    colors = pixels("sh0")
+    sh = codes("sh0")[colors[:, :3]][:, None]
+    if "shN" in meta:
+        entries = picture("shN")[:, :, :3]
+        k = entries.shape[1] // _PALETTE_COLUMNS
+        labels = pixels("shN", 1).astype(np.int64)
+        bands = codes("shN")[entries.reshape(-1, k, 3)]
+        sh = np.concatenate([sh, bands[labels[:, 0] + 256 * labels[:, 1]]], 1)
     gaussians = Gaussians(
-        means=torch.from_numpy(_means(sog)),
-        log_scales=torch.from_numpy(np.ascontiguousarray(sog.decoder("scales", 3)(sog.bytes("scales")[:, :3]))),
-        quaternions=torch.from_numpy(_quaternions(sog.bytes("quats"))),
-        opacity_logits=logits,
+        means=torch.from_numpy(np.copysign(np.expm1(np.abs(logarithm)), logarithm)),
+        log_scales=torch.from_numpy(np.ascontiguousarray(codes("scales")[pixels("scales")[:, :3]])),
+        quaternions=torch.from_numpy(_quaternions(pixels("quats"))),
+        opacity_logits=logits_from_bytes(torch.from_numpy(colors[:, 3].copy())),
         sh=torch.from_numpy(np.ascontiguousarray(sh)),
     )
-    up, metres = _own_metadata(meta)
-    return SceneFile(gaussians, up=up, metres_per_unit=metres)
+    own = meta.get(_OWN_KEY, {})
+    up = None
+    if "up" in own:
+        length = math.hypot(*own["up"])
+        up = (own["up"][0] / length, own["up"][1] / length, own["up"][2] / length)
+    return SceneFile(gaussians, up=up, metres_per_unit=own.get("metres_per_unit"))
 
 
-def _own_metadata(meta: dict[str, Any]) -> tuple[tuple[float, float, float] | None, float | None]:
-    """Up and metres per unit where our own writer stated them; other content is not ours."""
-    own = meta.get("splatgraft")
-    up, metres = (own.get("up"), own.get("metres_per_unit")) if isinstance(own, dict) else (None, None)
-    if isinstance(up, list) and len(up) == 3 and all(isinstance(value, int | float) for value in up):
-        length = math.hypot(*up)
-        up = (up[0] / length, up[1] / length, up[2] / length) if 0 < length < math.inf else None
-    else:
-        up = None
-    if not isinstance(metres, int | float) or isinstance(metres, bool) or not 0 < metres < math.inf:
-        return up, None
-    return up, float(metres)
+def _loader(path: Path) -> Callable[[str], bytes]:
+    """A function that gives the bytes of a file of the scene."""
+    if path.is_dir() or path.name.lower() == _META_FILE:
+        folder = path if path.is_dir() else path.parent
+        return lambda name: (folder / _plain(path, name)).read_bytes()
+
+    def load(name: str) -> bytes:
+        with zipfile.ZipFile(path) as archive:
+            return archive.read(name)
+
+    return load
 
 
-def _count(path: Path, meta: dict[str, Any], version: int) -> int:
-    means = meta.get("means")
-    shape = means.get("shape") if isinstance(means, dict) else None
-    count = meta.get("count") if version == 2 else (shape[0] if isinstance(shape, list) and shape else None)
-    if not isinstance(count, int) or isinstance(count, bool) or not 0 <= count < 1 << 28:
-        raise ValueError(f"{path}: expected the number of Gaussians in meta.json, found {excerpt(count)}")
-    return count
+def _plain(path: Path, name: str) -> str:
+    if Path(name).name != name or "\\" in name:
+        raise ValueError(f"{path}: expected plain file names in {_META_FILE}, found {name[:60]!r}")
+    return name
 
 
-def _means(sog: _Sog) -> Float[np.ndarray, "n 3"]:
-    low, high = sog.numbers("means", "mins", (3,)), sog.numbers("means", "maxs", (3,))
-    if max(np.abs(low).max(), np.abs(high).max()) > 60:
-        raise ValueError(f"{sog.path}: expected logarithms of positions up to 60, found larger bounds")
-    fixed = sog.bytes("means", 0)[:, :3].astype(np.float32) + 256 * sog.bytes("means", 1)[:, :3].astype(np.float32)
-    logarithm = low + (high - low) * (fixed / 65535)
-    return np.copysign(np.expm1(np.abs(logarithm)), logarithm)
+def _read_picture(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "h w 4"]:
+    with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
+        if image.width * image.height > max(_FREE_PIXELS, _MAX_PIXELS_PER_BYTE * len(data)):
+            found = f"{image.width} x {image.height} pixels in {len(data)} bytes"
+            raise ValueError(f"{path}: expected {name} to be as large as its bytes, found {found}")
+        return np.asarray(image.convert("RGBA"))
 
 
-def _quaternions(pixels: Bytes) -> Float[np.ndarray, "n 4"]:
+def _finite(path: Path, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    numbers = np.array(values, np.float64).astype(np.float32)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise ValueError(f"{path}: expected {shape[0]} finite numbers in {_META_FILE}, found others")
+    return numbers
+
+
+def _quaternions(pixels: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
     """Three components besides the largest, in order w, x, y, z; other tags stand for no rotation."""
-    three = (pixels[:, :3].astype(np.float32) / 255 * 2 - 1) * np.float32(_HALF_SQRT2)
-    largest = pixels[:, 3:].astype(np.int64) - _LARGEST_TAG
-    known = (largest >= 0) & (largest < 4)
-    three, largest = np.where(known, three, 0), np.where(known, largest, 0)
-    axes = np.arange(3) + (np.arange(3) >= largest)
+    three = (pixels[:, :3].astype(np.float32) / 255 * 2 - 1) * np.float32(0.5**0.5)
+    largest = pixels[:, 3:].astype(np.int64) - _FIRST_TAG
+    three, largest = np.where(largest >= 0, three, 0), np.maximum(largest, 0)
     out = np.zeros((len(pixels), 4), np.float32)
-    np.put_along_axis(out, axes, three, 1)
+    np.put_along_axis(out, np.arange(3) + (np.arange(3) >= largest), three, 1)
     np.put_along_axis(out, largest, np.sqrt(np.maximum(0, 1 - np.square(three).sum(1, keepdims=True))), 1)
     return out
 
 
-def _bands(sog: _Sog) -> Float[np.ndarray, "n k 3"]:
-    """Bands above 0: the palette's entry that each Gaussian names."""
-    labels = sog.bytes("shN", 1).astype(np.int64)
-    labels = labels[:, 0] + 256 * labels[:, 1]
-    palette = sog.picture("shN", 0)[:, :, :3]
-    height, width = palette.shape[:2]
-    degrees = {
-        _PALETTE_COLUMNS * (spherical_harmonics.coefficient_count(d) - 1): d
-        for d in range(1, spherical_harmonics.MAX_DEGREE + 1)
-    }
-    if width not in degrees or height > 65536 // _PALETTE_COLUMNS:
-        raise ValueError(f"{sog.path}: expected a palette 192, 512 or 960 pixels wide, found {width} x {height}")
-    k = width // _PALETTE_COLUMNS
-    entries = palette.reshape(height * _PALETTE_COLUMNS, k, 3)
-    if len(labels) and labels.max() >= len(entries):
-        raise ValueError(f"{sog.path}: expected labels below {len(entries)}, found {labels.max()}")
-    return sog.decoder("shN", 3)(entries.reshape(-1, 3)).reshape(-1, k, 3)[labels]
+def write_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
+    """Write positions in 16 bits of their logarithm, scales and colours by tables, bands by a palette.
+
+    Raises: ValueError where there are no Gaussians, or some are not finite.
+    """
+    with atomic_write(path) as stream:
+        stream.write(encode_sog(path, gaussians, metadata))
+
+
+def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> bytes:
+    """The bytes of a .sog; `path` is for messages.
+
+    Raises: ValueError where there are no Gaussians, or some are not finite.
+    """
+    g = writable(path, gaussians, ".sog")
+    g = g.select(morton_order(g.means))
+    meta: dict[str, Any] = {"version": 2, "asset": {"generator": "splatgraft"}, "count": g.count, "antialias": False}
+    pictures: dict[str, bytes] = {}
+
+    def add(key: str, files: dict[str, bytes], **about: Any) -> None:
+        meta[key] = about | {"files": list(files)}
+        pictures.update(files)
+
+    means = g.means.double().numpy()
+    logarithm = np.copysign(np.log1p(np.abs(means)), means)
+    low, high = logarithm.min(0), logarithm.max(0)
+    fixed = np.round((logarithm - low) / np.maximum(high - low, 1e-12) * 65535).astype(np.int64)
+    halves = {"means_l.webp": _picture(fixed & 255), "means_u.webp": _picture(fixed >> 8)}
+    add("means", halves, mins=low.tolist(), maxs=high.tolist())
+
+    scales = g.log_scales.numpy()
+    codes = scalar_codes(scales.ravel())
+    add("scales", {"scales.webp": _picture(nearest_codes(scales, codes))}, codebook=codes.tolist())
+
+    largest, three = smallest_three(g.quaternions)
+    three_bytes = bytes_from_unit(three * _SQRT2 / 2 + 0.5)
+    add("quats", {"quats.webp": _picture(three_bytes.numpy(), (largest + _FIRST_TAG).numpy())})
+
+    dc = g.sh[:, 0].numpy()
+    codes = scalar_codes(dc.ravel())
+    opacities = bytes_from_unit(g.opacities).numpy()
+    add("sh0", {"sh0.webp": _picture(nearest_codes(dc, codes), opacities)}, codebook=codes.tolist())
+
+    if g.sh_degree:
+        k = g.sh.shape[1] - 1
+        size = min(_MAX_PALETTE, max(_MIN_PALETTE, g.count // _GAUSSIANS_PER_ENTRY))
+        entries, labels = palette(g.sh[:, 1:].flatten(1), size)
+        values = entries.reshape(-1, k, 3).numpy()
+        codes = scalar_codes(values.ravel())
+        centroids = np.zeros((-(-len(values) // _PALETTE_COLUMNS) * _PALETTE_COLUMNS, k, 3), np.uint8)
+        centroids[: len(values)] = nearest_codes(values, codes)
+        files = {
+            "shN_centroids.webp": _picture(centroids.reshape(-1, 3), width=_PALETTE_COLUMNS * k),
+            "shN_labels.webp": _picture(np.stack([labels & 255, labels >> 8, np.zeros(len(labels))], 1)),
+        }
+        add("shN", files, count=len(values), bands=g.sh_degree, codebook=codes.tolist())
+    if metadata.known:
+        meta[_OWN_KEY] = metadata.known
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in {_META_FILE: json.dumps(meta, separators=(",", ":")).encode(), **pictures}.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), data)
+    return buffer.getvalue()
+
+
+def _picture(rgb: np.ndarray, alpha: np.ndarray | int = 255, *, width: int | None = None) -> bytes:
+    """Pixels (n 3) in rows as lossless WebP; about square, with sides of multiples of four, where no width is given."""
+    width = width or 4 * math.ceil(math.sqrt(len(rgb)) / 4)
+    height = -(-len(rgb) // width)
+    full = np.zeros((height * width, 4), np.uint8)
+    full[:, 3] = 255
+    full[: len(rgb), :3], full[: len(rgb), 3] = rgb, alpha
+    stream = io.BytesIO()
+    Image.fromarray(full.reshape(height, width, 4)).save(stream, "WEBP", lossless=True, exact=True, quality=80)
+    return stream.getvalue()
+
+
+def scalar_codes(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
+    """256 ascending numbers that represent `values` with a small squared error; the last one repeated where fewer do.
+
+    Starts from quantiles of the values, and moves each code to the mean of the values nearest to it.
+    """
+    ordered = np.sort(values.astype(np.float64))
+    distinct = np.unique(ordered)
+    if len(distinct) <= _CODES:
+        return np.pad(distinct, (0, _CODES - len(distinct)), mode="edge").astype(np.float32)
+    # half of the codes by quantiles, half evenly over the range, so that rare large values have codes from the start
+    quantiles = np.quantile(ordered, (np.arange(_CODES // 2) + 0.5) / (_CODES // 2))
+    codes = np.sort(np.concatenate([quantiles, np.linspace(ordered[0], ordered[-1], _CODES // 2)]))
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    for _ in range(_SCALAR_ROUNDS):
+        ends = np.concatenate([[0], np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2), [len(ordered)]])
+        counts = np.diff(ends)
+        codes = np.where(counts > 0, np.diff(sums[ends]) / np.maximum(counts, 1), codes)
+    return np.sort(codes).astype(np.float32)
+
+
+def nearest_codes(values: Float[np.ndarray, "*shape"], codes: Float[np.ndarray, "256"]) -> UInt8[np.ndarray, "*shape"]:
+    """Index of the code nearest to each value; codes ascend."""
+    return np.searchsorted((codes[1:] + codes[:-1]) / 2, values).astype(np.uint8)
+
+
+def palette(rows: Float[Tensor, "n f"], size: int) -> tuple[Float[Tensor, "p f"], Int64[Tensor, "n"]]:
+    """At most `size` rows that represent all, and which of them represents each row.
+
+    Args:
+        rows: Feature vectors.
+        size: Most entries; all rows themselves are entries where they are no more.
+    """
+    n = len(rows)
+    if n <= size:
+        return rows, torch.arange(n)
+    sample = rows[_spread(n, min(n, _COARSE_SAMPLE))]
+    coarse = k_means(sample, sample[_spread(len(sample), min(_COARSE_GROUPS, size))], rounds=_ROUNDS)
+    group = _nearest(rows, coarse)
+    members = [torch.nonzero(group == i)[:, 0] for i in range(int(group.max()) + 1)]
+    entries, labels, start = [], torch.empty(n, dtype=torch.int64), 0
+    for chosen in members:
+        if not len(chosen):
+            continue
+        own = rows[chosen]
+        # rounded down, and at least one: no more than `size` in all, as groups are no more than entries
+        share = max(1, int(len(chosen) / n * (size - len(members))))
+        means = k_means(own, own[_spread(len(own), share)], rounds=_ROUNDS)
+        entries.append(means)
+        labels[chosen] = start + _nearest(own, means)
+        start += len(means)
+    return torch.cat(entries), labels
+
+
+def _spread(n: int, count: int) -> Int64[Tensor, "count"]:
+    """`count` of n indices, evenly spaced."""
+    return (torch.arange(count) * n) // count
+
+
+def _nearest(rows: Float[Tensor, "n f"], means: Float[Tensor, "k f"]) -> Int64[Tensor, "n"]:
+    return torch.cat([torch.cdist(part, means).argmin(1) for part in rows.split(_ROWS_AT_ONCE)])

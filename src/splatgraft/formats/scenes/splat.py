@@ -11,13 +11,11 @@ import torch
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, writable
+from splatgraft.formats.scenes.quantization import SMALLEST_SCALE, bytes_from_unit, logits_from_bytes, writable
 from splatgraft.formats.scenes.scene_file import SceneFile
 from splatgraft.runtime.atomic_file import atomic_write
 
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)])
-_SMALLEST_SCALE = 1e-30
-"""World units; replaces a scale of exactly 0, since the logarithm is stored."""
 
 
 def read_splat(path: Path) -> SceneFile:
@@ -25,21 +23,19 @@ def read_splat(path: Path) -> SceneFile:
 
     Raises: ValueError where the file is no whole number of records, or they hold no positions and scales.
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a .splat file, found none")
     data = path.read_bytes()
     if not data or len(data) % _ROW.itemsize:
         raise ValueError(f"{path}: expected a multiple of {_ROW.itemsize} bytes above 0, found {len(data)}")
-    rows = np.frombuffer(data, _ROW)
-    positions, scales = rows["position"].astype(np.float32), rows["scale"].astype(np.float32)
-    if not (np.isfinite(positions).all() and np.isfinite(scales).all() and (scales >= 0).all()):
+    rows = {name: torch.from_numpy(np.frombuffer(data, _ROW)[name].copy()) for name in _ROW.names or ()}
+    scales = rows["scale"]
+    if not (rows["position"].isfinite().all() and scales.isfinite().all() and (scales >= 0).all()):
         raise ValueError(f"{path}: expected finite positions and scales of 0 or more, found others: is this a .splat?")
     gaussians = Gaussians(
-        means=torch.from_numpy(positions),
-        log_scales=torch.from_numpy(scales).clamp_min(_SMALLEST_SCALE).log(),
-        quaternions=(torch.from_numpy(rows["quaternion"].astype(np.float32)) - 128) / 128,
-        opacity_logits=logits_from_bytes(torch.from_numpy(rows["rgba"][:, 3].copy())),
-        sh=spherical_harmonics.dc_from_rgb(torch.from_numpy(rows["rgba"][:, :3].astype(np.float32)) / 255)[:, None],
+        means=rows["position"],
+        log_scales=scales.clamp_min(SMALLEST_SCALE).log(),
+        quaternions=(rows["quaternion"].float() - 128) / 128,
+        opacity_logits=logits_from_bytes(rows["rgba"][:, 3]),
+        sh=spherical_harmonics.dc_from_rgb(rows["rgba"][:, :3].float() / 255)[:, None],
     )
     return SceneFile(gaussians, notes=("the format has colours without view dependence",))
 

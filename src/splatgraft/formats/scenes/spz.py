@@ -1,25 +1,47 @@
-"""Reads .spz scenes (Niantic, versions 1 to 4) and writes version 3: quantised arrays, one per field.
+"""Reads .spz scenes (Niantic, versions 2 to 4) and writes them: quantised arrays, one per field.
 
-Stored axes are right-up-back unless the file says otherwise, ours and a .ply's are right-down-front.
+Layout of Niantic's load-spz.cc: a header, then the arrays; in one gzip stream (versions 2 and 3), or plain with a table
+of sizes and one zstd stream per array (version 4). Axes are right-up-back, ours and a .ply's are right-down-front.
 """
 
+import struct
+import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
-from splatgraft.formats.scenes.quantized import bytes_from_unit, logits_from_bytes, require_finite, smallest_three
+from splatgraft.formats.scenes.quantization import (
+    bytes_from_unit,
+    finite,
+    from_smallest_three,
+    logits_from_bytes,
+    smallest_three,
+)
 from splatgraft.formats.scenes.scene_file import SceneFile
-from splatgraft.formats.scenes.spz_container import PackedScene, pack, unpack
 from splatgraft.runtime.atomic_file import atomic_write
 
 SPZ_VERSIONS = (2, 3, 4)
-"""Those that are written; 1 is read as well."""
+AXES = "RUB"
+"""Right, up, back."""
+_MAGIC = 0x5053474E
+_HEADER = struct.Struct("<IIIBBBB")
+"""Magic number, version, Gaussians, SH degree, fractional bits of positions, flags; number of streams in version 4."""
+_TABLE_START = struct.Struct("<I12x")
+_TABLE_ENTRY = struct.Struct("<QQ")
+_ANTIALIASED = 1
+_GZIP = 31
+_ZSTD_LEVEL = 12
+"""As the format's own library."""
+_MAX_EXPANSION = 100
+"""Bytes of the arrays over compressed ones; files of trained scenes have about 2, a few repeated Gaussians 50."""
+_FREE_BYTES = 1 << 20
+"""Arrays below this size may expand further."""
 _COLOR_SCALE = 0.15
 _HALF_SQRT2 = 0.5**0.5
 
@@ -27,44 +49,72 @@ _HALF_SQRT2 = 0.5**0.5
 def read_spz(path: Path) -> SceneFile:
     """The scene in a .spz file.
 
-    Raises: ValueError where the file is cut, damaged, or of another version.
+    Raises: ValueError where the file is of another version, or shorter than its header claims.
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a .spz file, found none")
-    gaussians, axes, notes = decode_spz(path, path.read_bytes())
-    return SceneFile(change_axes(gaussians, rdf_from(axes)), axes, notes=notes)
-
-
-def decode_spz(path: Path, data: bytes) -> tuple[Gaussians, str, tuple[str, ...]]:
-    """The scene in the bytes of a .spz, in its own axes; their name; and what is said of it.
-
-    Raises: ValueError where the bytes are cut, damaged, or of another version.
-    """
-    packed = unpack(path, data)
-    notes = []
-    if packed.antialiased:
-        notes.append('trained with an anti-aliasing filter: set low_pass = "antialiased" in [render] and [consolidate]')
-    if packed.degree > spherical_harmonics.MAX_DEGREE:
-        notes.append(f"SH degree {packed.degree}: bands above {spherical_harmonics.MAX_DEGREE} are left out")
-    positions, alphas, colors, scales, rotations, bands = (torch.from_numpy(field.copy()) for field in packed.fields)
-    kept = spherical_harmonics.coefficient_count(min(packed.degree, spherical_harmonics.MAX_DEGREE)) - 1
-    bands = bands.reshape(len(bands), bands.shape[1] // 3, 3)[:, :kept]
+    data = path.read_bytes()
+    packed = data[:4] == struct.pack("<I", _MAGIC)
+    inflate = zlib.decompressobj(_GZIP)
+    head = data[: _HEADER.size] if packed else inflate.decompress(data, _HEADER.size)
+    magic, version, n, degree, bits, flags, streams = _HEADER.unpack(head)
+    if magic != _MAGIC or version not in ((4,) if packed else (2, 3)) or degree > 3 or bits > 24:
+        raise ValueError(
+            f"{path}: expected a .spz of version 2 to 4 with SH degree up to 3, "
+            f"found magic {magic:#x}, version {version}, degree {degree}, {bits} bits"
+        )
+    widths = (9, 1, 3, 3, 4 if version >= 3 else 3, 3 * ((degree + 1) ** 2 - 1))
+    sizes = [n * width for width in widths]
+    if sum(sizes) > max(_FREE_BYTES, _MAX_EXPANSION * len(data)):
+        raise ValueError(f"{path}: expected {n} Gaussians as the header says, found only {len(data)} compressed bytes")
+    if packed:
+        arrays = _zstd_arrays(path, data, streams, sizes)
+    else:
+        body = inflate.decompress(inflate.unconsumed_tail, sum(sizes) + _FREE_BYTES)  # extensions may follow
+        arrays = [body[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
+        if not inflate.eof:  # neither is its checksum compared
+            raise ValueError(f"{path}: expected {n} Gaussians in one gzip stream, found a cut one, or more")
+    fields = [np.frombuffer(array, np.uint8).reshape(n, width) for array, width in zip(arrays, widths, strict=True)]
+    positions, alphas, colors, scales, rotations, bands = (torch.from_numpy(field.copy()) for field in fields)
+    bands = (bands.reshape(n, widths[5] // 3, 3).float() - 128) / 128
     gaussians = Gaussians(
-        means=_half_floats(path, positions) if packed.version == 1 else _means(positions, packed.fractional_bits),
+        means=_means(positions, bits),
         log_scales=scales.float() / 16 - 10,
-        quaternions=_smallest_three(rotations) if packed.version >= 3 else _first_three(rotations),
+        quaternions=_four_bytes_unpacked(rotations) if version >= 3 else _three_bytes_unpacked(rotations),
         opacity_logits=logits_from_bytes(alphas[:, 0]),
-        sh=torch.cat([((colors.float() / 255 - 0.5) / _COLOR_SCALE)[:, None], (bands.float() - 128) / 128], 1),
+        sh=torch.cat([((colors.float() / 255 - 0.5) / _COLOR_SCALE)[:, None], bands], 1),
     )
-    return gaussians, packed.axes, tuple(notes)
+    filtered = 'trained with an anti-aliasing filter: set low_pass = "antialiased" in [render] and [consolidate]'
+    return SceneFile(change_axes(gaussians, rdf_from(AXES)), AXES, notes=(filtered,) if flags & _ANTIALIASED else ())
 
 
-def _half_floats(path: Path, positions: UInt8[Tensor, "n 6"]) -> Float[Tensor, "n 3"]:
-    """Version 1: three 16-bit floats."""
-    means = torch.from_numpy(positions.numpy().view("<f2").astype(np.float32))
-    if not bool(means.isfinite().all()):
-        raise ValueError(f"{path}: expected finite positions, found others")
-    return means
+def _zstd_arrays(path: Path, data: bytes, streams: int, sizes: list[int]) -> list[bytes]:
+    """Version 4: after the table, one zstd stream per array that is not empty."""
+    zstandard = _zstandard(path)
+    (table,) = _TABLE_START.unpack_from(data, _HEADER.size)
+    start, arrays = table + streams * _TABLE_ENTRY.size, []
+    for size in sizes:
+        if not size:
+            arrays.append(b"")
+            continue
+        length, _ = _TABLE_ENTRY.unpack_from(data, table)
+        stream = data[start : start + length]
+        if zstandard.frame_content_size(stream) not in (size, -1):
+            raise ValueError(f"{path}: expected a zstd stream of {size} bytes, found another size in its header")
+        arrays.append(zstandard.ZstdDecompressor(max_window_size=1 << 27).decompress(stream, max_output_size=size))
+        table, start = table + _TABLE_ENTRY.size, start + length
+    if start != len(data):
+        raise ValueError(f"{path}: expected the end of the file after its streams, found {len(data) - start} bytes")
+    return arrays
+
+
+def _zstandard(path: Path) -> Any:
+    try:
+        import zstandard
+    except ImportError:
+        raise ValueError(
+            f"{path}: expected the package zstandard for .spz version 4, found none; "
+            f"install it with: pip install 'splatgraft[spz]'"
+        ) from None
+    return zstandard
 
 
 def _means(positions: UInt8[Tensor, "n 9"], fractional_bits: int) -> Float[Tensor, "n 3"]:
@@ -74,23 +124,18 @@ def _means(positions: UInt8[Tensor, "n 9"], fractional_bits: int) -> Float[Tenso
     return torch.where(fixed >= 1 << 23, fixed - (1 << 24), fixed).float() / (1 << fractional_bits)
 
 
-def _first_three(rotations: UInt8[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+def _three_bytes_unpacked(rotations: UInt8[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
     """x, y, z of a unit quaternion with w >= 0."""
     xyz = rotations.float() / 127.5 - 1
     return torch.cat([(1 - xyz.square().sum(1, keepdim=True)).clamp_min(0).sqrt(), xyz], 1)
 
 
-def _smallest_three(rotations: UInt8[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+def _four_bytes_unpacked(rotations: UInt8[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
     """Index of the largest of x, y, z, w in two bits, then the others in order: sign and 9 bits each."""
     packed = torch.from_numpy(rotations.numpy().view("<u4")[:, 0].astype(np.int64))
-    largest = packed >> 30
-    shifts = torch.tensor([20, 10, 0])
-    three = packed[:, None] >> shifts & 0x3FF
+    three = packed[:, None] >> torch.tensor([20, 10, 0]) & 0x3FF
     values = (three & 0x1FF).float() / 0x1FF * _HALF_SQRT2 * torch.where(three >> 9 == 1, -1.0, 1.0)
-    axes = torch.arange(3) + (torch.arange(3) >= largest[:, None])
-    xyzw = torch.zeros(len(packed), 4).scatter_(1, axes, values)
-    xyzw = xyzw.scatter_(1, largest[:, None], (1 - values.square().sum(1, keepdim=True)).clamp_min(0).sqrt())
-    return xyzw[:, [3, 0, 1, 2]]
+    return from_smallest_three(packed >> 30, values)[:, [3, 0, 1, 2]]
 
 
 def write_spz(path: Path, gaussians: Gaussians, *, version: int = 4) -> None:
@@ -101,29 +146,40 @@ def write_spz(path: Path, gaussians: Gaussians, *, version: int = 4) -> None:
         gaussians: The scene.
         version: 4 (zstd streams), 3 (one gzip stream), or 2 (rotations in 3 bytes, for the oldest readers).
 
-    Raises: ValueError where a Gaussian is not finite or further out than 8 million units, or the version is another.
+    Raises:
+        ValueError: A Gaussian is not finite or further out than 8 million units, or the version is another.
     """
     if version not in SPZ_VERSIONS:
         raise ValueError(f"{path}: expected .spz version 2, 3 or 4 to write, found {version}")
-    require_finite(path, gaussians)
-    g = change_axes(gaussians.map(lambda tensor: tensor.detach().cpu().float()), rdf_from("RUB"))
+    g = change_axes(finite(path, gaussians), rdf_from(AXES))
     extent = float(g.means.abs().max()) if g.count else 1.0
     bits = max(b for b in range(-64, 24) if b < -60 or extent * 2.0**b <= 0x7FFFFF)
     if bits < 0:
         raise ValueError(f"{path}: expected positions within 8388607 units for a .spz file, found {extent:.4g}")
     fixed = (g.means.double() * 2.0**bits).round().to(torch.int64).numpy()
-    fields = (
-        np.stack([fixed & 0xFF, fixed >> 8 & 0xFF, fixed >> 16 & 0xFF], -1).astype(np.uint8).reshape(g.count, 9),
-        bytes_from_unit(g.opacities)[:, None].numpy(),
-        bytes_from_unit(g.sh[:, 0] * _COLOR_SCALE + 0.5).numpy(),
-        ((g.log_scales + 10) * 16).round().clamp(0, 255).to(torch.uint8).numpy(),
-        _three_bytes(g.quaternions) if version == 2 else _packed(g.quaternions),
-        (g.sh[:, 1:] * 128 + 128).round().clamp(0, 255).to(torch.uint8).flatten(1).numpy(),
-    )
-    packed = PackedScene(version, g.sh_degree, bits, antialiased=False, axes="RUB", fields=fields)
-    data = pack(path, packed)
+    arrays = [
+        field.tobytes()
+        for field in (
+            np.stack([fixed & 0xFF, fixed >> 8 & 0xFF, fixed >> 16 & 0xFF], -1).astype(np.uint8),
+            bytes_from_unit(g.opacities).numpy(),
+            bytes_from_unit(g.sh[:, 0] * _COLOR_SCALE + 0.5).numpy(),
+            ((g.log_scales + 10) * 16).round().clamp(0, 255).to(torch.uint8).numpy(),
+            _three_bytes(g.quaternions) if version == 2 else _four_bytes(g.quaternions),
+            (g.sh[:, 1:] * 128 + 128).round().clamp(0, 255).to(torch.uint8).numpy(),
+        )
+    ]
+    head = (_MAGIC, version, g.count, g.sh_degree, bits, 0)
+    if version == 4:
+        compressor = _zstandard(path).ZstdCompressor(level=_ZSTD_LEVEL, write_content_size=True)
+        streams = [(compressor.compress(array), len(array)) for array in arrays if array]
+        table_start = _HEADER.size + _TABLE_START.size
+        table = b"".join(_TABLE_ENTRY.pack(len(stream), size) for stream, size in streams)
+        parts = [_HEADER.pack(*head, len(streams)), _TABLE_START.pack(table_start), table, *(s for s, _ in streams)]
+    else:
+        deflate = zlib.compressobj(9, zlib.DEFLATED, _GZIP)
+        parts = [deflate.compress(part) for part in (_HEADER.pack(*head, 0), *arrays)] + [deflate.flush()]
     with atomic_write(path) as stream:
-        stream.write(data)
+        stream.write(b"".join(parts))
 
 
 def _three_bytes(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
@@ -133,9 +189,8 @@ def _three_bytes(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
     return ((xyz + 1) * 127.5).round().clamp(0, 255).to(torch.uint8).numpy()
 
 
-def _packed(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
+def _four_bytes(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
     largest, three = smallest_three(quaternions[:, [1, 2, 3, 0]])
     magnitude = (three.abs() / _HALF_SQRT2 * 0x1FF).round().clamp(0, 0x1FF).to(torch.int64)
     fields = magnitude | (three < 0).to(torch.int64) << 9
-    packed = largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
-    return packed.numpy().astype("<u4")[:, None].view(np.uint8)
+    return (largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]).numpy().astype("<u4")

@@ -1,4 +1,4 @@
-"""Conversion between bytes and raw Gaussian fields, shared by the compressed scene formats."""
+"""Conversion between bytes and raw Gaussian fields, and the order of Gaussians, for the compressed scene formats."""
 
 from pathlib import Path
 
@@ -8,16 +8,14 @@ from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
 
+SMALLEST_SCALE = 1e-30
+"""World units; replaces a linear scale of exactly 0, since its logarithm is stored."""
+_MORTON_BITS = 10
+
 
 def logits_from_bytes(alphas: UInt8[Tensor, "n"]) -> Float[Tensor, "n"]:
     """Opacity logits; 0 and 255 become a quarter step inside (0, 1), so that they stay finite and round back."""
     return (alphas.float().clamp(0.25, 254.75) / 255).logit()
-
-
-def logits_from_unit(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Opacity logits of linear opacities; 0 and 1 become finite, by a quarter step of 16 bits."""
-    step = 0.25 / 65535
-    return opacities.clamp(step, 1 - step).logit()
 
 
 def bytes_from_unit(values: Float[Tensor, "*n"]) -> UInt8[Tensor, "*n"]:
@@ -30,8 +28,18 @@ def smallest_three(quaternions: Float[Tensor, "n 4"]) -> tuple[Int64[Tensor, "n"
     unit = torch.nn.functional.normalize(quaternions, dim=1)
     largest = unit.abs().argmax(1, keepdim=True)
     unit = torch.where(unit.gather(1, largest) < 0, -unit, unit)
-    axes = torch.arange(3) + (torch.arange(3) >= largest)
-    return largest[:, 0], unit.gather(1, axes)
+    return largest[:, 0], unit.gather(1, _others(largest))
+
+
+def from_smallest_three(largest: Int64[Tensor, "n"], three: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Quaternions from the index of their largest component and the other three; the inverse of `smallest_three`."""
+    largest = largest[:, None]
+    out = torch.zeros(len(three), 4).scatter_(1, _others(largest), three)
+    return out.scatter_(1, largest, (1 - three.square().sum(1, keepdim=True)).clamp_min(0).sqrt())
+
+
+def _others(largest: Int64[Tensor, "n 1"]) -> Int64[Tensor, "n 3"]:
+    return torch.arange(3) + (torch.arange(3) >= largest)
 
 
 def writable(path: Path, gaussians: Gaussians, kind: str) -> Gaussians:
@@ -46,12 +54,11 @@ def writable(path: Path, gaussians: Gaussians, kind: str) -> Gaussians:
     """
     if gaussians.count == 0:
         raise ValueError(f"{path}: expected at least one Gaussian for a {kind} file, found none")
-    require_finite(path, gaussians)
-    return gaussians.map(lambda tensor: tensor.detach().cpu().float())
+    return finite(path, gaussians)
 
 
-def require_finite(path: Path, gaussians: Gaussians) -> None:
-    """Check that all fields are finite, as quantised formats store neither nan nor infinity.
+def finite(path: Path, gaussians: Gaussians) -> Gaussians:
+    """The Gaussians in float32 on the CPU, as quantised formats store neither nan nor infinity.
 
     Raises: ValueError where a field of any Gaussian is not finite.
     """
@@ -62,3 +69,18 @@ def require_finite(path: Path, gaussians: Gaussians) -> None:
             f"{path}: expected finite Gaussians in a {path.suffix} file, "
             f"found {int(bad.sum())} of {gaussians.count} that are not (only .ply keeps them)"
         )
+    return gaussians.map(lambda tensor: tensor.detach().cpu().float())
+
+
+def morton_order(points: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
+    """Indices of `points` along a Morton curve, in which neighbours in a file are neighbours in space.
+
+    The curve goes through 1024 cells per axis whose bounds are quantiles, as scenes have a few points far away.
+    """
+    ranks = points.argsort(dim=0, stable=True).argsort(dim=0)
+    cells = ranks * (1 << _MORTON_BITS) // max(1, len(points))
+    code = torch.zeros(len(points), dtype=torch.int64)
+    for bit in range(_MORTON_BITS):
+        for axis in range(3):
+            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return code.argsort(stable=True)

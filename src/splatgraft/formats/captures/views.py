@@ -1,7 +1,10 @@
-"""From view records to `Cameras` and `PosedImages`: image sizes checked against the files, distortion, masks."""
+"""The value `ViewRecord`, one photograph with its camera as a capture file describes it, and captures made of these.
+
+Image sizes are checked against the files, distortion is separated from pinhole cameras, and masks are found.
+"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +16,70 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import same_shape, stored_size
 from splatgraft.core.posed_images import LeftOut, PosedImages
-from splatgraft.formats.captures.masks import with_masks
-from splatgraft.formats.captures.view_record import MAX_SIDE, ViewRecord
+from splatgraft.formats.captures.masks import check_mask, masks_of
 
-LEAST_SHARE = 0.5
+MIN_SHARE = 0.5
 """Of the images that a capture names and of its masks; with fewer, the folder is not the one that was meant."""
+
+_RIGID_TOLERANCE = 1e-3
+"""Largest entry of R^T R - I; allows matrices printed with four digits."""
+
+MAX_SIDE = 32766
+"""Longest image side, pixels: OpenCV cannot undistort longer ones."""
+
+
+@dataclass(frozen=True)
+class ViewRecord:
+    """One photograph with its camera, as a capture file describes it."""
+
+    name: str
+    """Path of the image as the capture writes it."""
+    image_path: Path | None
+    """The image file; None where it does not exist."""
+    world_from_camera: np.ndarray
+    """(4, 4), rigid, OpenCV axes."""
+    focal: tuple[float, float]
+    """fx, fy, pixels of `size`."""
+    center: tuple[float, float]
+    """cx, cy, pixels of `size`, pixel centres at +0.5."""
+    size: tuple[int, int]
+    """Width, height."""
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 as in OpenCV."""
+    mask_path: Path | None = None
+
+
+def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
+    """The pose (4, 4) with its rotation made orthonormal in float64.
+
+    Raises: ValueError that starts with `where`, for a matrix that is not a rotation and a translation.
+    """
+    rotation = matrix[:3, :3]
+    if not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e30:
+        raise ValueError(f"{where}: expected a pose of finite numbers, found nan, infinity or more than 1e30")
+    if not np.array_equal(matrix[3], (0, 0, 0, 1)):
+        raise ValueError(f"{where}: expected a pose with the last row 0 0 0 1, found {matrix[3].tolist()}")
+    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if error > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+        scales = ", ".join(f"{s:.4g}" for s in np.linalg.norm(rotation, axis=0))
+        raise ValueError(
+            f"{where}: expected a rotation and a translation, "
+            f"found axes of length {scales} and determinant {np.linalg.det(rotation):.4g}"
+        )
+    if error < 1e-6:
+        return matrix
+    out = matrix.copy()
+    u, _, vt = np.linalg.svd(rotation)
+    out[:3, :3] = u @ vt
+    return out
+
+
+def existing_file(path: Path) -> Path | None:
+    """`path` where it is a file, otherwise None, also for invalid file names."""
+    try:
+        return path if path.is_file() else None
+    except (OSError, ValueError):
+        return None
 
 
 def posed_images_of(
@@ -44,7 +106,7 @@ def posed_images_of(
     left_out = [view for view in checked if isinstance(view, LeftOut)]
     kept = [view for view in checked if isinstance(view, ViewRecord)]
     _require_share(len(kept), left_out, "images", source)
-    fitted, without_mask = with_masks(kept, folder)
+    fitted, without_mask = _with_masks(kept, folder)
     _require_share(sum(view.mask_path is not None for view in fitted), without_mask, "masks", source)
     cameras, distortions = cameras_of(fitted, source)
     return PosedImages(
@@ -66,15 +128,35 @@ def view_or_reason(name: str, read: Callable[[], ViewRecord]) -> ViewRecord | Le
         return LeftOut(name, str(error))
 
 
+def _with_masks(views: list[ViewRecord], folder: Path) -> tuple[list[ViewRecord], list[LeftOut]]:
+    """The views with their masks; a mask that is missing, unreadable or of another shape is left out, with the reason.
+
+    A mask that a view already has stays.
+    """
+    if not any(view.mask_path for view in views):
+        masks = masks_of({view.image_path: view.name for view in views if view.image_path is not None}, [folder])
+        views = [replace(view, mask_path=masks.get(view.image_path) if view.image_path else None) for view in views]
+    left_out: list[LeftOut] = []
+    for index, view in enumerate(views):
+        if view.mask_path is None or view.mask_path == view.image_path:
+            continue
+        try:
+            check_mask(view.mask_path, view.size)
+        except ValueError as error:
+            left_out.append(LeftOut(view.name, str(error), mask_only=True))
+            views[index] = replace(view, mask_path=None)
+    return views, left_out
+
+
 def _require_share(kept: int, left_out: Sequence[LeftOut], what: str, source: Path) -> None:
-    """Raises: ValueError with the first reason, where less than `LEAST_SHARE` is left."""
+    """Raises: ValueError with the first reason, where less than `MIN_SHARE` is left."""
     total = kept + len(left_out)
-    if not left_out or kept >= LEAST_SHARE * total:
+    if not left_out or kept >= MIN_SHARE * total:
         return
     if len(left_out) == total:
         raise ValueError(left_out[0].reason)
     raise ValueError(
-        f"{source}: expected at least {LEAST_SHARE:.0%} of {total} {what} to be usable, found {kept}; "
+        f"{source}: expected at least {MIN_SHARE:.0%} of {total} {what} to be usable, found {kept}; "
         f"the first of the others: {left_out[0].reason}"
     )
 
@@ -138,33 +220,21 @@ def cameras_of(views: Sequence[ViewRecord], source: Path) -> tuple[Cameras, tupl
 
 def _pinhole(view: ViewRecord, source: Path) -> tuple[np.ndarray, Distortion | None]:
     """Intrinsics of the undistorted view, and its distortion."""
-    distortion = _distortion(view, source)
-    if distortion is None:
-        return _matrix(view), None
-    try:
-        return distortion.pinhole(), distortion
-    except ValueError as error:
-        raise ValueError(f"{source}: {view.name}: {error}") from None
-
-
-def _matrix(view: ViewRecord) -> np.ndarray:
-    return np.array([[view.focal[0], 0, view.center[0]], [0, view.focal[1], view.center[1]], [0, 0, 1]])
-
-
-def _distortion(view: ViewRecord, source: Path) -> Distortion | None:
     numbers = np.array([*view.focal, *view.center, *view.distortion])
     if not np.isfinite(numbers).all() or min(view.focal) <= 0 or np.abs(numbers).max() > 1e7:
         raise ValueError(
             f"{source}: {view.name}: expected finite intrinsics with a focal length above 0, "
             f"found {', '.join(f'{number:.4g}' for number in numbers)}"
         )
+    matrix = np.array([[view.focal[0], 0, view.center[0]], [0, view.focal[1], view.center[1]], [0, 0, 1]])
     if not any(view.distortion):
-        return None
-    return Distortion(
-        intrinsics=torch.tensor(_matrix(view)),
-        coefficients=torch.tensor(view.distortion, dtype=torch.float64),
-        size=view.size,
-    )
+        return matrix, None
+    coefficients = torch.tensor(view.distortion, dtype=torch.float64)
+    distortion = Distortion(torch.tensor(matrix), coefficients, view.size)
+    try:
+        return distortion.pinhole(), distortion
+    except ValueError as error:
+        raise ValueError(f"{source}: {view.name}: {error}") from None
 
 
 def _unique_names(views: Sequence[ViewRecord], source: Path) -> tuple[str, ...]:
