@@ -113,7 +113,7 @@ def _write_report(asked: argparse.Namespace, exam: Exam, results: list[SceneResu
         "commit": _commit(),
         "number": asked.number,
         "iterations": exam.options.all_iterations,
-        "budget": exam.options.most_gaussians,
+        "budget": exam.options.max_gaussians,
         "failures": failures,
     }
     text = f"# {_title(asked)}\n\n{_conditions(asked, head)}\n\n{summary_markdown(results)}"

@@ -4,10 +4,9 @@ import torch
 
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.fitting import FitState, Step
 from splatgraft.fitting.adam import no_moments
-from splatgraft.fitting.view_colors import ViewColors
 from splatgraft.reconstruction.density import DensityControl, split
+from splatgraft.reconstruction.fit import FitState, Step, ViewColors
 from splatgraft.rendering import RenderOptions
 
 
@@ -49,7 +48,7 @@ def split_parents(error_every: int) -> list[float]:
     residual[:, 30:] = -0.2
     gradients = {"means": torch.tensor([[1.1, 0, 0], [1, 0, 0], [1, 0, 0]])}
     seen = torch.ones(3, dtype=torch.bool)
-    step = Step(camera, seen, gradients, 0.0, residual, RenderOptions())
+    step = Step(camera, seen, gradients, residual, RenderOptions())
     state = FitState(
         10, gaussians, no_moments({"means": gaussians.means}, 3), ViewColors.identity(1, torch.device("cpu"))
     )

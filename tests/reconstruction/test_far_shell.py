@@ -3,7 +3,7 @@
 import torch
 
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.reconstruction.far_shell import ShellOptions, shell_points, shell_radius, shows_surroundings
+from splatgraft.reconstruction.far_shell import MIN_RADIUS, shell_points, shell_radius, shows_surroundings
 
 FOCUS = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64)
 RED, BLUE = torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.2, 0.8])
@@ -55,17 +55,16 @@ def test_the_shell_goes_on_beyond_the_pictures_in_the_nearest_colours():
 
 
 def test_the_shell_lies_behind_the_known_points_but_for_a_few_wrong_ones():
-    options = ShellOptions()
     points = 20 * torch.nn.functional.normalize(torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     far = torch.cat([points, torch.full((5, 3), 1e4)])
-    assert 20 < shell_radius(far, torch.zeros(3, dtype=torch.float64), 1.0, options) < 40
-    assert shell_radius(points[:0], torch.zeros(3, dtype=torch.float64), 2.0, options) == 2 * options.nearest
+    assert 20 < shell_radius(far, torch.zeros(3, dtype=torch.float64), 1.0) < 40
+    assert shell_radius(points[:0], torch.zeros(3, dtype=torch.float64), 2.0) == 2 * MIN_RADIUS
 
 
 def test_an_object_alone_before_the_background_colour_has_no_surroundings():
     _, images = outward()
-    assert shows_surroundings(images, (0.0, 0.0, 0.0), ShellOptions())
+    assert shows_surroundings(images, (0.0, 0.0, 0.0))
     alone = torch.zeros(30, 40, 3)
     alone[10:20, 10:20] = RED
-    assert not shows_surroundings([alone] * 3, (0.0, 0.0, 0.0), ShellOptions())
-    assert shows_surroundings([alone] * 3, (1.0, 1.0, 1.0), ShellOptions())
+    assert not shows_surroundings([alone] * 3, (0.0, 0.0, 0.0))
+    assert shows_surroundings([alone] * 3, (1.0, 1.0, 1.0))

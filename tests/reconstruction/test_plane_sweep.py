@@ -3,9 +3,8 @@
 import torch
 
 from splatgraft.core import cameras as camera_values
-from splatgraft.reconstruction.plane_sweep import SweepOptions, sweep
+from splatgraft.reconstruction.plane_sweep import NEAR, sweep
 
-OPTIONS = SweepOptions()
 DISTANCE = 4.0
 
 
@@ -34,7 +33,7 @@ def views_of_a_floor() -> tuple[list, list]:
 
 def test_points_lie_on_the_surface_that_the_views_show():
     cameras, images = views_of_a_floor()
-    found = sweep(cameras, images, known=torch.zeros(0, 3), reach=DISTANCE, options=OPTIONS)
+    found = sweep(cameras, images, known=torch.zeros(0, 3), reach=DISTANCE)
     assert len(found) > 500
     # 32 depths evenly spaced in inverse depth from 8 to 0.4 times the distance: the step at the floor is
     # d^2 (1 / 0.4 - 1 / 8) / (31 d) = 0.077 d = 0.31, and the nearest hypothesis half of it off; of ties the farther
@@ -49,21 +48,21 @@ def test_rays_with_a_known_point_are_left_alone():
     axis = torch.linspace(-8, 8, 200)
     floor = torch.cat([torch.cartesian_prod(axis, axis), torch.zeros(40_000, 1)], 1)
     # the floor's points are 0.08 apart, a cell of 6 pixels is 0.3 wide there
-    assert len(sweep(cameras, images, known=floor, reach=DISTANCE, options=OPTIONS)) == 0
+    assert len(sweep(cameras, images, known=floor, reach=DISTANCE)) == 0
 
 
 def test_no_point_is_put_in_front_of_a_camera():
     cameras, _ = views_of_a_floor()
     flat = [torch.full((64, 96, 3), 0.4) for _ in cameras]
-    found = sweep(cameras, flat, known=torch.zeros(0, 3), reach=DISTANCE, options=OPTIONS)
+    found = sweep(cameras, flat, known=torch.zeros(0, 3), reach=DISTANCE)
     centers = torch.cat([camera.centers for camera in cameras])
     if len(found):
-        assert torch.cdist(found.points, centers).min() > OPTIONS.near * DISTANCE
+        assert torch.cdist(found.points, centers).min() > NEAR * DISTANCE
         # nothing tells the depths of a blank wall apart: the farthest in view is taken
         assert (found.points - centers.mean(0)).norm(dim=1).median() > 2 * DISTANCE
 
 
 def test_views_from_one_place_give_no_points():
     cameras, images = views_of_a_floor()
-    found = sweep(cameras[:1] * 5, images[:1] * 5, known=torch.zeros(0, 3), reach=DISTANCE, options=OPTIONS)
+    found = sweep(cameras[:1] * 5, images[:1] * 5, known=torch.zeros(0, 3), reach=DISTANCE)
     assert len(found) == 0

@@ -7,8 +7,7 @@ sum over the pixels of its blending weight times the absolute error there (the e
 Densification in Gaussian Splatting). A split is along the longest axis (Deng et al. 2025).
 
 Chosen by measurement: on a room of 36 views at 352x248, 25k Gaussians and 1000 steps, this reached 27.9 dB held out in
-20 CPU-seconds, relocation and noise as in 3DGS-MCMC (Kheradmand et al. 2024; without its two penalties) 27.7 in 22;
-`mcmc.py` has the whole method.
+20 CPU-seconds, relocation and noise as in 3DGS-MCMC (Kheradmand et al. 2024) 27.7 in 22.
 """
 
 import math
@@ -19,31 +18,23 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.fitting import FitState, Step
+from splatgraft.reconstruction.fit import FitState, Step
 from splatgraft.rendering import view_operator
 
-
-@dataclass(frozen=True)
-class SplitOptions:
-    """How a Gaussian is split, and when one is removed or limited; set by hand where no source is named."""
-
-    dead_opacity: float = 0.005
-    """Opacity below which a Gaussian is removed (3DGS, Sec. 5)."""
-    shift: float = 0.5
-    """Distance of the children from the parent's centre, in the parent's longest standard deviation."""
-    short_scale: float = 0.85
-    """Width of a child across the split axis, over the parent's."""
-    opacity: float = 0.6
-    """Opacity of a child over the parent's."""
-    least_opacity: float = 1.2
-    """Least opacity of a child, over `dead_opacity`."""
-    largest: float = 0.5
-    """Bound on the standard deviation, over the distance to the nearest camera."""
-
-    @property
-    def long_scale(self) -> float:
-        """Width of a child along the split axis, over the parent's; keeps the variance: shift^2 + long_scale^2 = 1."""
-        return math.sqrt(1 - self.shift**2)
+# set by hand where no source is named
+_DEAD_OPACITY = 0.005
+"""Opacity below which a Gaussian is removed (3DGS, Sec. 5)."""
+_SHIFT = 0.5
+"""Distance of the children from the parent's centre, in the parent's longest standard deviation."""
+_LONG_SCALE = math.sqrt(1 - _SHIFT**2)
+"""Width of a child along the split axis, over the parent's; keeps the variance: shift^2 + long_scale^2 = 1."""
+_SHORT_SCALE = 0.85
+"""Width of a child across the split axis, over the parent's."""
+_CHILD_OPACITY = 0.6
+"""Opacity of a child over the parent's."""
+_MIN_CHILD_OPACITY = 1.2 * _DEAD_OPACITY
+_MAX_SCALE = 0.5
+"""Bound on the standard deviation, over the distance to the nearest camera."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +53,6 @@ class DensityControl:
     """Step after which nothing is added or removed."""
     camera_centers: Float[Tensor, "v 3"]
     """World units; their distance bounds the scale of a Gaussian."""
-    split: SplitOptions = SplitOptions()
-    """How Gaussians are split, removed and limited."""
     error_every: int = 0
     """Steps between two measurements of the error that each Gaussian covers; 0 measures none: the score is the gradient
     alone."""
@@ -99,14 +88,14 @@ class DensityControl:
         return memory
 
     def _densify(self, state: FitState, score: Float[Tensor, "n"], seen: Bool[Tensor, "n"]) -> FitState:
-        alive = state.gaussians.opacities > self.split.dead_opacity
+        alive = state.gaussians.opacities > _DEAD_OPACITY
         parents_wanted = min(max(self.allowed(state.iteration) - int(alive.sum()), 0), int((alive & seen).sum()))
         parents = torch.where(alive & seen, score, -1.0).topk(parents_wanted).indices.sort().values
         stays = alive.clone()
         stays[parents] = False
         kept = torch.nonzero(stays).flatten()
         out = state.select(torch.cat([kept, parents, parents]))
-        children = split(state.gaussians.select(parents), self.split)
+        children = split(state.gaussians.select(parents))
         fresh = torch.arange(len(kept), out.gaussians.count, device=kept.device)
         return replace(
             out,
@@ -120,21 +109,19 @@ class DensityControl:
         nearest = torch.full_like(means[:, 0], torch.inf)
         for center in self.camera_centers:
             nearest = torch.minimum(nearest, (means - center).norm(dim=1))
-        bound = (self.split.largest * nearest).clamp_min(1e-6).log()[:, None]
+        bound = (_MAX_SCALE * nearest).clamp_min(1e-6).log()[:, None]
         log_scales = torch.minimum(state.gaussians.log_scales, bound)
         return replace(state, gaussians=replace(state.gaussians, log_scales=log_scales))
 
 
-def split(parents: Gaussians, options: SplitOptions = SplitOptions()) -> Gaussians:
+def split(parents: Gaussians) -> Gaussians:
     """Two children of each parent, side by side along its longest axis: first one of each, then the other."""
-    n = parents.count
-    rows = torch.arange(n, device=parents.device)
+    rows = torch.arange(parents.count, device=parents.device)
     axis = parents.log_scales.argmax(1)
-    shift = options.shift * parents.scales[rows, axis, None] * parents.rotations[rows, :, axis]
-    log_scales = parents.log_scales + math.log(options.short_scale)
-    log_scales[rows, axis] = parents.log_scales[rows, axis] + math.log(options.long_scale)
-    least = options.least_opacity * options.dead_opacity
-    opacity = (options.opacity * parents.opacities).clamp_min(least)
+    shift = _SHIFT * parents.scales[rows, axis, None] * parents.rotations[rows, :, axis]
+    log_scales = parents.log_scales + math.log(_SHORT_SCALE)
+    log_scales[rows, axis] = parents.log_scales[rows, axis] + math.log(_LONG_SCALE)
+    opacity = (_CHILD_OPACITY * parents.opacities).clamp_min(_MIN_CHILD_OPACITY)
     child = replace(parents, log_scales=log_scales, opacity_logits=opacity.logit())
     return concatenate([replace(child, means=parents.means + side * shift) for side in (1.0, -1.0)])
 

@@ -7,7 +7,6 @@ sphere of Gaussians around a scene as its sky.)
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,58 +16,43 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.reconstruction.initialization import SeedPoints
 
-_FEWEST = 64
+# set by hand
+_QUANTILE = 0.99
+"""Quantile of the known points' distances from where the cameras look; wrong points lie beyond."""
+_BEYOND = 1.5
+"""Radius of the shell over that distance."""
+MIN_RADIUS = 6.0
+"""Smallest radius, over the cameras' distance from where they look."""
+_MIN_DIRECTIONS = 64
 """Directions by which the seen share of the sphere is found."""
 _NEIGHBOURS = 8
 """Seen points whose mean colour continues beyond them."""
+_PLAIN_SHARE = 0.05
+"""Share of the pixels at the images' edges above which a colour is taken for what was put behind the scene; that of
+black in the bonsai's photos is .01."""
+_PLAIN_TOLERANCE = 2.5 / 255
+"""How far a pixel of that colour may be from it, sRGB."""
 
 
-@dataclass(frozen=True)
-class ShellOptions:
-    """Size of the shell; set by hand."""
-
-    share: float = 0.05
-    """Gaussians of the shell over the budget."""
-    quantile: float = 0.99
-    """Of the known points' distances from where the cameras look; wrong points lie beyond."""
-    beyond: float = 1.5
-    """Radius over that distance."""
-    nearest: float = 6.0
-    """Least radius, over the cameras' distance from where they look."""
-    margin_deg: float = 15.0
-    """How far the shell goes on beyond what photographs show, so that walls do not end at the edge of a photograph."""
-    longest_side_px: int = 160
-    """Size of the images whose colours are taken."""
-    plain: float = 0.05
-    """Share of the pixels at the images' edges above which a colour is taken for what was put behind the scene; that of
-    black in the bonsai's photos is .01."""
-    plain_tolerance: float = 2.5 / 255
-    """How far a pixel of that colour may be from it, sRGB."""
-
-
-def shell_radius(points: Float[Tensor, "m 3"], focus: Float[Tensor, "3"], reach: float, options: ShellOptions) -> float:
+def shell_radius(points: Float[Tensor, "m 3"], focus: Float[Tensor, "3"], reach: float) -> float:
     """Distance of the shell from `focus`, world units.
 
     Args:
         points: Known points of the scene.
         focus: Where the cameras look.
         reach: Their mean distance from it.
-        options: Size of the shell.
     """
-    least = options.nearest * reach
     if not len(points):
-        return least
+        return MIN_RADIUS * reach
     distances = (points.double() - focus.to(points.device)).norm(dim=1)
-    return max(least, options.beyond * float(distances.quantile(options.quantile)))
+    return max(MIN_RADIUS * reach, _BEYOND * float(distances.quantile(_QUANTILE)))
 
 
-def shows_surroundings(
-    images: Sequence[Float[Tensor, "_ _ 3"]], background: tuple[float, float, float], options: ShellOptions
-) -> bool:
+def shows_surroundings(images: Sequence[Float[Tensor, "_ _ 3"]], background: tuple[float, float, float]) -> bool:
     """Whether images show what is around, and not a scene cut out before the colour `background`."""
     edges = torch.cat([torch.cat([image[0], image[-1], image[:, 0], image[:, -1]]) for image in images])
-    plain = ((edges - torch.tensor(background)).abs() <= options.plain_tolerance).all(1)
-    return float(plain.double().mean()) <= options.plain
+    plain = ((edges - torch.tensor(background)).abs() <= _PLAIN_TOLERANCE).all(1)
+    return float(plain.double().mean()) <= _PLAIN_SHARE
 
 
 def shell_points(
@@ -78,7 +62,7 @@ def shell_points(
     center: Float[Tensor, "3"],
     radius: float,
     count: int,
-    margin_deg: float,
+    margin_deg: float = 15.0,
 ) -> SeedPoints:
     """Points on a sphere that some camera sees, evenly distributed, in the mean colour of all photographs there.
 
@@ -88,61 +72,52 @@ def shell_points(
         center: Of the sphere, world units.
         radius: Of the sphere, world units.
         count: About how many points there are.
-        margin_deg: How far from a seen point, as an angle at the centre, there are points that no camera sees; they
-            have the colours of the nearest that are seen.
+        margin_deg: How far from a seen point, as an angle at the centre, there are points that no camera sees, so that
+            walls do not end at the edge of a photograph; they have the colours of the nearest that are seen.
 
     Returns:
         No points where no camera sees the sphere.
     """
-    trial = _Colors.of(_directions(max(count, _FEWEST)), center.float(), radius, cameras, images)
-    share = float(trial.near(margin_deg).double().mean())
+    center = center.float()
+    trial = _directions(max(count, _MIN_DIRECTIONS))
+    share = float(_near(trial, _colors(center + radius * trial, cameras, images)[1], margin_deg).double().mean())
     if share == 0:
         return SeedPoints.none()
     directions = _directions(max(1, round(count / share)))
-    found = _Colors.of(directions, center.float(), radius, cameras, images)
+    points = center + radius * directions
+    colors, seen = _colors(points, cameras, images)
+    # where nothing is seen, the mean colour of the nearest directions that are
+    neighbours = min(_NEIGHBOURS, int(seen.sum()))
+    nearest = KDTree(directions[seen].numpy()).query(directions.numpy(), k=neighbours)[1]
+    around = colors[seen][torch.from_numpy(nearest.reshape(len(directions), -1))].mean(1)
     spacing = radius * math.sqrt(4 * math.pi / len(directions))
-    points = center.float() + radius * directions
-    return SeedPoints(points, found.filled(), torch.full((len(points),), spacing)).select(found.near(margin_deg))
+    shell = SeedPoints(points, torch.where(seen[:, None], colors, around), torch.full((len(points),), spacing))
+    return shell.select(_near(directions, seen, margin_deg))
 
 
-@dataclass(frozen=True)
-class _Colors:
-    """What cameras see in directions from the centre."""
+def _colors(
+    points: Float[Tensor, "m 3"], cameras: Sequence[Cameras], images: Sequence[Tensor]
+) -> tuple[Float[Tensor, "m 3"], Bool[Tensor, "m"]]:
+    """Mean colour of the points in all images, and which any camera sees."""
+    total, count = torch.zeros(len(points), 3), torch.zeros(len(points))
+    for camera, image in zip(cameras, images, strict=True):
+        pose, k = camera.camera_from_world[0].float(), camera.intrinsics[0].float()
+        x = points @ pose[:3, :3].T + pose[:3, 3]
+        pixels = (x @ k.T)[:, :2] / x[:, 2:].clamp_min(1e-6)
+        size = torch.tensor([camera.width, camera.height])
+        inside = (x[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+        column, row = pixels[inside].long().T
+        total[inside] += image[row, column]
+        count[inside] += 1
+    return total / count.clamp_min(1)[:, None], count > 0
 
-    directions: Float[Tensor, "m 3"]
-    colors: Float[Tensor, "m 3"]
-    seen: Bool[Tensor, "m"]
 
-    @staticmethod
-    def of(
-        directions: Tensor, center: Tensor, radius: float, cameras: Sequence[Cameras], images: Sequence[Tensor]
-    ) -> "_Colors":
-        points = center + radius * directions
-        total, count = torch.zeros(len(points), 3), torch.zeros(len(points))
-        for camera, image in zip(cameras, images, strict=True):
-            pose, k = camera.camera_from_world[0].float(), camera.intrinsics[0].float()
-            x = points @ pose[:3, :3].T + pose[:3, 3]
-            pixels = (x @ k.T)[:, :2] / x[:, 2:].clamp_min(1e-6)
-            size = torch.tensor([camera.width, camera.height])
-            inside = (x[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
-            column, row = pixels[inside].long().T
-            total[inside] += image[row, column]
-            count[inside] += 1
-        return _Colors(directions, total / count.clamp_min(1)[:, None], count > 0)
-
-    def near(self, margin_deg: float) -> Bool[Tensor, "m"]:
-        """Which directions are seen, or closer than this to one that is."""
-        if not self.seen.any():
-            return self.seen
-        distance = KDTree(self.directions[self.seen].numpy()).query(self.directions.numpy())[0]
-        return torch.from_numpy(distance <= 2 * math.sin(math.radians(margin_deg) / 2))
-
-    def filled(self) -> Float[Tensor, "m 3"]:
-        """Colours, where nothing is seen the mean of the nearest that are."""
-        neighbours = min(_NEIGHBOURS, int(self.seen.sum()))
-        nearest = KDTree(self.directions[self.seen].numpy()).query(self.directions.numpy(), k=neighbours)[1]
-        around = self.colors[self.seen][torch.from_numpy(nearest.reshape(len(self.directions), -1))].mean(1)
-        return torch.where(self.seen[:, None], self.colors, around)
+def _near(directions: Float[Tensor, "m 3"], seen: Bool[Tensor, "m"], margin_deg: float) -> Bool[Tensor, "m"]:
+    """Which directions are seen, or closer than this to one that is."""
+    if not seen.any():
+        return seen
+    distance = KDTree(directions[seen].numpy()).query(directions.numpy())[0]
+    return torch.from_numpy(distance <= 2 * math.sin(math.radians(margin_deg) / 2))
 
 
 def _directions(count: int) -> Float[Tensor, "m 3"]:

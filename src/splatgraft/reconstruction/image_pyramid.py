@@ -15,16 +15,27 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import resize
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.fitting import View
 from splatgraft.reconstruction.options import Sampling
 from splatgraft.runtime.progress import Progress
 
-LOW_PASS_PX2 = 0.3
-"""Of the photographs' pixels, as in rendering (3DGS)."""
+_LOW_PASS_PX2 = 0.3
+"""Low pass of the photographs' pixels, as in rendering (3DGS)."""
 _COPRIME = 3
 """Step through the cells of a stride: visits go through all of them, for strides of 2 and 4."""
-_SMALLEST = 32
-"""Least side of a reduced image, pixels: below it the 11-pixel window of SSIM covers most of the image."""
+_MIN_SIDE_PX = 32
+"""Smallest side of a reduced image, pixels: below it the 11-pixel window of SSIM covers most of the image."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera and its target image."""
+
+    camera: Cameras
+    """A batch of one."""
+    image: Float[Tensor, "h w 3"]
+    """sRGB."""
+    low_pass_px2: float | None = None
+    """Low pass of the rendering where it is not that of the fit's options, pixels squared."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +52,9 @@ class Level:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """`fitting.Views` of photographs, from coarse to fine."""
+    """The photographs to fit, from coarse to fine."""
 
     levels: tuple[Level, ...]
-    """From coarse to fine."""
 
     def __len__(self) -> int:
         """Number of views."""
@@ -60,17 +70,17 @@ class Pyramid:
         return cameras, images
 
     def at(self, index: int, *, visit: int, done: float) -> View:
-        """Camera and photograph `index` at the level for the share `done` of all steps."""
+        """View `index` when it is seen for the time `visit` (from 0), after the share `done` in [0, 1] of all steps."""
         level = next((level for level in self.levels if done < level.sampling.until), self.levels[-1])
         camera, image, stride = level.cameras[index], level.images[index], level.sampling.stride
-        if stride == 1 or min(image.shape[:2]) < stride * _SMALLEST:
+        if stride == 1 or min(image.shape[:2]) < stride * _MIN_SIDE_PX:
             return View(camera, image.float() / 255)
         cell = (visit * _COPRIME + index) % stride**2
         left, top = cell % stride, cell // stride
         return View(
             _every_nth(camera, stride, left, top),
             image[top::stride, left::stride].float() / 255,
-            low_pass_px2=LOW_PASS_PX2 / stride**2,
+            low_pass_px2=_LOW_PASS_PX2 / stride**2,
         )
 
 
@@ -92,7 +102,7 @@ def read_pyramid(capture: PosedImages, schedule: Sequence[Sampling], *, device: 
         photograph = capture.image(i)
         camera = capture.cameras[i].to(device)
         for level, sampling in enumerate(schedule):
-            smallest = min(1.0, _SMALLEST / min(camera.sizes[0].tolist()))
+            smallest = min(1.0, _MIN_SIDE_PX / min(camera.sizes[0].tolist()))
             reduced = camera.resized(max(sampling.factor, smallest))
             width, height = reduced.sizes[0].tolist()
             cameras[level].append(reduced)

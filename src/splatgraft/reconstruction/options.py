@@ -8,7 +8,6 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.spherical_harmonics import MAX_DEGREE
 
 Quality = Literal["draft", "standard", "high", "full"]
-Density = Literal["splits", "mcmc"]
 
 
 @dataclass(frozen=True)
@@ -39,15 +38,14 @@ class _Preset:
     beyond_draft: bool = False
     """Whether backgrounds are drawn by chance, the start has a far shell, and splits look at covered errors: `draft`
     has none of them, since the numbers of the light estimate were fitted on draft scenes."""
-    density: Density = "splits"
 
 
 _PRESETS: dict[str, _Preset] = {
     "draft": _Preset(1_000, 25_000, 640),
     "standard": _Preset(4_000, 100_000, 960, beyond_draft=True),
     "high": _Preset(10_000, 100_000, 960, beyond_draft=True),
-    # as published: 3DGS-MCMC's settings, and the usual size of images
-    "full": _Preset(30_000, 1_000_000, 1600, EVERY_PIXEL, density="mcmc"),
+    # 3DGS's length and the usual size of images
+    "full": _Preset(30_000, 1_000_000, 1600, EVERY_PIXEL, beyond_draft=True),
 }
 
 
@@ -57,7 +55,7 @@ class ReconstructOptions:
 
     quality: Quality = "standard"
     """`draft`: 1000 steps, 25k Gaussians; `standard`: 4000, 100k; `high`: 10000, 100k; `full`:
-    30000, 1M, 3DGS-MCMC as published (GPU)."""
+    30000, 1M, every pixel (for GPUs)."""
     iterations: int | None = None
     """Steps, one view each; every schedule scales with it."""
     budget: int | None = None
@@ -74,21 +72,18 @@ class ReconstructOptions:
     says that they differ."""
     random_background: bool | None = None
     """Whether each step draws the scene over another colour, so that dark surfaces are not fitted by holes before
-    `background`; None: at `standard` and `high`, unless the photos show an object alone before `background`."""
+    `background`; None: unless at `draft`, or the photos show an object alone before `background`."""
     far_shell: bool | None = None
     """Whether the start has Gaussians behind everything, in the colours around; None: likewise."""
     error_splits: bool | None = None
-    """Whether Gaussians are split by gradient and covered error, not by the gradient alone; None: at `standard` and
-    `high`."""
-    density: Density | None = None
-    """How Gaussians are added and removed: `splits`, by gradients; `mcmc`, by relocation, noise and penalties
-    (3DGS-MCMC, with its published settings); None: `mcmc` at `full`."""
+    """Whether Gaussians are split by gradient and covered error, not by the gradient alone; None: unless at
+    `draft`."""
     eval_every: int = 0
     """Every how many views one is held out, from the first (3DGS: 8); 0 holds out none."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """sRGB behind the scene."""
     seed: int = 0
-    """Of the order of views and everything that is drawn by chance."""
+    """Seed of the order of views and of everything that is drawn by chance."""
     device: str = "cpu"
     """`cpu` or `cuda`."""
 
@@ -113,7 +108,7 @@ class ReconstructOptions:
         return _PRESETS[self.quality].iterations if self.iterations is None else self.iterations
 
     @property
-    def most_gaussians(self) -> int:
+    def max_gaussians(self) -> int:
         """The budget, given or of the quality."""
         return _PRESETS[self.quality].budget if self.budget is None else self.budget
 
@@ -121,11 +116,6 @@ class ReconstructOptions:
     def splits_by_error(self) -> bool:
         """Whether splits look at the error that a Gaussian covers, given or of the quality."""
         return _PRESETS[self.quality].beyond_draft if self.error_splits is None else self.error_splits
-
-    @property
-    def density_control(self) -> Density:
-        """How Gaussians are added and removed, given or of the quality."""
-        return self.density or _PRESETS[self.quality].density
 
     def decided(self, surroundings: bool) -> "ReconstructOptions":
         """The same options with the choices made that the quality and the photos decide.
@@ -152,7 +142,7 @@ class ReconstructOptions:
         sampling = _PRESETS[self.quality].sampling
         sizes = served.sizes.prod(1).double()
         seen = (float(sizes.mean()) if len(sizes) else 0.0) / max(part.stride for part in sampling) ** 2
-        return DENSE if sampling is SPARSE and seen < self.most_gaussians else sampling
+        return DENSE if sampling is SPARSE and seen < self.max_gaussians else sampling
 
     def served(self, capture: PosedImages) -> PosedImages:
         """The capture, resampled to the size at which it is fitted."""

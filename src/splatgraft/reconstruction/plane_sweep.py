@@ -7,8 +7,6 @@ pixels of a photograph reduced to a hundred or two, parallel to the image; costs
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import reduce
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,46 +15,31 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.reconstruction.initialization import SeedPoints
 
-
-@dataclass(frozen=True)
-class SweepOptions:
-    """Grid, depths and views of the sweep."""
-
-    longest_side_px: int = 160
-    """To which photographs are reduced."""
-    cell_px: int = 6
-    """Distance of two rays in the reduced image."""
-    depths: int = 32
-    """Hypotheses per ray, evenly spaced in inverse depth."""
-    neighbours: int = 4
-    """Views that each is compared with."""
-    spacing_px: float = 1.5
-    """Between the 3x3 pixels of a patch."""
-    least_angle_deg: float = 2.0
-    """Between the directions of two views to what they look at; less tells nothing about depth."""
-    least_cosine: float = 0.5
-    """Of the angle between the optical axes of two views that are compared."""
-    near: float = 0.4
-    """Least distance from every camera, over the cameras' mean distance from what they look at."""
-    fewest_known: int = 100
-    """Known points from which the nearest depth is taken instead, where it is larger."""
-    known_nearest: float = 0.02
-    """Share of the known points that are nearer to a camera; structure from motion has some outliers."""
-    far: float = 8.0
-    """Farthest depth, over the same."""
-    tie: float = 0.015
-    """Difference in cost that tells nothing, four grey levels."""
-    most_cost: float = 0.12
-    """Mean absolute difference in sRGB above which a ray gives no point."""
+_CELL_PX = 6
+"""Distance of two rays in the reduced image."""
+_DEPTHS = 32
+"""Hypotheses per ray, evenly spaced in inverse depth."""
+_COMPARED_VIEWS = 4
+_PATCH_SPACING_PX = 1.5
+"""Distance of the 3x3 pixels of a patch."""
+_MIN_ANGLE_DEG = 2.0
+"""Between the directions of two views to what they look at; less tells nothing about depth."""
+_MIN_COSINE = 0.5
+"""Of the angle between the optical axes of two views that are compared."""
+NEAR, _FAR = 0.4, 8.0
+"""Range of the distance from every camera, over the cameras' mean distance from what they look at."""
+_MIN_KNOWN = 100
+"""Known points from which the nearest depth is taken instead, where it is larger."""
+_KNOWN_QUANTILE = 0.02
+"""Share of the known points that are nearer to a camera; structure from motion has some outliers."""
+_TIE = 0.015
+"""Difference in cost that tells nothing, four grey levels."""
+_MAX_COST = 0.12
+"""Mean absolute difference in sRGB above which a ray gives no point."""
 
 
 def sweep(
-    cameras: Sequence[Cameras],
-    images: Sequence[Float[Tensor, "_ _ 3"]],
-    *,
-    known: Float[Tensor, "p 3"],
-    reach: float,
-    options: SweepOptions,
+    cameras: Sequence[Cameras], images: Sequence[Float[Tensor, "_ _ 3"]], *, known: Float[Tensor, "p 3"], reach: float
 ) -> SeedPoints:
     """Points on the rays through grid cells in which no known point lies.
 
@@ -65,65 +48,61 @@ def sweep(
         images: sRGB, small.
         known: World points that are there already.
         reach: The cameras' mean distance from what they look at, world units.
-        options: Grid, depths and views.
 
     Returns:
         Points of all views, as wide as the distance of neighbouring rays at most.
     """
-    nearest = options.near * reach
-    if len(known) >= options.fewest_known:
-        nearest = max(nearest, float(_nearest(known, cameras).quantile(options.known_nearest)))
-    depths = 1 / torch.linspace(1 / (options.far * reach), 1 / nearest, options.depths)
-    search = _Search(tuple(cameras), tuple(images), known, depths, reach, options)
-    none = SeedPoints.none()
-    return reduce(SeedPoints.joined, (search.view(i) for i in range(len(cameras))), none)
-
-
-@dataclass(frozen=True)
-class _Search:
-    cameras: tuple[Cameras, ...]
-    images: tuple[Tensor, ...]
-    known: Float[Tensor, "p 3"]
-    depths: Float[Tensor, "d"]
-    """From the farthest to the nearest."""
-    reach: float
-    options: SweepOptions
-
-    def view(self, view: int) -> SeedPoints:
-        """Points on the rays of one view."""
-        camera, image, cell = self.cameras[view], self.images[view], self.options.cell_px
-        rows, columns = torch.arange(cell // 2, camera.height, cell), torch.arange(cell // 2, camera.width, cell)
+    nearest = NEAR * reach
+    if len(known) >= _MIN_KNOWN:
+        nearest = max(nearest, float(_nearest(known, cameras).quantile(_KNOWN_QUANTILE)))
+    depths = 1 / torch.linspace(1 / (_FAR * reach), 1 / nearest, _DEPTHS)
+    found = SeedPoints.none()
+    for view, camera in enumerate(cameras):
+        rows, columns = (torch.arange(_CELL_PX // 2, n, _CELL_PX) for n in (camera.height, camera.width))
         y, x = (grid.flatten() for grid in torch.meshgrid(rows, columns, indexing="ij"))
-        free = ~_occupied(self.known, camera, cell, (len(columns), len(rows)))
-        x, y = x[free].float() + 0.5, y[free].float() + 0.5
-        others = self._neighbours(view)
-        if len(x) == 0 or not others:
-            return SeedPoints.none()
-        step = self.options.spacing_px * torch.tensor([-1.0, 0.0, 1.0])
-        dy, dx = (grid.flatten() for grid in torch.meshgrid(step, step, indexing="ij"))
-        pixels = torch.stack([x[:, None] + dx, y[:, None] + dy], -1)
-        own = _sampled(image, pixels)
-        patches = camera.centers[0].float() + self.depths[:, None, None, None] * _rays(camera, pixels)
-        costs = torch.stack([_cost(patches, own, self.cameras[j], self.images[j]) for j in others])
-        costs = costs.sort(0).values[: (len(others) + 1) // 2].mean(0)
-        best = costs.min(0).values
-        # of the depths that explain the patch equally well, the farthest hides no other view's surface
-        index = (costs <= best + self.options.tie).int().argmax(0)
-        middle = patches.shape[2] // 2
-        points = patches[index, torch.arange(len(x)), middle]
-        good = (best < self.options.most_cost) & (_nearest(points, self.cameras) > self.depths[-1])
-        spacing = cell * self.depths[index] / camera.intrinsics[0, 0, 0].float()
-        return SeedPoints(points[good], own[good].mean(1), spacing[good])
+        free = ~_occupied(known, camera, (len(columns), len(rows)))
+        centers = torch.stack([x[free], y[free]], -1).float() + 0.5
+        others = _compared_views(view, cameras, reach)
+        if len(centers) and others:
+            found = found.joined(_points_of_view(view, centers, others, cameras=cameras, images=images, depths=depths))
+    return found
 
-    def _neighbours(self, view: int) -> list[int]:
-        """The nearest views that look the same way from another place."""
-        centers = torch.cat([camera.centers for camera in self.cameras]).float()
-        forward = torch.cat([camera.world_from_camera[:, :3, 2] for camera in self.cameras]).float()
-        distance, same = (centers - centers[view]).norm(dim=1), forward @ forward[view]
-        least = self.reach * math.radians(self.options.least_angle_deg)
-        usable = (distance > least) & (same > self.options.least_cosine)
-        order = torch.where(usable, distance + self.reach * (1 - same), torch.inf).argsort()
-        return [int(j) for j in order[: self.options.neighbours] if usable[j]]
+
+def _points_of_view(
+    view: int,
+    centers: Float[Tensor, "m 2"],
+    others: list[int],
+    *,
+    cameras: Sequence[Cameras],
+    images: Sequence[Tensor],
+    depths: Float[Tensor, "d"],
+) -> SeedPoints:
+    """Points on the rays through `centers` of one view, compared with the others; `depths` end with the nearest."""
+    camera = cameras[view]
+    step = _PATCH_SPACING_PX * torch.tensor([-1.0, 0.0, 1.0])
+    dy, dx = (grid.flatten() for grid in torch.meshgrid(step, step, indexing="ij"))
+    pixels = centers[:, None] + torch.stack([dx, dy], -1)
+    own = _sampled(images[view], pixels)
+    patches = camera.centers[0].float() + depths[:, None, None, None] * _rays(camera, pixels)
+    costs = torch.stack([_cost(patches, own, cameras[j], images[j]) for j in others])
+    costs = costs.sort(0).values[: (len(others) + 1) // 2].mean(0)
+    best = costs.min(0).values
+    # of the depths that explain the patch equally well, the farthest hides no other view's surface
+    index = (costs <= best + _TIE).int().argmax(0)
+    points = patches[index, torch.arange(len(centers)), patches.shape[2] // 2]
+    good = (best < _MAX_COST) & (_nearest(points, cameras) > depths[-1])
+    spacing = _CELL_PX * depths[index] / camera.intrinsics[0, 0, 0].float()
+    return SeedPoints(points[good], own[good].mean(1), spacing[good])
+
+
+def _compared_views(view: int, cameras: Sequence[Cameras], reach: float) -> list[int]:
+    """The nearest views that look the same way from another place."""
+    centers = torch.cat([camera.centers for camera in cameras]).float()
+    forward = torch.cat([camera.world_from_camera[:, :3, 2] for camera in cameras]).float()
+    distance, same = (centers - centers[view]).norm(dim=1), forward @ forward[view]
+    usable = (distance > reach * math.radians(_MIN_ANGLE_DEG)) & (same > _MIN_COSINE)
+    order = torch.where(usable, distance + reach * (1 - same), torch.inf).argsort()
+    return [int(j) for j in order[:_COMPARED_VIEWS] if usable[j]]
 
 
 def _nearest(points: Float[Tensor, "m 3"], cameras: Sequence[Cameras]) -> Float[Tensor, "m"]:
@@ -172,12 +151,12 @@ def _cost(
     return torch.where(inside, difference, 1.0)
 
 
-def _occupied(points: Tensor, camera: Cameras, cell: int, cells: tuple[int, int]) -> Bool[Tensor, "c"]:
+def _occupied(points: Tensor, camera: Cameras, cells: tuple[int, int]) -> Bool[Tensor, "c"]:
+    """Which of columns x rows cells of an image hold a point."""
     columns, rows = cells
     out = torch.zeros(rows * columns, dtype=torch.bool)
-    if len(points):
-        pixels, depth = _project(points, camera)
-        place = (pixels / cell).floor().long()
-        inside = (depth > 0) & (place >= 0).all(1) & (place[:, 0] < columns) & (place[:, 1] < rows)
-        out[place[inside, 1] * columns + place[inside, 0]] = True
+    pixels, depth = _project(points, camera)
+    place = (pixels / _CELL_PX).floor().long()
+    inside = (depth > 0) & (place >= 0).all(1) & (place[:, 0] < columns) & (place[:, 1] < rows)
+    out[place[inside, 1] * columns + place[inside, 0]] = True
     return out

@@ -6,84 +6,58 @@ Gaussians. Measured on a room of 36 views at 352x248, 25k Gaussians, 1000 steps,
 rates other than the centres' eight times 28.1 (a bunch of bananas, 16 photographs: 29.0 and 29.1).
 """
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import torch
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.fitting import FitOptions, FitState, LearningRates, Step, fit
+from splatgraft.reconstruction.cost import require_memory
 from splatgraft.reconstruction.density import DensityControl
-from splatgraft.reconstruction.far_shell import ShellOptions, shell_points, shell_radius, shows_surroundings
+from splatgraft.reconstruction.far_shell import shell_points, shell_radius, shows_surroundings
+from splatgraft.reconstruction.fit import FitOptions, FitState, LearningRates, Step, fit
 from splatgraft.reconstruction.image_pyramid import Pyramid, read_pyramid
 from splatgraft.reconstruction.initialization import SeedPoints, from_points, looked_at, random_seeds, scene_extent
-from splatgraft.reconstruction.mcmc import McmcControl, McmcOptions
-from splatgraft.reconstruction.memory import require_memory
 from splatgraft.reconstruction.options import ReconstructOptions
-from splatgraft.reconstruction.plane_sweep import SweepOptions, sweep
+from splatgraft.reconstruction.plane_sweep import sweep
 from splatgraft.rendering import RenderOptions
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
-
-@dataclass(frozen=True)
-class ScheduleOptions:
-    """Schedules of a reconstruction; 3DGS's for 30000 steps, shorter runs by the measurements above."""
-
-    published_iterations: int = 30_000
-    """Steps for which the published values hold (3DGS)."""
-    few_points: int = 1000
-    """Sparse points below which more are found by a plane sweep."""
-    fewest_points: int = 100
-    """Points of both kinds below which random ones are taken."""
-    sweep: SweepOptions = field(default_factory=SweepOptions)
-    """The search for points where the capture has none."""
-    shell: ShellOptions = field(default_factory=ShellOptions)
-    """The shell behind the scene, where the options ask for one."""
-    start_share: float = 0.6
-    """Gaussians at the start at most, over the budget; the others come where the density control wants them."""
-    published_opacity: float = 0.1
-    """Opacity at the start of a run of the published length or longer (3DGS)."""
-    short_run_opacity: float = 0.5
-    """Opacity at the start of a shorter run."""
-    band_share: int = 30
-    """All steps over the steps between two bands of colour."""
-    densify_every: int = 100
-    """Most steps between two densifications (3DGS)."""
-    densifications: int = 20
-    """Least number of densification intervals in a run."""
-    full_at: float = 0.6
-    """Share of the steps after which the budget may be reached."""
-    stop_at: float = 0.8
-    """Share of the steps after which Gaussians are neither split nor removed."""
-    mcmc: McmcOptions = field(default_factory=McmcOptions)
-    """Settings of the density control `mcmc`, whose schedule follows."""
-    mcmc_start: int = 500
-    """Step of a run of the published length after which it relocates and adds (3DGS-MCMC)."""
-    mcmc_stop: int = 25_000
-    """Step from which it does not."""
-    error_every: int = 4
-    """Steps between two measurements of the error that each Gaussian covers, where the options ask for it."""
-    means_power: float = 0.5
-    """Exponent of the published length over the run's, the factor on the rate of the centres."""
-    most_means: float = 4.0
-    """Bound on that factor."""
-    others_power: float = 0.6
-    """The same exponent for all other rates."""
-    most_others: float = 8.0
-    """Bound on that factor."""
-    color_rate: float = 0.003
-    """Learning rate of each photograph's own affine map of colours."""
-    short_run_final: float = 0.1
-    """Last rate over the first, for all but the centres, in a shorter run."""
+_PUBLISHED_ITERATIONS = 30_000
+"""Steps for which the published values hold (3DGS)."""
+_MANY_POINTS, _MIN_POINTS = 1000, 100
+"""Sparse points below which more are found by a plane sweep; points of both kinds below which random ones are taken."""
+_SMALL_SIDE_PX = 160
+"""Longest side of the images of the plane sweep and of the far shell's colours."""
+_SHELL_SHARE = 0.05
+"""Gaussians of the far shell over the budget; set by hand."""
+_START_SHARE = 0.6
+"""Gaussians at the start at most, over the budget; the others come where the density control wants them."""
+_PUBLISHED_OPACITY, _SHORT_RUN_OPACITY = 0.1, 0.5
+"""Opacity at the start of a run of the published length or longer (3DGS), and of a shorter run."""
+_BAND_SHARE = 30
+"""All steps over the steps between two bands of colour."""
+_DENSIFY_EVERY, _MIN_DENSIFICATIONS = 100, 20
+"""Most steps between two densifications (3DGS), and least number of such intervals in a run."""
+_FULL_AT, _STOP_AT = 0.6, 0.8
+"""Shares of the steps after which the budget may be reached, and after which nothing is split or removed."""
+_ERROR_EVERY = 4
+"""Steps between two measurements of the error that each Gaussian covers, where the options ask for it."""
+_MEANS_POWER, _MAX_MEANS = 0.5, 4.0
+"""Exponent of the published length over the run's, the factor on the rate of the centres, and its bound."""
+_OTHERS_POWER, _MAX_OTHERS = 0.6, 8.0
+"""The same for all other rates."""
+_COLOR_RATE = 0.003
+"""Learning rate of each photograph's own affine map of colours."""
+_SHORT_RUN_FINAL = 0.1
+"""Last rate over the first, for all but the centres, in a shorter run."""
 
 
 def reconstruct(
     capture: PosedImages,
     options: ReconstructOptions = ReconstructOptions(),
     *,
-    schedule: ScheduleOptions = ScheduleOptions(),
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
@@ -92,12 +66,11 @@ def reconstruct(
     Args:
         capture: Posed images; sparse points are the start where there are at least 100.
         options: Length, size, resolution and seed.
-        schedule: Learning rates and density over the run.
         progress: Called with steps done, steps in all and a short text.
         checkpoint: Where the state is saved, and from where a run that was stopped continues.
 
     Returns:
-        At most `options.most_gaussians` Gaussians in the frame of the cameras, on `options.device`.
+        At most `options.max_gaussians` Gaussians in the frame of the cameras, on `options.device`.
 
     Raises:
         ValueError: There are fewer than 2 views or too little memory, or a value stops being finite.
@@ -109,18 +82,33 @@ def reconstruct(
         raise ValueError(f"reconstruct: expected at least 2 views to fit, found {len(capture)}")
     capture = options.served(capture)
     views = read_pyramid(capture, options.sampling(capture.cameras), device=options.device, progress=progress)
-    options = options.decided(_show_surroundings(views, options, schedule))
-    start = _start(capture, views, options, schedule, progress=progress).to(options.device)
-    by_mcmc = options.density_control == "mcmc"
-    density = _mcmc(options, schedule) if by_mcmc else _density(options, schedule, start.count, cameras=capture.cameras)
-    control = _Control(options.sh_degree, max(1, options.all_iterations // schedule.band_share), density)
+    options = options.decided(shows_surroundings(views.reduced(_SMALL_SIDE_PX)[1], options.background))
+    start = _start(capture, views, options, progress=progress).to(options.device)
+    density = DensityControl(
+        budget=options.max_gaussians,
+        first_count=start.count,
+        every=max(1, min(_DENSIFY_EVERY, options.all_iterations // _MIN_DENSIFICATIONS)),
+        full_at=int(_FULL_AT * options.all_iterations),
+        stop=int(_STOP_AT * options.all_iterations),
+        camera_centers=capture.cameras.centers.to(options.device),
+        error_every=_ERROR_EVERY if options.splits_by_error else 0,
+    )
+    band_every = max(1, options.all_iterations // _BAND_SHARE)
+
+    def control(state: FitState, step: Step) -> FitState:
+        """Density, and one more band of colour every `band_every` steps."""
+        state = density.update(state, step)
+        degree = min(options.sh_degree, state.iteration // band_every)
+        if degree <= state.gaussians.sh_degree:
+            return state
+        wider = state.gaussians.with_sh_degree(degree)
+        return replace(state, gaussians=wider, moments=state.moments.padded("sh", wider.sh.shape[1]))
+
     fit_options = FitOptions(
         iterations=options.all_iterations,
-        rates=_rates(capture.cameras, options, schedule),
-        opacity_penalty=schedule.mcmc.opacity_penalty if by_mcmc else 0.0,
-        scale_penalty=schedule.mcmc.scale_penalty if by_mcmc else 0.0,
+        rates=_rates(capture.cameras, options.all_iterations),
         seed=options.seed,
-        view_color_rate=schedule.color_rate if options.photo_colors else 0.0,
+        view_color_rate=_COLOR_RATE if options.photo_colors else 0.0,
         rendering=RenderOptions(background=options.background),
         random_background=bool(options.random_background),
     )
@@ -128,115 +116,50 @@ def reconstruct(
     return fitted.with_sh_degree(options.sh_degree)
 
 
-@dataclass(frozen=True)
-class _Control:
-    """The `Control` of the fit: density, and one more band of colour every `band_every` steps."""
-
-    sh_degree: int
-    band_every: int
-    density: DensityControl | McmcControl
-
-    def __call__(self, state: FitState, step: Step) -> FitState:
-        state = self.density.update(state, step)
-        degree = min(self.sh_degree, state.iteration // self.band_every)
-        if degree <= state.gaussians.sh_degree:
-            return state
-        wider = state.gaussians.with_sh_degree(degree)
-        return replace(state, gaussians=wider, moments=state.moments.padded("sh", wider.sh.shape[1]))
-
-
-def _start(
-    capture: PosedImages, views: Pyramid, options: ReconstructOptions, schedule: ScheduleOptions, *, progress: Progress
-) -> Gaussians:
-    """Gaussians at sparse points; of few, also at points of a plane sweep; else at random."""
-    most = max(1, int(schedule.start_share * options.most_gaussians))
+def _start(capture: PosedImages, views: Pyramid, options: ReconstructOptions, *, progress: Progress) -> Gaussians:
+    """Gaussians at sparse points; of few, also at points of a plane sweep; else at random; and the far shell."""
+    small = views.reduced(_SMALL_SIDE_PX)
+    focus, reach = looked_at(capture.cameras)
+    budget = options.max_gaussians
     seeds = SeedPoints(
         capture.points.float(), capture.point_colors.float(), torch.full((len(capture.points),), torch.inf)
     )
-    if len(seeds) < schedule.few_points:
-        cameras, images = views.reduced(schedule.sweep.longest_side_px)
-        reach = looked_at(capture.cameras)[1]
-        swept = sweep(cameras, images, known=seeds.points, reach=reach, options=schedule.sweep)
+    if len(seeds) < _MANY_POINTS:
+        swept = sweep(*small, known=seeds.points, reach=reach)
         found = f"{len(seeds) or 'no'} sparse points"
         seeds = seeds.joined(swept)
-        if len(seeds) < schedule.fewest_points:
-            seeds = random_seeds(capture.cameras, count=max(options.most_gaussians // 4, 1), seed=options.seed)
+        if len(seeds) < _MIN_POINTS:
+            seeds = random_seeds(capture.cameras, count=max(budget // 4, 1), seed=options.seed)
             found = f"{found}: starting from {len(seeds)} random ones where the cameras look"
         else:
             found = f"{found}: {len(swept)} found by comparing views"
         progress(0, options.all_iterations, found)
-    shell = _shell(capture, views, options.most_gaussians, schedule.shell) if options.far_shell else SeedPoints.none()
+    shell = SeedPoints.none()
+    if options.far_shell:
+        radius = shell_radius(capture.points, focus, reach)
+        shell = shell_points(*small, center=focus, radius=radius, count=max(1, int(_SHELL_SHARE * budget)))
+    most = max(1, int(_START_SHARE * budget))
     start = from_points(seeds.drawn(max(1, most - len(shell)), options.seed))
     if len(shell):
         # apart from the others, whose spacing bounds that of isolated points
         start = concatenate([start, from_points(shell)])
-    if options.density_control == "mcmc":
-        opacity = torch.full_like(start.opacity_logits, schedule.mcmc.start_opacity)
-        log_scales = start.log_scales + math.log(schedule.mcmc.start_scale)
-        return replace(start, opacity_logits=opacity.logit(), log_scales=log_scales)
-    short = options.all_iterations < schedule.published_iterations
-    opacity = schedule.short_run_opacity if short else schedule.published_opacity
+    opacity = _SHORT_RUN_OPACITY if options.all_iterations < _PUBLISHED_ITERATIONS else _PUBLISHED_OPACITY
     return replace(start, opacity_logits=torch.full_like(start.opacity_logits, opacity).logit())
 
 
-def _show_surroundings(views: Pyramid, options: ReconstructOptions, schedule: ScheduleOptions) -> bool:
-    _, images = views.reduced(schedule.shell.longest_side_px)
-    return shows_surroundings(images, options.background, schedule.shell)
-
-
-def _shell(capture: PosedImages, views: Pyramid, budget: int, options: ShellOptions) -> SeedPoints:
-    """Points behind the scene."""
-    cameras, images = views.reduced(options.longest_side_px)
-    focus, reach = looked_at(capture.cameras)
-    radius = shell_radius(capture.points, focus, reach, options)
-    count = max(1, int(options.share * budget))
-    return shell_points(cameras, images, center=focus, radius=radius, count=count, margin_deg=options.margin_deg)
-
-
-def _mcmc(options: ReconstructOptions, schedule: ScheduleOptions) -> McmcControl:
-    n, published = options.all_iterations, schedule.published_iterations
-    return McmcControl(
-        budget=options.most_gaussians,
-        start=n * schedule.mcmc_start // published,
-        stop=n * schedule.mcmc_stop // published,
-        every=_densify_every(n, schedule),
-        seed=options.seed,
-        options=schedule.mcmc,
-    )
-
-
-def _densify_every(iterations: int, schedule: ScheduleOptions) -> int:
-    return max(1, min(schedule.densify_every, iterations // schedule.densifications))
-
-
-def _density(
-    options: ReconstructOptions, schedule: ScheduleOptions, first_count: int, *, cameras: Cameras
-) -> DensityControl:
-    n = options.all_iterations
-    return DensityControl(
-        budget=options.most_gaussians,
-        first_count=first_count,
-        every=_densify_every(n, schedule),
-        full_at=int(schedule.full_at * n),
-        stop=int(schedule.stop_at * n),
-        camera_centers=cameras.centers.to(options.device),
-        error_every=schedule.error_every if options.splits_by_error else 0,
-    )
-
-
-def _rates(cameras: Cameras, options: ReconstructOptions, schedule: ScheduleOptions) -> LearningRates:
+def _rates(cameras: Cameras, iterations: int) -> LearningRates:
     """3DGS's published rates, higher for shorter runs."""
     extent = scene_extent(cameras)
-    shorter = max(1.0, schedule.published_iterations / options.all_iterations)
-    means_factor = min(schedule.most_means, shorter**schedule.means_power)
-    factor = min(schedule.most_others, shorter**schedule.others_power)
+    shorter = max(1.0, _PUBLISHED_ITERATIONS / iterations)
+    means_factor = min(_MAX_MEANS, shorter**_MEANS_POWER)
+    factor = min(_MAX_OTHERS, shorter**_OTHERS_POWER)
     return LearningRates(
         means=1.6e-4 * extent * means_factor,
         means_final=1.6e-6 * extent * means_factor,
         log_scales=0.005 * factor,
         quaternions=0.001 * factor,
-        opacity_logits=(schedule.mcmc.opacity_rate if options.density_control == "mcmc" else 0.025) * factor,
+        opacity_logits=0.025 * factor,
         sh=0.0025 * factor,
         sh_higher=0.0025 / 20 * factor,
-        final=schedule.short_run_final if shorter > 1 else 1.0,
+        final=_SHORT_RUN_FINAL if shorter > 1 else 1.0,
     )

@@ -1,0 +1,296 @@
+"""The fit of Gaussians to images: render, loss (3DGS, Eq. 7), gradient, sparse Adam, density control after each step.
+
+Step i depends only on the state after step i - 1, the seed and i, so that a run resumed from a checkpoint gives the
+same bits as an uninterrupted one.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.fitting import adam, l1_dssim
+from splatgraft.reconstruction.image_pyramid import Pyramid, View
+from splatgraft.rendering import RenderOptions, render
+from splatgraft.runtime.interruption import interruption_held
+from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
+
+_REPORT_EVERY = 10
+"""Steps."""
+_CHECKPOINT_SECONDS = 30.0
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Learning rate of Adam for each field; a field with rate 0 is frozen and no gradient is computed for it."""
+
+    means: float = 0.0
+    """World units per step at the start."""
+    means_final: float = 0.0
+    """World units per step at the end; the rate falls exponentially from `means` to it."""
+    log_scales: float = 0.0
+    """Natural logarithm of world units."""
+    quaternions: float = 0.0
+    """Raw quaternion components."""
+    opacity_logits: float = 0.0
+    """Before the sigmoid."""
+    sh: float = 0.0
+    """Band 0."""
+    sh_higher: float = 0.0
+    """Bands 1 to 3; 3DGS takes a twentieth of band 0."""
+    final: float = 1.0
+    """Factor on all rates but that of the means at the end; reached along half a cosine in the last third."""
+
+    def active(self) -> tuple[str, ...]:
+        """Names of the fields that are fitted."""
+        names = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+        return tuple(name for name in names if getattr(self, name) > 0)
+
+    def at(self, field: str, done: float, columns: int) -> Float[Tensor, "c"]:
+        """Rate of each of the `columns` values of `field` per Gaussian, after the share `done` of all steps."""
+        if field == "means":
+            fallen = (self.means_final / self.means) ** done if self.means_final > 0 else 1.0
+            return torch.full((columns,), self.means * fallen)
+        late = min(max(3 * done - 2, 0.0), 1.0)
+        cosine = 0.5 + 0.5 * torch.cos(torch.tensor(torch.pi * late))
+        left = self.final + (1 - self.final) * float(cosine)
+        rates = torch.full((columns,), getattr(self, field) * left)
+        if field == "sh":
+            rates[3:] = self.sh_higher * left
+        return rates
+
+
+@dataclass(frozen=True)
+class ViewColors:
+    """The colours of each of v photographs over those of the scene: exposure and white balance, fitted beside it.
+
+    They are an affine map of the scene's (12 numbers instead of the embeddings of Martin-Brualla et al. 2021). The mean
+    of the maps stays the identity, so that the scene shows the mean appearance. Adam updates a view's map when the view
+    is visited, tens of times in all, which a slower second moment would not follow.
+    """
+
+    maps: Float[Tensor, "v 3 4"]
+    """Matrix and offset of each view, less the identity."""
+    first: Float[Tensor, "v 3 4"]
+    """Running mean of gradients."""
+    second: Float[Tensor, "v 3 4"]
+    """Running mean of squared gradients."""
+    steps: Int[Tensor, "v"]
+    """Updates of each view."""
+
+    @staticmethod
+    def identity(views: int, device: torch.device) -> "ViewColors":
+        """No view differs from the scene."""
+        zeros = torch.zeros(views, 3, 4, device=device)
+        return ViewColors(zeros, zeros, zeros, torch.zeros(views, dtype=torch.int32, device=device))
+
+    def of(self, view: int) -> Float[Tensor, "3 4"]:
+        """Matrix and offset from the scene's colours to the view's."""
+        return self.maps[view] + torch.eye(3, 4, device=self.maps.device)
+
+    def updated(self, view: int, gradient: Float[Tensor, "3 4"], rate: float) -> "ViewColors":
+        """After a step of Adam on one view; the mean of all maps is taken out."""
+        beta_1, beta_2, epsilon = 0.9, 0.99, 1e-12
+        maps, first, second, steps = (tensor.clone() for tensor in (self.maps, self.first, self.second, self.steps))
+        steps[view] += 1
+        first[view] = beta_1 * first[view] + (1 - beta_1) * gradient
+        second[view] = beta_2 * second[view] + (1 - beta_2) * gradient**2
+        count = int(steps[view])
+        mean, square = first[view] / (1 - beta_1**count), second[view] / (1 - beta_2**count)
+        maps[view] -= rate * mean / (square.sqrt() + epsilon)
+        return ViewColors(maps - maps.mean(0), first, second, steps)
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Length and learning rates of a fit."""
+
+    iterations: int
+    """Steps; each sees one view."""
+    rates: LearningRates
+    """Learning rates; fields with rate 0 are not fitted."""
+    view_color_rate: float = 0.0
+    """Learning rate of each view's colours at the start, from where it falls to 0 along half a cosine; 0 fits none."""
+    seed: int = 0
+    """Seed of the order of views and of random backgrounds."""
+    rendering: RenderOptions = field(default_factory=RenderOptions)
+    """Background, low-pass and near plane."""
+    random_background: bool = False
+    """Whether each step draws the scene over another colour, by chance, instead of that of `rendering`."""
+
+
+@dataclass(frozen=True)
+class FitState:
+    """Everything besides options and views that the next step depends on."""
+
+    iteration: int
+    """Steps done."""
+    gaussians: Gaussians
+    """As fitted so far."""
+    moments: adam.Moments
+    """Of the fields that are fitted."""
+    view_colors: ViewColors
+    """Colours of each view over the scene's."""
+    memory: dict[str, Tensor] = field(default_factory=dict)
+    """Tensors that the control stores between steps."""
+
+    def select(self, which: Tensor) -> "FitState":
+        """The state of the chosen Gaussians (indices or mask) with an empty `memory`."""
+        return replace(self, gaussians=self.gaussians.select(which), moments=self.moments.select(which), memory={})
+
+
+@dataclass(frozen=True)
+class Step:
+    """The last step, as the control sees it."""
+
+    camera: Cameras
+    """The view's camera."""
+    visible: Bool[Tensor, "n"]
+    """Gaussians in the view."""
+    gradients: dict[str, Tensor]
+    """Gradients of the loss, by field."""
+    residual: Float[Tensor, "h w 3"]
+    """The rendered image minus the photograph, sRGB."""
+    rendering: RenderOptions
+    """With which it was rendered."""
+
+
+Control = Callable[[FitState, Step], FitState]
+"""Called after every step; may add, change and remove Gaussians, and store tensors in `memory`."""
+
+
+def fit(
+    gaussians: Gaussians,
+    views: Pyramid,
+    *,
+    options: FitOptions,
+    control: Control | None = None,
+    progress: Progress = silent,
+    checkpoint: Checkpoint = NoCheckpoint(),
+) -> Gaussians:
+    """Fit the fields of `gaussians` whose learning rate is above 0 to the images of `views`.
+
+    Args:
+        gaussians: Start of the fit; stays unchanged.
+        views: Cameras and target images, at least one.
+        options: Length and rates.
+        control: Called after every step, as for density control.
+        progress: Called every ten steps.
+        checkpoint: Where the state is saved every 30 seconds and on Ctrl-C, and from which a run is resumed.
+
+    Raises:
+        ValueError: Where loss or gradients are not finite.
+    """
+    names = options.rates.active()
+    saved = checkpoint.load()
+    state = _start(gaussians, names, len(views)) if saved is None else _unpacked(saved, gaussians.device)
+    last_save, recent = time.monotonic(), 0.0
+    with interruption_held() as interrupted:
+        while state.iteration < options.iterations:
+            state, value, step = _stepped(state, views, names, options)
+            if control is not None:
+                state = control(state, step)
+            recent = value if recent == 0 else 0.95 * recent + 0.05 * value
+            if state.iteration % _REPORT_EVERY == 0 or state.iteration == options.iterations:
+                message = f"loss {recent:.4f}, {state.gaussians.count / 1000:.1f}k Gaussians"
+                progress(state.iteration, options.iterations, message)
+            due = interrupted() or time.monotonic() - last_save > _CHECKPOINT_SECONDS
+            if due and not isinstance(checkpoint, NoCheckpoint):
+                checkpoint.save(_packed(state))
+                last_save = time.monotonic()
+            if interrupted():
+                raise KeyboardInterrupt
+    return state.gaussians
+
+
+def _stepped(
+    state: FitState, views: Pyramid, names: tuple[str, ...], options: FitOptions
+) -> tuple[FitState, float, Step]:
+    """The state after one step on one view, the loss, and what the control sees."""
+    done = state.iteration / options.iterations
+    visit, place = divmod(state.iteration, len(views))
+    # each pass visits all views in an order that depends on seed and pass only
+    index = int(torch.randperm(len(views), generator=_generator(options.seed, visit))[place])
+    view = views.at(index, visit=visit, done=done)
+    rendering = _rendering_of(view, state.iteration, options)
+    leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
+    drawn = render(replace(state.gaussians, **leaves), view.camera, options=rendering)
+    fits_colors = options.view_color_rate > 0
+    colors = state.view_colors.of(index).requires_grad_(fits_colors)
+    picture = drawn.color[0] @ colors[:, :3].T + colors[:, 3] if fits_colors else drawn.color[0]
+    loss = l1_dssim(picture, view.image)
+    value = float(loss.detach())
+    if not math.isfinite(value):
+        raise _diverged(state, f"a loss of {value}")
+    found = torch.autograd.grad(loss, [*leaves.values(), *([colors] if fits_colors else [])])
+    gradients = dict(zip(names, found[: len(names)], strict=True))
+    if fits_colors:
+        rate = options.view_color_rate * (0.5 + 0.5 * math.cos(math.pi * done))
+        state = replace(state, view_colors=state.view_colors.updated(index, found[-1], rate))
+    values = {name: leaf.detach() for name, leaf in leaves.items()}
+    rates = {name: options.rates.at(name, done, v[0].numel() if len(v) else 1) for name, v in values.items()}
+    if not adam.step(values, gradients, moments=state.moments, rates=rates, visible=drawn.visible[0]):
+        raise _diverged(state, "a gradient that is not finite")
+    step = Step(view.camera, drawn.visible[0], gradients, picture.detach() - view.image, rendering)
+    return replace(state, iteration=state.iteration + 1), value, step
+
+
+def _diverged(state: FitState, found: str) -> ValueError:
+    return ValueError(
+        f"fit: expected finite numbers, found {found} at step {state.iteration} (the last checkpoint stands); "
+        "lower the learning rates or look for broken images and cameras"
+    )
+
+
+def _generator(seed: int, number: int, plus: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed((seed * 1_000_003 + number) % 2**62 + plus)
+
+
+def _rendering_of(view: View, iteration: int, options: FitOptions) -> RenderOptions:
+    """How the view is drawn in an iteration."""
+    rendering = options.rendering
+    if view.low_pass_px2 is not None:
+        rendering = replace(rendering, low_pass_px2=view.low_pass_px2)
+    if options.random_background:
+        # uniform in sRGB; depends on seed and iteration only
+        red, green, blue = torch.rand(3, generator=_generator(options.seed, iteration, plus=1)).tolist()
+        rendering = replace(rendering, background=(red, green, blue))
+    return rendering
+
+
+def _start(gaussians: Gaussians, names: tuple[str, ...], views: int) -> FitState:
+    own = gaussians.map(lambda tensor: tensor.detach().clone().contiguous())
+    moments = adam.no_moments({name: getattr(own, name) for name in names}, own.count)
+    return FitState(0, own, moments, ViewColors.identity(views, own.device))
+
+
+def _packed(state: FitState) -> dict[str, Any]:
+    return {
+        "iteration": state.iteration,
+        "gaussians": {f.name: getattr(state.gaussians, f.name) for f in fields(Gaussians)},
+        "first": state.moments.first,
+        "second": state.moments.second,
+        "steps": state.moments.steps,
+        "view_colors": {f.name: getattr(state.view_colors, f.name) for f in fields(ViewColors)},
+        "memory": state.memory,
+    }
+
+
+def _unpacked(saved: dict[str, Any], device: torch.device) -> FitState:
+    def placed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {name: tensor.to(device).clone() for name, tensor in tensors.items()}
+
+    return FitState(
+        saved["iteration"],
+        Gaussians(**placed(saved["gaussians"])),
+        adam.Moments(placed(saved["first"]), placed(saved["second"]), saved["steps"].to(device).clone()),
+        ViewColors(**placed(saved["view_colors"])),
+        placed(saved["memory"]),
+    )

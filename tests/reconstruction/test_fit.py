@@ -1,0 +1,129 @@
+"""The loop that fits Gaussians to images: fields, rates, the views' colours, resuming."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from memory_checkpoint import KilledError, MemoryCheckpoint
+
+from splatgraft.core import cameras as camera_values
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.reconstruction.fit import FitOptions, LearningRates, ViewColors, fit
+from splatgraft.reconstruction.image_pyramid import Level, Pyramid
+from splatgraft.reconstruction.options import Sampling
+from splatgraft.rendering import render
+
+
+def blobs(n: int, seed: int, degree: int = 1) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(
+        means=0.5 * draw(n, 3),
+        log_scales=-2.0 + 0.2 * draw(n, 3),
+        quaternions=draw(n, 4),
+        opacity_logits=draw(n),
+        sh=0.5 * draw(n, (degree + 1) ** 2, 3),
+    )
+
+
+def ring(count: int, size: int = 32) -> camera_values.Cameras:
+    angle = torch.arange(count) * (2 * torch.pi / count)
+    eye = torch.stack([3 * angle.cos(), 3 * angle.sin(), torch.ones(count)], 1)
+    poses = camera_values.look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    return camera_values.pinhole(poses, 1.2 * size, width=size, height=size)
+
+
+def as_views(cameras: camera_values.Cameras, images: list[torch.Tensor]) -> Pyramid:
+    pictures = tuple((255 * image.clamp(0, 1)).round().to(torch.uint8) for image in images)
+    return Pyramid((Level(Sampling(1.0, 1, 1.0), tuple(cameras), pictures),))
+
+
+def views_of(scene: Gaussians, gains: tuple[float, ...] = (1.0,) * 6) -> Pyramid:
+    cameras = ring(len(gains))
+    with torch.no_grad():
+        return as_views(cameras, [g * image for g, image in zip(gains, render(scene, cameras).color, strict=True)])
+
+
+def test_colours_alone_are_recovered_and_all_else_stays():
+    truth = blobs(60, 4)
+    start = replace(truth, sh=torch.zeros_like(truth.sh))
+    options = FitOptions(iterations=120, rates=LearningRates(sh=0.05, sh_higher=0.05))
+    fitted = fit(start, views_of(truth), options=options)
+    assert torch.equal(fitted.means, truth.means)
+    assert torch.equal(fitted.opacity_logits, truth.opacity_logits)
+    before, after = (
+        (render(g, ring(6)).color.clamp(0, 1) - render(truth, ring(6)).color.clamp(0, 1)).square().mean()
+        for g in (start, fitted)
+    )
+    # linear in the colours, so nothing but the number of steps stands between the fit and zero error
+    assert after < 0.02 * before
+
+
+def test_every_field_that_has_a_rate_moves():
+    truth = blobs(60, 5)
+    rates = LearningRates(means=1e-3, log_scales=1e-3, quaternions=1e-3, opacity_logits=1e-3, sh=1e-3)
+    fitted = fit(truth, views_of(blobs(60, 6)), options=FitOptions(iterations=6, rates=rates))
+    for name in rates.active():
+        assert not torch.equal(getattr(fitted, name), getattr(truth, name)), name
+    assert torch.equal(fitted.sh[:, 1:], truth.sh[:, 1:])
+
+
+def test_a_killed_fit_resumes_bit_for_bit(monkeypatch):
+    monkeypatch.setattr("splatgraft.reconstruction.fit._CHECKPOINT_SECONDS", -1.0)
+    views, start = views_of(blobs(60, 7)), blobs(60, 8)
+    rates = LearningRates(means=1e-2, means_final=1e-4, log_scales=1e-2, quaternions=1e-2, opacity_logits=1e-2, sh=1e-2)
+    options = FitOptions(iterations=40, rates=rates, seed=3)
+    whole = fit(start, views, options=options)
+    checkpoint = MemoryCheckpoint()
+
+    def die(done: int, total: int, message: str) -> None:
+        if done == 20:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        fit(start, views, options=options, progress=die, checkpoint=checkpoint)
+    assert checkpoint.state is not None
+    assert 0 < checkpoint.state["iteration"] < 40
+    resumed = fit(start, views, options=options, checkpoint=checkpoint)
+    for name in rates.active():
+        assert torch.equal(getattr(whole, name), getattr(resumed, name)), name
+
+
+def test_colours_that_differ_between_views_do_not_enter_the_scene():
+    truth = blobs(60, seed=3, degree=0)
+    tinted = views_of(truth, gains=(1.3, 0.7, 1.0, 1.2, 0.8, 1.0))
+    grey = replace(truth, sh=torch.zeros_like(truth.sh))
+    errors = []
+    for rate in (0.0, 0.01):
+        options = FitOptions(iterations=240, rates=LearningRates(sh=0.02), view_color_rate=rate)
+        fitted = fit(grey, tinted, options=options)
+        errors.append(float((fitted.sh - truth.sh).abs().median()))
+    # the gains' mean is 1, so the scene's colours are those before the gains
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_the_mean_of_the_views_colours_stays_the_identity():
+    colors = ViewColors.identity(5, torch.device("cpu"))
+    generator = torch.Generator().manual_seed(0)
+    for step in range(40):
+        colors = colors.updated(step % 3, torch.randn(3, 4, generator=generator), 0.01)
+    assert colors.maps.abs().max() > 0.01
+    # float32 rounding of forty sums
+    assert colors.maps.mean(0).abs().max() < 1e-6
+
+
+def test_what_is_not_finite_is_an_error_that_says_so():
+    broken = replace(blobs(20, 9), sh=torch.full((20, 4, 3), float("nan")))
+    with pytest.raises(ValueError, match="found a loss of nan at step 0"):
+        fit(broken, views_of(blobs(20, 9)), options=FitOptions(iterations=3, rates=LearningRates(sh=0.1)))
+
+
+def test_rates_fall_as_3dgs_says():
+    rates = LearningRates(means=1.6e-4, means_final=1.6e-6, sh=0.0025, sh_higher=0.0025 / 20)
+    # exponential: the geometric mean half-way
+    assert torch.allclose(rates.at("means", 0.5, 3), torch.full((3,), 1.6e-5))
+    assert torch.allclose(rates.at("sh", 0.9, 12), torch.tensor([0.0025] * 3 + [0.0025 / 20] * 9))
+    assert rates.active() == ("means", "sh")
