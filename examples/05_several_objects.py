@@ -28,7 +28,12 @@ def main() -> None:
             surroundings=cut.surroundings,
             options=sg.PlaceOptions(scale=1.0),
         )
-        print(folder.name, "at", [round(x, 2) for x in placed.support.point.tolist()], *placed.warnings)
+        print(
+            folder.name,
+            "at",
+            [round(x, 2) for x in placed.support.point.tolist()],
+            *(note.text for note in placed.warnings),
+        )
         composite = composite.with_object(cut.object, placed.target_from_object)
 
     relit = sg.relight(composite, target.cameras, sources=sources)

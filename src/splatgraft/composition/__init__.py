@@ -1,11 +1,8 @@
 """Compose: place objects in a target scene, by given transforms or on a surface found for them."""
 
-from splatgraft.composition.assemble import compose
-from splatgraft.composition.object_base import ObjectBase, object_base
-from splatgraft.composition.place_suggestion import Suggestion, suggest_places
-from splatgraft.composition.placement import Placed, PlaceOptions, place_object
-from splatgraft.composition.point_visibility import hidden_fraction
-from splatgraft.composition.resting_pose import RestOptions, rest_on_surface
+from splatgraft.composition.object_base import ObjectBase, RestOptions, object_base, rest_on_surface
+from splatgraft.composition.placement import Placed, PlaceOptions, compose, place_object
+from splatgraft.composition.places import Suggestion, hidden_fraction, suggest_places
 from splatgraft.composition.support_surface import Support, support_below
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import Composite, PlacedObject

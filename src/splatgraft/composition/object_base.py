@@ -1,14 +1,17 @@
-"""Base point, up axis, height and radius of an object, from weighted quantiles and the surface it was captured on."""
+"""Base of an object, from weighted quantiles and the surface it was captured on, and its pose on another surface."""
 
+import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.composition.support_surface import support_below
+from splatgraft.composition.support_surface import Support, support_below
 from splatgraft.core.directions import tangents
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.rotations import rotation_about, rotation_between
+from splatgraft.core.similarity import Similarity
 
 
 @dataclass(frozen=True)
@@ -27,27 +30,24 @@ class ObjectBase:
     """Source of the base: "surface" (of its own capture) or "extent" (lowest parts of the object)."""
 
 
-@dataclass(frozen=True)
-class ObjectBaseOptions:
-    """Quantiles of the object's extent, and when its own ground is used; values set by hand."""
-
-    height_trim: float = 0.01
-    """Share of the object's weight beyond its lowest and its highest level."""
-    middle_trim: float = 0.02
-    """Share of the object's weight beyond either end of its horizontal extent, whose middle is taken."""
-    reach: float = 0.97
-    """Share of the object's weight within its radius."""
-    search_height: float = 0.3
-    """Height above the lowest part from which the ground is searched downwards, over the object's height."""
-    disc_radius: float = 2.0
-    """Radius of the searched disc over the object's: nothing was seen under the object, so its surroundings count."""
-    most_rise: float = 0.1
-    """Largest height of the ground above the lowest part, over the object's: masks that take more of the ground are
-    rare, and what hangs on a wall has edges of other things beside it that look like ground."""
-    most_gap: float = 0.25
-    """Largest depth of the ground below the lowest part, over the height: masks do not miss more of a foot."""
-    least_flat: float = 0.25
-    """Least share of the disc that lies on the ground."""
+# set by hand; shares of the object's weight
+_HEIGHT_TRIM = 0.01
+"""Beyond its lowest and its highest level."""
+_MIDDLE_TRIM = 0.02
+"""Beyond either end of its horizontal extent, whose middle is taken."""
+_WITHIN_RADIUS = 0.97
+# lengths over the object's height or radius
+_SEARCH_HEIGHT = 0.3
+"""Height above the lowest part from which the ground is searched downwards."""
+_DISC_RADIUS = 2.0
+"""Radius of the searched disc: nothing was seen under the object, so its surroundings count."""
+_MAX_RISE = 0.1
+"""Largest height of the ground above the lowest part: masks that take more of the ground are rare, and what hangs on a
+wall has edges of other things beside it that look like ground."""
+_MAX_GAP = 0.25
+"""Largest depth of the ground below the lowest part: masks do not miss more of a foot."""
+_MIN_FLAT = 0.25
+"""Least share of the disc that lies on the ground."""
 
 
 def object_base(
@@ -55,7 +55,6 @@ def object_base(
     *,
     up: Float[Tensor, "3"],
     surroundings: Gaussians | None = None,
-    options: ObjectBaseOptions = ObjectBaseOptions(),
 ) -> ObjectBase:
     """Base of `object_`, on its own ground where that is found, otherwise at its lowest parts.
 
@@ -63,7 +62,6 @@ def object_base(
         object_: The object in the frame of its capture.
         up: Of any length but zero.
         surroundings: The capture without the object; None where there is none.
-        options: Quantiles and tolerances.
 
     Raises:
         ValueError: Where the object is empty.
@@ -74,9 +72,9 @@ def object_base(
     weight = object_.opacities * object_.log_scales.sort(dim=-1).values[:, 1:].sum(-1).exp()
     level = object_.means @ up
     reach = torch.einsum("i,nij,j->n", up, object_.covariances, up).clamp_min(0).sqrt()
-    low = _quantile(level - reach, weight, options.height_trim)
-    high = _quantile(level + reach, weight, 1 - options.height_trim)
-    ends = options.middle_trim, 1 - options.middle_trim
+    low = _quantile(level - reach, weight, _HEIGHT_TRIM)
+    high = _quantile(level + reach, weight, 1 - _HEIGHT_TRIM)
+    ends = _MIDDLE_TRIM, 1 - _MIDDLE_TRIM
     middle = sum(
         0.5
         * (_quantile(object_.means @ axis, weight, ends[0]) + _quantile(object_.means @ axis, weight, ends[1]))
@@ -84,26 +82,23 @@ def object_base(
         for axis in tangents(up)
     )
     offset = object_.means - middle
-    radius = float(_quantile((offset - (offset @ up)[:, None] * up).norm(dim=-1), weight, options.reach))
+    radius = float(_quantile((offset - (offset @ up)[:, None] * up).norm(dim=-1), weight, _WITHIN_RADIUS))
     base = ObjectBase(
         point=middle + low * up, up=up, height=float(high - low), radius=max(radius, 1e-9), stands_on="extent"
     )
-    return base if surroundings is None else _on_own_surface(base, surroundings, options)
+    return base if surroundings is None else _on_own_surface(base, surroundings)
 
 
-def _on_own_surface(base: ObjectBase, surroundings: Gaussians, options: ObjectBaseOptions) -> ObjectBase:
+def _on_own_surface(base: ObjectBase, surroundings: Gaussians) -> ObjectBase:
     """The base moved to the ground around the object; unchanged where there is none near its lowest part."""
-    start = base.point + options.search_height * base.height * base.up
+    start = base.point + _SEARCH_HEIGHT * base.height * base.up
     try:
-        radius = options.disc_radius * base.radius
+        radius = _DISC_RADIUS * base.radius
         found = support_below(surroundings, start, up=base.up, radius=radius, clearance=0.0)
     except ValueError:
         return base
     rise = float((found.point - base.point) @ base.up)
-    if (
-        not -options.most_gap * base.height <= rise <= options.most_rise * base.height
-        or found.flat_fraction < options.least_flat
-    ):
+    if not -_MAX_GAP * base.height <= rise <= _MAX_RISE * base.height or found.flat_fraction < _MIN_FLAT:
         return base
     point = found.point
     return ObjectBase(point=point, up=found.normal, height=base.height - rise, radius=base.radius, stands_on="surface")
@@ -115,3 +110,43 @@ def _quantile(values: Float[Tensor, "n"], weight: Float[Tensor, "n"], share: flo
     filled = weight[order].double().cumsum(0)
     index = int(torch.searchsorted(filled, share * filled[-1]))
     return values[order[min(index, len(values) - 1)]]
+
+
+@dataclass(frozen=True)
+class RestOptions:
+    """Scale, yaw and offset of the resting object."""
+
+    scale: float = 1.0
+    """Size in the target over size in the object's own capture."""
+    yaw_deg: float = 0.0
+    """Rotation about the surface's normal, counterclockwise seen from above."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Added to the position, world units of the target."""
+
+
+def rest_on_surface(
+    target: Gaussians,
+    base: ObjectBase,
+    *,
+    point: Float[Tensor, "3"],
+    up: Float[Tensor, "3"],
+    options: RestOptions = RestOptions(),
+) -> tuple[Similarity, Support]:
+    """`target_from_object` that rests `base` on the surface below `point`, along its normal, and that surface.
+
+    Args:
+        target: The receiving scene.
+        base: The object's base, in its own capture.
+        point: On or above the surface, in the target.
+        up: Of the target, of any length but zero.
+        options: Scale, yaw and offset.
+
+    Raises:
+        ValueError: Where no surface lies below `point`.
+    """
+    support = support_below(target, point, up=up, radius=options.scale * base.radius)
+    yaw = rotation_about(support.normal, math.radians(options.yaw_deg))
+    rotation = yaw @ rotation_between(base.up, support.normal)
+    place = support.point + torch.tensor(options.offset).to(support.point)
+    translation = place - options.scale * rotation @ base.point
+    return Similarity(scale=options.scale, rotation=rotation.float(), translation=translation.float()), support

@@ -1,21 +1,34 @@
-"""Automatic placement of an object in a target scene: its base, a place, a scale, an upright pose and a yaw."""
+"""Places objects in a target scene, by given transforms, or by a base, a place, a scale, an upright pose and a yaw."""
 
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatgraft.composition.facing_direction import facing_yaw_deg, unseen_share
-from splatgraft.composition.object_base import ObjectBase, object_base
-from splatgraft.composition.place_suggestion import Suggestion, scale_in_view, suggest_places
-from splatgraft.composition.point_visibility import hidden_fraction
-from splatgraft.composition.resting_pose import RestOptions, rest_on_surface
+from splatgraft.composition.object_base import ObjectBase, RestOptions, object_base, rest_on_surface
+from splatgraft.composition.places import Suggestion, hidden_fraction, scale_in_view, suggest_places
 from splatgraft.composition.support_surface import Support, support_below
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.composite import Composite, PlacedObject
+from splatgraft.core.directions import tangents
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
+from splatgraft.runtime.note import Note
+
+# set by hand
+_CLEARLY_BETTER = 1.5
+"""By which factor a later place has to be better: an earlier one is nearer to where the cameras look. With 1.1 a second
+object was put on top of the first."""
+_YAW_SPREAD_DEG, _YAW_STEP_DEG = 30.0, 5
+"""Standard deviation of the azimuth that a photograph covers around its own, and distance of the yaws tried."""
+_GOOD_YAW = 0.98
+"""Coverage over the best one above which the smallest turn is preferred."""
+_PHOTOGRAPHED_DEG = 50.0
+"""Largest angle to a photograph's direction from which a side of the object was seen well enough."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +57,8 @@ class Placed:
     """The surface under it."""
     hidden_fraction: float
     """Share of the object that no target camera can see, in [0, 1]."""
-    warnings: tuple[str, ...] = field(default=())
-    """Problems that a user should look at, one sentence each."""
+    warnings: tuple[Note, ...] = ()
+    """Problems that a user should look at."""
 
 
 def place_object(
@@ -90,18 +103,13 @@ def place_object(
         base=base,
         support=support,
         hidden_fraction=hidden,
-        warnings=found.reasons + _warnings(support, hidden, unseen),
+        warnings=tuple(Note(reason, "warning") for reason in found.reasons) + _warnings(support, hidden, unseen),
     )
 
 
 def _towards(source_cameras: Cameras, base: ObjectBase, target_from_object: Similarity) -> Float[Tensor, "s 3"]:
     """From the object to the cameras of its own capture, in the target's frame, object units."""
     return (source_cameras.centers - base.point) @ target_from_object.rotation.T
-
-
-_CLEARLY_BETTER = 1.5
-"""By which factor a later place has to be better: an earlier one is nearer to where the cameras look. With 1.1 a second
-object was put on top of the first."""
 
 
 def _best_place(
@@ -125,18 +133,100 @@ def _best_place(
     return best
 
 
-def _warnings(support: Support, hidden: float, unseen: float) -> tuple[str, ...]:
-    out = []
-    if unseen > 0.2:
-        out.append(
-            f"{unseen:.0%} of the target's images show a side of the object that none of its photos shows, where it is "
-            "unknown: turn it (--yaw-deg), place it before a wall, or photograph it from there too."
-        )
+def _warnings(support: Support, hidden: float, unseen: float) -> tuple[Note, ...]:
     # the underside is always hidden: a sixth of a cube
-    if hidden > 0.25:
-        out.append(f"{hidden:.0%} of the object is hidden from every camera: it may stick in a wall or in furniture.")
-    if support.flat_fraction < 0.6:
-        out.append(f"Only {support.flat_fraction:.0%} of the ground under the object is level.")
-    if support.obstructed_fraction > 0.1:
-        out.append(f"{support.obstructed_fraction:.0%} of the ground under the object is taken by something else.")
-    return tuple(out)
+    found = (
+        (
+            unseen > 0.2,
+            f"{unseen:.0%} of the target's images show a side of the object that none of its photos shows, where it is "
+            "unknown.",
+            "Turn it (--yaw-deg), place it before a wall, or photograph it from there too.",
+        ),
+        (
+            hidden > 0.25,
+            f"{hidden:.0%} of the object is hidden from every camera: it may stick in a wall or in furniture.",
+            "",
+        ),
+        (support.flat_fraction < 0.6, f"Only {support.flat_fraction:.0%} of the ground under the object is level.", ""),
+        (
+            support.obstructed_fraction > 0.1,
+            f"{support.obstructed_fraction:.0%} of the ground under the object is taken by something else.",
+            "",
+        ),
+    )
+    return tuple(Note(text, "warning", remedy) for true, text, remedy in found if true)
+
+
+def facing_yaw_deg(
+    to_source_cameras: Float[Tensor, "s 3"],
+    to_target_cameras: Float[Tensor, "t 3"],
+    *,
+    up: Float[Tensor, "3"],
+) -> float:
+    """Rotation about `up` that turns photographed sides towards the target's cameras.
+
+    Args:
+        to_source_cameras: From the object to the cameras of its own capture, in the target's frame.
+        to_target_cameras: From the object to the target's cameras, in the target's frame.
+        up: Unit.
+
+    Returns:
+        Degrees in [-180, 180); the smallest of about equally good ones: 0 where the capture goes all round.
+    """
+    yaw = torch.arange(-180, 180, _YAW_STEP_DEG, dtype=torch.float64)
+    source, target = (_azimuth(x.double(), up.double()) for x in (to_source_cameras, to_target_cameras))
+    miss = target[None, :, None] - source[None, None, :] - torch.deg2rad(yaw)[:, None, None]
+    miss = torch.remainder(miss + math.pi, 2 * math.pi) - math.pi
+    # for each camera of the target, how near in azimuth the nearest photograph was taken
+    covered = torch.exp(-0.5 * (miss / math.radians(_YAW_SPREAD_DEG)) ** 2).amax(2).mean(1)
+    good = covered >= _GOOD_YAW * covered.max()
+    return float(yaw[good][yaw[good].abs().argmin()])
+
+
+def unseen_share(to_source_cameras: Float[Tensor, "s 3"], to_target_cameras: Float[Tensor, "t 3"]) -> float:
+    """Share of the target's cameras, in [0, 1], that see the object from where no photograph of it was taken.
+
+    Args:
+        to_source_cameras: From the object to the cameras of its own capture, in the target's frame.
+        to_target_cameras: From the object to the target's cameras, in the target's frame.
+    """
+    source, target = (torch.nn.functional.normalize(x.double(), dim=1) for x in (to_source_cameras, to_target_cameras))
+    nearest = (target @ source.T).amax(1)
+    return float((nearest < math.cos(math.radians(_PHOTOGRAPHED_DEG))).double().mean())
+
+
+def _azimuth(directions: Float[Tensor, "n 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "n"]:
+    tangent, bitangent = tangents(up)
+    return torch.atan2(directions @ bitangent, directions @ tangent)
+
+
+def compose(
+    target: Gaussians,
+    objects: Sequence[Gaussians],
+    *,
+    target_from_objects: Sequence[Similarity],
+    erased: Bool[Tensor, "n"] | None = None,
+) -> Composite:
+    """Place objects in a target scene.
+
+    Args:
+        target: The scene that receives the objects, n Gaussians.
+        objects: The objects, each in the frame of the capture that it comes from.
+        target_from_objects: The placement of each object, such as `place_object` finds.
+        erased: Gaussians of the target that are left out; none where not given.
+
+    Returns:
+        The composite; its parts are kept apart until it is baked.
+
+    Raises:
+        ValueError: There is not one transform per object, or `erased` has another length than the target.
+    """
+    if len(objects) != len(target_from_objects):
+        raise ValueError(f"placement: expected {len(objects)} objects, one per .ply, found {len(target_from_objects)}")
+    if erased is None:
+        erased = torch.zeros(target.count, dtype=torch.bool, device=target.device)
+    if len(erased) != target.count:
+        raise ValueError(f"erased: expected one flag for each of {target.count} Gaussians, found {len(erased)}")
+    pairs = zip(objects, target_from_objects, strict=True)
+    placed = tuple(PlacedObject(gaussians=g, target_from_object=t) for g, t in pairs)
+    return Composite(target=target, objects=placed, erased=erased)

@@ -1,4 +1,10 @@
-"""The level surface below a point of a scene: the most frequent level of a height map, refined by least squares."""
+"""The level surface below a point of a scene: the most frequent level of a height map, refined by least squares.
+
+The height map is depth rendered from straight above, without what lies over a given level. The mean depth of a pixel
+lies below a surface that lets some light through, as reconstructed glossy table tops do: their reflections are
+Gaussians underneath. There the height is the median over the pixel's blending weights; at edges, which are as fuzzy as
+Gaussians are, the mean stands, so that what reaches beyond them does not count as ground.
+"""
 
 from dataclasses import dataclass
 
@@ -6,36 +12,145 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatgraft.composition.height_map import height_map
+from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.rendering import RenderOptions, render
+
+_CAMERA_DISTANCE = 24.0
+"""Distance of the camera over the radius: rays are vertical within 2.4 degrees."""
+_LEVELS, _LEVELS_AT_ONCE = 64, 16
+"""Heights between which the median is interpolated, and how many of them are blended at a time, which bounds memory."""
+_EDGE_RISE = 4.0
+"""Rise over three pixels, in pixels, from which on the middle one is at an edge."""
+_MIN_DIFFERENCE = 0.25
+"""Distance from the mean, over that of two levels, from which on the median is taken: interpolation errs by .1."""
 
 
 @dataclass(frozen=True)
-class SupportOptions:
-    """What counts as a level surface; lengths over the radius of the disc, values set by hand."""
+class HeightMap:
+    """s x s heights of the topmost surface around a point."""
 
-    steepest: float = 0.35
-    """Sine of the largest slope that counts as level: 20 degrees, mainly for errors of the estimated up."""
-    clearance: float = 0.25
-    """Height above the point from which the surface is searched downwards, where it is not given."""
-    map_size: int = 64
-    """Width and height of the height map, pixels."""
-    least_pixels: int = 8
-    """Solid pixels of the height map below which there is no surface."""
-    widened: tuple[float, ...] = (1.0, 2.0, 4.0)
-    """Radii of the discs, over the given one, until one has a surface: the place may be a hole in the scene."""
-    level_step: float = 0.05
-    """Width of a bin of the histogram of heights."""
-    tolerances: tuple[float, ...] = (0.3, 0.2, 0.12, 0.08, 0.06, 0.06)
-    """Distance from the plane of the points that each fit takes: from 20 degrees of slope to surface noise."""
-    on_surface: float = 0.06
-    """Largest distance from the plane of a point that lies on it."""
-    above: float = 0.1
-    """Least distance above the plane of a point that obstructs the disc."""
-    capped_error: float = 0.12
-    """Bound on the distance of a point when a sloped plane is compared with a level one."""
-    slope_gain: float = 0.7
-    """Largest error of the sloped plane over that of the level one; a slope that explains less is noise."""
+    points: Float[Tensor, "s s 3"]
+    """Surface points, in the world; meaningless where alpha is 0."""
+    heights: Float[Tensor, "s s"]
+    """Along `up` above the map's centre, world units."""
+    alpha: Float[Tensor, "s s"]
+    """Opacity of the scene seen from above, in [0, 1]."""
+    offsets: Float[Tensor, "s s 2"]
+    """Horizontal position from the map's centre, world units."""
+    pixel: float
+    """Width of a pixel, world units."""
+
+
+def height_map(
+    scene: Gaussians,
+    center: Float[Tensor, "3"],
+    *,
+    up: Float[Tensor, "3"],
+    radius: float,
+    top: float,
+    size: int = 96,
+) -> HeightMap:
+    """The height map of the square of half width `radius` around `center`.
+
+    Args:
+        scene: What is seen from above.
+        center: World units.
+        up: Of any length but zero.
+        radius: World units.
+        top: Gaussians centred more than this above `center` are left out, world units.
+        size: Width and height of the map, pixels.
+    """
+    center, up = center.to(scene.means), torch.nn.functional.normalize(up.to(scene.means), dim=0)
+    distance = _CAMERA_DISTANCE * radius
+    eye = center + (top + distance) * up
+    # any image orientation will do; look_at only needs an axis that is not parallel to the view
+    world_axis = torch.eye(3).to(up)[int(up.abs().argmin())]
+    pose = look_at(eye[None], center, world_axis)
+    focal = size / 2 * distance / radius
+    camera = pinhole(pose, focal, width=size, height=size)
+    rendered = render(scene, camera, outputs=frozenset({"depth"}), options=RenderOptions(near=distance))
+    depth, alpha = rendered.depth[0].detach(), rendered.alpha[0].detach()
+    median = _median_depth(scene, camera, depth, alpha, near=distance)
+    steepest = _EDGE_RISE * 2 * radius / size
+    depth = torch.where(_range_around(median) < steepest, median, depth)
+    x = (torch.arange(size).to(depth) + 0.5 - size / 2) / focal
+    v, u = torch.meshgrid(x, x, indexing="ij")
+    in_camera = torch.stack([u * depth, v * depth, depth], -1)
+    points = in_camera @ pose[0, :3, :3].T + pose[0, :3, 3]
+    relative = points - center
+    right, down = pose[0, :3, 0], pose[0, :3, 1]
+    return HeightMap(
+        points=points,
+        heights=relative @ up,
+        alpha=alpha,
+        offsets=torch.stack([relative @ right, relative @ down], -1),
+        pixel=2 * radius / size,
+    )
+
+
+def _range_around(depth: Float[Tensor, "s s"]) -> Float[Tensor, "s s"]:
+    """Largest difference within a pixel and its eight neighbours."""
+    pool = torch.nn.functional.max_pool2d
+    return (pool(depth[None], 3, 1, 1) + pool(-depth[None], 3, 1, 1))[0]
+
+
+def _median_depth(
+    scene: Gaussians, camera: Cameras, mean: Float[Tensor, "s s"], alpha: Float[Tensor, "s s"], *, near: float
+) -> Float[Tensor, "s s"]:
+    """`mean`, and the median depth where it differs from it by more than interpolation does, world units."""
+    solid = alpha > 0.5
+    if not bool(solid.any()):
+        return mean
+    pose = camera.camera_from_world[0]
+    across = (scene.means @ pose[:2, :3].T + pose[:2, 3]).abs().amax(1)
+    # rays that are all but vertical: what is drawn lies in the square, give or take its own width
+    half = 1.2 * near / _CAMERA_DISTANCE
+    scene = scene.select(across < half + 4 * scene.scales.amax(1))
+    depths = scene.means @ pose[2, :3] + pose[2, 3]
+    deepest = float(mean[solid].max())
+    step = (deepest - near) / (_LEVELS - 2)
+    if not step > 0:
+        return mean
+    # one level beyond the deepest mean, so that the shares of an even surface reach a half
+    levels = near + step * torch.arange(_LEVELS).to(mean)
+    options, nearer = RenderOptions(near=near), []
+    for part in levels.split(_LEVELS_AT_ONCE):
+        # share of each Gaussian that lies nearer than a level, in steps that join
+        shares = ((part - depths[:, None]) / step + 0.5).clamp(0, 1)
+        drawn = render(scene, camera, outputs=frozenset(), features=shares, options=options)
+        nearer.append(drawn.features[0].detach())
+    share = torch.cat(nearer, -1) / alpha.clamp_min(1e-6)[..., None]
+    reached = share >= 0.5
+    after = reached.int().argmax(-1).clamp_min(1)
+    low, high = (share.gather(-1, at[..., None])[..., 0] for at in (after - 1, after))
+    median = levels[after - 1] + step * ((0.5 - low) / (high - low).clamp_min(1e-6)).clamp(0, 1)
+    # a median below the last level is not known
+    known = solid & reached.any(-1)
+    return torch.where(known & ((median - mean).abs() > _MIN_DIFFERENCE * step), median, mean)
+
+
+# lengths over the radius of the disc, set by hand
+_MAX_SLOPE = 0.35
+"""Sine of the largest slope that counts as level: 20 degrees, mainly for errors of the estimated up."""
+_CLEARANCE = 0.25
+"""Height above the point from which the surface is searched downwards, where it is not given."""
+_DISC_SIZE_PX = 64
+"""Width and height of the height map."""
+_MIN_PIXELS = 8
+"""Solid pixels of the height map below which there is no surface."""
+_WIDENED = (1.0, 2.0, 4.0)
+"""Radii of the discs, over the given one, until one has a surface: the place may be a hole in the scene."""
+_LEVEL_STEP = 0.05
+"""Width of a bin of the histogram of heights."""
+_TOLERANCES = (0.3, 0.2, 0.12, 0.08, 0.06, 0.06)
+"""Distance from the plane of the points that each fit takes: from 20 degrees of slope to surface noise."""
+_ON_SURFACE, _ABOVE = 0.06, 0.1
+"""Largest distance from the plane of a point that lies on it, and least of one that obstructs the disc."""
+_MAX_ERROR = 0.12
+"""Bound on the distance of a point when a sloped plane is compared with a level one."""
+_SLOPE_GAIN = 0.7
+"""Largest error of the sloped plane over that of the level one; a slope that explains less is noise."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +174,6 @@ def support_below(
     up: Float[Tensor, "3"],
     radius: float,
     clearance: float | None = None,
-    options: SupportOptions = SupportOptions(),
 ) -> Support:
     """The surface that fills most of a horizontal disc below `point`, level as far as one is.
 
@@ -72,28 +186,27 @@ def support_below(
         radius: Of the disc, world units.
         clearance: Height above `point` from which the search starts, world units; what is higher, such as a lamp, is
             ignored. None takes a share of the radius, so that a point on a noisy surface finds it.
-        options: What counts as level.
 
     Raises:
         ValueError: Where no surface lies below.
     """
     up = torch.nn.functional.normalize(up.to(scene.means), dim=0)
     point = point.to(scene.means)
-    top = options.clearance * radius if clearance is None else clearance
-    for factor in options.widened:
-        ground = height_map(scene, point, up=up, radius=factor * radius, top=top, size=options.map_size)
+    top = _CLEARANCE * radius if clearance is None else clearance
+    for factor in _WIDENED:
+        ground = height_map(scene, point, up=up, radius=factor * radius, top=top, size=_DISC_SIZE_PX)
         disc = ground.offsets.norm(dim=-1) <= factor * radius
         # what is half transparent is a floater or an edge
         solid = disc & (ground.alpha > 0.5)
-        if int(solid.sum()) >= options.least_pixels:
+        if int(solid.sum()) >= _MIN_PIXELS:
             break
     else:
         where = ", ".join(f"{x:.3g}" for x in point.tolist())
         raise ValueError(f"placement: expected a surface below ({where}), found none; name another point")
     points = ground.points[solid] - point
-    on_plane, normal, height = _fit_level_plane(points, ground.heights[solid], up=up, radius=radius, options=options)
+    on_plane, normal, height = _fit_level_plane(points, ground.heights[solid], up=up, radius=radius)
     flat = float(on_plane.sum() / disc.sum())
-    above = (points @ normal - height) > options.above * radius
+    above = (points @ normal - height) > _ABOVE * radius
     return Support(
         point=point + up * height / (normal @ up),
         normal=normal,
@@ -108,16 +221,15 @@ def _fit_level_plane(
     *,
     up: Float[Tensor, "3"],
     radius: float,
-    options: SupportOptions,
 ) -> tuple[Bool[Tensor, "m"], Float[Tensor, "3"], Float[Tensor, ""]]:
     """Points on the most frequent level, its normal and its distance along the normal from the origin."""
-    step = options.level_step * radius
+    step = _LEVEL_STEP * radius
     # a moving sum of five bins: noise and a slight slope spread one surface over several
     counts = torch.bincount(((heights - heights.min()) / step).long())
     smooth = torch.nn.functional.conv1d(counts[None, None].float(), torch.ones(1, 1, 5), padding=2)[0, 0]
     level = heights.min() + (float(smooth.argmax()) + 0.5) * step
     normal, distance = up, level
-    for tolerance in options.tolerances:
+    for tolerance in _TOLERANCES:
         near = (points @ normal - distance).abs() < tolerance * radius
         if int(near.sum()) < 8:
             break
@@ -125,14 +237,14 @@ def _fit_level_plane(
         middle = chosen.mean(0)
         _, _, axes = torch.linalg.svd(chosen - middle, full_matrices=False)
         candidate = axes[2] * torch.sign(axes[2] @ up.double())
-        if float(candidate @ up.double()) < (1 - options.steepest**2) ** 0.5:
+        if float(candidate @ up.double()) < (1 - _MAX_SLOPE**2) ** 0.5:
             break
         normal = candidate.to(points)
         distance = (middle @ candidate).to(points)
-    height = heights[(heights - level).abs() < options.on_surface * radius].median()
-    cap = options.capped_error * radius
+    height = heights[(heights - level).abs() < _ON_SURFACE * radius].median()
+    cap = _MAX_ERROR * radius
     errors = [(points @ n - d).abs().clamp_max(cap).mean() for n, d in ((normal, distance), (up, height))]
-    if errors[0] > options.slope_gain * errors[1]:
+    if errors[0] > _SLOPE_GAIN * errors[1]:
         normal, distance = up, height
-    near = (points @ normal - distance).abs() < options.on_surface * radius
+    near = (points @ normal - distance).abs() < _ON_SURFACE * radius
     return near, normal, distance

@@ -1,7 +1,8 @@
-"""Numba kernels: compiled once and cached under a hash of all kernel sources, and run one at a time in a process."""
+"""Numba kernels: cached under a hash of all sources that they are made of, and run one at a time in a process."""
 
 import functools
 import hashlib
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -14,8 +15,11 @@ KERNEL_LOCK = threading.Lock()
 start kernels at the same time."""
 
 
+_IMPORT = re.compile(rb"^(?:from [\w.]+ )?import (?:\([^)]*\)|.*)", re.MULTILINE)
+
+
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """`numba.njit` with a cache that is renewed when any kernel source of the package changes.
+    """`numba.njit` with a cache that is renewed when a kernel file that the function's file imports changes, too.
 
     Numba looks at the file of the function alone, and would go on to run what it once inlined from another file.
     Constants that kernels use stand in files with kernels, too.
@@ -25,16 +29,28 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     compiled = numba.njit(cache=True, **options)(function)
     if not numba.config.DISABLE_JIT:
         index = compiled._cache._cache_file
-        index._source_stamp = (index._source_stamp, _hash_of_sources())
+        index._source_stamp = (index._source_stamp, _hash_of_sources(Path(function.__code__.co_filename)))
     return compiled
 
 
 @functools.cache
-def _hash_of_sources() -> str:
-    """Of all files of the package that name numba or this module."""
-    sources = (path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py")))
-    kernels = [source for source in sources if b"numba" in source or b"runtime.kernels" in source]
-    return hashlib.sha256(b"\0".join(kernels)).hexdigest()
+def _kernel_sources() -> dict[Path, bytes]:
+    """All files of the package that name numba or this module."""
+    sources = {path: path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py"))}
+    return {path: text for path, text in sources.items() if b"numba" in text or b"runtime.kernels" in text}
+
+
+@functools.cache
+def _hash_of_sources(file: Path) -> str:
+    """Hash of a kernel file and of the kernel files that it imports, directly or through others."""
+    sources = _kernel_sources()
+    reached, found = set(), {file}
+    while found:
+        reached |= found
+        imports = b" ".join(part for path in found for part in _IMPORT.findall(sources[path]))
+        words = set(re.findall(rb"\w+", imports))
+        found = {path for path in sources if path.stem.encode() in words} - reached
+    return hashlib.sha256(b"\0".join(sources[path] for path in sorted(reached))).hexdigest()
 
 
 def serialized(kernel: Callable[..., Any]) -> Callable[..., Any]:

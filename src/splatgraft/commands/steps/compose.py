@@ -78,8 +78,7 @@ class Compose:
         where = ", ".join(f"{x:.3f}" for x in placed.support.point.tolist())
         context.console.say(f"placed at ({where}), scale {placed.target_from_object.scale:.3f}")
         context.console.say(_size(placed, self.options.scale, in_metres[0], in_metres[1]))
-        for warning in placed.warnings:
-            context.console.warn(warning)
+        context.console.tell(*placed.warnings)
         return Placement(objects=(ObjectPlacement(target_from_object=placed.target_from_object),))
 
 
