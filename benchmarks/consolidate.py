@@ -120,7 +120,7 @@ def problem_of(capture: PosedImages, scene: Gaussians) -> Problem:
 
 def compare_methods(problem: Problem, loss: ImageLoss, iterations: int) -> str:
     """Both methods on photographs that agree."""
-    options = ConsolidateOptions(loss=loss, view_error=None)
+    options = ConsolidateOptions(loss=loss, view_error=False)
     consolidate(problem.composite, problem.cameras[:2], problem.images[:2], options)  # compiles the kernels
     runs = {
         "fast": options,
@@ -156,9 +156,9 @@ def compare_losses(problem: Problem, passes: int) -> None:
         print(f"without LPIPS: {error}")
     settings = {"A: 0.8 px": (0.8, 44.0), "B: 1.5 px": (1.5, 44.0), "C: fine jitter": (0.8, 8.0)}
     polish = ConsolidateOptions().polish
-    rows = [("equations alone", ConsolidateOptions(polish_passes=0, view_error=None))]
+    rows = [("equations alone", ConsolidateOptions(polish_passes=0, view_error=False))]
     rows += [
-        (name, ConsolidateOptions(loss=loss, view_error=None, polish_passes=passes, polish=polish))
+        (name, ConsolidateOptions(loss=loss, view_error=False, polish_passes=passes, polish=polish))
         for name, loss in losses.items()
     ]
     rows += [("per-view tint and flow, equations alone", ConsolidateOptions(polish_passes=0))]

@@ -113,7 +113,7 @@ def renderer(setting: Setting) -> list[Row]:
 
 
 def reconstruct_room(setting: Setting) -> list[Row]:
-    """Quality and time of reconstructions: a draft, and `full` (3DGS-MCMC, a million Gaussians) with 7000 steps."""
+    """Quality and time of reconstructions: a draft, and `full` (a million Gaussians) with 7000 steps."""
     from splatgraft.core.image_metrics import psnr
     from splatgraft.core.posed_images import held_out
     from splatgraft.formats import read_capture

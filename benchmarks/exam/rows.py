@@ -63,7 +63,7 @@ def _fitted_to_truth(scene: ExamScene) -> Gaussians:
         shadowed = srgb_from_linear(linear_from_srgb(view.background) * with_object / without.clamp_min(1e-3))
         image = torch.where(regions.rest[..., None], view.picture(told), shadowed.clamp(0, 1))
         images.append(torch.where(regions.object[..., None], view.truth.image, image))
-    return consolidate(told, scene.cameras, images, ConsolidateOptions(view_error=None))
+    return consolidate(told, scene.cameras, images, ConsolidateOptions(view_error=False))
 
 
 def _told(row: str, scene: ExamScene) -> tuple[SourceScene, Light | None]:

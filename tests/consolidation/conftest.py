@@ -1,11 +1,15 @@
 """A small ball of Gaussians with cameras around it, and the same ball under another light."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from splatgraft.consolidation import ConsolidateOptions
+from splatgraft.consolidation.frozen_views import Views
+from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import render
@@ -40,6 +44,18 @@ def ring(views: int, size: int = 48) -> Cameras:
     angle = torch.arange(views) / views * 2 * torch.pi
     eyes = torch.stack([3 * angle.cos(), 0.8 * (3 * angle).sin(), 3 * angle.sin()], -1)
     return pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), 50.0, width=size, height=size)
+
+
+def views_of(scene: Gaussians, cameras: Cameras, images: Sequence[Tensor], **changes) -> Views:
+    """Exact maps, which tests compare with the renderer."""
+    exact = ConsolidateOptions(min_row_weight=0.0, cache_bytes=2**24)
+    return Views(scene, cameras, images, weights=changes.pop("weights", None), options=replace(exact, **changes))
+
+
+def basis_towards(scene: Gaussians, camera: Cameras) -> Tensor:
+    """Spherical harmonics of every Gaussian in the direction from the camera."""
+    directions = torch.nn.functional.normalize(scene.means - camera.centers, dim=-1)
+    return spherical_harmonics.basis(directions, scene.sh_degree)
 
 
 @pytest.fixture(scope="session")

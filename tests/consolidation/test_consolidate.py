@@ -1,23 +1,32 @@
-"""Consolidation: closer to the images, geometry unchanged, reproducible, bounded memory."""
+"""Consolidation: closer to the images, geometry unchanged, reproducible, bounded memory; iterative updates."""
 
 import os
 import subprocess
 import sys
 from dataclasses import fields, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numba
 import pytest
 import torch
+from memory_checkpoint import KilledError, MemoryCheckpoint
 
-from splatgraft.consolidation import ConsolidateOptions, DescentOptions, consolidate
+from splatgraft.consolidation import (
+    ConsolidateOptions,
+    DescentOptions,
+    consolidate,
+    geometric_schedule,
+    iterative_update,
+    linear_schedule,
+)
 from splatgraft.core.gaussians import concatenate
 from splatgraft.core.image_metrics import psnr
 from splatgraft.fitting.perceptual_losses import l1
 from splatgraft.rendering import render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
-PLAIN = ConsolidateOptions(view_error=None)
+PLAIN = ConsolidateOptions(view_error=False)
 ADAM = ConsolidateOptions(method="adam", loss=l1, reference=DescentOptions(iterations=24, save_every=8))
 
 
@@ -74,10 +83,10 @@ def test_pixels_of_no_weight_have_no_influence(relit):
     assert torch.equal(clean.sh, masked.sh)
 
 
-def test_the_same_twice_and_from_lazy_images(relit):
+def test_neither_lazy_images_nor_the_cache_change_the_result(relit):
     lazy = LazySequence(len(relit.images), lambda index: relit.images[index].clone())
     a = consolidate(relit.composite, relit.cameras, relit.images)
-    b = consolidate(relit.composite, relit.cameras, lazy)
+    b = consolidate(relit.composite, relit.cameras, lazy, ConsolidateOptions(cache_bytes=0))
     assert torch.equal(a.sh, b.sh)
 
 
@@ -94,30 +103,9 @@ def test_the_number_of_threads_changes_time_alone(relit):
     assert (found[0] - found[1]).abs().max() < 1e-3 / 255
 
 
-def test_the_cache_changes_time_alone(relit):
-    a = consolidate(relit.composite, relit.cameras, relit.images)
-    b = consolidate(relit.composite, relit.cameras, relit.images, replace(ConsolidateOptions(), cache_bytes=0))
-    assert torch.equal(a.sh, b.sh)
-
-
-class KilledError(Exception):
-    pass
-
-
-class Memory:
-    def __init__(self) -> None:
-        self.state = None
-
-    def load(self):
-        return self.state
-
-    def save(self, state) -> None:
-        self.state = {key: value.clone() if isinstance(value, torch.Tensor) else value for key, value in state.items()}
-
-
 def test_a_killed_descent_resumes_to_the_same_bits(relit):
     whole = consolidate(relit.composite, relit.cameras, relit.images, ADAM)
-    memory = Memory()
+    memory = MemoryCheckpoint()
 
     def die(done, total, message):
         if done == 19:
@@ -125,6 +113,7 @@ def test_a_killed_descent_resumes_to_the_same_bits(relit):
 
     with pytest.raises(KilledError):
         consolidate(relit.composite, relit.cameras, relit.images, ADAM, progress=die, checkpoint=memory)
+    assert memory.state is not None
     assert memory.state["iteration"] == 16
     resumed = consolidate(relit.composite, relit.cameras, relit.images, ADAM, checkpoint=memory)
     assert torch.equal(resumed.sh, whole.sh)
@@ -149,6 +138,38 @@ def test_no_views_are_refused(relit):
         consolidate(relit.composite, relit.cameras[[]], [])
 
 
+def test_schedules_run_from_full_noise_to_a_tenth():
+    assert linear_schedule() == pytest.approx((1.0, 0.775, 0.55, 0.325, 0.1))
+    geometric = geometric_schedule()
+    assert geometric[0] == 1.0
+    assert geometric[-1] == pytest.approx(0.1)
+    ratios = [b / a for a, b in pairwise(geometric)]
+    assert ratios == pytest.approx([0.1**0.25] * 4)
+    assert linear_schedule(1) == geometric_schedule(1) == (1.0,)
+
+
+def test_each_update_harmonises_renders_of_the_one_before(relit):
+    seen = []
+
+    def harmonize_at(scene, strength):
+        seen.append((scene, strength))
+        return relit.images
+
+    options = ConsolidateOptions(view_error=False, polish_passes=1)
+    out = iterative_update(relit.composite, relit.cameras, harmonize_at, (1.0, 0.5), options)
+    assert [strength for _, strength in seen] == [1.0, 0.5]
+    assert seen[0][0] is relit.composite
+    wanted = torch.stack(relit.images)
+    scores = [float(psnr(render(scene, relit.cameras).color, wanted)) for scene in (relit.composite, seen[1][0], out)]
+    assert scores[1] > scores[0]
+    assert scores[2] == scores[1]  # the same images give the same scene
+
+
+def test_strengths_outside_the_range_are_refused(relit):
+    with pytest.raises(ValueError, match=r"strengths in \(0, 1\]"):
+        iterative_update(relit.composite, relit.cameras, lambda scene, strength: relit.images, (1.0, 0.0))
+
+
 MEASURE = """
 import sys
 sys.path.insert(0, sys.argv[3])
@@ -170,6 +191,7 @@ print(peak_memory_bytes())
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory over a stretch is read from /proc")
 def test_memory_does_not_grow_with_the_number_of_views():
     # glibc gives every freed block of 256 KB or more back at once. Left to itself it keeps freed blocks in its heaps,

@@ -1,31 +1,27 @@
-"""Frozen views: equal to the renderer, cropped cameras, transposes, the cache."""
+"""Frozen views: equal to the renderer, cropped cameras, transposes, the cache, restriction to what changed."""
 
 from dataclasses import replace
 
+import pytest
 import torch
-from conftest import ball, ring
+from conftest import ball, basis_towards, ring, views_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatgraft.consolidation import ConsolidateOptions
-from splatgraft.consolidation.frozen_views import Views
+from splatgraft.consolidation.consolidate import drop_higher_bands, restrict_to_changes
+from splatgraft.core.gaussians import concatenate
 from splatgraft.fitting import adam
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
-
-def views_of(scene, cameras, **changes) -> Views:
-    images = LazySequence(len(cameras), lambda index: torch.zeros(40, 40, 3))
-    # exact maps, which are compared with the renderer
-    exact = ConsolidateOptions(least_row_weight=0.0, cache_bytes=2**24)
-    return Views(scene, cameras, images, weights=None, options=replace(exact, **changes))
+BLACK = LazySequence(6, lambda index: torch.zeros(40, 40, 3))
 
 
 def test_render_equals_the_renderer_with_and_without_a_subset():
     scene, cameras = ball(200, degree=2, seed=1), ring(3, 40)
     rendering = RenderOptions(background=(0.2, 0.4, 0.6))
     wanted = render(scene, cameras, options=rendering).color
-    views = views_of(scene, cameras, rendering=rendering)
+    views = views_of(scene, cameras, BLACK, rendering=rendering)
     active = torch.arange(200) % 3 == 0
     part = views.restricted(active, [(0, 0, 40, 40)] * 3)
     for index in range(3):
@@ -39,7 +35,7 @@ def test_render_equals_the_renderer_with_and_without_a_subset():
 def test_blend_transpose_is_the_transpose_of_blend(seed):
     scene, cameras = ball(100, degree=1, seed=seed), ring(2, 40)
     active = torch.arange(100) % 2 == 0
-    view = views_of(scene, cameras).restricted(active, [(0, 0, 40, 40)] * 2)[1]
+    view = views_of(scene, cameras, BLACK).restricted(active, [(0, 0, 40, 40)] * 2)[1]
     generator = torch.Generator().manual_seed(seed)
     colors, image = torch.rand(50, 3, generator=generator), torch.rand(40, 40, 3, generator=generator)
     left, right = (view.blend(colors) * image).sum(), (colors * view.blend_transpose(image)).sum()
@@ -62,17 +58,17 @@ def test_a_cropped_camera_sees_a_cut_of_the_picture():
 
 def test_the_budget_bounds_what_is_kept():
     scene, cameras = ball(300, degree=2, seed=3), ring(6, 40)
-    one = views_of(scene, cameras)[0].own_bytes
+    one = views_of(scene, cameras, BLACK)[0].own_bytes
     assert one > 40 * 40 * 4  # the opacity of every pixel alone
-    views = views_of(scene, cameras, cache_bytes=int(2.5 * one))
+    views = views_of(scene, cameras, BLACK, cache_bytes=int(2.5 * one))
     kept = [views[index] is views[index] for index in range(6)]
     assert 1 <= sum(kept) <= 3
-    assert views_of(scene, cameras, cache_bytes=0)[0] is not None
+    assert views_of(scene, cameras, BLACK, cache_bytes=0)[0] is not None
 
 
 def test_what_is_cached_stays_cached_where_a_view_is_not_cropped():
     scene, cameras = ball(300, degree=2, seed=4), ring(3, 40)
-    views = views_of(scene, cameras)
+    views = views_of(scene, cameras, BLACK)
     operators = [views[index].operator for index in range(3)]
     part = views.restricted(torch.arange(300) > 9, [(0, 0, 40, 40), None, (0, 0, 39, 40)])
     assert part[0].operator is operators[0]
@@ -81,7 +77,7 @@ def test_what_is_cached_stays_cached_where_a_view_is_not_cropped():
 
 def test_a_fused_step_of_descent_is_adam_on_the_transpose():
     scene, cameras = ball(150, degree=2, seed=9), ring(2, 40)
-    views, generator = views_of(scene, cameras), torch.Generator().manual_seed(10)
+    views, generator = views_of(scene, cameras, BLACK), torch.Generator().manual_seed(10)
     rates = torch.rand(27, generator=generator)
     fused, plain = scene.sh.clone(), scene.sh.clone()
     of_fused, of_plain = (adam.no_moments({"sh": fused}, 150) for _ in range(2))
@@ -90,7 +86,7 @@ def test_a_fused_step_of_descent_is_adam_on_the_transpose():
         if turn == 3:
             colors[int(torch.nonzero(view.visible)[0]), 1] = torch.nan
         gradient = torch.zeros_like(plain)
-        view.expansion.write_transpose(colors, gradient)
+        view.expansion.add_transpose(colors, gradient)
         of = {"moments": of_plain, "visible": view.visible, "rates": {"sh": rates}}
         finite = adam.step({"sh": plain}, {"sh": gradient}, **of)
         assert view.expansion.descend(fused, colors, moments=of_fused, rates=rates) == finite == (turn < 3)
@@ -100,26 +96,58 @@ def test_a_fused_step_of_descent_is_adam_on_the_transpose():
     assert torch.allclose(of_fused.second["sh"], of_plain.second["sh"], rtol=1e-5)
 
 
-@given(st.integers(0, 3))
+@pytest.mark.parametrize("degree", [0, 3])
 def test_an_expansion_and_its_transposes_are_products_with_the_basis(degree):
     scene, cameras = ball(150, degree=degree, seed=8), ring(1, 40)
     scene = replace(scene, means=torch.cat([scene.means[:140], scene.means[140:] + 50]))
-    view = views_of(scene, cameras)[0]
+    view = views_of(scene, cameras, BLACK)[0]
     generator = torch.Generator().manual_seed(degree)
-    basis, shown = view.expansion.basis * view.visible[:, None], view.visible
-    assert not bool(shown[140:].any())
+    basis = basis_towards(scene, cameras) * view.visible[:, None]
+    assert not bool(view.visible[140:].any())
     colors, weights = torch.randn(150, 3, generator=generator), torch.rand(150, 1, generator=generator)
     # float32 sums of at most 16 terms of size 1
     assert torch.allclose(view.expansion.colors(scene.sh), torch.einsum("mk,mkc->mc", basis, scene.sh), atol=1e-5)
-    outer = basis[:, :, None] * colors[:, None, :]
-    added, written = torch.ones_like(scene.sh), torch.ones_like(scene.sh)
+    added = torch.ones_like(scene.sh)
     view.expansion.add_transpose(colors, added)
-    view.expansion.write_transpose(colors, written)
-    assert torch.allclose(added, 1 + outer, atol=1e-5)
-    assert torch.allclose(written, torch.where(shown[:, None, None], outer, 1), atol=1e-5)
+    assert torch.allclose(added, 1 + basis[:, :, None] * colors[:, None, :], atol=1e-5)
     squares = torch.zeros(150, basis.shape[1], basis.shape[1])
     view.expansion.add_squares(weights, squares)
     assert torch.allclose(squares, (weights * basis)[:, :, None] * basis[:, None, :], atol=1e-5)
-    sh = scene.sh.clone().requires_grad_()
-    view.expansion.colors(sh).backward(colors)
-    assert torch.allclose(sh.grad, outer, atol=1e-5)
+
+
+def scene_with_a_satellite():
+    far = ball(20, degree=1, seed=8)
+    far = replace(far, means=far.means * 0.2 + torch.tensor([0.0, 1.6, 0.0]))
+    return concatenate([ball(150, degree=1, seed=7), far])
+
+
+def test_nothing_moves_where_nothing_changed():
+    scene, cameras = scene_with_a_satellite(), ring(4)
+    views = restrict_to_changes(views_of(scene, cameras, list(render(scene, cameras).color)), 2 / 255)
+    assert len(views) == 0
+
+
+def test_only_what_changed_pixels_see_moves():
+    scene, cameras = scene_with_a_satellite(), ring(4)
+    darker = replace(scene, sh=torch.cat([scene.sh[:150], scene.sh[150:] - 1.0]))
+    views = restrict_to_changes(views_of(scene, cameras, list(render(darker, cameras).color)), 2 / 255)
+    assert views.active is not None
+    active = torch.zeros(170, dtype=torch.bool)
+    active[views.active] = True
+    visible = render(scene, cameras).visible.any(0)
+    assert bool(active[150:][visible[150:]].float().mean() > 0.9)
+    assert float(active[:150].float().mean()) < 0.5
+    # windows hold the satellite, not the whole picture
+    assert bool((views.cameras.sizes.prod(1) < 48 * 48).all())
+
+
+def test_zero_switches_it_off():
+    scene, cameras = scene_with_a_satellite(), ring(2)
+    views = views_of(scene, cameras, list(render(scene, cameras).color))
+    assert restrict_to_changes(views, 0.0) is views
+
+
+def test_reset_keeps_band_zero_alone():
+    sh = ball(5, degree=3, seed=0).sh
+    assert torch.equal(drop_higher_bands(sh)[:, :1], sh[:, :1])
+    assert not drop_higher_bands(sh)[:, 1:].any()

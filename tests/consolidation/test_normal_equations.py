@@ -3,21 +3,13 @@
 from dataclasses import replace
 
 import torch
-from conftest import ball, ring
+from conftest import ball, basis_towards, ring, views_of
 
-from splatgraft.consolidation.changed_region import drop_higher_bands
-from splatgraft.consolidation.corrected_targets import CorrectedTargets
-from splatgraft.consolidation.frozen_views import Views
+from splatgraft.consolidation.consolidate import drop_higher_bands
 from splatgraft.consolidation.normal_equations import _build_equations, _select_ridge, solve
-from splatgraft.consolidation.options import ConsolidateOptions, SolveOptions
-from splatgraft.consolidation.view_errors import ViewErrorOptions
+from splatgraft.consolidation.options import SolveOptions
+from splatgraft.consolidation.view_errors import CorrectedTargets
 from splatgraft.rendering import render
-
-
-def views_of(scene, cameras, images, weights=None) -> Views:
-    return Views(
-        scene, cameras, images, weights=weights, options=ConsolidateOptions(least_row_weight=0.0, cache_bytes=2**24)
-    )
 
 
 def test_equals_dense_ridge_regression():
@@ -30,14 +22,14 @@ def test_equals_dense_ridge_regression():
     weights = [torch.rand(32, 32, generator=generator) for _ in range(5)]
     options = SolveOptions(rounds=1, steps=120, prior_px=0.5, band_ridges=(0.1,))
     prior = scene.sh.clone()
-    views = views_of(scene, cameras, images, weights)
-    found = solve(prior, CorrectedTargets(views, None), options)
+    views = views_of(scene, cameras, images, weights=weights)
+    found = solve(prior, CorrectedTargets(views, estimated=False), options)
 
     rows, right, seen = [], [], torch.zeros(40, dtype=torch.float64)
     for index in range(5):
         blend = views[index].operator.blend(torch.eye(40)).reshape(-1, 40).double()
         root = weights[index].flatten().double().sqrt()[:, None]
-        design = (blend[:, :, None] * views[index].expansion.basis.double()[None]).reshape(-1, 160)
+        design = (blend[:, :, None] * basis_towards(scene, cameras[index]).double()[None]).reshape(-1, 160)
         rows.append(root * design)
         right.append(root * (images[index].reshape(-1, 3).double() - 0.5 * blend.sum(1, keepdim=True)))
         seen += blend.T @ (root[:, 0] ** 2 * blend.sum(1))
@@ -58,7 +50,7 @@ def test_an_unseen_gaussian_keeps_its_prior():
     cameras = ring(4, 32)
     images = list(0.5 * render(scene, cameras).color)
     prior = scene.sh.clone()
-    found = solve(prior, CorrectedTargets(views_of(scene, cameras, images), None), SolveOptions())
+    found = solve(prior, CorrectedTargets(views_of(scene, cameras, images), estimated=False), SolveOptions())
     assert torch.equal(found[50:], prior[50:])
     assert not torch.equal(found[:50], prior[:50])
 
@@ -70,7 +62,7 @@ def test_the_ridge_follows_how_much_the_views_disagree():
     options = SolveOptions(band_ridges=(0.001, 0.1, 10.0))
 
     def chosen(pictures) -> float:
-        targets = CorrectedTargets(views_of(scene, cameras, list(pictures)), None)
+        targets = CorrectedTargets(views_of(scene, cameras, list(pictures)), estimated=False)
         equations = _build_equations(prior, targets.views, 0.1, options.prior_px)
         return _select_ridge(prior, targets, equations, options)
 
@@ -86,9 +78,9 @@ def test_tints_are_taken_off_before_the_colours_are_fitted():
     gains /= gains.log().mean(0, keepdim=True).exp()  # the mean gain is the scene's
     prior = drop_higher_bands(scene.sh)
 
-    def error(view_error) -> float:
-        targets = CorrectedTargets(views_of(scene, cameras, list(images * gains)), view_error)
+    def error(estimated) -> float:
+        targets = CorrectedTargets(views_of(scene, cameras, list(images * gains)), estimated)
         found = replace(scene, sh=solve(prior, targets, SolveOptions()))
         return float((render(found, cameras).color - images).square().mean().sqrt())
 
-    assert error(ViewErrorOptions()) < error(None)
+    assert error(True) < error(False)

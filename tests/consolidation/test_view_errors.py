@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from splatgraft.consolidation.view_errors import ViewError, ViewErrorOptions, no_view_error, refine
+from splatgraft.consolidation.view_errors import ViewError, no_view_error, refine
 
 
 def texture(height: int = 96, width: int = 128, seed: int = 0) -> torch.Tensor:
@@ -19,16 +19,16 @@ def spoilt_by(view_error: ViewError, image: torch.Tensor) -> torch.Tensor:
 
 
 def test_nothing_is_found_where_nothing_is_wrong():
-    image, options = texture(), ViewErrorOptions()
-    found = refine(no_view_error(image, options), image, image, None, options)
+    image = texture()
+    found = refine(no_view_error(image), image, image, None)
     assert not found.flow.any()
     assert not found.log_gain.any()
 
 
 def test_a_known_tint_and_flow_are_found():
-    image, options = texture(), ViewErrorOptions()
+    image = texture()
     generator = torch.Generator().manual_seed(1)
-    clean = no_view_error(image, options)
+    clean = no_view_error(image)
     # constant over the picture, plus a little that varies
     flow = torch.tensor([0.6, -0.4]) + 0.1 * torch.randn(clean.flow.shape, generator=generator)
     gain = torch.tensor([0.06, -0.04, 0.0]) + 0.01 * torch.randn(clean.log_gain.shape, generator=generator)
@@ -36,7 +36,7 @@ def test_a_known_tint_and_flow_are_found():
     spoilt = spoilt_by(true, image)
     found = clean
     for _ in range(4):
-        found = refine(found, spoilt, image, None, options)
+        found = refine(found, spoilt, image, None)
     # the ridge shrinks, and knots share pixels: a third of the size, which is far from not finding it
     assert float((found.flow - flow).abs().mean()) < 0.17
     assert float((found.log_gain - gain).abs().mean()) < 0.02
@@ -45,10 +45,10 @@ def test_a_known_tint_and_flow_are_found():
 
 
 def test_untrusted_pixels_do_not_pull():
-    image, options = texture(), ViewErrorOptions()
+    image = texture()
     spoilt, weight = image.clone(), torch.ones(96, 128)
     spoilt[:, 64:], weight[:, 64:] = 0.9, 0.0
-    found = refine(no_view_error(image, options), spoilt, image, weight, options)
+    found = refine(no_view_error(image), spoilt, image, weight)
     # right of column 64 the picture is ruined; knots that share no cell with it see no difference, but for the coupling
     # of neighbours through their overlaps, which falls by about 4 from knot to knot: 2 px / 4^3 at most
     assert float(found.flow[:, 0].abs().max()) < 2 / 4**3
@@ -56,8 +56,7 @@ def test_untrusted_pixels_do_not_pull():
 
 @pytest.mark.parametrize(("height", "width"), [(11, 17), (16, 200), (5, 5)])
 def test_small_images_have_grids_too(height, width):
-    options = ViewErrorOptions()
     image = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(2))
-    found = refine(no_view_error(image, options), image, image.flip(0), None, options)
+    found = refine(no_view_error(image), image, image.flip(0), None)
     assert found.correct(image).shape == image.shape
     assert bool(torch.isfinite(found.correct(image)).all())

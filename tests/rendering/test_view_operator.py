@@ -76,7 +76,7 @@ def test_rows_of_no_weight_are_left_out_of_the_map_and_of_its_transpose():
     scene = random_scene(4000, 0, seed=10)
     scene = replace(scene, opacity_logits=scene.opacity_logits + 3)  # most lie behind others
     exact = rendering.view_operator(scene, camera(100, 70))
-    operator = rendering.view_operator(scene, camera(100, 70), least_row_weight=1e-4)
+    operator = rendering.view_operator(scene, camera(100, 70), min_row_weight=1e-4)
     generator = torch.Generator().manual_seed(11)
     values, image = torch.rand(4000, 3, generator=generator), torch.randn(70, 100, 3, generator=generator)
     assert 0 < operator.visible.sum() < exact.visible.sum()

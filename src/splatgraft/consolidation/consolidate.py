@@ -1,20 +1,39 @@
 """Consolidation: fits the SH colours of a composite to independently harmonised views; geometry and opacity stay.
 
-Two methods: the paper's gradient descent (section Multi-View Consolidation), and least squares by normal equations,
-followed by a short descent.
+Two methods: the paper's gradient descent (section Multi-View Consolidation), and least squares by normal equations on
+what the harmoniser changed, followed by a short descent. `iterative_update` harmonises and consolidates in turn, with
+decreasing noise (paper: ablation Iterative Dataset Update, after Haque 2023, Instruct-NeRF2NeRF).
 """
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from splatgraft.consolidation.changed_region import drop_higher_bands, restrict_to_changes
-from splatgraft.consolidation.color_optimization import optimize_colors
-from splatgraft.consolidation.corrected_targets import CorrectedTargets
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
 from splatgraft.consolidation.frozen_views import Views
 from splatgraft.consolidation.normal_equations import solve
-from splatgraft.consolidation.options import ConsolidateOptions, ImageSequence
-from splatgraft.core.cameras import Cameras
+from splatgraft.consolidation.options import ConsolidateOptions, DescentOptions, ImageSequence
+from splatgraft.consolidation.view_errors import CorrectedTargets
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.cameras import Cameras, Window
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.fitting import adam
+from splatgraft.fitting.perceptual_losses import ImageLoss
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
+
+# set by hand
+_CHANGED_SHARE = 0.02
+"""Share of a Gaussian's blending weight on changed pixels above which it is active."""
+_VISIBLE_SHARE = 1.0 / 255
+"""Share of a pixel that active Gaussians make up, from which it lies in the window: one grey level."""
+_MARGIN_PX = 16
+"""Border of the windows, so that windowed losses and SSIM see the surroundings."""
+
+HarmonizeAt = Callable[[Gaussians, float], ImageSequence]
+"""From the current scene and a noise strength in (0, 1] to one harmonised image per camera."""
 
 
 def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services of every long stage
@@ -53,17 +72,11 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
             numbers that are not finite.
     """
     _check_counts(cameras, images, weights)
-    views = Views(
-        composite,
-        cameras,
-        images,
-        weights=weights,
-        options=options,
-    )
+    views = Views(composite, cameras, images, weights=weights, options=options)
     if options.method == "adam":
         sh = optimize_colors(
             drop_higher_bands(composite.sh),
-            CorrectedTargets(views, None),
+            CorrectedTargets(views, estimated=False),
             options.reference,
             loss=options.loss,
             seed=options.seed,
@@ -96,3 +109,175 @@ def _check_counts(cameras: Cameras, images: ImageSequence, weights: ImageSequenc
     for kind, sequence in (("image", images), ("weight", weights)):
         if sequence is not None and len(sequence) != len(cameras):
             raise ValueError(f"consolidate: expected one {kind} per camera, found {len(sequence)} for {len(cameras)}")
+
+
+def iterative_update(
+    composite: Gaussians,
+    cameras: Cameras,
+    harmonize_at: HarmonizeAt,
+    strengths: Sequence[float],
+    options: ConsolidateOptions = ConsolidateOptions(),
+    *,
+    progress: Progress = silent,
+) -> Gaussians:
+    """The scene after one consolidation per strength, each on images harmonised from renders of the one before.
+
+    Args:
+        composite: The start of each consolidation.
+        cameras: Of the views.
+        harmonize_at: Conditions on the composite and adds noise to renders of the scene that it is given, which the
+            paper found sharper.
+        strengths: Noise strengths in (0, 1], one per update.
+        options: Of each consolidation.
+        progress: Of each consolidation.
+
+    Raises:
+        ValueError: Where a strength is outside (0, 1].
+    """
+    if any(not 0 < strength <= 1 for strength in strengths):
+        raise ValueError(f"iterative update: expected strengths in (0, 1], found {tuple(strengths)}")
+    scene = composite
+    for strength in strengths:
+        scene = consolidate(composite, cameras, harmonize_at(scene, strength), options, progress=progress)
+    return scene
+
+
+def linear_schedule(updates: int = 5, first: float = 1.0, last: float = 0.1) -> tuple[float, ...]:
+    """Noise strengths from `first` to `last` with equal differences."""
+    return tuple(first + (last - first) * _share(i, updates) for i in range(updates))
+
+
+def geometric_schedule(updates: int = 5, first: float = 1.0, last: float = 0.1) -> tuple[float, ...]:
+    """Noise strengths from `first` to `last` with equal ratios."""
+    return tuple(first * (last / first) ** _share(i, updates) for i in range(updates))
+
+
+def _share(index: int, count: int) -> float:
+    return index / (count - 1) if count > 1 else 0.0
+
+
+@torch.no_grad()
+def restrict_to_changes(views: Views, unchanged_below: float) -> Views:
+    """The views cropped to what the harmoniser changed, with the Gaussians that no changed pixel sees fixed.
+
+    Args:
+        views: Of all Gaussians, whole.
+        unchanged_below: Difference from the composite's render, in sRGB, below which a pixel is unchanged; 0 or less
+            returns `views`.
+    """
+    if unchanged_below <= 0:
+        return views
+    active = _on_changed_pixels(views, unchanged_below)
+    if bool(active.all()):
+        return views
+    return views.restricted(active, [_window(views, index, active) for index in range(len(views))])
+
+
+def _on_changed_pixels(views: Views, unchanged_below: float) -> Bool[Tensor, "n"]:
+    weights = torch.zeros(views.composite.count, 2, device=views.composite.device)
+    for index in range(len(views)):
+        view = views[index]
+        picture = view.render(views.composite.sh).clamp(0, 1)
+        changed = ((views.target(index) - picture).abs().amax(-1) >= unchanged_below).to(picture.dtype)
+        weights += view.blend_transpose(torch.stack([changed, torch.ones_like(changed)], -1))
+    return (weights[:, 0] > _CHANGED_SHARE * weights[:, 1]) & (weights[:, 1] > 0)
+
+
+def _window(views: Views, index: int, active: Bool[Tensor, "n"]) -> Window | None:
+    share: Float[Tensor, "h w"] = views[index].blend(active[:, None].to(views.composite.sh.dtype))[..., 0]
+    rows, columns = torch.nonzero(share >= _VISIBLE_SHARE, as_tuple=True)
+    if len(rows) == 0:
+        return None
+    height, width = share.shape
+    return (
+        max(0, int(columns.min()) - _MARGIN_PX),
+        max(0, int(rows.min()) - _MARGIN_PX),
+        min(width, int(columns.max()) + 1 + _MARGIN_PX),
+        min(height, int(rows.max()) + 1 + _MARGIN_PX),
+    )
+
+
+def drop_higher_bands(sh: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k 3"]:
+    """Coefficients with bands above 0 set to zero (paper, section Multi-View Consolidation)."""
+    return spherical_harmonics.with_degree(
+        spherical_harmonics.with_degree(sh, 0), spherical_harmonics.degree_of(sh.shape[1])
+    )
+
+
+def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
+    sh: Float[Tensor, "m k 3"],
+    targets: CorrectedTargets,
+    options: DescentOptions,
+    *,
+    loss: ImageLoss,
+    seed: int = 0,
+    progress: Progress = silent,
+    checkpoint: Checkpoint = NoCheckpoint(),
+) -> Float[Tensor, "m k 3"]:
+    """Colours after `options.iterations` steps of Adam over views in shuffled order; only visible Gaussians change.
+
+    Args:
+        sh: Initial coefficients of the active Gaussians.
+        targets: Views and their corrected images.
+        options: Rates and number of iterations.
+        loss: Distance from the render to the target.
+        seed: Of the order of views.
+        progress: Called after each iteration.
+        checkpoint: Where the state is saved every `options.save_every` iterations.
+
+    Raises:
+        ValueError: Where a gradient is not finite, which a loss that divides can cause.
+    """
+    views, start = targets.views, 0
+    sh = sh.clone().contiguous()
+    moments = adam.no_moments({"sh": sh}, len(sh))
+    saved = checkpoint.load()
+    if saved is not None:
+        start, sh = int(saved["iteration"]), saved["sh"].clone()
+        moments = adam.Moments({"sh": saved["first"].clone()}, {"sh": saved["second"].clone()}, saved["steps"].clone())
+    shares = torch.full((3 * sh.shape[1],), options.rest_ratio, device=sh.device)
+    shares[:3] = 1.0
+    for iteration in range(start, options.iterations):
+        index = _view_of(iteration, len(views), seed)
+        view = views[index]
+        colors = view.colors(sh).requires_grad_()
+        picture = view.draw(colors)
+        picture, target = _weighted_pair(picture, targets.target(index), views.weight(index))
+        value = loss(picture, target)
+        rates = options.rate * _decay(iteration / options.iterations, options.final_ratio) * shares
+        if not view.expansion.descend(sh, torch.autograd.grad(value, colors)[0], moments=moments, rates=rates):
+            name = views.cameras.names[index]
+            raise ValueError(f"consolidate: expected finite gradients, found others in {name} at iteration {iteration}")
+        if (iteration + 1) % options.save_every == 0:
+            checkpoint.save(
+                {
+                    "iteration": iteration + 1,
+                    "sh": sh,
+                    "first": moments.first["sh"],
+                    "second": moments.second["sh"],
+                    "steps": moments.steps,
+                }
+            )
+        progress(iteration + 1, options.iterations, f"loss {float(value.detach()):.4f}")
+    return sh
+
+
+def _view_of(iteration: int, count: int, seed: int) -> int:
+    """The view of an iteration: each pass visits all views in an order that depends on seed and pass only."""
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + iteration // count))
+    return int(order[iteration % count])
+
+
+def _decay(done: float, final_ratio: float) -> float:
+    """Factor on the learning rate after the share `done` of all iterations: half a cosine from 1 to `final_ratio`."""
+    return final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * done))
+
+
+def _weighted_pair(
+    picture: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], weight: Float[Tensor, "h w"] | None
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]]:
+    """Both images blended by confidence with the detached render, so that any loss ignores pixels of weight 0."""
+    if weight is None:
+        return picture, target
+    share, constant = weight[..., None], picture.detach()
+    return share * picture + (1 - share) * constant, share * target + (1 - share) * constant

@@ -20,7 +20,7 @@ from splatgraft.runtime.kernels import kernel, serialized
 
 _PART = 512
 """Gaussians of one task of a kernel."""
-_MOST = 16
+_MAX_COEFFICIENTS = 16
 """Coefficients of degree 3."""
 
 
@@ -31,20 +31,20 @@ class Expansion:
     means: Float[Tensor, "m 3"]
     """World units; shared by all views."""
     center: Float[Tensor, "3"]
-    """Of the camera."""
+    """Centre of the camera."""
     shown: Int[Tensor, "s"]
     """Gaussians with weight in the view, ascending int32; the maps are 0 for the others."""
     degree: int
-    """Of the harmonics."""
-
-    @property
-    def basis(self) -> Float[Tensor, "m k"]:
-        """The harmonics of all Gaussians."""
-        return self._basis(slice(None))
+    """Degree of the harmonics."""
 
     def colors(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
-        """The sum of harmonics times coefficients; differentiable."""
-        return _Colors.apply(self, sh) if sh.requires_grad else self._colors(sh)
+        """The sum of harmonics times coefficients."""
+        out = sh.new_zeros(len(sh), 3)
+        if self._on_cpu:
+            _fill_colors(*self._numbers, sh.contiguous().numpy(), out.numpy())
+        else:
+            out[self.shown] = torch.einsum("mk,mkc->mc", self._basis(self.shown), sh[self.shown])
+        return out
 
     def add_transpose(self, colors: Float[Tensor, "m 3"], out: Float[Tensor, "m k 3"]) -> None:
         """Add the transpose of `colors` at some colours to `out`."""
@@ -52,13 +52,6 @@ class Expansion:
             _add_transpose(*self._numbers, colors.contiguous().numpy(), out.numpy())
         else:
             out[self.shown] += self._basis(self.shown)[:, :, None] * colors[self.shown][:, None, :]
-
-    def write_transpose(self, colors: Float[Tensor, "m 3"], out: Float[Tensor, "m k 3"]) -> None:
-        """Set the rows `shown` of `out` to the transpose at some colours; the other rows stay as they are."""
-        if self._on_cpu:
-            _write_transpose(*self._numbers, colors.contiguous().numpy(), out.numpy())
-        else:
-            out[self.shown] = self._basis(self.shown)[:, :, None] * colors[self.shown][:, None, :]
 
     def descend(
         self,
@@ -73,7 +66,7 @@ class Expansion:
         Args:
             sh: Changed in place, with `moments` of the field "sh".
             colors: The loss's gradient by the colours.
-            moments: Of the coefficients.
+            moments: Adam's, of the coefficients.
             rates: Learning rate of each coefficient, flattened.
 
         Returns:
@@ -84,7 +77,7 @@ class Expansion:
             numbers = colors.contiguous().numpy(), flat, moments.steps.numpy(), rates.numpy()
             return _descend(self._numbers, *numbers) == 0
         gradient = torch.zeros_like(sh)
-        self.write_transpose(colors, gradient)
+        self.add_transpose(colors, gradient)
         visible = torch.zeros(len(sh), dtype=torch.bool, device=sh.device)
         visible[self.shown] = True
         return adam.step({"sh": sh}, {"sh": gradient}, moments=moments, rates={"sh": rates}, visible=visible)
@@ -105,30 +98,9 @@ class Expansion:
     def _numbers(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.means.numpy(), self.center.numpy(), self.shown.numpy()
 
-    def _basis(self, which: Tensor | slice) -> Float[Tensor, "s k"]:
+    def _basis(self, which: Tensor) -> Float[Tensor, "s k"]:
         directions = torch.nn.functional.normalize(self.means[which] - self.center, dim=-1)
         return spherical_harmonics.basis(directions, self.degree)
-
-    def _colors(self, sh: Tensor) -> Tensor:
-        out = sh.new_zeros(len(sh), 3)
-        if self._on_cpu:
-            _fill_colors(*self._numbers, sh.contiguous().numpy(), out.numpy())
-        else:
-            out[self.shown] = torch.einsum("mk,mkc->mc", self._basis(self.shown), sh[self.shown])
-        return out
-
-
-class _Colors(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, expansion: Expansion, sh: Tensor) -> Tensor:
-        ctx.expansion, ctx.shape = expansion, sh.shape
-        return expansion._colors(sh.detach())
-
-    @staticmethod
-    def backward(ctx, grad):
-        out = grad.new_zeros(ctx.shape)
-        ctx.expansion.write_transpose(grad, out)
-        return None, out
 
 
 @kernel
@@ -145,7 +117,7 @@ def _basis_towards(mean, center, k, out):
 def _fill_colors(means, center, shown, sh, out):
     n, k = shown.shape[0], sh.shape[1]
     for part in numba.prange((n + _PART - 1) // _PART):
-        basis = np.empty(_MOST, np.float32)
+        basis = np.empty(_MAX_COEFFICIENTS, np.float32)
         for i in range(part * _PART, min(n, (part + 1) * _PART)):
             g = shown[i]
             _basis_towards(means[g], center, k, basis)
@@ -163,7 +135,7 @@ def _fill_colors(means, center, shown, sh, out):
 def _add_transpose(means, center, shown, colors, out):
     n, k = shown.shape[0], out.shape[1]
     for part in numba.prange((n + _PART - 1) // _PART):
-        basis = np.empty(_MOST, np.float32)
+        basis = np.empty(_MAX_COEFFICIENTS, np.float32)
         for i in range(part * _PART, min(n, (part + 1) * _PART)):
             g = shown[i]
             _basis_towards(means[g], center, k, basis)
@@ -175,25 +147,10 @@ def _add_transpose(means, center, shown, colors, out):
 @serialized
 @kernel(parallel=True)
 @no_type_check
-def _write_transpose(means, center, shown, colors, out):
-    n, k = shown.shape[0], out.shape[1]
-    for part in numba.prange((n + _PART - 1) // _PART):
-        basis = np.empty(_MOST, np.float32)
-        for i in range(part * _PART, min(n, (part + 1) * _PART)):
-            g = shown[i]
-            _basis_towards(means[g], center, k, basis)
-            for j in range(k):
-                for c in range(3):
-                    out[g, j, c] = basis[j] * colors[g, c]
-
-
-@serialized
-@kernel(parallel=True)
-@no_type_check
 def _add_squares(means, center, shown, weights, out):
     n, k = shown.shape[0], out.shape[1]
     for part in numba.prange((n + _PART - 1) // _PART):
-        basis = np.empty(_MOST, np.float32)
+        basis = np.empty(_MAX_COEFFICIENTS, np.float32)
         for i in range(part * _PART, min(n, (part + 1) * _PART)):
             g = shown[i]
             _basis_towards(means[g], center, k, basis)
@@ -207,12 +164,12 @@ def _add_squares(means, center, shown, weights, out):
 @kernel(parallel=True)
 @no_type_check
 def _descend(seen, colors, rows, steps, rates):
-    """`_write_transpose` and `adam.update_row` without a gradient in memory; returns the rows that are not finite."""
+    """`_add_transpose` and `adam.update_row` without a gradient in memory; returns how many rows are not finite."""
     (means, center, shown), (values, firsts, seconds) = seen, rows
     n, k = shown.shape[0], rates.shape[0] // 3
     bad = 0
     for part in numba.prange((n + _PART - 1) // _PART):
-        basis, gradient = np.empty(_MOST, np.float32), np.empty(3 * _MOST, np.float32)
+        basis, gradient = np.empty(_MAX_COEFFICIENTS, np.float32), np.empty(3 * _MAX_COEFFICIENTS, np.float32)
         counted, corrections = np.int32(0), (np.float32(1), np.float32(1))
         for i in range(part * _PART, min(n, (part + 1) * _PART)):
             g = shown[i]

@@ -44,7 +44,7 @@ class View:
         return sum(memory_bytes(part) for part in (self.operator, self.static, self.expansion.shown))
 
     def colors(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
-        """The expansion towards this view, plus one half, not clamped; one half where the view shows nothing."""
+        """The colours towards this view, not clamped; one half where the view shows nothing."""
         return self.expansion.colors(sh) + 0.5
 
     def blend(self, colors: Float[Tensor, "m c"]) -> Float[Tensor, "h w c"]:
@@ -52,7 +52,7 @@ class View:
         return self.operator.blend(self._of_all(colors))
 
     def render(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "h w 3"]:
-        """The image, with colours clamped at zero as every 3DGS renderer does; differentiable."""
+        """The image, with colours clamped at zero as every 3DGS renderer does."""
         return self.draw(self.colors(sh))
 
     def draw(self, colors: Float[Tensor, "m 3"]) -> Float[Tensor, "h w 3"]:
@@ -136,8 +136,9 @@ class Views:
         """The view's map, from the cache or built anew."""
         if index in self._cached:
             return self._cached[index]
-        rendering, least = self.options.rendering, self.options.least_row_weight
-        operator = view_operator(self.composite, self.cameras[index], rendering, least_row_weight=least)
+        operator = view_operator(
+            self.composite, self.cameras[index], self.options.rendering, min_row_weight=self.options.min_row_weight
+        )
         view = self._view(index, operator)
         self._keep(index, view)
         return view
@@ -221,13 +222,9 @@ class _Cropped:
 
 
 def memory_bytes(value: object) -> int:
-    """Bytes of all tensors and arrays in a value, its items and its fields."""
+    """Bytes of all tensors and arrays in a value and its fields."""
     if isinstance(value, Tensor):
         return value.numel() * value.element_size()
     if isinstance(value, np.ndarray):
         return value.nbytes
-    if isinstance(value, dict):
-        return sum(memory_bytes(part) for part in value.values())
-    if isinstance(value, list | tuple):
-        return sum(memory_bytes(part) for part in value)
     return sum(memory_bytes(part) for part in vars(value).values()) if hasattr(value, "__dict__") else 0

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.consolidation.corrected_targets import CorrectedTargets
 from splatgraft.consolidation.frozen_views import Views
 from splatgraft.consolidation.options import SolveOptions
+from splatgraft.consolidation.view_errors import CorrectedTargets
 from splatgraft.runtime.progress import Progress, silent
 
 _FACTORED_AT_ONCE = 2**14

@@ -5,7 +5,6 @@ from typing import Literal, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from splatgraft.consolidation.view_errors import ViewErrorOptions
 from splatgraft.fitting.perceptual_losses import ImageLoss, windowed_fourier
 from splatgraft.rendering import RenderOptions
 
@@ -63,8 +62,8 @@ class ConsolidateOptions:
     """`adam`: the paper's descent (`reference`). `fast`: normal equations, then a short descent (`polish`)."""
     loss: ImageLoss = windowed_fourier
     """Loss of the descent."""
-    view_error: ViewErrorOptions | None = field(default_factory=ViewErrorOptions)
-    """How a tint and a flow per view are estimated beside the colours; None: they are not. `fast` only."""
+    view_error: bool = True
+    """Whether a tint and a flow per view are estimated beside the colours; `fast` only."""
     solve: SolveOptions = field(default_factory=SolveOptions)
     """The linear part of `fast`."""
     polish_passes: int = 12
@@ -75,13 +74,13 @@ class ConsolidateOptions:
     """The descent of `adam`."""
     unchanged_below: float = 2.0 / 255
     """Pixels that differ less than this from the composite's render are unchanged; 0: all count as changed. `fast`."""
-    least_row_weight: float = 1e-4
+    min_row_weight: float = 1e-4
     """Weights of a Gaussian in 16 pixels of a row that add up to no more are left out at its ends; 0: none are.
 
-    As the renderer's least transmittance; at most a fortieth of a grey level in a pixel. It saves half of the work."""
+    As the least transmittance of the renderer; at most a fortieth of a grey level in a pixel. It saves half the work."""
     cache_bytes: int = 3 * 2**30
     """Bytes of tile lists and bases cached between passes; the rest is computed again in each pass."""
     rendering: RenderOptions = field(default_factory=RenderOptions)
     """How the scene is rendered."""
     seed: int = 0
-    """Order of the views."""
+    """Seed of the order of the views."""

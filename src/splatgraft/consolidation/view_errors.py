@@ -1,36 +1,31 @@
-"""Per-view errors of a harmoniser: a low-frequency tint and a small flow, estimated against a render of the scene.
+"""Per-view errors of a harmoniser, a low-frequency tint and a small flow, and target images without them.
 
 A harmoniser that works view by view shifts edges by a pixel and drifts in colour. Both are smooth over the image, so a
 coarse grid per view describes them; removing them from the view's image before the colours are fitted keeps the scene
 sharp. Each call takes one robust Gauss-Newton step in closed form.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.consolidation.frozen_views import Views, memory_bytes
 
-@dataclass(frozen=True)
-class ViewErrorOptions:
-    """Resolution and strength of the per-view errors; values set by hand."""
-
-    flow_cell_px: float = 32.0
-    """Distance between the knots of the flow, pixels."""
-    tint_cell_px: float = 88.0
-    """Distance between the knots of the tint, pixels."""
-    flow_sigma_px: float = 0.5
-    """Expected size of the flow, pixels: the ridge that keeps it small where the image has no texture."""
-    tint_sigma: float = 0.1
-    """Expected size of the logarithm of the gain."""
-    residual_sigma: float = 0.05
-    """Expected size of the remaining residual; larger ones count less (Geman-McClure weights)."""
-    correlated_px: float = 16.0
-    """Pixels over which a residual (a misplaced edge, a wrong shade) stays alike and counts as one observation."""
-    most_flow: float = 4.0
-    """Bound on the flow, over `flow_sigma_px`."""
+# set by hand
+_FLOW_CELL_PX, _TINT_CELL_PX = 32.0, 88.0
+"""Distance between the knots of the flow and of the tint."""
+_FLOW_SIGMA_PX = 0.5
+"""Expected size of the flow: the ridge that keeps it small where the image has no texture."""
+_MAX_FLOW_PX = 4.0 * _FLOW_SIGMA_PX
+_TINT_SIGMA = 0.1
+"""Expected size of the logarithm of the gain."""
+_RESIDUAL_SIGMA = 0.05
+"""Expected size of the remaining residual; larger ones count less (Geman-McClure weights)."""
+_CORRELATED_PX = 16.0
+"""Pixels over which a residual (a misplaced edge, a wrong shade) stays alike and counts as one observation."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +43,9 @@ class ViewError:
         return _warp(image, _upsample(self.flow, h, w)) * _upsample(self.log_gain, h, w).exp()
 
 
-def no_view_error(image: Float[Tensor, "h w 3"], options: ViewErrorOptions) -> ViewError:
+def no_view_error(image: Float[Tensor, "h w 3"]) -> ViewError:
     """A zero error, on the grids for an image of that size."""
-    (a, b), (c, d) = (
-        [_knots(n, cell) for n in image.shape[:2]] for cell in (options.flow_cell_px, options.tint_cell_px)
-    )
+    (a, b), (c, d) = ([_knots(n, cell) for n in image.shape[:2]] for cell in (_FLOW_CELL_PX, _TINT_CELL_PX))
     return ViewError(flow=image.new_zeros(a, b, 2), log_gain=image.new_zeros(c, d, 3))
 
 
@@ -62,7 +55,6 @@ def refine(
     image: Float[Tensor, "h w 3"],
     render: Float[Tensor, "h w 3"],
     weight: Float[Tensor, "h w"] | None,
-    options: ViewErrorOptions,
 ) -> ViewError:
     """The view's error after one Gauss-Newton step on the tint, then one on the flow.
 
@@ -71,18 +63,57 @@ def refine(
         image: The view's harmonised image, sRGB.
         render: The current scene from the same camera, sRGB.
         weight: Confidence of each pixel in [0, 1]; None: all are 1.
-        options: Grids and priors.
     """
     h, w = image.shape[:2]
     confidence = image.new_ones(h, w) if weight is None else weight
     warped = _warp(image, _upsample(view_error.flow, h, w))
     tinted = warped * _upsample(view_error.log_gain, h, w).exp()
-    log_gain = _refine_tint(view_error.log_gain, tinted, render, confidence, options)
+    log_gain = _refine_tint(view_error.log_gain, tinted, render, confidence)
     tinted = warped * _upsample(log_gain, h, w).exp()
     return ViewError(
-        flow=_refine_flow(view_error.flow, tinted, render, confidence, options),
+        flow=_refine_flow(view_error.flow, tinted, render, confidence),
         log_gain=log_gain,
     )
+
+
+class CorrectedTargets:
+    """The views' targets, each corrected by its `ViewError` (a few kB), which is refined while colours are fitted."""
+
+    def __init__(self, views: Views, estimated: bool = True) -> None:
+        """Start without errors; unless `estimated` none are sought."""
+        self.views, self._estimated = views, estimated
+        self._of_view: list[ViewError | None] = [None] * len(views)
+        self._kept: dict[int, Tensor] | None = None
+
+    def target(self, index: int) -> Float[Tensor, "h w 3"]:
+        """The view's image, corrected by its error as estimated so far."""
+        if self._kept is not None and index in self._kept:
+            return self._kept[index]
+        image, view_error = self.views.target(index), self._of_view[index]
+        corrected = image if view_error is None else view_error.correct(image)
+        if self._kept is not None and self.views.take_bytes(memory_bytes(corrected)):
+            self._kept[index] = corrected
+        return corrected
+
+    def keep(self) -> None:
+        """From now on keep corrected images in what the views leave of their cache; errors are not refined any more."""
+        self._kept = {}
+
+    def refine(self, index: int, render: Float[Tensor, "h w 3"]) -> None:
+        """Refine the view's error against a render of the current scene."""
+        assert self._kept is None
+        if not self._estimated:
+            return
+        image = self.views.target(index)
+        known = self._of_view[index] or no_view_error(image)
+        self._of_view[index] = refine(known, image, render.detach(), self.views.weight(index))
+
+    def center(self) -> None:
+        """Subtract the mean gain of all views from their errors, since it belongs to the scene."""
+        gains = [n.log_gain.mean((0, 1)) for n in self._of_view if n is not None]
+        if gains:
+            mean = torch.stack(gains).mean(0)
+            self._of_view = [n and replace(n, log_gain=n.log_gain - mean) for n in self._of_view]
 
 
 def _refine_tint(
@@ -90,17 +121,14 @@ def _refine_tint(
     tinted: Float[Tensor, "h w 3"],
     render: Float[Tensor, "h w 3"],
     confidence: Float[Tensor, "h w"],
-    options: ViewErrorOptions,
 ) -> Float[Tensor, "c d 3"]:
     rows, columns = _grid_bases(log_gain, tinted)
     residual = render - tinted
-    robust = _robust_weights(residual, confidence, options)
+    robust = _robust_weights(residual, confidence)
     channels = []
     for channel in range(3):
         slope, knots = tinted[..., channel], log_gain[..., channel]
-        ridge = (options.residual_sigma / options.tint_sigma) ** 2 * _observations_per_knot(
-            robust, slope.numel(), knots.numel(), options
-        )
+        ridge = (_RESIDUAL_SIGMA / _TINT_SIGMA) ** 2 * _observations_per_knot(robust, slope.numel(), knots.numel())
         normal = _normal_matrix(robust * slope**2, rows, columns) + ridge * torch.eye(
             knots.numel(), device=knots.device
         )
@@ -115,13 +143,12 @@ def _refine_flow(
     tinted: Float[Tensor, "h w 3"],
     render: Float[Tensor, "h w 3"],
     confidence: Float[Tensor, "h w"],
-    options: ViewErrorOptions,
 ) -> Float[Tensor, "a b 2"]:
     rows, columns = _grid_bases(flow, tinted)
     # a slight blur widens the basin of the linearisation to about 1.5 px and keeps noise out of the slopes
     smooth_image, smooth_render = _blur(tinted), _blur(render)
     residual = smooth_render - smooth_image
-    robust = _robust_weights(residual, confidence, options)
+    robust = _robust_weights(residual, confidence)
     dx, dy = _slopes(0.5 * (smooth_image + smooth_render))
     xx, xy, yy = (_over_channels(a * b) * robust for a, b in ((dx, dx), (dx, dy), (dy, dy)))
     right = torch.stack([rows.T @ (robust * _over_channels(d * residual)) @ columns for d in (dx, dy)])
@@ -133,25 +160,21 @@ def _refine_flow(
         ]
     )
     knots = flow.permute(2, 0, 1).flatten()
-    ridge = (options.residual_sigma / options.flow_sigma_px) ** 2 * _observations_per_knot(
-        robust, xx.numel(), len(knots) // 2, options
-    )
+    ridge = (_RESIDUAL_SIGMA / _FLOW_SIGMA_PX) ** 2 * _observations_per_knot(robust, xx.numel(), len(knots) // 2)
     step = _solve(normal + ridge * torch.eye(len(knots), device=knots.device), right.flatten() - ridge * knots)
     moved = (knots + step).reshape(2, *flow.shape[:2]).permute(1, 2, 0)
-    return moved.clamp(-options.most_flow * options.flow_sigma_px, options.most_flow * options.flow_sigma_px)
+    return moved.clamp(-_MAX_FLOW_PX, _MAX_FLOW_PX)
 
 
-def _robust_weights(
-    residual: Float[Tensor, "h w 3"], confidence: Float[Tensor, "h w"], options: ViewErrorOptions
-) -> Float[Tensor, "h w"]:
+def _robust_weights(residual: Float[Tensor, "h w 3"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Confidence times Geman-McClure weights of the residual."""
-    squares = _over_channels(residual**2) / (3 * options.residual_sigma**2)
+    squares = _over_channels(residual**2) / (3 * _RESIDUAL_SIGMA**2)
     return confidence / (1 + squares) ** 2
 
 
-def _observations_per_knot(robust: Float[Tensor, "h w"], pixels: int, knots: int, options: ViewErrorOptions) -> float:
-    """Independent observations per knot: weighted pixels over `correlated_px`, as neighbours are correlated."""
-    return max(float(robust.sum()) / pixels, 1e-3) * pixels / knots / options.correlated_px
+def _observations_per_knot(robust: Float[Tensor, "h w"], pixels: int, knots: int) -> float:
+    """Independent observations per knot: weighted pixels over `_CORRELATED_PX`, as neighbours are correlated."""
+    return max(float(robust.sum()) / pixels, 1e-3) * pixels / knots / _CORRELATED_PX
 
 
 def _normal_matrix(

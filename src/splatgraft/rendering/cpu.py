@@ -33,10 +33,10 @@ def render(
 
 
 def view_operator(
-    gaussians: Gaussians, camera: Cameras, options: RenderOptions, least_row_weight: float
+    gaussians: Gaussians, camera: Cameras, options: RenderOptions, min_row_weight: float
 ) -> "CpuViewOperator":
     """`rendering.view_operator` for tensors on the CPU."""
-    return CpuViewOperator(gaussians, camera, options, least_row_weight)
+    return CpuViewOperator(gaussians, camera, options, min_row_weight)
 
 
 def _stack(parts: tuple[Tensor, ...]) -> Tensor:
@@ -115,14 +115,14 @@ class _TileLists:
         out[self.order[np.diff(self.first) > 0]] = True
         return out
 
-    def without_hidden(self, view: _View, least_row_weight: float) -> "_TileLists":
+    def without_hidden(self, view: _View, min_row_weight: float) -> "_TileLists":
         """Lists of the splats with weight in some pixel of the tile, and the rows in which they have more than a bound.
 
         With the bound 0, rendered to the end, they give the same image.
         """
         rows = np.empty((len(self.entries), 2), np.uint8)
         size = view.height, view.width
-        cpu_rows.find_rows(self.splats, self.start, self.entries, size, np.float32(least_row_weight), rows)
+        cpu_rows.find_rows(self.splats, self.start, self.entries, size, np.float32(min_row_weight), rows)
         listed = rows[:, 1] > 0
         shown = np.empty_like(listed)
         shown[self.slots] = listed
@@ -227,12 +227,12 @@ class _RenderView(torch.autograd.Function):
 class CpuViewOperator:
     """`ViewOperator` on the CPU: tile lists of the visible splats are made once and always rendered to their ends."""
 
-    def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions, least_row_weight: float) -> None:
+    def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions, min_row_weight: float) -> None:
         """Project, sort, make tile lists, and drop hidden splats and rows."""
         self._view = _View.of(camera, options)
         with KERNEL_LOCK:
             lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
-            self._lists = lists.without_hidden(self._view, least_row_weight)
+            self._lists = lists.without_hidden(self._view, min_row_weight)
         self.visible = torch.from_numpy(self._lists.drawn)
 
     @cached_property

@@ -25,7 +25,7 @@ from splatgraft.runtime.kernels import kernel
 
 @kernel(parallel=True)
 @no_type_check
-def find_rows(splats, start, entries, size, least_weight, rows):
+def find_rows(splats, start, entries, size, min_weight, rows):
     """Fill `rows (e, 2)`: first and one past the last row of each entry with more weight than a bound.
 
     `size`: height and width of the image, outside of which nothing counts. Both are 0 for entries without such a row.
@@ -48,7 +48,7 @@ def find_rows(splats, start, entries, size, least_weight, rows):
                 before = load(work, at)
                 weight = smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
                 store(work, at, before - weight)
-                if total(weight * load(work, at + PIXELS)) > least_weight:
+                if total(weight * load(work, at + PIXELS)) > min_weight:
                     if rows[k, 1] == 0:
                         rows[k, 0] = y
                     rows[k, 1] = y + 1

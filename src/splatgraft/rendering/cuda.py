@@ -35,7 +35,7 @@ def render(
 
 
 def view_operator(
-    gaussians: Gaussians, camera: Cameras, options: RenderOptions, _least_row_weight: float
+    gaussians: Gaussians, camera: Cameras, options: RenderOptions, _min_row_weight: float
 ) -> "CudaViewOperator":
     """`rendering.view_operator` for tensors on a CUDA device; gsplat leaves nothing out.
 

@@ -131,7 +131,7 @@ def view_operator(
     camera: Cameras,
     options: RenderOptions = RenderOptions(),
     *,
-    least_row_weight: float = 0.0,
+    min_row_weight: float = 0.0,
 ) -> ViewOperator:
     """The map from Gaussian values to the pixels of one camera, with depth order and tile lists computed once.
 
@@ -139,11 +139,11 @@ def view_operator(
         gaussians: n Gaussians.
         camera: A batch of one.
         options: Low-pass filter and near plane.
-        least_row_weight: The weights of a Gaussian in 16 neighbouring pixels of a row that add up to no more than this
+        min_row_weight: The weights of a Gaussian in 16 neighbouring pixels of a row that add up to no more than this
             count as 0 where they are its first or last in a tile of 16 rows; behind opaque surfaces most rows are so.
             0 is exact. On CUDA nothing is left out.
     """
-    return _implementation(gaussians).view_operator(gaussians, camera, options, least_row_weight)
+    return _implementation(gaussians).view_operator(gaussians, camera, options, min_row_weight)
 
 
 def _implementation(gaussians: Gaussians) -> ModuleType:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from splatgraft.consolidation import ConsolidateOptions, ViewErrorOptions, consolidate
+from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.core.images import read_mask, read_rgb
 from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import ImageLoss, lpips_and_l1, lpips_vgg, windowed_fourier
@@ -76,7 +76,7 @@ class Consolidate:
             standard,
             method=self.method,
             loss=self._loss(),
-            view_error=ViewErrorOptions() if self.nuisance == "tint-flow" else None,
+            view_error=self.nuisance == "tint-flow",
             polish_passes=self.passes,
             reference=replace(standard.reference, iterations=self.iterations),
             rendering=RenderOptions(low_pass=self.low_pass),
