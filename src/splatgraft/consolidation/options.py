@@ -77,7 +77,7 @@ class ConsolidateOptions:
     min_row_weight: float = 1e-4
     """Weights of a Gaussian in 16 pixels of a row that add up to no more are left out at its ends; 0: none are.
 
-    As the least transmittance of the renderer; at most a fortieth of a grey level in a pixel. It saves half the work."""
+    As the renderer's least transmittance; at most a fortieth of a grey level in a pixel. It saves half the work."""
     cache_bytes: int = 3 * 2**30
     """Bytes of tile lists and bases cached between passes; the rest is computed again in each pass."""
     rendering: RenderOptions = field(default_factory=RenderOptions)

@@ -1,6 +1,5 @@
 """Rendering of Gaussians (3D Gaussian Splatting): one interface, numba kernels on the CPU, gsplat on CUDA."""
 
-from splatgraft.rendering.interface import Render, RenderOptions, ViewOperator, render, view_operator
-from splatgraft.rendering.surface_points import surface_points
+from splatgraft.rendering.interface import Render, RenderOptions, ViewOperator, render, surface_points, view_operator
 
 __all__ = ["Render", "RenderOptions", "ViewOperator", "render", "surface_points", "view_operator"]

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.rendering import cpu_blend, cpu_normal_matrix, cpu_project, cpu_rows, cpu_tiles
-from splatgraft.rendering.channels import CHANNEL_COUNTS, assemble_render
-from splatgraft.rendering.interface import Output, Render, RenderOptions
+from splatgraft.rendering import cpu_blend, cpu_frozen, cpu_project, cpu_tiles
+from splatgraft.rendering.interface import CHANNEL_COUNTS, Output, Render, RenderOptions, assemble_render
 from splatgraft.runtime.kernels import KERNEL_LOCK
 
 
@@ -30,13 +29,6 @@ def render(
     views = [_RenderView.apply(_View.of(camera, options), outputs, *fields) for camera in cameras]
     image, alpha, visible = (_stack(parts) for parts in zip(*views, strict=True))
     return assemble_render(image, alpha, visible, outputs=outputs, has_features=features is not None, options=options)
-
-
-def view_operator(
-    gaussians: Gaussians, camera: Cameras, options: RenderOptions, min_row_weight: float
-) -> "CpuViewOperator":
-    """`rendering.view_operator` for tensors on the CPU."""
-    return CpuViewOperator(gaussians, camera, options, min_row_weight)
 
 
 def _stack(parts: tuple[Tensor, ...]) -> Tensor:
@@ -122,7 +114,7 @@ class _TileLists:
         """
         rows = np.empty((len(self.entries), 2), np.uint8)
         size = view.height, view.width
-        cpu_rows.find_rows(self.splats, self.start, self.entries, size, np.float32(min_row_weight), rows)
+        cpu_frozen.find_rows(self.splats, self.start, self.entries, size, np.float32(min_row_weight), rows)
         listed = rows[:, 1] > 0
         shown = np.empty_like(listed)
         shown[self.slots] = listed
@@ -224,7 +216,7 @@ class _RenderView(torch.autograd.Function):
         return None, None, *(torch.from_numpy(grad) for grad in grads)
 
 
-class CpuViewOperator:
+class FrozenView:
     """`ViewOperator` on the CPU: tile lists of the visible splats are made once and always rendered to their ends."""
 
     def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions, min_row_weight: float) -> None:
@@ -258,7 +250,7 @@ class CpuViewOperator:
         pixels = np.ones((view.height, view.width), np.float32) if weights is None else _array(weights)
         sums = np.empty((len(lists.entries), values.shape[1]), np.float32)
         with KERNEL_LOCK:
-            cpu_normal_matrix.blend_and_transpose(
+            cpu_frozen.blend_and_transpose(
                 lists.splats, lists.start, lists.entries, lists.rows, lists.slots,
                 lists.in_order(_array(values)), pixels, sums,
             )  # fmt: skip
@@ -269,7 +261,7 @@ class CpuViewOperator:
         lists = self._lists
         sums = np.empty((len(lists.entries), 1), np.float32)
         with KERNEL_LOCK:
-            cpu_normal_matrix.transpose_residual(
+            cpu_frozen.transpose_residual(
                 lists.splats, lists.start, lists.entries, lists.rows, lists.slots,
                 lists.in_order(_array(values)[:, None])[:, 0], _array(target), sums,
             )  # fmt: skip

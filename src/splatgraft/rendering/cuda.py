@@ -10,8 +10,7 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.rendering.channels import assemble_render
-from splatgraft.rendering.interface import Output, Render, RenderOptions
+from splatgraft.rendering.interface import Output, Render, RenderOptions, assemble_render
 
 
 def render(
@@ -34,21 +33,11 @@ def render(
     )
 
 
-def view_operator(
-    gaussians: Gaussians, camera: Cameras, options: RenderOptions, _min_row_weight: float
-) -> "CudaViewOperator":
-    """`rendering.view_operator` for tensors on a CUDA device; gsplat leaves nothing out.
-
-    Raises: ValueError where gsplat is not installed.
-    """
-    return CudaViewOperator(gaussians, camera, options)
-
-
-class CudaViewOperator:
+class FrozenView:
     """`ViewOperator` on CUDA: gsplat keeps no tile lists between calls, so each call rasterises again."""
 
-    def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> None:
-        """Freeze geometry and opacity."""
+    def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions, _min_row_weight: float) -> None:
+        """Freeze geometry and opacity; gsplat leaves no row out."""
         self._gaussians, self._camera, self._options = gaussians.map(Tensor.detach), camera, options
         _, self.alpha, _ = self._draw(gaussians.means.new_zeros(gaussians.count, 1))
         self.visible = (self.blend_transpose(torch.ones_like(self.alpha)[..., None]) > 0)[:, 0]
@@ -107,7 +96,7 @@ def _draw(
 def _channels(
     gaussians: Gaussians, camera: Cameras, outputs: AbstractSet[Output], features: Tensor | None
 ) -> Float[Tensor, "n c"]:
-    """What `channels.CHANNEL_COUNTS` lists, per Gaussian."""
+    """What `CHANNEL_COUNTS` lists, per Gaussian."""
     offset = gaussians.means - camera.centers[0].to(gaussians.means)
     parts = []
     if "color" in outputs:

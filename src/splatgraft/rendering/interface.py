@@ -1,11 +1,13 @@
-"""Rendering of Gaussians: options, results, and the choice of the implementation by device."""
+"""Rendering of Gaussians: options, results, the choice of the implementation by device, and what all of them share."""
 
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 from typing import Literal, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -13,6 +15,8 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 
 Output = Literal["color", "depth", "normal"]
+CHANNEL_COUNTS: dict[Output, int] = {"color": 3, "depth": 1, "normal": 3}
+"""Number of channels of each output, blended in this order; features follow."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +147,70 @@ def view_operator(
             count as 0 where they are its first or last in a tile of 16 rows; behind opaque surfaces most rows are so.
             0 is exact. On CUDA nothing is left out.
     """
-    return _implementation(gaussians).view_operator(gaussians, camera, options, min_row_weight)
+    return _implementation(gaussians).FrozenView(gaussians, camera, options, min_row_weight)
+
+
+def surface_points(scene: Gaussians, camera: Cameras, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
+    """The points of the scene's surface that a picture shows at `pixels`; those that show nothing are left out.
+
+    Args:
+        scene: What is seen.
+        camera: One camera.
+        pixels: x and y, pixels of the camera's picture.
+    """
+    drawn = render(scene, camera, outputs=frozenset({"depth"}))
+    pixels = pixels.to(drawn.depth)
+    size = camera.sizes[0].to(pixels)
+    pixels = torch.minimum(pixels.clamp_min(0), size - 1)
+    column, row = pixels.long().unbind(-1)
+    solid = drawn.alpha[0][row, column] > 0.5
+    depth = drawn.depth[0][row, column]
+    rays = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1) @ torch.linalg.inv(camera.intrinsics[0].to(pixels)).T
+    pose = camera.world_from_camera[0].to(pixels)
+    return ((rays * depth[:, None]) @ pose[:3, :3].T + pose[:3, 3])[solid].detach()
 
 
 def _implementation(gaussians: Gaussians) -> ModuleType:
     # imported when first drawn: numba and gsplat take seconds to load
     name = "cuda" if gaussians.device.type == "cuda" else "cpu"
     return import_module(f"splatgraft.rendering.{name}")
+
+
+def assemble_render(
+    image: Float[Tensor, "v c h w"],
+    alpha: Float[Tensor, "v h w"],
+    visible: Bool[Tensor, "v n"],
+    *,
+    outputs: AbstractSet[Output],
+    has_features: bool,
+    options: RenderOptions,
+) -> Render:
+    """Split blended channels into the outputs of a `Render`.
+
+    Args:
+        image: Blended channels over black, in the order of `CHANNEL_COUNTS`, then features.
+        alpha: Accumulated opacity.
+        visible: Gaussians in each view.
+        outputs: Which of `CHANNEL_COUNTS` are in `image`.
+        has_features: Whether features follow.
+        options: Of which the background is added to the colour.
+    """
+    planes, at = {}, 0
+    for name, width in CHANNEL_COUNTS.items():
+        if name in outputs:
+            planes[name], at = image[:, at : at + width], at + width
+    made: dict[str, Tensor] = {}
+    if "color" in outputs:
+        color = planes["color"]
+        if any(options.background):
+            color = color + (1 - alpha)[:, None] * color.new_tensor(options.background)[:, None, None]
+        made["color"] = color.permute(0, 2, 3, 1)
+    if "depth" in outputs:
+        made["depth"] = planes["depth"][:, 0] / torch.where(alpha > 0, alpha, 1)
+    if "normal" in outputs:
+        normal = planes["normal"].permute(0, 2, 3, 1)
+        squares = (normal * normal).sum(-1, keepdim=True)
+        made["normal"] = normal / torch.where(squares > 0, squares, 1).sqrt()
+    if has_features:
+        made["features"] = image[:, at:].permute(0, 2, 3, 1)
+    return Render(alpha=alpha, visible=visible, pictures=made)
