@@ -75,9 +75,9 @@ def test_a_killed_reconstruction_resumes_bit_for_bit(capture, monkeypatch, more)
         budget=220,
         sh_degree=1,
         seed=5,
+        quality="standard" if more else "draft",
         random_background=more,
         far_shell=more,
-        error_splits=more,
     )
     whole = reconstruct(capture, options)
     checkpoint = MemoryCheckpoint()
@@ -153,7 +153,7 @@ def holes(scene: Gaussians, capture: PosedImages) -> float:
 
 def test_a_random_background_leaves_no_holes_before_dark_walls(before_walls):
     options = ReconstructOptions(
-        iterations=200, budget=1500, sh_degree=0, random_background=False, far_shell=True, error_splits=False
+        iterations=200, budget=1500, sh_degree=0, random_background=False, far_shell=True, quality="draft"
     )
     fixed = reconstruct(before_walls, options)
     random = reconstruct(before_walls, replace(options, random_background=True))
@@ -162,9 +162,7 @@ def test_a_random_background_leaves_no_holes_before_dark_walls(before_walls):
 
 
 def test_a_far_shell_shows_held_out_views_what_is_behind_the_points(before_walls):
-    options = ReconstructOptions(
-        iterations=200, budget=1500, sh_degree=0, eval_every=8, quality="draft", error_splits=False
-    )
+    options = ReconstructOptions(iterations=200, budget=1500, sh_degree=0, eval_every=8, quality="draft")
     without = held_out_psnr(reconstruct(before_walls, options), before_walls, 8)
     # a decibel is a fifth of the squared error: walls fill most of these pictures
     assert held_out_psnr(reconstruct(before_walls, replace(options, far_shell=True)), before_walls, 8) > without + 1
@@ -173,7 +171,7 @@ def test_a_far_shell_shows_held_out_views_what_is_behind_the_points(before_walls
 def test_draft_has_nothing_of_what_standard_adds_and_an_object_alone_no_surroundings():
     def choices(quality: Quality, surroundings: bool) -> tuple[bool | None, ...]:
         options = ReconstructOptions(quality=quality).decided(surroundings)
-        return options.random_background, options.far_shell, options.error_splits
+        return options.random_background, options.far_shell, options.splits_by_error
 
     assert choices("draft", True) == (False, False, False)
     assert choices("standard", True) == choices("high", True) == choices("full", True) == (True, True, True)
@@ -230,10 +228,6 @@ def test_more_time_is_predicted_for_more_work(capture):
         predict_cpu_seconds(capture.cameras, ReconstructOptions(quality=q)) for q in ("draft", "standard", "high")
     ]
     assert durations == sorted(durations)
-    every_pixel = ReconstructOptions(coarse_to_fine=False)
-    assert predict_cpu_seconds(capture.cameras, every_pixel) > predict_cpu_seconds(
-        capture.cameras, ReconstructOptions()
-    )
     assert describe_duration(312.0) == "5 minutes"
 
 

@@ -7,7 +7,6 @@ gradient flows to the image only. Nothing is downloaded: LPIPS reads weights fro
 import math
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -23,7 +22,8 @@ HEADS_FILE = "vgg.pth"
 # index of each 3x3 convolution in torchvision's vgg16().features, one row per resolution
 _VGG_LAYERS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 _VGG_CHANNELS = (64, 128, 256, 512, 512)
-
+_WINDOW_PX = fourier_windows.SIZE
+_L1_SHARE = 0.1
 
 ImageLoss = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], Float[Tensor, ""]]
 """A distance from the first image to the second, differentiable in the first."""
@@ -34,93 +34,44 @@ def l1(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[T
     return (image - target).abs().mean()
 
 
-def windowed_fourier(
-    image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], *, window_px: int = 16, l1_weight: float = 0.1
-) -> Float[Tensor, ""]:
-    """L1 between the Fourier magnitudes of overlapping Hann windows, plus `l1_weight` L1 between the pixels.
+def windowed_fourier(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """L1 between the Fourier magnitudes of overlapping Hann windows, plus a tenth of L1 between the pixels.
 
-    Windows of `window_px` every half window, all channels. Magnitudes do not depend on where in the window an edge
-    lies, so that views that disagree by a pixel favour one sharp edge over the average of two. They are scaled so that
+    Windows of 16 pixels every half window, all channels. Magnitudes do not depend on where in the window an edge lies,
+    so that views that disagree by a pixel favour one sharp edge over the average of two. They are scaled so that
     independent noise has the same standard deviation in them as in the pixels.
     """
-    window, multiplicity = _hann(window_px, image.dtype, image.device)
-    planes, wanted_planes = _padded(image, window_px), _padded(target.detach(), window_px)
-    if image.device.type == "cpu" and image.dtype == torch.float32 and window_px == fourier_windows.SIZE:
+    window = _hann(image.dtype, image.device)
+    planes, wanted_planes = _padded(image), _padded(target.detach())
+    if image.device.type == "cpu" and image.dtype == torch.float32:
         spectral = fourier_windows.spectral_distance(planes, wanted_planes, window)
     else:
+        # how much of the full spectrum each column of a half spectrum holds
+        shares = window.new_full((_WINDOW_PX // 2 + 1,), 2 / _WINDOW_PX)
+        shares[0] = shares[-1] = 1 / _WINDOW_PX
         difference = _magnitudes(planes, window) - _magnitudes(wanted_planes, window)
-        spectral = (difference.abs().mean((0, 1, 2, 3)) * multiplicity).sum()
-    return spectral + l1_weight * l1(image, target.detach())
+        spectral = (difference.abs().mean((0, 1, 2, 3)) * shares).sum()
+    return spectral + _L1_SHARE * l1(image, target.detach())
 
 
 @lru_cache(maxsize=8)
-def _hann(
-    size: int, dtype: torch.dtype, device: torch.device
-) -> tuple[Float[Tensor, "size size"], Float[Tensor, "half"]]:
-    """The window, of mean square 1, and the share of the full spectrum that each column of a half spectrum holds."""
-    ramp = torch.hann_window(size, dtype=dtype, device=device)
+def _hann(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size"]:
+    """The window, of mean square 1."""
+    ramp = torch.hann_window(_WINDOW_PX, dtype=dtype, device=device)
     window = ramp[:, None] * ramp[None, :]
-    multiplicity = torch.full((size // 2 + 1,), 2.0 / size, dtype=dtype, device=device)
-    multiplicity[0] = multiplicity[-1] = 1.0 / size
-    return window / (window**2).mean().sqrt(), multiplicity
+    return window / (window**2).mean().sqrt()
 
 
-def _padded(image: Float[Tensor, "h w 3"], size: int) -> Float[Tensor, "3 y x"]:
-    """Planes whose border repeats so far that windows of `size` cover every pixel twice in each direction."""
-    hop = size // 2
+def _padded(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 y x"]:
+    """Planes whose border repeats so far that windows cover every pixel twice in each direction."""
+    hop = _WINDOW_PX // 2
     pads = [(hop, hop + (-length) % hop) for length in image.shape[1::-1]]
     return F.pad(image.permute(2, 0, 1)[None], [*pads[0], *pads[1]], mode="replicate")[0]
 
 
 def _magnitudes(planes: Float[Tensor, "3 y x"], window: Float[Tensor, "s s"]) -> Float[Tensor, "3 i j s t"]:
-    size = len(window)
-    patches = planes.unfold(1, size, size // 2).unfold(2, size, size // 2)
+    patches = planes.unfold(1, _WINDOW_PX, _WINDOW_PX // 2).unfold(2, _WINDOW_PX, _WINDOW_PX // 2)
     return torch.fft.rfft2(patches * window, norm="ortho").abs()
-
-
-@dataclass(frozen=True)
-class LpipsVgg:
-    """LPIPS of Zhang 2018 (version 0.1, VGG-16, linear heads) in plain torch: call it with an image and a target."""
-
-    convolutions: tuple[tuple[tuple[Float[Tensor, "_ _ 3 3"], Float[Tensor, "_"]], ...], ...]
-    """Weights and biases of VGG-16's 13 convolutions, one tuple per resolution."""
-    heads: tuple[Float[Tensor, "1 _ 1 1"], ...]
-    """Non-negative channel weights of the five taps."""
-
-    def __call__(self, image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-        """The perceptual distance; the gradient flows to `image` alone.
-
-        Raises: ValueError where an image is too small for four halvings.
-        """
-        with torch.no_grad():
-            wanted = self.features(target)
-        return self.distance(self.features(image), wanted)
-
-    def features(self, image: Float[Tensor, "h w 3"]) -> tuple[Tensor, ...]:
-        """Activations (c, h', w') after the last convolution of each resolution, of unit length over the channels.
-
-        Raises: ValueError where an image is too small for four halvings.
-        """
-        if min(image.shape[:2]) < 16:
-            raise ValueError(f"lpips: expected images of at least 16x16 pixels, found {tuple(image.shape[:2])}")
-        # the input scaling of the published weights
-        shift, scale = image.new_tensor([-0.030, -0.088, -0.188]), image.new_tensor([0.458, 0.448, 0.450])
-        x = ((2 * image - 1 - shift) / scale).permute(2, 0, 1)[None]
-        taps = []
-        for level, convolutions in enumerate(self.convolutions):
-            x = F.max_pool2d(x, 2) if level else x
-            for weight, bias in convolutions:
-                x = F.relu(F.conv2d(x, weight.to(x), bias.to(x), padding=1))
-            taps.append((x / ((x**2).sum(1, keepdim=True) + 1e-20).sqrt())[0])
-        return tuple(taps)
-
-    def distance(self, features: tuple[Tensor, ...], wanted: tuple[Tensor, ...]) -> Float[Tensor, ""]:
-        """The distance between the features of two images of one size."""
-        parts = [
-            F.conv2d(((a - b) ** 2)[None], head.to(a)).mean()
-            for a, b, head in zip(features, wanted, self.heads, strict=True)
-        ]
-        return torch.stack(parts).sum()
 
 
 def lpips_and_l1(folder: Path | None = None) -> ImageLoss:
@@ -134,28 +85,51 @@ def lpips_and_l1(folder: Path | None = None) -> ImageLoss:
     return lambda image, target: perceptual(image, target) + l1(image, target)
 
 
-def lpips_vgg(folder: Path | None = None) -> LpipsVgg:
-    """LPIPS with the weights vgg16-397923af.pth and vgg.pth in `folder`, by default torch hub's cache.
+def lpips_vgg(folder: Path | None = None) -> ImageLoss:
+    """LPIPS (Zhang 2018, version 0.1, VGG-16, linear heads) with weights from `folder`, by default torch hub's cache.
 
     vgg16-397923af.pth is torchvision's; vgg.pth holds the heads and is lpips/weights/v0.1/vgg.pth of the lpips package.
 
-    Raises: ValueError where a file is missing or holds something else.
+    Raises: ValueError where a file is missing or holds something else, and later where an image is below 16x16 pixels.
     """
     folder = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
     vgg, heads = _load(folder / VGG_FILE), _load(folder / HEADS_FILE)
-    convolutions, below = [], 3
+    convolutions: list[list[tuple[Tensor, Tensor]]] = []
+    below = 3
     for layers, channels in zip(_VGG_LAYERS, _VGG_CHANNELS, strict=True):
-        level = []
+        convolutions.append([])
         for layer in layers:
             weight = _take(vgg, f"features.{layer}.weight", (channels, below, 3, 3), folder / VGG_FILE)
-            level.append((weight, _take(vgg, f"features.{layer}.bias", (channels,), folder / VGG_FILE)))
+            bias = _take(vgg, f"features.{layer}.bias", (channels,), folder / VGG_FILE)
+            convolutions[-1].append((weight, bias))
             below = channels
-        convolutions.append(tuple(level))
-    taps = tuple(
+    taps = [
         _take(heads, f"lin{i}.model.1.weight", (1, channels, 1, 1), folder / HEADS_FILE)
         for i, channels in enumerate(_VGG_CHANNELS)
-    )
-    return LpipsVgg(convolutions=tuple(convolutions), heads=taps)
+    ]
+
+    def features(image: Float[Tensor, "h w 3"]) -> list[Tensor]:
+        """Activations (c, h', w') after the last convolution of each resolution, of unit length over the channels."""
+        if min(image.shape[:2]) < 16:
+            raise ValueError(f"lpips: expected images of at least 16x16 pixels, found {tuple(image.shape[:2])}")
+        # the input scaling of the published weights
+        shift, scale = image.new_tensor([-0.030, -0.088, -0.188]), image.new_tensor([0.458, 0.448, 0.450])
+        x = ((2 * image - 1 - shift) / scale).permute(2, 0, 1)[None]
+        found = []
+        for level, layers in enumerate(convolutions):
+            x = F.max_pool2d(x, 2) if level else x
+            for weight, bias in layers:
+                x = F.relu(F.conv2d(x, weight.to(x), bias.to(x), padding=1))
+            found.append((x / ((x**2).sum(1, keepdim=True) + 1e-20).sqrt())[0])
+        return found
+
+    def loss(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+        with torch.no_grad():
+            wanted = features(target)
+        pairs = zip(features(image), wanted, taps, strict=True)
+        return torch.stack([F.conv2d(((a - b) ** 2)[None], tap.to(a)).mean() for a, b, tap in pairs]).sum()
+
+    return loss
 
 
 def _load(path: Path) -> dict[str, Tensor]:
@@ -168,8 +142,7 @@ def _load(path: Path) -> dict[str, Tensor]:
         # the published heads were saved from a GPU
         state = torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"{path}: expected torch weights, found {reason}") from error
+        raise ValueError(f"{path}: expected torch weights, found {type(error).__name__}") from error
     if not isinstance(state, dict):
         raise ValueError(f"{path}: expected a table of weights, found {type(state).__name__}")
     return state

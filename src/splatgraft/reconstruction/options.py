@@ -65,8 +65,6 @@ class ReconstructOptions:
     at most."""
     sh_degree: int = 3
     """Highest band of the colours; bands come in one by one during the first tenth of the steps."""
-    coarse_to_fine: bool = True
-    """Whether steps see smaller images first and then every second pixel; without it, every pixel in every step."""
     photo_colors: bool | None = None
     """Whether each photo has its own exposure and white balance, which then stay out of the scene; None: where its EXIF
     says that they differ."""
@@ -75,9 +73,6 @@ class ReconstructOptions:
     `background`; None: unless at `draft`, or the photos show an object alone before `background`."""
     far_shell: bool | None = None
     """Whether the start has Gaussians behind everything, in the colours around; None: likewise."""
-    error_splits: bool | None = None
-    """Whether Gaussians are split by gradient and covered error, not by the gradient alone; None: unless at
-    `draft`."""
     eval_every: int = 0
     """Every how many views one is held out, from the first (3DGS: 8); 0 holds out none."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -114,8 +109,8 @@ class ReconstructOptions:
 
     @property
     def splits_by_error(self) -> bool:
-        """Whether splits look at the error that a Gaussian covers, given or of the quality."""
-        return _PRESETS[self.quality].beyond_draft if self.error_splits is None else self.error_splits
+        """Whether Gaussians are split by gradient and covered error, not by the gradient alone."""
+        return _PRESETS[self.quality].beyond_draft
 
     def decided(self, surroundings: bool) -> "ReconstructOptions":
         """The same options with the choices made that the quality and the photos decide.
@@ -128,7 +123,6 @@ class ReconstructOptions:
             self,
             random_background=usual if self.random_background is None else self.random_background,
             far_shell=usual if self.far_shell is None else self.far_shell,
-            error_splits=self.splits_by_error,
         )
 
     def sampling(self, served: Cameras) -> tuple[Sampling, ...]:
@@ -137,8 +131,6 @@ class ReconstructOptions:
         Pixels are left out only as long as a step still sees as many pixels as there are Gaussians: on a room at
         352x248 with 25k Gaussians, which has fewer, every second pixel costs half a decibel.
         """
-        if not self.coarse_to_fine:
-            return EVERY_PIXEL
         sampling = _PRESETS[self.quality].sampling
         sizes = served.sizes.prod(1).double()
         seen = (float(sizes.mean()) if len(sizes) else 0.0) / max(part.stride for part in sampling) ** 2

@@ -26,19 +26,15 @@ from splatgraft.reconstruction import (
     reconstruct,
 )
 from splatgraft.rendering import RenderOptions, render
+from splatgraft.runtime.note import Note
 
 EVAL_EVERY = 8
 """Every 8th view, as in 3DGS."""
 
 
-@dataclass(frozen=True)
-class FarBelow:
-    """When a held-out view counts as far worse than the rest."""
-
-    deviations: float = 3.0
-    """Robust standard deviations (1.4826 median absolute deviations) below the median: the usual three."""
-    decibels: float = 3.0
-    """And this much below the median in PSNR at least: twice the squared error."""
+_FAR_BELOW_DEVIATIONS, _FAR_BELOW_DB = 3.0, 3.0
+"""A held-out view is far worse than the rest from so many robust standard deviations (1.4826 median absolute
+deviations) below the median PSNR: the usual three, and twice the squared error at least."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +69,7 @@ class Reconstruct:
             context.console.say(f"time: about {describe_duration(seconds)} on {threads} idle cores, half or twice that")
         warnings = exposure_warnings(self.capture, capture.image_paths)
         if read_record(self.capture) is None:  # of its own results the command `capture` has said it
-            for warning in warnings:
-                context.console.warn(warning, minor=True)
+            context.console.tell(*(Note(warning, "minor") for warning in warnings))
         if options.photo_colors is None:
             options = replace(options, photo_colors=bool(warnings))
             if warnings:
@@ -88,22 +83,21 @@ class Reconstruct:
                 f"colours of each view fitted, SSIM {metrics['ssim']:.4f}"
             )
             photo_of = dict(zip(capture.cameras.names, capture.image_paths, strict=True))
-            for name, sentence in far_worse(metrics["psnr_by_view"]).items():
-                context.console.warn(sentence, picture=photo_of[name])
+            for name, text in far_worse(metrics["psnr_by_view"]).items():
+                context.console.tell(Note(text, "warning", picture=photo_of[name]))
             (folder / METRICS_FILE).write_text(json.dumps(metrics, indent=1))
 
 
-def far_worse(psnr_by_view: dict[str, float], rule: FarBelow = FarBelow()) -> dict[str, str]:
+def far_worse(psnr_by_view: dict[str, float]) -> dict[str, str]:
     """One sentence per held-out view that is far worse than the rest, the worst first.
 
     Args:
         psnr_by_view: PSNR of each held-out view in dB, by the name of its photo.
-        rule: What far worse means.
     """
     values = np.array(list(psnr_by_view.values()))
     middle = float(np.median(values))
     spread = 1.4826 * float(np.median(np.abs(values - middle)))
-    limit = middle - max(rule.deviations * spread, rule.decibels)
+    limit = middle - max(_FAR_BELOW_DEVIATIONS * spread, _FAR_BELOW_DB)
     return {
         name: f"held out: {name} is far worse than the rest: {value:.1f} dB, median {middle:.1f} dB; its pose may be "
         f"wrong, or the photo blurred"
