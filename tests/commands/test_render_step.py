@@ -9,8 +9,8 @@ from tiny_project import ball, photograph, plane
 
 from splatgraft.commands.steps.render import Render
 from splatgraft.core.gaussians import concatenate
-from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import write_gaussians
+from splatgraft.formats.gaussian_flags import write_flags
 from splatgraft.project.step import job_of, perform
 from splatgraft.relighting import Light, LightSource, light_to_json
 from splatgraft.relighting.light.confidence import light_confidence
@@ -27,7 +27,7 @@ def step(tmp_path: Path) -> Render:
     (tmp_path / "relit").mkdir()
     for name in ("scene.ply", "relit/scene.ply"):
         write_gaussians(tmp_path / name, scene)
-    write_selection(tmp_path / "is_object.npy", torch.arange(scene.count) >= scene.count - ball().count)
+    write_flags(tmp_path / "is_object.npy", torch.arange(scene.count) >= scene.count - ball().count)
     return Render(
         tmp_path / "scene.ply",
         tmp_path / "target",

@@ -59,17 +59,19 @@ def test_quaternion_form_and_defaults(tmp_path):
         ("[]", 'list "objects"'),
         ('{"objects": 3}', 'list "objects"'),
         ('{"objects": [], "surprise": 1}', "found also"),
-        ('{"objects": [{"scale": 0}]}', "scale above 0, found 0.0"),
-        ('{"objects": [{"scale": "big"}]}', "a finite number"),
-        ('{"objects": [{"scale": true}]}', "a finite number"),
-        ('{"objects": [{"scale": NaN}]}', "a finite number"),
+        ('{"objects": [{"scale": 0}]}', r"objects\[0\]: expected a scale above 0"),
+        ('{"objects": [{"scale": "big"}]}', "a finite number for 'scale'"),
+        ('{"objects": [{"scale": true}]}', "a finite number for 'scale'"),
+        ('{"objects": [{"scale": NaN}]}', "a finite number for 'scale'"),
+        ('{"objects": [{"translation": [1, 2, NaN]}]}', "a finite translation"),
+        ('{"objects": [{"rotation": [1, 0, 0, Infinity]}]}', "a finite quaternion"),
         ('{"objects": [{"rotation": [0, 0, 0, 0]}]}', "other than zero"),
-        ('{"objects": [{"rotation": [1, 0, 0]}]}', "4 finite numbers"),
-        ('{"objects": [{"rotation": [[1, 0], [0, 1]]}]}', "3x3 finite numbers"),
+        ('{"objects": [{"rotation": [1, 0, 0]}]}', "numbers of shape"),
+        ('{"objects": [{"rotation": [[1, 0], [0, 1]]}]}', "numbers of shape"),
         ('{"objects": [{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}]}', "determinant 1"),
         ('{"objects": [{"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}]}', "orthonormal"),
-        ('{"objects": [{"translation": [1, 2]}]}', "3 finite numbers"),
-        ('{"objects": [{"turn": 3}]}', "to have only"),
+        ('{"objects": [{"translation": [1, 2]}]}', "numbers of shape"),
+        ('{"objects": [{"turn": 3}]}', "an object with only"),
         ('{"objects": [{"object": 3}]}', "a file name"),
         ('{"objects": [], "erased": 3}', "a file name"),
         ('{"objects": [], "erased": "none.npy"}', "found no file"),
@@ -93,7 +95,7 @@ def test_erased_of_another_kind_is_refused(tmp_path, array):
 
 
 def test_missing_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match="found no file"):
+    with pytest.raises(ValueError, match="expected a JSON file, found none"):
         read_placement(tmp_path / "placement.json")
 
 

@@ -91,8 +91,8 @@ def test_a_level_that_was_not_prepared_is_one_line(folder):
 def test_the_benchmark_s_updates_hand_each_strength_of_their_schedule_to_the_network(folder, tmp_path, monkeypatch):
     from splatgraft.core.cameras import Cameras
     from splatgraft.core.gaussians import Gaussians
-    from splatgraft.folders.selection_file import write_selection
     from splatgraft.formats import write_cameras, write_gaussians
+    from splatgraft.formats.gaussian_flags import write_flags
     from splatgraft.project.step import perform
     from splatgraft.runtime.console import Console
     from splatgraft_paper.benchmark.methods import UpdateIteratively
@@ -108,7 +108,7 @@ def test_the_benchmark_s_updates_hand_each_strength_of_their_schedule_to_the_net
     )
     (tmp_path / "composite").mkdir()
     write_gaussians(tmp_path / "composite" / "scene.ply", scene)
-    write_selection(tmp_path / "composite" / "is_object.npy", torch.arange(n) < 20)
+    write_flags(tmp_path / "composite" / "is_object.npy", torch.arange(n) < 20)
     cameras = Cameras(
         world_from_camera=torch.eye(4).repeat(2, 1, 1),
         intrinsics=torch.tensor([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]).repeat(2, 1, 1),

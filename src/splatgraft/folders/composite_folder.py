@@ -10,8 +10,8 @@ from types import MappingProxyType
 
 from splatgraft.composition import Composite, compose
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_gaussians, write_gaussians
+from splatgraft.formats.gaussian_flags import write_flags
 from splatgraft.formats.placement import Placement, read_placement, write_placement
 from splatgraft.project.layout import IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
 
@@ -61,5 +61,5 @@ def write_composite(folder: Path, composite: Composite, placement: Placement) ->
     """Write the three files; `placement` describes `composite` and names every object's file."""
     gaussians, is_object = composite.bake()
     write_gaussians(folder / SCENE_FILE, gaussians)
-    write_selection(folder / IS_OBJECT_FILE, is_object)
+    write_flags(folder / IS_OBJECT_FILE, is_object)
     write_placement(folder / PLACEMENT_FILE, placement)

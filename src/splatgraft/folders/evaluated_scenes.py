@@ -13,8 +13,8 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.evaluation import ComparedView, Truth
 from splatgraft.folders.capture_files import capture_inputs
-from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import read_cameras, read_gaussians, read_images
+from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.project.layout import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
 from splatgraft.rendering import render
 

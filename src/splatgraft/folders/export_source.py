@@ -7,8 +7,8 @@ import torch
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.exports.export_source import ExportSource
-from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import is_scene, read_cameras, read_gaussians, read_scene
+from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.formats.metric_scale import read_scale
 from splatgraft.formats.placement import read_placement
 from splatgraft.formats.scenes.scene_file import SceneMetadata

@@ -25,40 +25,40 @@ def load(path: Path) -> Any:
         raise ValueError(f"{path}: expected JSON, found {str(error)[:200]}") from None
 
 
-def number(path: Path, entry: dict[str, Any], key: str, default: float | None = None) -> float:
+def number(where: Path | str, entry: dict[str, Any], key: str, default: float | None = None) -> float:
     """A finite number below 1e9.
 
     Raises: ValueError where the value is none.
     """
     value = entry.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
-        raise ValueError(f"{path}: expected a finite number for '{key}', found {excerpt(value)}")
+        raise ValueError(f"{where}: expected a finite number for '{key}', found {excerpt(value)}")
     return float(value)
 
 
-def whole_side(path: Path, entry: dict[str, Any], key: str) -> int:
+def whole_side(where: Path | str, entry: dict[str, Any], key: str) -> int:
     """An image side, pixels.
 
     Raises: ValueError where the value is no whole number from 1 to `MAX_SIDE`.
     """
-    value = number(path, entry, key)
+    value = number(where, entry, key)
     if not (value.is_integer() and 1 <= value <= MAX_SIDE):
-        raise ValueError(f"{path}: expected a whole number from 1 to {MAX_SIDE} for '{key}', found {value:g}")
+        raise ValueError(f"{where}: expected a whole number from 1 to {MAX_SIDE} for '{key}', found {value:g}")
     return int(value)
 
 
-def text(path: Path, entry: dict[str, Any], key: str) -> str:
+def text(where: Path | str, entry: dict[str, Any], key: str) -> str:
     """A file name, with forward slashes.
 
     Raises: ValueError where the value is none.
     """
     value = entry.get(key)
     if not isinstance(value, str) or not value.strip("./\\ ") or not value.isprintable() or len(value) > 1024:
-        raise ValueError(f"{path}: expected a file name for '{key}', found {excerpt(value)}")
+        raise ValueError(f"{where}: expected a file name for '{key}', found {excerpt(value)}")
     return value.replace("\\", "/")
 
 
-def array(path: Path, entry: dict[str, Any], key: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
+def array(where: Path | str, entry: dict[str, Any], key: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     """Numbers in one of `shapes`, float64; they may be nan.
 
     Raises: ValueError where the value has another shape.
@@ -69,7 +69,7 @@ def array(path: Path, entry: dict[str, Any], key: str, shapes: tuple[tuple[int, 
     except (ValueError, TypeError, OverflowError):
         out = np.empty(0)
     if out.shape not in shapes:
-        raise ValueError(f"{path}: expected numbers of shape {shapes[0]} for '{key}', found {excerpt(value)}")
+        raise ValueError(f"{where}: expected numbers of shape {shapes[0]} for '{key}', found {excerpt(value)}")
     return out
 
 

@@ -8,7 +8,6 @@ file; x_in_target = scale * rotation @ x_in_object + translation. erased.npy: on
 """
 
 import json
-import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +15,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
+from splatgraft.formats.gaussian_flags import read_flags, write_flags
+from splatgraft.formats.json_file import array, excerpt, load, number
 from splatgraft.runtime.atomic_file import atomic_write
 
-_OBJECT_KEYS = frozenset({"object", "scale", "rotation", "translation"})
+_ERASED_FILE = "erased.npy"
+_DEFAULTS = {"object": None, "scale": 1.0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
+_RIGID = 1e-4
+"""Largest entry of R R^T - I; accepts files with six digits, refuses a scale or shear in the matrix."""
 
 
 @dataclass(frozen=True)
@@ -51,107 +55,62 @@ def read_placement(path: Path) -> Placement:
 
     Raises: ValueError where either file is missing, broken or inconsistent.
     """
-    content = _load_json(path)
+    content = load(path)
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
-        raise ValueError(f'{path}: expected an object with a list "objects", found {_short(content)}')
+        raise ValueError(f'{path}: expected an object with a list "objects", found {excerpt(content)}')
     unknown = sorted(set(content) - {"objects", "erased"})
     if unknown:
         raise ValueError(f'{path}: expected the keys "objects" and "erased", found also {unknown}')
-    objects = tuple(_parse_object(entry, path, f"objects[{i}]") for i, entry in enumerate(content["objects"]))
-    erased = content.get("erased")
-    if erased is not None and not isinstance(erased, str):
-        raise ValueError(f'{path}: expected a file name as "erased", found {_short(erased)}')
-    return Placement(objects=objects, erased=None if erased is None else read_erased(path.parent / erased))
+    objects = tuple(_object(entry, path, f"{path}: objects[{i}]") for i, entry in enumerate(content["objects"]))
+    erased = _file(content.get("erased"), path, f"{path}: erased")
+    return Placement(objects=objects, erased=None if erased is None else read_flags(erased))
 
 
 def write_placement(path: Path, placement: Placement) -> None:
     """Write placement.json, and erased.npy beside it where anything is erased; both are read back exactly."""
     entries = []
     for item in placement.objects:
-        entry: dict[str, Any] = {}
-        if item.object_path is not None:
-            entry["object"] = os.path.relpath(item.object_path, path.parent)
-        move = item.target_from_object
-        entry |= {
-            "scale": move.scale,
-            "rotation": move.rotation.tolist(),
-            "translation": move.translation.tolist(),
-        }
-        entries.append(entry)
+        move, named = item.target_from_object, item.object_path is not None
+        entries.append(
+            ({"object": os.path.relpath(item.object_path, path.parent)} if named else {})
+            | {
+                "scale": move.scale,
+                "rotation": move.rotation.tolist(),
+                "translation": move.translation.tolist(),
+            }
+        )
     content: dict[str, Any] = {"objects": entries}
     if placement.erased is not None:
-        content["erased"] = "erased.npy"
-        with atomic_write(path.parent / "erased.npy") as stream:
-            np.save(stream, placement.erased.cpu().numpy())
+        content["erased"] = _ERASED_FILE
+        write_flags(path.parent / _ERASED_FILE, placement.erased)
     with atomic_write(path) as stream:
         stream.write((json.dumps(content, indent=1) + "\n").encode())
 
 
-def read_erased(path: Path) -> Bool[Tensor, "n"]:
-    """Which Gaussians of a scene are left out.
-
-    Raises: ValueError where the file is no one-dimensional bool array.
-    """
-    try:
-        array = np.load(path, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise ValueError(f"{path}: expected a .npy of bools, found no file") from error
-    except (ValueError, OSError, EOFError, SyntaxError, MemoryError) as error:
-        raise ValueError(f"{path}: expected a .npy of bools, found {type(error).__name__}: {error}") from error
-    if not isinstance(array, np.ndarray) or array.dtype != np.bool_ or array.ndim != 1:
-        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-        raise ValueError(f"{path}: expected a one-dimensional array of bools, found {found}")
-    return torch.from_numpy(array)
+def _object(entry: Any, path: Path, where: str) -> ObjectPlacement:
+    if not isinstance(entry, dict) or not set(entry) <= set(_DEFAULTS):
+        raise ValueError(f"{where}: expected an object with only {', '.join(_DEFAULTS)}, found {excerpt(entry)}")
+    given = _DEFAULTS | entry
+    scale, translation = number(where, given, "scale"), array(where, given, "translation", ((3,),))
+    if scale <= 0 or not np.isfinite(translation).all():
+        raise ValueError(f"{where}: expected a scale above 0 and a finite translation, found {excerpt(entry)}")
+    move = Similarity(scale, _rotation(given, where), torch.from_numpy(translation).float())
+    return ObjectPlacement(move, _file(given["object"], path, f"{where} object"))
 
 
-def _load_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ValueError(f"{path}: expected a placement, found no file") from error
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise ValueError(f"{path}: expected JSON, found {type(error).__name__}: {error}") from error
-
-
-def _parse_object(entry: Any, path: Path, where: str) -> ObjectPlacement:
-    if not isinstance(entry, dict) or not set(entry) <= _OBJECT_KEYS:
-        raise ValueError(f"{path}: expected {where} to have only {sorted(_OBJECT_KEYS)}, found {_short(entry)}")
-    name = entry.get("object")
+def _file(name: Any, path: Path, where: str) -> Path | None:
     if name is not None and not isinstance(name, str):
-        raise ValueError(f'{path}: expected a file name as {where} "object", found {_short(name)}')
-    scale = _numbers(entry.get("scale", 1.0), (), path, f"{where} scale")
-    if float(scale) <= 0:
-        raise ValueError(f"{path}: expected {where} scale above 0, found {float(scale)}")
-    move = Similarity(
-        scale=float(scale),
-        rotation=_parse_rotation(entry.get("rotation", [1, 0, 0, 0]), path, f"{where} rotation"),
-        translation=_numbers(entry.get("translation", [0, 0, 0]), (3,), path, f"{where} translation").float(),
-    )
-    return ObjectPlacement(target_from_object=move, object_path=None if name is None else path.parent / name)
+        raise ValueError(f"{where}: expected a file name, found {excerpt(name)}")
+    return None if name is None else path.parent / name
 
 
-def _parse_rotation(value: Any, path: Path, where: str) -> Tensor:
-    if isinstance(value, list) and value and isinstance(value[0], list):
-        matrix = _numbers(value, (3, 3), path, where)
-        # accepts files with six digits, refuses a scale or shear in the matrix
-        if (matrix @ matrix.T - torch.eye(3, dtype=matrix.dtype)).abs().max() > 1e-4 or torch.linalg.det(matrix) < 0:
-            raise ValueError(f"{path}: expected {where} to be orthonormal with determinant 1, found {_short(value)}")
-        return matrix.float()
-    quaternion = _numbers(value, (4,), path, where)
-    if not float(quaternion.norm()) > 1e-6:
-        raise ValueError(f"{path}: expected {where} to be a quaternion other than zero, found {_short(value)}")
-    return rotation_from_quaternion(quaternion[None])[0].float()
-
-
-def _numbers(value: Any, shape: tuple[int, ...], path: Path, where: str) -> Tensor:
-    found = np.array(value, dtype=object)
-    kinds = all(isinstance(x, int | float) and not isinstance(x, bool) for x in found.flatten())
-    if found.shape != shape or not kinds or not all(math.isfinite(x) for x in found.flatten()):
-        wanted = "x".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
-        raise ValueError(f"{path}: expected {where} to be {wanted}, found {_short(value)}")
-    return torch.tensor(found.astype(np.float64))
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+def _rotation(entry: dict[str, Any], where: str) -> Float[Tensor, "3 3"]:
+    given = torch.from_numpy(array(where, entry, "rotation", ((4,), (3, 3))))
+    if given.ndim == 1:
+        if not 1e-6 < float(given.norm()) < float("inf"):
+            raise ValueError(f"{where}: expected a finite quaternion other than zero, found {given.tolist()}")
+        return rotation_from_quaternion(given[None])[0].float()
+    error = (given @ given.T - torch.eye(3, dtype=given.dtype)).abs().max()
+    if not error <= _RIGID or torch.linalg.det(given) < 0:
+        raise ValueError(f"{where}: expected a rotation that is orthonormal with determinant 1, found {given.tolist()}")
+    return given.float()

@@ -51,7 +51,7 @@ _SECTIONS = {
     "reconstruction": "reconstruct",
     "commands.steps.segment": "segment",
     "folders.selection_file": "segment",
-    "formats.corrections": "segment",
+    "formats.gaussian_flags": "segment",
     "segmentation": "segment",
     "commands.steps.compose": "compose-and-placementjson",
     "composition": "compose-and-placementjson",

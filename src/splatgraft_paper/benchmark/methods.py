@@ -19,8 +19,8 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import lpips_and_l1, lpips_vgg, windowed_fourier
 from splatgraft.folders.composite_folder import placement_files, read_composite
-from splatgraft.folders.selection_file import read_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
+from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.harmonization import (
     HarmonizerContext,
     NoisyStartHarmonizer,

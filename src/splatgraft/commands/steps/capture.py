@@ -22,8 +22,13 @@ from splatgraft.capture import (
 )
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import LeftOut, PosedImages
-from splatgraft.folders.capture_files import capture_inputs, describe_left_out, describe_unposed, has_poses
-from splatgraft.folders.photo_exposures import exposure_warnings
+from splatgraft.folders.capture_files import (
+    capture_inputs,
+    describe_left_out,
+    describe_unposed,
+    exposure_warnings,
+    has_poses,
+)
 from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, write_capture
 from splatgraft.formats.captures.given_poses import pose_files, read_given_poses
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos

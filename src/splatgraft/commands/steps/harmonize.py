@@ -9,8 +9,14 @@ from typing import Annotated, Any
 
 from tyro.conf import subcommand
 
-from splatgraft.folders.harmonized_views import Part, finished, harmonize_part, picture_folders
-from splatgraft.folders.parallel_harmonization import harmonize_with_processes, harmonize_with_ray
+from splatgraft.folders.harmonized_views import (
+    Part,
+    finished,
+    harmonize_part,
+    harmonize_with_processes,
+    harmonize_with_ray,
+    picture_folders,
+)
 from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.harmonization import (
     HARMONIZERS,

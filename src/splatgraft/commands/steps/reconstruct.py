@@ -12,8 +12,7 @@ from splatgraft.capture import readable_views, require_coverage
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import fit_color, psnr, ssim
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.folders.capture_files import capture_inputs, describe_left_out
-from splatgraft.folders.photo_exposures import exposure_warnings
+from splatgraft.folders.capture_files import capture_inputs, describe_left_out, exposure_warnings
 from splatgraft.formats import read_capture, write_gaussians
 from splatgraft.project.layout import METRICS_FILE, SCENE_FILE
 from splatgraft.project.record import read_record

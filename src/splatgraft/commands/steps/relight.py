@@ -10,11 +10,10 @@ import torch
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.composite import Composite
 from splatgraft.core.images import write_image
-from splatgraft.folders.capture_files import camera_files
+from splatgraft.folders.capture_files import camera_files, read_luminance_scale
 from splatgraft.folders.composite_folder import placement_files, read_composite
-from splatgraft.folders.photo_exposures import read_luminance_scale
-from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
+from splatgraft.formats.gaussian_flags import write_flags
 from splatgraft.formats.placement import read_placement
 from splatgraft.project.layout import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_PICTURE, LIGHT_TEXT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Inputs
@@ -89,7 +88,7 @@ class Relight:
             doubts = (*_doubts(relit, composite), *(line.text for line in levels if line.is_doubtful))
             _draw_lights(folder, relit, composite, sources)
         write_gaussians(folder / SCENE_FILE, gaussians)
-        write_selection(folder / IS_OBJECT_FILE, is_object)
+        write_flags(folder / IS_OBJECT_FILE, is_object)
         (folder / LIGHT_TEXT_FILE).write_text("\n".join(sentences) + "\n")
         if found is not None:
             (folder / LIGHT_FILE).write_text(light_to_json(found))

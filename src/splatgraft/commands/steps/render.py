@@ -11,9 +11,9 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.folders.capture_files import camera_files
-from splatgraft.folders.selection_file import read_selection
 from splatgraft.folders.view_folder import ViewFolder, file_stems
 from splatgraft.formats import read_cameras, read_gaussians, write_capture
+from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.harmonization import render_views
 from splatgraft.project.layout import LIGHT_TEXT_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device

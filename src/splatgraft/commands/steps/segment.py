@@ -15,7 +15,6 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import resize
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs
-from splatgraft.folders.mask_sheet import write_mask_sheet
 from splatgraft.folders.object_masks import (
     CUT_SIDE_PX,
     CutRequest,
@@ -25,11 +24,11 @@ from splatgraft.folders.object_masks import (
     masked_views,
     network_masks,
     with_mask_folder,
+    write_mask_sheet,
 )
 from splatgraft.folders.picture_points import prompts_by_view
-from splatgraft.folders.selection_file import write_selection
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
-from splatgraft.formats.corrections import read_corrections
+from splatgraft.formats.gaussian_flags import read_corrections, write_flags
 from splatgraft.formats.prompts import read_prompts
 from splatgraft.project.layout import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
@@ -148,7 +147,7 @@ class Segment:
             context.console.say(f"object, made solid: {chosen.count:,} Gaussians")
         write_gaussians(folder / OBJECT_FILE, chosen.to("cpu"))
         write_gaussians(folder / SURROUNDINGS_FILE, scene.select(~selection).to("cpu"))
-        write_selection(folder / SELECTION_FILE, selection)
+        write_flags(folder / SELECTION_FILE, selection)
         with atomic_write(folder / "feature.npy") as stream:
             np.save(stream, feature.cpu().numpy())
 

@@ -19,7 +19,8 @@ from splatgraft.editor.session.placement_operations import PlaceableObject, plac
 from splatgraft.editor.session.project_access import ProjectFiles
 from splatgraft.editor.session.scene_sample import SceneSample, read_sample, sample_count
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
-from splatgraft.formats.placement import ObjectPlacement, read_erased
+from splatgraft.formats.gaussian_flags import read_flags
+from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.relighting import SourceScene
 from splatgraft.runtime.memo import Memo
 
@@ -105,7 +106,7 @@ class SceneCache:
         """Flags of the source's Gaussians in the last result of `segment`; None where there is none."""
         if not self.files.selection.is_file() or not self.files.source_scene.is_file():
             return None
-        found = self._read("selection", self.files.selection, read_erased)
+        found = self._read("selection", self.files.selection, read_flags)
         # flags of another reconstruction do not apply
         return found if len(found) == self.gaussians(self.files.source_scene).count else None
 

@@ -10,7 +10,7 @@ from typing import Any
 from splatgraft.editor.session.edit_state import BoxNumbers, EditState
 from splatgraft.editor.session.state_checks import check_state
 from splatgraft.editor.session.toml_edit import with_keys
-from splatgraft.formats.corrections import read_corrections, write_corrections
+from splatgraft.formats.gaussian_flags import read_corrections, write_flags
 from splatgraft.formats.placement import Placement, read_placement, write_placement
 from splatgraft.formats.prompts import read_prompts, write_prompts
 from splatgraft.project.layout import ERASED_FILE, LIGHT_FILE, PLACEMENT_FILE
@@ -108,7 +108,7 @@ def write_state(project: Path, before: EditState | None, after: EditState) -> No
     for table, keys in _changed_keys(before, after).items():
         text = with_keys(text, table, keys)
     if after.corrections is not None and (before is None or after.corrections is not before.corrections):
-        write_corrections(folder / CORRECTIONS_FILE, after.corrections)
+        write_flags(folder / CORRECTIONS_FILE, after.corrections)
     if after.prompts is not None and (before is None or after.prompts is not before.prompts):
         write_prompts(folder / PROMPTS_FILE, after.prompts)
     if after.light is not None and (before is None or after.light is not before.light):

@@ -1,0 +1,64 @@
+"""Files with one value per Gaussian of a scene: what is selected or erased, and what a user corrects by hand.
+
+Selections (`selection.npy`, `is_object.npy`, `erased.npy`) have one bool per Gaussian. `corrections.npy` has one int8
+per Gaussian of the source scene: 1 added, -1 removed, 0 as selected by the masks.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int8
+from torch import Tensor
+
+from splatgraft.runtime.atomic_file import atomic_write
+
+
+def read_flags(path: Path) -> Bool[Tensor, "n"]:
+    """The flags in `path`.
+
+    Raises: ValueError where the file is no one-dimensional array of bools.
+    """
+    return torch.from_numpy(_read(path, np.dtype(np.bool_)))
+
+
+def read_selection(path: Path, count: int, scene: Path) -> Bool[Tensor, "n"]:
+    """The flags in `path`, one for each of the `count` Gaussians of `scene`.
+
+    Raises: ValueError where the file is no array of bools, or has another number of them.
+    """
+    flags = read_flags(path)
+    if len(flags) != count:
+        raise ValueError(f"{path}: expected one flag for each of the {count} Gaussians of {scene}, found {len(flags)}")
+    return flags
+
+
+def read_corrections(path: Path) -> Int8[Tensor, "n"]:
+    """The corrections in `path`.
+
+    Raises: ValueError where the file is no one-dimensional int8 array of -1, 0 and 1.
+    """
+    corrections = _read(path, np.dtype(np.int8))
+    if (abs(corrections) > 1).any():
+        raise ValueError(f"{path}: expected one int8 of -1, 0 or 1 per Gaussian, found {int(corrections.max())}")
+    return torch.from_numpy(corrections)
+
+
+def write_flags(path: Path, flags: Bool[Tensor, "n"] | Int8[Tensor, "n"]) -> None:
+    """Write a selection or corrections, atomically."""
+    with atomic_write(path) as stream:
+        np.save(stream, flags.cpu().numpy())
+
+
+def _read(path: Path, kind: np.dtype) -> np.ndarray:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: expected a .npy with one {kind} per Gaussian, found no file") from error
+    except (ValueError, OSError, EOFError, SyntaxError, MemoryError) as error:
+        found = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{path}: expected a .npy with one {kind} per Gaussian, found {found}") from error
+    if not isinstance(array, np.ndarray) or array.dtype != kind or array.ndim != 1:
+        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+        raise ValueError(f"{path}: expected a .npy with one {kind} per Gaussian, found {found}")
+    return array
