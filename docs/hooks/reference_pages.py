@@ -4,7 +4,6 @@ mkdocs calls `on_files` once per build.
 """
 
 import argparse
-import importlib
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -105,12 +104,11 @@ def _weights_page() -> Iterator[str]:
 
 
 def _parser(name: str) -> Any:
-    module = importlib.import_module(commands()[name].module)
     with warnings.catch_warnings():
         # tyro has no other public way to its options; constraints.txt pins its version
         warnings.simplefilter("ignore", DeprecationWarning)
         return tyro.extras.get_parser(
-            module.COMMAND,
+            commands()[name].load(),
             prog=f"splatgraft {name}",
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff, tyro.conf.CascadeSubcommandArgs),
         )

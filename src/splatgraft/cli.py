@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
+from typing import Any
 
 ENTRY_POINTS = "splatgraft.commands"
 """Group of entry points by which other packages add commands."""
@@ -54,21 +55,26 @@ _RENAMED = {
 class Command:
     """One command of the command line."""
 
-    module: str
-    """Full name of the module that defines `COMMAND`, the dataclass of its arguments."""
+    place: str
+    """MODULE or MODULE:CLASS of the dataclass of its arguments; without a class it is `COMMAND`."""
     summary: str
     """What it does, in a few words."""
+
+    def load(self) -> Any:
+        """The dataclass of the command's arguments; its module is imported."""
+        module, _, name = self.place.partition(":")
+        return getattr(importlib.import_module(module), name or "COMMAND")
 
 
 @cache
 def commands() -> Mapping[str, Command]:
     """All commands by name: those of this package, and those that installed packages add (entry point `ENTRY_POINTS`).
 
-    Such a package gives rows (name, full module, summary), each name beginning with the entry point's.
+    Such a package gives rows (name, MODULE:CLASS, summary), each name beginning with the entry point's.
     """
     found = {name: Command(f"splatgraft.commands.{module}", summary) for name, module, summary in _TABLE}
     for entry in entry_points(group=ENTRY_POINTS):
-        found |= {name: Command(module, summary) for name, module, summary in entry.load()}
+        found |= {name: Command(place, summary) for name, place, summary in entry.load()}
     return found
 
 
@@ -117,17 +123,18 @@ def _dispatch(words: list[str]) -> int:
     if not length:
         return _group(words)
     command, rest = " ".join(words[:length]), words[length:]
-    if ".steps." in table[command].module and len(rest) == 1 and rest[0].endswith(".toml"):
+    if ".steps." in table[command].place and len(rest) == 1 and rest[0].endswith(".toml"):
         command, rest = "run", [rest[0], "--to", command]  # `reconstruct project.toml`: the project up to there
     import tyro
 
     from splatgraft.runtime.console import Console
 
-    console, module = Console(), importlib.import_module(table[command].module)
-    if hasattr(module, "current_arguments"):
-        rest = module.current_arguments(rest, console.say)
+    console, kind = Console(), table[command].load()
+    for place in (kind, sys.modules[table[command].place.partition(":")[0]]):
+        if hasattr(place, "current_arguments"):
+            rest = place.current_arguments(rest, console.say)
     options = tyro.cli(
-        module.COMMAND,
+        kind,
         prog=f"splatgraft {command}",
         args=rest,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff, tyro.conf.CascadeSubcommandArgs),

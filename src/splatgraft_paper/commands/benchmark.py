@@ -1,4 +1,4 @@
-"""The command `evaluate benchmark`: methods are measured on scenes with ground truth."""
+"""The command `paper benchmark`: methods are measured on scenes with ground truth."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -64,6 +64,3 @@ class EvaluateBenchmark:
         if unknown := [name for name in self.only if name not in names]:
             raise ValueError(f"--only: expected names among {', '.join(names)}; found {unknown[0]}")
         return tuple(scene for scene in found if not self.only or scene.name in self.only)
-
-
-COMMAND = EvaluateBenchmark

@@ -1,4 +1,4 @@
-"""The command `evaluate paper`: tables on the authors' data set or on SynCom, published numbers beside measured."""
+"""The command `paper tables`: tables on the authors' data set or on SynCom, published numbers beside measured."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -84,6 +84,3 @@ class EvaluatePaper:
         if unknown := [name for name in self.only if name not in names]:
             raise ValueError(f"--only: expected names among {', '.join(names)}; found {unknown[0]}")
         return replace(layout, scenes=tuple(s for s in layout.scenes if not self.only or s.name in self.only))
-
-
-COMMAND = EvaluatePaper

@@ -1,44 +1,35 @@
-"""The training loop of the compact harmoniser, on one process; a killed run resumes bit for bit.
+"""Training of the compact harmoniser: its task for the training loop, and its loss.
 
-The pairs of a step and their augmentation follow from the seed and the step alone. A saved state holds weights,
-optimiser and moving average.
+The loss has errors by region, squared errors, gradients, and being worse than the prior. The pairs of a step and their
+augmentation follow from the seed and the step alone.
 """
 
-import json
 import math
 import random
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import srgb_from_linear
-from splatgraft.harmonization.compact.features import apply_output
+from splatgraft.harmonization.compact.features import CompactInput, CompactOutput, apply_output
 from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
-from splatgraft.runtime.atomic_file import atomic_write
-from splatgraft.runtime.progress import Progress
-from splatgraft_paper.training.compact.augmentation import augment, batch_inputs
-from splatgraft_paper.training.compact.loss import compact_loss
-from splatgraft_paper.training.compact.pairs import CompactPairs
-from splatgraft_paper.training.moving_average import MovingAverage
-from splatgraft_paper.training.training_log import LOG_FILE, TrainingLog, truncate_log
+from splatgraft_paper.training.compact.pairs import CompactPairs, augment, batch_inputs
+from splatgraft_paper.training.loop import LoopOptions, Validation
 
-STATE_FILE = "state.pt"
 _BETAS = (0.9, 0.99)
 """Of AdamW."""
-_MAX_GRADIENT_NORM = 1.0
 _FINAL_RATE = 0.02
 """Learning rate at the last step over the largest."""
 _SHEET_ROWS = 12
 
 
 @dataclass(frozen=True)
-class CompactLoopOptions:
-    """Options of the training loop."""
+class CompactOptions:
+    """Options of the training of the compact harmoniser."""
 
     steps: int = 2000
     batch: int = 8
@@ -56,163 +47,231 @@ class CompactLoopOptions:
     validation_pairs: int = 96
     bf16: bool = False
     """Compute the network in bfloat16; halves the time on processors that support it."""
-    threads: int = 0
-    """Threads of torch; 0 keeps its default."""
     network: CompactSize = field(default_factory=CompactSize)
+
+    def loop(self, *, cpu: bool) -> LoopOptions:
+        """The options as the training loop takes them."""
+        names = ("steps", "batch", "rate", "ema", "seed", "save_every", "validate_every", "validation_pairs")
+        same = {name: getattr(self, name) for name in names}
+        return LoopOptions(**same, precision="bf16" if self.bf16 else "no", readers=1, cpu=cpu)
+
+
+class CompactTask:
+    """The compact network on rendered pairs, as the training loop takes it."""
+
+    def __init__(
+        self, pairs: CompactPairs, options: CompactOptions, device: torch.device, begin: dict[str, Tensor] | None = None
+    ) -> None:
+        """Make the network; `begin` holds its initial weights, random where None."""
+        torch.manual_seed(options.seed)
+        self._pairs, self._options, self._device = pairs, options, device
+        self.network = CompactNetwork(options.network)
+        if begin is not None:
+            self.network.load_state_dict(begin)
+        settings: dict[str, Any] = {name: asdict(options)[name] for name in ("steps", "decay", "size", "network")}
+        start = 0.0 if begin is None else sum(float(tensor.double().abs().sum()) for tensor in begin.values())
+        self.fingerprint = {**settings, "pairs": pairs.fingerprint(), "begin": start}
+
+    def optimizer(self) -> torch.optim.Optimizer:
+        """AdamW; biases and scales do not decay."""
+        groups = [
+            {"params": [p for p in self.network.parameters() if p.ndim > 1], "weight_decay": self._options.decay},
+            {"params": [p for p in self.network.parameters() if p.ndim <= 1], "weight_decay": 0.0},
+        ]
+        return torch.optim.AdamW(groups, lr=self._options.rate, betas=_BETAS)
+
+    def rate_at(self, step: int) -> float:
+        """Learning rate at a step, counted from 0."""
+        steps = self._options.steps
+        rise = min(1.0, (step + 1) / max(1, steps // 100))
+        fall = _FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps))
+        return self._options.rate * (rise * fall)
+
+    def read(self, position: int) -> tuple[CompactInput, Tensor]:
+        """Read and augment the view at a position; each epoch has an order of its own."""
+        pairs, seed = self._pairs, self._options.seed
+        epoch, place = divmod(position, len(pairs.training))
+        order = torch.randperm(len(pairs.training), generator=torch.Generator().manual_seed(seed * 7919 + epoch))
+        name = f"compact-{seed}-{position}"
+        variant = random.Random(name).randrange(pairs.variants)
+        return augment(*pairs.read(pairs.training[int(order[place])], variant), self._options.size, name)
+
+    def loss(self, network: Callable[..., Any], items: Sequence[tuple[CompactInput, Tensor]]) -> Float[Tensor, ""]:
+        """The loss of a batch of views."""
+        view = batch_inputs([item[0] for item in items]).to(self._device)
+        return compact_loss(view, network(view.channels()).float(), torch.cat([t for _, t in items]).to(self._device))[
+            0
+        ]
+
+    def name(self, position: int) -> str:
+        """The position: pairs are held in memory."""
+        return f"pair {position}"
+
+    @torch.no_grad()
+    def validate(self, network: Callable[..., Any]) -> Validation:
+        """Errors by region on the held-out pairs, of the network and of the prior.
+
+        A row of the sheet shows the composite, the prior, the network's result and the ground truth.
+        """
+        pairs, count = self._pairs, self._options.validation_pairs
+        chosen = pairs.validation or pairs.training
+        chosen = chosen[:: max(1, len(chosen) // count)][:count]
+        totals: dict[str, float] = {}
+        rows = []
+        for number, index in enumerate(chosen):
+            view, truth = augment(
+                *pairs.read(index, number % pairs.variants), self._options.size, f"validation-{number}"
+            )
+            view, truth = view.to(self._device), truth.to(self._device)
+            output = network(view.channels()).float()
+            _, errors, prior_errors = compact_loss(view, output, truth)
+            for region in ("object", "shadow", "rest"):
+                for suffix, regions in (("", errors), ("_prior", prior_errors)):
+                    key = f"{region}{suffix}"
+                    totals[key] = totals.get(key, 0.0) + float(getattr(regions, region).mean()) / len(chosen)
+            if number < _SHEET_ROWS:
+                pictures = (view.composite, view.prior(), apply_output(view, output), truth)
+                images = [srgb_from_linear(p[0].clamp(0, 1)).permute(1, 2, 0).cpu() for p in pictures]
+                rows.append(torch.cat(images, 1))
+        words = ", ".join(f"{name} {value:.4f}" for name, value in totals.items())
+        return Validation(totals, f"held out: {words}", torch.cat(rows))
 
 
 @dataclass(frozen=True)
-class CompactTraining:
-    """Everything that one run needs."""
+class LossWeights:
+    """Weights and thresholds of the loss, set by hand."""
 
-    pairs: CompactPairs
-    loop: CompactLoopOptions
-    folder: Path
-    """Receives state.pt, log.jsonl and validation/."""
-    device: torch.device
-    say: Callable[[str], None]
-    progress: Progress
-    begin: dict[str, Tensor] | None = None
-    """Initial weights; random where None."""
+    ratio_offset: float = 0.01
+    """Linear light added to both sides of a ratio."""
+    shadow_ratio: float = 0.95
+    """Truth over background below which a pixel is in shadow."""
+    max_outside_coverage: float = 0.02
+    """Coverage by the object below which a pixel is off the object."""
+    min_area: float = 0.003
+    """Share of the image added to a region's area in its mean, so that small regions count less."""
+    object_and_shadow: float = 0.6
+    """Weight of the absolute errors of object and shadow."""
+    rest: float = 4.0
+    """Weight of the absolute error elsewhere."""
+    srgb: float = 2.0
+    """Weight of the sRGB difference in the absolute error."""
+    log: float = 0.3
+    """Weight of the log difference in the absolute error."""
+    squared_object: float = 4.0
+    """Weight of the squared sRGB error of the object."""
+    squared_shadow: float = 2.0
+    """Weight of the squared error of the light ratio in the shadow."""
+    gradients: float = 0.5
+    """Weight of the error of gradients."""
+    uncertainty: float = 0.02
+    """Weight of the likelihood of the expected error."""
+    max_light: float = 4.0
+    """Linear light to which the image is clipped where the truth is not clipped."""
+    clipped_truth: float = 0.99
+    """Linear light from which the truth counts as clipped."""
 
 
-def train_compact(run: CompactTraining) -> tuple[CompactSize, dict[str, Tensor]]:
-    """Train to the last step, resuming from the folder's state.
+WEIGHTS = LossWeights()
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Mean error of each image of a batch, by region."""
+
+    object: Float[Tensor, "b"]
+    shadow: Float[Tensor, "b"]
+    rest: Float[Tensor, "b"]
+
+
+def regions(view: CompactInput, truth: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights (b 1 h w) of the object, of its shadow and of the rest."""
+    offset = WEIGHTS.ratio_offset
+    ratio = (truth.mean(1, keepdim=True) + offset) / (view.background.mean(1, keepdim=True) + offset)
+    outside = (view.mask < WEIGHTS.max_outside_coverage).to(truth)
+    shadow = outside * (ratio < WEIGHTS.shadow_ratio)
+    return view.mask, shadow, outside - shadow
+
+
+def region_errors(image: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"], view: CompactInput) -> Errors:
+    """Average the sRGB and log errors of `image` over each region; images are linear light."""
+    error = _absolute_error(image, truth)
+    object_, shadow, rest = regions(view, truth)
+    return Errors(_mean(error, object_), _mean(error, shadow), _mean(error, rest))
+
+
+def compact_loss(
+    view: CompactInput, output: CompactOutput, truth: Float[Tensor, "b 3 h w"]
+) -> tuple[Tensor, Errors, Errors]:
+    """Compute the loss.
+
+    Args:
+        view: the network's input.
+        output: its prediction.
+        truth: the ground truth, linear light.
 
     Returns:
-        The network's size and its averaged weights.
-
-    Raises:
-        ValueError: the loss is not finite, or the folder holds another training.
+        The loss, the errors of the harmonised view, and the errors of the prior.
     """
-    loop = run.loop
-    if loop.threads:
-        torch.set_num_threads(loop.threads)
-    torch.manual_seed(loop.seed)
-    network = CompactNetwork(loop.network).to(run.device)
-    if run.begin is not None:
-        network.load_state_dict(run.begin)
-    decayed = [p for p in network.parameters() if p.ndim > 1]
-    others = [p for p in network.parameters() if p.ndim <= 1]
-    groups = [{"params": decayed, "weight_decay": loop.decay}, {"params": others, "weight_decay": 0.0}]
-    optimizer = torch.optim.AdamW(groups, lr=loop.rate, betas=_BETAS)
-    average = MovingAverage(network, loop.ema)
-    first = _resumed(run, network, optimizer, average)
-    truncate_log(run.folder / LOG_FILE, first)
-    with closing(TrainingLog(run.folder, tensorboard=False)) as log:
-        for step in range(first, loop.steps):
-            for group in optimizer.param_groups:
-                group["lr"] = loop.rate * _schedule(step, loop.steps)
-            loss = _batch_loss(run, network, step)
-            optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(network.parameters(), _MAX_GRADIENT_NORM)
-            optimizer.step()
-            average.update()
-            value = float(loss.detach())
-            if not math.isfinite(value):
-                raise ValueError(
-                    f"training: expected a finite loss at step {step + 1}, found {value}; the last state is kept"
-                )
-            log.add(step + 1, value, optimizer.param_groups[0]["lr"])
-            run.progress(step + 1, loop.steps, f"loss {log.smooth:.4f}")
-            last = step + 1 == loop.steps
-            if last or (step + 1) % loop.validate_every == 0:
-                with average.applied():
-                    metrics, sheet = validate_compact(run, network)
-                words = ", ".join(f"{name} {value:.4f}" for name, value in metrics.items())
-                run.say(f"step {step + 1}, held out: {words}")
-                log.add_validation(step + 1, metrics, sheet)
-            if last or (step + 1) % loop.save_every == 0:
-                _save(run, network, optimizer, average, step + 1)
-    with average.applied():
-        return loop.network, {name: tensor.detach().cpu().clone() for name, tensor in network.state_dict().items()}
+    image = apply_output(view, output)
+    errors, prior_errors = region_errors(image, truth, view), region_errors(view.prior(), truth, view)
+    loss = WEIGHTS.object_and_shadow * (errors.object + errors.shadow) + WEIGHTS.rest * errors.rest
+    for name in ("object", "shadow", "rest"):
+        loss = loss + (getattr(errors, name) - getattr(prior_errors, name)).clamp_min(0)
+    loss = loss + _squared_errors(image, truth, view) + WEIGHTS.gradients * _gradient_errors(image, truth, view)
+    likelihood = _error_likelihood(image.detach(), truth, output)
+    return loss.mean() + WEIGHTS.uncertainty * likelihood, errors, prior_errors
 
 
-def _schedule(step: int, steps: int) -> float:
-    rise = min(1.0, (step + 1) / max(1, steps // 100))
-    return rise * (_FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps)))
+def _absolute_error(image: Tensor, truth: Tensor) -> Float[Tensor, "b 1 h w"]:
+    clipped, offset = _clipped(image, truth), WEIGHTS.ratio_offset
+    srgb = (srgb_from_linear(clipped) - srgb_from_linear(truth.clamp(1e-6, 1))).abs()
+    log = ((clipped + offset) / (truth + offset)).log().abs()
+    return (WEIGHTS.srgb * srgb + WEIGHTS.log * log).mean(1, keepdim=True)
 
 
-def _batch_loss(run: CompactTraining, network: CompactNetwork, step: int) -> Tensor:
-    pairs, loop = run.pairs, run.loop
-    views, truths = [], []
-    for position in range(step * loop.batch, (step + 1) * loop.batch):
-        epoch, place = divmod(position, len(pairs.training))
-        order = torch.randperm(len(pairs.training), generator=torch.Generator().manual_seed(loop.seed * 7919 + epoch))
-        name = f"compact-{loop.seed}-{position}"
-        variant = random.Random(name).randrange(pairs.variants)
-        view, truth = pairs.read(pairs.training[int(order[place])], variant)
-        view, truth = augment(view, truth, loop.size, name)
-        views.append(view)
-        truths.append(truth)
-    view, truth = batch_inputs(views).to(run.device), torch.cat(truths).to(run.device)
-    with torch.autocast(run.device.type, torch.bfloat16, enabled=loop.bf16):
-        output = network(view.channels())
-    return compact_loss(view, output.float(), truth)[0]
+def _clipped(image: Tensor, truth: Tensor) -> Tensor:
+    """Clip the image to 1 where the truth is clipped; elsewhere excess light stays an error."""
+    unclipped = truth < WEIGHTS.clipped_truth
+    return torch.where(unclipped, image.clamp_max(WEIGHTS.max_light), image.clamp_max(1)).clamp_min(1e-6)
 
 
-@torch.no_grad()
-def validate_compact(run: CompactTraining, network: CompactNetwork) -> tuple[dict[str, float], Tensor]:
-    """Errors by region on the held-out pairs, of the network and of the prior, and a contact sheet.
+def _squared_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[Tensor, "b"]:
+    """Squared errors: of sRGB on the object, of the ratio to the background in shadows.
 
-    A row of the sheet shows the composite, the prior, the network's result and the ground truth.
+    Their minimum is the mean of the possible results. That of absolute errors is the median, which is no shadow where a
+    shadow is less likely than not.
     """
-    pairs, loop = run.pairs, run.loop
-    chosen = pairs.validation or pairs.training
-    chosen = chosen[:: max(1, len(chosen) // loop.validation_pairs)][: loop.validation_pairs]
-    totals: dict[str, float] = {}
-    rows = []
-    for number, index in enumerate(chosen):
-        view, truth = pairs.read(index, number % pairs.variants)
-        view, truth = augment(view, truth, loop.size, f"validation-{number}")
-        view, truth = view.to(run.device), truth.to(run.device)
-        output = network(view.channels())
-        _, errors, prior_errors = compact_loss(view, output, truth)
-        for region in ("object", "shadow", "rest"):
-            for suffix, regions in (("", errors), ("_prior", prior_errors)):
-                key = f"{region}{suffix}"
-                totals[key] = totals.get(key, 0.0) + float(getattr(regions, region).mean()) / len(chosen)
-        if number < _SHEET_ROWS:
-            pictures = (view.composite, view.prior(), apply_output(view, output), truth)
-            images = [srgb_from_linear(p[0].clamp(0, 1)).permute(1, 2, 0).cpu() for p in pictures]
-            rows.append(torch.cat(images, 1))
-    return totals, torch.cat(rows)
+    object_, shadow, _ = regions(view, truth)
+    clipped = _clipped(image, truth)
+    srgb = (srgb_from_linear(clipped) - srgb_from_linear(truth.clamp(1e-6, 1))) ** 2
+    ratio = ((clipped - truth) / (view.background + 2 * WEIGHTS.ratio_offset)).clamp(-2, 2) ** 2
+    on_object = WEIGHTS.squared_object * _mean(srgb.mean(1, keepdim=True), object_)
+    return on_object + WEIGHTS.squared_shadow * _mean(ratio.mean(1, keepdim=True), shadow)
 
 
-def _fingerprint(run: CompactTraining) -> dict[str, Any]:
-    options = asdict(run.loop)
-    for name in ("save_every", "validate_every", "validation_pairs", "threads"):
-        options.pop(name)
-    begin = 0.0 if run.begin is None else sum(float(tensor.double().abs().sum()) for tensor in run.begin.values())
-    return json.loads(json.dumps(options | {"pairs": run.pairs.fingerprint(), "begin": begin}))
+def _mean(values: Tensor, weight: Tensor) -> Float[Tensor, "b"]:
+    """Mean over a region of each image; small regions count less than their share."""
+    area = weight.sum((1, 2, 3))
+    image_area = values.shape[-1] * values.shape[-2]
+    return (values * weight).sum((1, 2, 3)) / (area + WEIGHTS.min_area * image_area)
 
 
-def _save(run: CompactTraining, network: CompactNetwork, optimizer: Any, average: MovingAverage, step: int) -> None:
-    state = {
-        "step": step,
-        "job": json.dumps(_fingerprint(run)),
-        "network": network.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "average": average.state_dict(),
-    }
-    with atomic_write(run.folder / STATE_FILE) as stream:
-        torch.save(state, stream)
+def _gradient_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[Tensor, "b"]:
+    """Differences of the log ratio between neighbouring pixels, on the object and in its shadow."""
+    offset = WEIGHTS.ratio_offset
+    ratio = ((_clipped(image, truth) + offset) / (truth + offset)).log().clamp(-2, 2)
+    object_, shadow, _ = regions(view, truth)
+    weight = (object_ + shadow).clamp_max(1)
+    across = _mean((ratio[..., 1:] - ratio[..., :-1]).abs().mean(1, keepdim=True), weight[..., 1:])
+    down = _mean((ratio[..., 1:, :] - ratio[..., :-1, :]).abs().mean(1, keepdim=True), weight[..., 1:, :])
+    return across + down
 
 
-def _resumed(run: CompactTraining, network: CompactNetwork, optimizer: Any, average: MovingAverage) -> int:
-    path = run.folder / STATE_FILE
-    if not path.is_file():
-        return 0
-    state = torch.load(path, map_location=run.device, weights_only=True)
-    saved, current = json.loads(state["job"]), _fingerprint(run)
-    if changed := [name for name in current if saved.get(name) != current[name]]:
-        raise ValueError(
-            f"{path}: expected the same training to go on with, found {changed[0]} {saved.get(changed[0])} instead "
-            f"of {current[changed[0]]}; name another folder"
-        )
-    network.load_state_dict(state["network"])
-    optimizer.load_state_dict(state["optimizer"])
-    average.load_state_dict(state["average"])
-    run.say(f"resumed from step {state['step']}")
-    return int(state["step"])
+def _error_likelihood(image: Tensor, truth: Tensor, output: CompactOutput) -> Tensor:
+    """Negative log likelihood of the error under a Laplace distribution; trains only the expected error."""
+    error = (
+        (srgb_from_linear(image.clamp(1e-6, 1)) - srgb_from_linear(truth.clamp(1e-6, 1))).abs().mean(1, keepdim=True)
+    )
+    size = output.log_error.shape[-2:]
+    error = torch.nn.functional.interpolate(error, size=size, mode="area")
+    return (error * (-output.log_error).exp() + output.log_error).mean()

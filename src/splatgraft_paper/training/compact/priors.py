@@ -7,18 +7,24 @@ import json
 import math
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.directions import frames_along
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import read_mask, read_rgb
+from splatgraft.core.rotations import quaternion_from_rotation
+from splatgraft.core.spherical_harmonics import C0
 from splatgraft.relighting.light.confidence import light_confidence
-from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.light import Light, LightSource
 from splatgraft.relighting.shading.irradiance import irradiance, shade_ratio
 from splatgraft.relighting.shadows.light_sampling import sample_light
 from splatgraft.relighting.shadows.scene_ratio import (
@@ -34,31 +40,36 @@ from splatgraft.runtime.progress import Progress, silent
 from splatgraft_paper.benchmark.true_light import light_from_probe
 from splatgraft_paper.synthesis.benchmark import rendered_cameras
 from splatgraft_paper.synthesis.pairs import samples_in
-from splatgraft_paper.training.compact.light_perturbation import perturb_light
-from splatgraft_paper.training.compact.rendered_surfaces import SurfacePixels, read_pixels, read_surfels, surfels
 
 _GRAY = torch.tensor([0.5, 0.5, 0.5])
-
-
-@dataclass(frozen=True)
-class PriorSettings:
-    """Numbers of the priors."""
-
-    reach: float = 8.0
-    """Extent of the scene's shadow maps in radii of the object, as in `RelightOptions`."""
-    region_margin: float = 1.2
-    """Radius of the region of occluders over `reach`. Set by hand."""
-    offset_m: float = 0.004
-    """Metres by which a point is raised along its normal, against self-shadowing by its own surfels. Set by hand."""
-    normal_noise_deg: float = 12.0
-    """Error of normals, as on Gaussians. Set by hand."""
-    noise_px: int = 10
-    """Pixels over which the errors of normals are alike. Set by hand."""
-    min_coverage: float = 0.02
-    """Coverage from which a pixel gets the object's ratio, and below one minus which it gets the scene's."""
-
-
-SETTINGS = PriorSettings()
+_MAX_SPREAD_DEG, _MAX_ANGLE_DEG = 20.0, 30.0
+"""The standard deviation of a light's error in direction is drawn from 0 up to the first; the largest error."""
+_LEVEL_DEVIATION, _MAX_LEVEL = 0.35, 1.4
+"""Standard deviation of the log error of a light's overall level, and the largest one. Set by hand, as all below."""
+_TINT_DEVIATION = 0.06
+"""Standard deviation of the log error of each colour channel."""
+_MAX_STRENGTH_FACTOR, _STRENGTH_DEVIATION = 4.0, 0.45
+"""Largest factor between sources and ambient light, either way; standard deviation in units of its log."""
+_MISSED_SHARE = 0.05
+"""Probability that a source is missed."""
+_COVERAGE, _CONFIDENCE = (0.45, 1.0), (0.6, 1.0)
+"""Ranges of the coverage of the environment, and of a source's confidence."""
+_UNCERTAINTY_OFFSET_DEG, _UNCERTAINTY_FACTOR = 2.0, (0.7, 1.3)
+"""Added to every source's uncertainty; range of the recorded uncertainty over the true spread."""
+_REACH, _REGION_MARGIN = 8.0, 1.2
+"""Extent of the scene's shadow maps in radii of the object, as in `RelightOptions`; radius of the region of occluders
+over it."""
+_OFFSET_M = 0.004
+"""Metres by which a point is raised along its normal, against self-shadowing by its own surfels."""
+_NORMAL_NOISE_DEG, _NOISE_PX = 12.0, 10
+"""Error of normals, as on Gaussians, and the pixels over which it is alike."""
+_MIN_COVERAGE = 0.02
+"""Coverage from which a pixel gets the object's ratio, and below one minus which it gets the scene's."""
+_SURFEL_NEIGHBOR, _SPACING_STRIDE = 4, 7
+"""The spacing of points is the median distance to this nearest neighbour, measured at every so manyth point."""
+_SURFEL_WIDTH, _MIN_SURFEL_WIDTH, _SURFEL_FLATNESS, _SURFEL_OPACITY_LOGIT = 0.6, 1e-4, 0.1, 3.0
+"""Standard deviation in the surface over the spacing, the smallest one in metres, that along the normal over that in
+the surface, and the opacity."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +157,85 @@ def light_transfer_priors(folder: Path, object_: str, lights: list[str], *, seed
     return priors
 
 
+@dataclass(frozen=True)
+class SurfacePixels:
+    """The surface points visible in the pixels of all cameras, with one object in the scene."""
+
+    points: Float[Tensor, "v h w 3"]
+    """World, metres."""
+    normals: Float[Tensor, "v h w 3"]
+    """Unit, world."""
+    mask: Float[Tensor, "v h w"]
+    """Coverage by the object, in [0, 1]."""
+    hit: Bool[Tensor, "v h w"]
+    """False where the pixel shows the sky."""
+
+
+def read_pixels(folder: Path, object_: str, cameras: Cameras) -> SurfacePixels:
+    """Read the pixels of an object's take and lift them to points by their depth.
+
+    Args:
+        folder: of a rendered scene.
+        object_: name of the object.
+        cameras: of the scene.
+
+    Raises:
+        ValueError: a file is missing or broken.
+    """
+    take, points, normals, masks = folder / object_, [], [], []
+    for i in range(len(cameras)):
+        path = take / f"{i:04d}_depth.npy"
+        try:
+            depth = torch.from_numpy(np.load(path, allow_pickle=False).astype(np.float32))
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{path}: expected a depth map, found {error}") from error
+        k, pose = cameras.intrinsics[i], cameras.world_from_camera[i]
+        h, w = depth.shape
+        v, u = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
+        rays = torch.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], torch.ones_like(u)], -1)
+        points.append((rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3])
+        normal = read_rgb(take / f"{i:04d}_normal.png") * 2 - 1
+        normals.append(torch.nn.functional.normalize(normal, dim=-1))
+        masks.append(torch.where(depth > 0, read_mask(take / f"{i:04d}_mask.png"), -1.0))
+    mask = torch.stack(masks)
+    return SurfacePixels(torch.stack(points), torch.stack(normals), mask.clamp_min(0), mask >= 0)
+
+
+def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussians:
+    """Read points sampled on a surface as surfels, see `surfels`.
+
+    Args:
+        folder: of a rendered scene.
+        name: of the object, or `scene`.
+        color: of all surfels, sRGB.
+
+    Raises:
+        ValueError: the points are missing or broken.
+    """
+    path = folder / f"{name}_surface" / "0000.npy"
+    try:
+        found = torch.from_numpy(np.load(path, allow_pickle=False).astype(np.float32))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: expected points on surfaces, found {error}") from error
+    if found.ndim != 2 or found.shape[1] != 6 or len(found) < 10:
+        raise ValueError(f"{path}: expected (n, 6) points and normals, found {tuple(found.shape)}")
+    return surfels(found[:, :3], torch.nn.functional.normalize(found[:, 3:], dim=1), color)
+
+
+def surfels(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], color: Float[Tensor, "3"]) -> Gaussians:
+    """Make flat, opaque Gaussians whose width follows the spacing of the points, so that they close the surface."""
+    distances, _ = KDTree(points.numpy()).query(points.numpy()[::_SPACING_STRIDE], k=_SURFEL_NEIGHBOR + 1)
+    width = max(_MIN_SURFEL_WIDTH, _SURFEL_WIDTH * float(np.median(distances[:, -1])))
+    rotations = frames_along(-normals).transpose(1, 2)
+    return Gaussians(
+        means=points,
+        log_scales=torch.tensor([width, width, _SURFEL_FLATNESS * width]).log().repeat(len(points), 1),
+        quaternions=quaternion_from_rotation(rotations),
+        opacity_logits=torch.full((len(points),), _SURFEL_OPACITY_LOGIT),
+        sh=((color - 0.5) / C0).repeat(len(points), 1)[:, None],
+    )
+
+
 class _PairTransfer:
     """Light transfer of one object from its source light to the target light."""
 
@@ -160,7 +250,7 @@ class _PairTransfer:
         self._pixels, self._source_light = pixels, source_light
         self._samples = sample_light(target_light)
         self._sphere = bounding_sphere(object_surfels)
-        radius = SETTINGS.region_margin * SETTINGS.reach * self._sphere.radius
+        radius = _REGION_MARGIN * _REACH * self._sphere.radius
         self._region = BoundingSphere(self._sphere.center, radius)
         self._object_maps = object_shadow_maps(object_surfels, self._sphere, self._samples)
         self._scene_maps = scene_shadow_maps(scene_surfels, self._region, self._samples)
@@ -168,10 +258,10 @@ class _PairTransfer:
     def object_log_ratio(self, noise: torch.Generator) -> Float[Tensor, "v h w 3"]:
         """Log ratio of the object's irradiance; 0 in the other pixels."""
         pixels, samples = self._pixels, self._samples
-        inside = (pixels.mask > SETTINGS.min_coverage) & pixels.hit
+        inside = (pixels.mask > _MIN_COVERAGE) & pixels.hit
         normals = torch.nn.functional.normalize(pixels.normals + _smooth_noise(pixels.normals.shape, noise), dim=-1)
         normals = normals[inside].contiguous()
-        points = surfels(pixels.points[inside] + SETTINGS.offset_m * pixels.normals[inside], normals, _GRAY)
+        points = surfels(pixels.points[inside] + _OFFSET_M * pixels.normals[inside], normals, _GRAY)
         visible = scene_visibility(self._scene_maps, points.means, normals)
         visible = torch.where(torch.as_tensor(samples.is_source), visible, torch.ones(()))
         self_visible = self_visibility(self._object_maps, points, normals, samples)
@@ -186,10 +276,10 @@ class _PairTransfer:
     def scene_log_ratio(self) -> Float[Tensor, "v h w 3"]:
         """Log ratio of the shadow and bounce that the object causes on the scene; 0 in the other pixels."""
         pixels, samples = self._pixels, self._samples
-        outside = (pixels.mask < 1 - SETTINGS.min_coverage) & pixels.hit
+        outside = (pixels.mask < 1 - _MIN_COVERAGE) & pixels.hit
         points, normals = pixels.points[outside], pixels.normals[outside]
         near = reachable(points, self._sphere, samples, farthest=self._region.radius)
-        points, normals = points[near] + SETTINGS.offset_m * normals[near], normals[near].contiguous()
+        points, normals = points[near] + _OFFSET_M * normals[near], normals[near].contiguous()
         visible = scene_visibility(self._scene_maps, points, normals)
         ratio = scene_ratio(self._object_maps, points, normals, sample_visibility=visible)
         found = torch.zeros(len(near), 3)
@@ -202,7 +292,49 @@ class _PairTransfer:
 def _smooth_noise(shape: torch.Size, generator: torch.Generator) -> Float[Tensor, "v h w 3"]:
     """Errors of normals as on Gaussians: alike over several pixels."""
     v, h, w, _ = shape
-    coarse = torch.randn(
-        v, 3, max(2, h // SETTINGS.noise_px), max(2, w // SETTINGS.noise_px), generator=generator
-    ) * math.tan(math.radians(SETTINGS.normal_noise_deg))
+    coarse = torch.randn(v, 3, max(2, h // _NOISE_PX), max(2, w // _NOISE_PX), generator=generator) * math.tan(
+        math.radians(_NORMAL_NOISE_DEG)
+    )
     return torch.nn.functional.interpolate(coarse, size=(h, w), mode="bilinear").permute(0, 2, 3, 1)
+
+
+def perturb_light(light: Light, rng: random.Random) -> Light:
+    """Draw a copy of a known light with the errors, uncertainty and confidence of an estimate.
+
+    The recorded uncertainty is that of the distribution from which the error in direction was drawn, times a factor.
+    """
+    spread = rng.uniform(0.0, _MAX_SPREAD_DEG)
+    level = math.exp(max(-_MAX_LEVEL, min(_MAX_LEVEL, rng.gauss(0.0, _LEVEL_DEVIATION))))
+    tint = [math.exp(rng.gauss(0.0, _TINT_DEVIATION)) for _ in range(3)]
+    log_strength = max(-1.0, min(1.0, rng.gauss(0.0, _STRENGTH_DEVIATION)))
+    strength = math.exp(log_strength * math.log(_MAX_STRENGTH_FACTOR))
+    factor = [level * strength * t for t in tint]
+    sources = [
+        _perturb_source(source, rng, spread, factor=factor) for source in light.sources if rng.random() > _MISSED_SHARE
+    ]
+    coverage = rng.uniform(*_COVERAGE)
+    return Light(
+        tuple(sources),
+        ambient=light.ambient * (level * torch.tensor(tint)),
+        coverage=coverage,
+        unseen_up=1 - coverage,
+    )
+
+
+def _perturb_source(source: LightSource, rng: random.Random, spread: float, *, factor: list[float]) -> LightSource:
+    angle = math.radians(min(_MAX_ANGLE_DEG, abs(rng.gauss(0.0, spread))))
+    azimuth = rng.uniform(0.0, 2 * math.pi)
+    direction = torch.tensor(source.direction)
+    helper = torch.tensor([0.0, 0.0, 1.0]) if abs(source.direction[2]) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
+    tangent = torch.nn.functional.normalize(torch.linalg.cross(direction, helper), dim=0)
+    bitangent = torch.linalg.cross(direction, tangent)
+    offset = math.cos(azimuth) * tangent + math.sin(azimuth) * bitangent
+    x, y, z = (math.cos(angle) * direction + math.sin(angle) * offset).tolist()
+    r, g, b = (value * f for value, f in zip(source.irradiance, factor, strict=True))
+    return replace(
+        source,
+        direction=(x, y, z),
+        irradiance=(r, g, b),
+        uncertainty_deg=_UNCERTAINTY_OFFSET_DEG + spread * rng.uniform(*_UNCERTAINTY_FACTOR),
+        confidence=rng.uniform(*_CONFIDENCE),
+    )

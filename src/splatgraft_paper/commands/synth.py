@@ -1,0 +1,257 @@
+"""The commands `paper synth ...` of rendered data: pairs, benchmark scenes, spheres, their checks and sheets."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.images import read_rgb, resize, write_image
+from splatgraft.project.folder_lock import locked
+from splatgraft.project.step import Positional
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.workers import Task
+from splatgraft.workflow.image_size import parse_image_size
+from splatgraft_paper.benchmark.true_light_file import TRUE_LIGHT_FILE, write_true_light
+from splatgraft_paper.synthesis import benchmark, pairs
+from splatgraft_paper.synthesis.jobs import copy_shared_takes, render_job
+from splatgraft_paper.synthesis.outdoors import SUPPLIED_MAPS
+from splatgraft_paper.synthesis.rendered_data import RenderWorkers, check_pairs, read_render_size, write_failures
+from splatgraft_paper.synthesis.spheres import render_spheres
+from splatgraft_paper.training.pairs import RECORD_FILE, RelitSample, write_relit_manifest, write_sample
+
+_MAPS = (".hdr", ".exr")
+_MODELS = (".glb", ".gltf", ".obj", ".blend")
+
+
+@dataclass(frozen=True)
+class SynthPairs:
+    """Render training pairs for a harmoniser; a killed run is continued."""
+
+    out: Positional
+    """Folder for one folder per scene, manifest.jsonl and, where something failed, failures.txt."""
+    scenes: int = 60
+    """Number of scenes; each gives 5 cameras x objects x lights pairs."""
+    first: int = 0
+    """Number of the first scene, so that several machines can share the work without Ray."""
+    size: str = "704x496"
+    """Pixels of a picture, WIDTHxHEIGHT."""
+    samples: int = 128
+    """Light paths per pixel; with the denoiser 16 are enough for small sizes."""
+    objects: int = 2
+    """Per scene; the background is rendered once for all."""
+    lights: int = 3
+    """Environment maps per object."""
+    seed: int = 0
+    """Of all random choices."""
+    maps: Path | None = None
+    """Folder with .hdr and .exr environment maps; those that come with Blender where not given."""
+    models: Path | None = None
+    """Folder with .glb, .gltf, .obj and .blend models that alternate with generated objects."""
+    workers: RenderWorkers = field(default_factory=RenderWorkers)
+
+    def execute(self, console: Console) -> int:
+        """Render what is missing, check everything; 1 where a scene failed or a pair is faulty."""
+        plan = pairs.PairPlan(
+            scenes=self.scenes,
+            objects=self.objects,
+            lights=self.lights,
+            seed=self.seed,
+            size=read_render_size(self.size, self.samples),
+            maps=_files(self.maps, _MAPS, "--maps") or SUPPLIED_MAPS,
+            models=_files(self.models, _MODELS, "--models"),
+        )
+        python = self.workers.python(console)
+        with locked(self.out):
+            tasks, folders, failures = [], [], []
+            for number in range(self.first, self.first + self.scenes):
+                try:
+                    job = pairs.plan(plan, number)
+                except ValueError as error:
+                    failures.append(f"scene {number}: {error}")
+                    continue
+                folders.append(self.out / pairs.job_folder_name(job))
+                tasks.append(Task(folders[-1].name, partial(render_job, job, folders[-1], python)))
+            failures += self.workers.run(tasks, console)
+            return check_pairs(self.out, failures, console)
+
+
+def _files(folder: Path | None, suffixes: tuple[str, ...], option: str) -> tuple[str, ...]:
+    if folder is None:
+        return ()
+    found = sorted(str(path.resolve()) for path in folder.rglob("*") if path.suffix.lower() in suffixes)
+    if not found:
+        raise ValueError(f"{option} {folder}: expected files that end in {', '.join(suffixes)}, found none")
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class SynthBenchmark:
+    """Render the benchmark scenes with ground truth; a killed run is continued."""
+
+    out: Positional
+    """Folder for one folder per scene."""
+    size: Literal["small", "paper"] = "small"
+    """small: 352x248, 40 views, 16 samples. paper: 704x496, 200 views, 128 samples."""
+    scenes: tuple[str, ...] = ()
+    """Names of scenes; all nine where none is given."""
+    rotations: bool = False
+    """Also the three scenes with the object at three rotations (name_p0, name_p1, name_p2)."""
+    views: int | None = None
+    """Another number of views per capture."""
+    pixels: str | None = None
+    """Another size of pictures, WIDTHxHEIGHT."""
+    samples: int | None = None
+    """Another number of light paths per pixel."""
+    workers: RenderWorkers = field(default_factory=RenderWorkers)
+
+    def execute(self, console: Console) -> int:
+        """Render what is missing, write the scenes as captures and check them; 1 where one failed."""
+        chosen, size = self._chosen(), self._size()
+        python = self.workers.python(console)
+        with locked(self.out):
+            failures = []
+            # pictures that several rotations of one object share are rendered once, with the first of them
+            first = [
+                which
+                for i, which in enumerate(chosen)
+                if not set(chosen[:i]) & set(benchmark.scenes_with_shared_renders(which))
+            ]
+            for wave in (first, [which for which in chosen if which not in first]):
+                tasks = []
+                for which in wave:
+                    self._take_over(which, size)
+                    for job, folder in zip(benchmark.plan(which, size), self._folders(which), strict=True):
+                        tasks.append(Task(folder.name, partial(render_job, job, folder, python)))
+                failures += self.workers.run(tasks, console) if tasks else []
+            for which in chosen:
+                target, source = benchmark.plan(which, size)
+                if target.is_done(self._folders(which)[0]) and source.is_done(self._folders(which)[1]):
+                    failures += self._gather(which, console)
+            write_failures(self.out, failures, console)
+        return 1 if failures else 0
+
+    def _take_over(self, which: benchmark.BenchmarkScene, size: benchmark.BenchmarkSize) -> None:
+        for twin in benchmark.scenes_with_shared_renders(which):
+            ours, theirs = benchmark.plan(which, size), benchmark.plan(twin, size)
+            for job, folder, elder, there in zip(ours, self._folders(which), theirs, self._folders(twin), strict=True):
+                if not job.is_done(folder):
+                    copy_shared_takes(job, folder, elder, there)
+
+    def _gather(self, which: benchmark.BenchmarkScene, console: Console) -> list[str]:
+        out = self.out / which.name
+        if not (out / TRUE_LIGHT_FILE).is_file():
+            benchmark.gather(which, *self._folders(which), out)
+            write_true_light(out)
+        wrong = benchmark.find_defect(out)
+        if wrong is None:
+            console.result(out)
+        return [wrong] if wrong else []
+
+    def _folders(self, which: benchmark.BenchmarkScene) -> tuple[Path, Path]:
+        return tuple(self.out / "renders" / f"{which.name}_{side}" for side in ("target", "source"))  # pyright: ignore
+
+    def _chosen(self) -> list[benchmark.BenchmarkScene]:
+        known = {scene.name: scene for scene in (*benchmark.SCENES, *benchmark.ROTATIONS)}
+        if unknown := [name for name in self.scenes if name not in known]:
+            raise ValueError(f"--scenes: expected names among {', '.join(known)}; found {unknown[0]}")
+        names = self.scenes or [scene.name for scene in benchmark.SCENES]
+        return [known[name] for name in names] + (list(benchmark.ROTATIONS) if self.rotations else [])
+
+    def _size(self) -> benchmark.BenchmarkSize:
+        named = benchmark.BenchmarkSize.named(self.size)
+        pixels = self.pixels or f"{named.render.width}x{named.render.height}"
+        render = read_render_size(pixels, self.samples or named.render.samples)
+        return benchmark.BenchmarkSize(render, self.views or named.views)
+
+
+@dataclass(frozen=True)
+class SynthCheck:
+    """Check every picture of a folder of pairs or benchmark scenes, and list the damaged and empty ones."""
+
+    out: Positional
+    """The folder that `synth pairs` or `synth benchmark` wrote."""
+
+    def execute(self, console: Console) -> int:
+        """Rewrite the manifest of pairs; 1 where something is faulty."""
+        scenes = sorted(path.parent for path in self.out.glob("*/scene.json"))
+        if not scenes:
+            return check_pairs(self.out, [], console)
+        faults = [wrong for wrong in map(benchmark.find_defect, scenes) if wrong]
+        console.say(f"{len(scenes) - len(faults)} of {len(scenes)} scenes are sound")
+        write_failures(self.out, faults, console)
+        return 1 if faults else 0
+
+
+@dataclass(frozen=True)
+class SynthSheet:
+    """Write one picture with all scenes of a folder."""
+
+    out: Positional
+    """The folder that `synth pairs` or `synth benchmark` wrote."""
+    picture: Path | None = None
+    """Where to write it; sheet.png in the folder where not given."""
+    columns: int = 6
+    """Pictures side by side."""
+    width: int = 240
+    """Pixels of one picture."""
+
+    def execute(self, console: Console) -> int:
+        """Write the sheet."""
+        paths = sorted(self.out.glob("*/object*/0002.png")) or sorted(self.out.glob("*/ground_truth/images/0002.png"))
+        paths = [path for path in paths if "_light" not in path.parent.name]
+        if not paths:
+            raise ValueError(f"{self.out}: expected rendered pairs or benchmark scenes, found none")
+        pictures = [read_rgb(path) for path in paths]
+        height = round(self.width * pictures[0].shape[0] / pictures[0].shape[1])
+        small = [resize(picture, self.width, height) for picture in pictures]
+        small += [torch.ones(height, self.width, 3)] * (-len(small) % self.columns)
+        rows = [torch.cat(small[i : i + self.columns], 1) for i in range(0, len(small), self.columns)]
+        target = self.picture or self.out / "sheet.png"
+        write_image(target, torch.cat(rows, 0))
+        console.result(target)
+        return 0
+
+
+@dataclass(frozen=True)
+class SynthSpheres:
+    """Render pairs of two balls on a floor without Blender, a fifth of a second each; a killed run is continued."""
+
+    out: Positional
+    """Folder for one folder per scene and manifest.jsonl."""
+    scenes: int = 400
+    """Number of scenes."""
+    lights: int = 3
+    """Other suns per scene."""
+    size: str = "64x48"
+    """Pixels, WIDTHxHEIGHT."""
+    seed: int = 0
+    """Of places, colours and suns."""
+
+    def execute(self, console: Console) -> int:
+        """Render the missing scenes."""
+        width, height = parse_image_size(self.size)
+        self.out.mkdir(parents=True, exist_ok=True)
+        with locked(self.out), console.bar("spheres") as progress:
+            for number in range(self.scenes):
+                folder = self.out / f"{number:05d}"
+                if not (folder / RECORD_FILE).is_file():
+                    shown = render_spheres(
+                        self.seed * 1_000_003 + number, width=width, height=height, lights=self.lights
+                    )
+                    relit = [_tensor(picture) for picture in shown.relit]
+                    sample = RelitSample(_tensor(shown.target), _tensor(shown.background), _tensor(shown.mask), relit)
+                    write_sample(folder, sample, {"group": folder.name, "licence": "own render"})
+                progress(number + 1, self.scenes, folder.name)
+            count = write_relit_manifest(self.out)
+        console.say(f"{count} scenes with {self.lights} pairs each")
+        console.result(self.out / "manifest.jsonl")
+        return 0
+
+
+def _tensor(picture: np.ndarray) -> Float[Tensor, "h w *c"]:
+    return torch.from_numpy(np.ascontiguousarray(picture)).float()

@@ -1,1 +1,0 @@
-"""The commands `synth ...`, one file each: synthetic training pairs and benchmark scenes."""

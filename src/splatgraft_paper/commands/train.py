@@ -1,0 +1,158 @@
+"""The commands `paper train ...`: the paper's harmoniser, its object removal, and the compact harmoniser."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from splatgraft.project.step import Device, Positional, choose_device
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.weights.catalogue import find_model
+from splatgraft.runtime.weights.store import folder_of
+from splatgraft_paper.synthesis.pairs import read_manifest
+from splatgraft_paper.training.compact.loop import CompactOptions, CompactTask
+from splatgraft_paper.training.compact.pairs import CompactPairs, HeldOutOptions
+from splatgraft_paper.training.compact.priors import write_priors
+from splatgraft_paper.training.flux import FluxTrainingOptions, train_flux
+from splatgraft_paper.training.loop import train
+from splatgraft_paper.training.recipes import arguments_with_recipe
+from splatgraft_paper.training.removal import RemovalTrainingOptions, train_removal
+
+
+@dataclass(frozen=True)
+class TrainFlux:
+    """Train the paper's harmoniser; a killed run is continued. Many GPUs: `torchrun -m splatgraft train`."""
+
+    out: Positional
+    """Folder for the model, states, log and validation pictures."""
+    options: FluxTrainingOptions = field(default_factory=FluxTrainingOptions)
+
+    @staticmethod
+    def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
+        """Put the options of --recipe before the user's own words."""
+        return arguments_with_recipe("train flux", words)
+
+    def execute(self, console: Console) -> int:
+        """Train, and print the folder of the model."""
+        model = train_flux(self.out, self.options, console)
+        if model is not None:
+            console.result(model)
+        return 0
+
+
+@dataclass(frozen=True)
+class TrainRemoval:
+    """Train the object removal on Stable Diffusion 2 (v-prediction); a killed run is continued."""
+
+    out: Positional
+    """Folder for the model, states, log and validation pictures."""
+    options: RemovalTrainingOptions = field(default_factory=RemovalTrainingOptions)
+
+    @staticmethod
+    def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
+        """Put the options of --recipe before the user's own words."""
+        return arguments_with_recipe("train removal", words)
+
+    def execute(self, console: Console) -> int:
+        """Train, and print the folder of the model."""
+        model = train_removal(self.out, self.options, console)
+        if model is not None:
+            console.result(model)
+        return 0
+
+
+@dataclass(frozen=True)
+class TrainCompact:
+    """Train the compact harmoniser; a killed run is continued."""
+
+    out: Positional
+    """Folder for compact.safetensors, priors/, state, log and validation pictures."""
+    pairs: Path
+    """Folder that `splatgraft synth pairs` rendered."""
+    loop: CompactOptions = field(default_factory=CompactOptions)
+    held_out: HeldOutOptions = field(default_factory=HeldOutOptions)
+    variants: int = 1
+    """Perturbed lights per pair; each adds 0.25 MB per pair at 240x160."""
+    start: Path | None = None
+    """Initial weights, a compact.safetensors, to continue the training with other pairs."""
+    device: Device = "auto"
+    """Where to compute."""
+
+    def execute(self, console: Console) -> int:
+        """Write the missing priors, train, write the weights."""
+        from splatgraft.harmonization.compact.factory import SHIPPED
+        from splatgraft.harmonization.compact.weights import read_weights, write_weights
+
+        device = choose_device(self.device, console)
+        samples = read_manifest(self.pairs)
+        folders = sorted({sample.folder for sample in samples})
+        self.out.mkdir(parents=True, exist_ok=True)
+        begin = None if self.start is None else read_weights(self.start)
+        loop = self.loop if begin is None else replace(self.loop, network=begin.size)
+        priors = [self.out / "priors" / str(variant) for variant in range(self.variants)]
+        for variant, folder in enumerate(priors):
+            with console.bar(f"light {variant + 1}") as progress:
+                write_priors(folders, folder, seed=loop.seed + variant, progress=progress)
+        with console.bar("read") as progress:
+            pairs = CompactPairs(self.pairs, priors, self.held_out, progress)
+        console.say(f"{len(pairs.training)} pairs to train on, {len(pairs.validation)} held out")
+        with console.bar("train") as progress:
+            task = CompactTask(pairs, loop, device, None if begin is None else begin.state_dict())
+            options = loop.loop(cpu=device.type == "cpu")
+            state = train(task, options, self.out, say=console.say, progress=progress)
+        notes = {
+            "pairs": json.dumps({"folders": [folder.name for folder in folders], **pairs.fingerprint()}),
+            "steps": str(loop.steps),
+            "seed": str(loop.seed),
+        }
+        write_weights(self.out / SHIPPED.name, loop.network, state, notes)
+        console.say(f"{self.out / SHIPPED.name}")
+        return 0
+
+
+_BASES = {
+    "flux": find_model("flux-schnell").repository,
+    "stable-diffusion": find_model("stable-diffusion-2").repository,
+    "ic-light": find_model("realistic-vision").repository,
+}
+"""Default base by kind."""
+
+
+@dataclass(frozen=True)
+class TrainEmbed:
+    """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or Stable Diffusion, or IC-Light's prompts."""
+
+    out: Annotated[Path | None, tyro.conf.Positional] = None
+    """File to write; where `harmonize` and `train` look, unless given: in the folder --base, or that of its weights."""
+    base: str | None = None
+    """Folder or hub id with the text encoders and tokenizers; the default base of --kind where not given."""
+    tokens: int = 256
+    """Length of FLUX's text sequence; schnell was distilled at 256."""
+    kind: Literal["flux", "stable-diffusion", "ic-light"] = "flux"
+    """The model whose text encoders are used; needs transformers (pip install 'splatgraft[text]')."""
+
+    def execute(self, console: Console) -> int:
+        """Write the file."""
+        from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
+        from splatgraft.harmonization.flux.weights.text_encoders import (
+            IC_LIGHT_PROMPT_FILE,
+            embed_empty_prompt,
+            embed_empty_prompt_stable_diffusion,
+            embed_ic_light_prompts,
+        )
+
+        base = self.base or _BASES[self.kind]
+        folder = Path(base) if Path(base).is_dir() else folder_of("/".join(base.split("/")[:2]))
+        out = self.out or folder / (IC_LIGHT_PROMPT_FILE if self.kind == "ic-light" else PROMPT_FILE)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        if self.kind == "flux":
+            embed_empty_prompt(base, out, tokens=self.tokens, say=console.say)
+        elif self.kind == "stable-diffusion":
+            embed_empty_prompt_stable_diffusion(base, out, say=console.say)
+        else:
+            embed_ic_light_prompts(base, out, say=console.say)
+        console.result(out)
+        return 0

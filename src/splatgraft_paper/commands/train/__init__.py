@@ -1,1 +1,0 @@
-"""The commands `train ...`, one file each: training of image models on pairs."""

@@ -1,0 +1,249 @@
+"""Training of FLUX as a harmoniser: rectified flow matching on the velocity (paper, Sec. 5, Eq. 1)."""
+
+import math
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE, read_prompt
+from splatgraft.harmonization.flux.network import velocity
+from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
+from splatgraft.harmonization.flux.weights.diffusers_library import flux_transformer_class
+from splatgraft.harmonization.flux.weights.folder import FluxFolder, Variant, find_part, local_folder, write_description
+from splatgraft.harmonization.flux.weights.loading import load_autoencoder, load_transformer, widen_transformer
+from splatgraft.harmonization.flux.weights.lora import add_lora, write_lora
+from splatgraft.harmonization.flux.weights.widening import FirstLayer
+from splatgraft.project.folder_lock import locked
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.image_size import parse_image_size
+from splatgraft_paper.training.loop import LoopOptions, join_processes
+from splatgraft_paper.training.objective import Latents, Network, save_weights, train_objective
+from splatgraft_paper.training.pairs import DataOptions, Role, TrainingData, crop_pair_to_size, open_training_data
+from splatgraft_paper.training.recipes import Recipe, TrainingCost, activation_bytes, plan
+from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
+
+Times = Literal["uniform", "logit-normal", "schnell"]
+TINY = "tiny"
+"""In place of a base model: one of three million weights is made first, in OUT/base."""
+_BASE_PICTURES = 1200
+"""Most pictures that the tiny base model's autoencoder is trained on."""
+_RESERVED_BYTES = 1 << 30
+"""For the CUDA context, kernels and fragmentation. An estimate."""
+_TEXT_TOKENS = 512
+"""At most."""
+
+
+@dataclass(frozen=True)
+class FluxTrainingOptions:
+    """Options of the training of the FLUX harmoniser (paper, Sec. 5)."""
+
+    base: str = "black-forest-labs/FLUX.1-schnell"
+    """Folder or hub id with transformer/ and vae/ (a harmoniser's to go on); `tiny` makes a small one in OUT/base."""
+    data: DataOptions = field(default_factory=DataOptions)
+    loop: LoopOptions = field(default_factory=LoopOptions)
+    condition: Variant = "image-mask"
+    """The network's input beside the composite: the object's mask (the paper) or the scene without the object."""
+    first_layer: FirstLayer = "repeat"
+    """How the first layer is widened: by its own weights (the paper) or by zeros."""
+    lora: int = 0
+    """Rank of a low-rank adaptation; 0 trains all weights."""
+    times: Times = "uniform"
+    """Noise levels that are trained: all alike, the middle ones more often (Esser et al. 2024), or inference's four."""
+    no_checkpointing: bool = False
+    """Keep activations instead of computing them twice: faster, several times the memory."""
+    recipe: str | None = None
+    """paper, without-blender, without-flux, without-orida, tiny or a .toml file: options where you give none."""
+    plan: bool = False
+    """Only print what would run: steps, hours, memory per device, disk, licences."""
+
+
+class FluxObjective:
+    """A FLUX transformer conditioned on the composite and a second image."""
+
+    output_role: Role = "target"
+
+    def __init__(self, folder: Path, options: FluxTrainingOptions, say: Callable[[str], None]) -> None:
+        """Load the base model and widen its first layer where needed.
+
+        Args:
+            folder: the base model's, with transformer/, vae/ and empty_prompt.safetensors.
+            options: of the training.
+            say: receives how many layers are adapted.
+
+        Raises:
+            ValueError: a folder is of another kind or broken.
+        """
+        checked = FluxFolder.open(folder)
+        self._folder, self._options = folder, options
+        config = checked.config
+        self._prompt_path = find_part(PROMPT_FILE, folder)
+        self.prompt = read_prompt(
+            self._prompt_path,
+            tokens_width=config.get("joint_attention_dim", 4096),
+            pooled_width=config.get("pooled_projection_dim", 768),
+        )
+        self.autoencoder = load_autoencoder(find_part("vae", folder))
+        self.autoencoder.network.eval().requires_grad_(False)
+        dtype = torch.bfloat16 if options.loop.precision == "bf16" and options.lora else torch.float32
+        self.network = load_transformer(checked, dtype=dtype)
+        if checked.inputs == 1:
+            widen_transformer(self.network, options.first_layer)
+        else:
+            checked.variant(options.condition)
+        if options.lora:
+            count = add_lora(self.network, options.lora, seed=options.loop.seed)
+            say(f"lora: {count} layers of rank {options.lora} are trained")
+            self.network.x_embedder.float()
+        else:
+            self.network.requires_grad_(True)
+        if not options.no_checkpointing:
+            self.network.enable_gradient_checkpointing()
+        condition: Role = "mask" if options.condition == "image-mask" else "background"
+        self.roles: tuple[Role, ...] = ("target", "composite", condition)
+
+    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
+        """Encode sRGB images in [0, 1] to latents."""
+        return self.autoencoder.encode(images)
+
+    def to(self, device: Any) -> None:
+        """Move autoencoder and prompt to a device."""
+        self.autoencoder.network.to(device)
+        self.prompt = self.prompt.to(torch.device(device), torch.float32)
+
+    def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
+        """Mean of || v(z_t, z_comp, z_mask, c, t) - (eps - z_0) ||^2 (paper, Eq. 1)."""
+        clean = latents["target"]
+        levels, eps = [], []
+        for seed in seeds:
+            generator = torch.Generator().manual_seed(seed)
+            levels.append(_level(self._options.times, generator))
+            eps.append(torch.randn(clean.shape[1:], generator=generator))
+        level, drawn = torch.stack(levels).to(clean.device), torch.stack(eps).to(clean.device)
+        joined = torch.cat([noisy(clean, drawn, level), self._conditions(latents)], 1)
+        return ((velocity(network, joined, level, self.prompt).float() - (drawn - clean)) ** 2).mean()
+
+    def predict(self, network: Network, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
+        """Harmonise by schnell's four steps."""
+        conditions = self._conditions(latents)
+        b, device = conditions.shape[0], conditions.device
+        size = tuple(latents["composite"].shape[1:])
+        start = noise(size, seed).to(device).expand(b, -1, -1, -1)  # pyright: ignore
+
+        def step(z: Tensor, level: float) -> Tensor:
+            return velocity(network, torch.cat([z, conditions], 1), torch.full((b,), level, device=device), self.prompt)
+
+        return self.autoencoder.decode(sample(step, start, schnell_levels()))
+
+    def save(self, state: dict[str, Tensor], folder: Path) -> None:
+        """Write a folder for `harmonize --method flux --weights`, or lora.safetensors for its --lora."""
+        folder.mkdir(parents=True, exist_ok=True)
+        description = {
+            "variant": self._options.condition,
+            "base": str(self._folder),
+            "first_layer": self._options.first_layer,
+        }
+        write_description(folder, description)
+        if self._options.lora:
+            write_lora(folder / "lora.safetensors", state, {"rank": str(self._options.lora), "base": str(self._folder)})
+            return
+        save_weights(flux_transformer_class(), self.network.config, state, folder / "transformer")
+        self.autoencoder.network.save_pretrained(folder / "vae")
+        shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
+
+    def _conditions(self, latents: Latents) -> Float[Tensor, "b k h w"]:
+        return torch.cat([latents[role] for role in self.roles[1:]], 1)
+
+
+def _level(times: Times, generator: torch.Generator) -> Float[Tensor, ""]:
+    """Draw a noise level in (0, 1]."""
+    if times == "logit-normal":
+        return torch.randn((), generator=generator).sigmoid()
+    if times == "schnell":
+        return torch.tensor(schnell_levels()[int(torch.randint(4, (), generator=generator))])
+    return 1 - torch.rand((), generator=generator)
+
+
+def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Path | None:
+    """Train a harmoniser.
+
+    Returns:
+        The folder of the model; None in all but the first of several processes, and where only the plan is printed.
+
+    Raises:
+        ValueError: Weights, pairs or options are not as expected.
+    """
+    recipe = Recipe.read(options.recipe) if options.recipe else None
+    processes = join_processes(options.loop)
+    if options.plan or recipe:
+        count = processes.num_processes
+        count = recipe.processes if recipe and count == 1 else count  # a plan without a launcher is the recipe's
+        for line in _plan(recipe, options, _known_config(options.base), count):
+            if processes.is_main_process:
+                console.say(line)
+        if options.plan:
+            return None
+    data = open_training_data(options.data, options.loop.seed, recipe)
+    folder = out / "base"
+    if options.base != TINY:
+        folder = local_folder(options.base, console.say)
+    elif processes.is_main_process and not folder.is_dir():
+        _make_tiny_base(folder, data, options.loop.seed, console)
+    processes.wait_for_everyone()
+    if recipe is None and processes.is_main_process:
+        console.say(_plan(None, options, FluxFolder.open(folder).config, processes.num_processes)[-1])
+    objective = FluxObjective(folder, options, console.say)
+    return train_objective(objective, data, out, options.loop, base=folder, console=console)
+
+
+def _make_tiny_base(folder: Path, data: TrainingData, seed: int, console: Console) -> None:
+    """Make the tiny base model from training pictures."""
+    pictures = []
+    for files in data.mixture.all()[: _BASE_PICTURES // 3]:
+        pair = crop_pair_to_size(files.read(), data.width, data.height)
+        pictures += [pair.picture(role).permute(2, 0, 1) for role in ("target", "composite", "mask")]
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with console.bar("autoencoder") as progress, locked(folder.parent):
+        write_tiny_base(folder, pictures, TinyBaseOptions(seed=seed), say=console.say, progress=progress)
+
+
+def _known_config(base: str) -> dict[str, Any]:
+    """The transformer's config, or nothing where FLUX.1-schnell's holds: a plan fetches no weights."""
+    if base == TINY:
+        tiny = TinyBaseOptions()
+        heads = {"num_attention_heads": tiny.heads, "attention_head_dim": tiny.head_width}
+        return {**heads, "num_layers": tiny.double_blocks, "num_single_layers": tiny.single_blocks}
+    return FluxFolder.open(Path(base)).config if Path(base).is_dir() else {}
+
+
+def _plan(recipe: Recipe | None, options: FluxTrainingOptions, config: dict[str, Any], processes: int) -> list[str]:
+    """Lines that say what will run; the last one is about the memory."""
+    loop = options.loop
+    width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
+    doubles, singles = config.get("num_layers", 19), config.get("num_single_layers", 38)
+    # with the modulations that inference bakes: 6 a stream of a double block, 3 a single one
+    parameters = width**2 * (36 * doubles + 15 * singles)
+    cost = TrainingCost(
+        steps=loop.steps,
+        batch=loop.batch,
+        size=options.data.size,
+        parameters=parameters,
+        trained=options.lora * width * (36 * doubles + 20 * singles) if options.lora else parameters,
+        processes=processes,
+        ema=loop.ema > 0,
+        shards=processes if loop.parallel == "shards" else 1,
+        half=loop.precision != "no",
+    )
+    tokens = math.prod(parse_image_size(options.data.size, multiple_of=16)) // 256 + _TEXT_TOKENS
+    tokens *= max(1, loop.batch // (processes * loop.accumulate))
+    activations = activation_bytes(
+        tokens=tokens, width=width, blocks=doubles + singles, checkpointing=not options.no_checkpointing
+    )
+    need = cost.weight_bytes + activations * (1 if cost.half else 2) + _RESERVED_BYTES
+    what = f"lora of rank {options.lora}" if options.lora else "all weights"
+    return [*plan(recipe, cost, loop.rate), f"memory: {what}: {need / 1e9:.0f} GB a device"]

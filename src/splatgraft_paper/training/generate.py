@@ -1,0 +1,292 @@
+"""Samples of relit images: of prompts by FLUX.1-schnell, and of ORIDa's photographs (paper, Sec. 5.2 and 5.3).
+
+Finished samples are kept, unsuitable ones are recorded. Untested with FLUX's real weights and ORIDa's archive.
+"""
+
+import csv
+import json
+import random
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.images import resize, write_image
+from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.progress import Progress, silent
+from splatgraft_paper.training.pairs import (
+    RECORD_FILE,
+    PairFolder,
+    RelitSample,
+    open_relit,
+    write_relit_manifest,
+    write_sample,
+)
+from splatgraft_paper.training.relighters import DiffusionRenderer, Relighter, RelightingInput, SilhouetteRelighter
+
+SHEET_FILE = "sheet.png"
+_REJECTED = "rejected"
+_MIN_COVERED, _MAX_COVERED = 0.01, 0.6
+"""Share of the image that an object may cover; set by hand."""
+
+
+@dataclass(frozen=True)
+class UnrelitSample:
+    """A target with its background and mask, before relighting."""
+
+    target: Float[Tensor, "h w 3"]
+    background: Float[Tensor, "h w 3"]
+    mask: Float[Tensor, "h w"]
+
+
+@dataclass(frozen=True)
+class SamplePlan:
+    """One sample to be generated."""
+
+    name: str
+    """Of the sample's folder."""
+    group: str
+    """Samples of one group are held out together."""
+    make: Callable[[], UnrelitSample]
+    record: Mapping[str, Any]
+    """Provenance: prompt, seed, models, licence."""
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """The relighter and the environment maps of the samples."""
+
+    relighter: Relighter
+    maps: Sequence[Path]
+    """Environment maps to choose from."""
+    each: int
+    """Lights per sample."""
+    seed: int
+
+    def choose(self, name: str) -> list[Path]:
+        """Choose the maps of a sample, determined by its name and the seed."""
+        return random.Random(f"lights-{self.seed}-{name}").sample(list(self.maps), min(self.each, len(self.maps)))
+
+
+def generate(
+    out: Path, plans: Iterable[SamplePlan], lighting: Lighting, *, total: int, progress: Progress = silent
+) -> int:
+    """Generate missing samples, then write the manifest and a contact sheet.
+
+    A sample whose object is too small, too large or not found is recorded in rejected/ and not tried again.
+
+    Args:
+        out: folder of the samples.
+        plans: candidates, in order.
+        lighting: how they are relit.
+        total: number of samples to reach.
+        progress: called after each candidate.
+
+    Returns:
+        The number of samples in `out`.
+
+    Raises:
+        ValueError: a model fails; finished samples are kept.
+    """
+    (out / _REJECTED).mkdir(parents=True, exist_ok=True)
+    done = 0
+    try:
+        for plan in plans:
+            if done >= total:
+                break
+            if (out / plan.name / RECORD_FILE).is_file():
+                done += 1
+            elif not (out / _REJECTED / f"{plan.name}.json").is_file():
+                done += _generate_one(out, plan, lighting)
+            progress(done, total, plan.name)
+    finally:
+        count = write_relit_manifest(out)
+    if count:
+        write_image(out / SHEET_FILE, contact_sheet(open_relit(out)))
+    return count
+
+
+def contact_sheet(folder: PairFolder, *, rows: int = 24, width: int = 240) -> Float[Tensor, "h w 3"]:
+    """Show evenly chosen pairs, one per row: target, background, composite."""
+    count = len(folder.pairs)
+    chosen = [round(i * (count - 1) / max(rows - 1, 1)) for i in range(min(rows, count))]
+    lines = []
+    for index in chosen:
+        pair = folder.pairs[index].read()
+        height = round(width * pair.target.shape[0] / pair.target.shape[1])
+        pictures = (pair.target, pair.background, pair.composite)
+        lines.append(torch.cat([resize(picture, width, height) for picture in pictures], 1))
+    tallest = max(line.shape[0] for line in lines)
+    return torch.cat([torch.cat([line, torch.ones(tallest - line.shape[0], *line.shape[1:])]) for line in lines])
+
+
+def _generate_one(out: Path, plan: SamplePlan, lighting: Lighting) -> int:
+    """Write the sample; 1 where it was written, 0 where it was rejected."""
+    unrelit = plan.make()
+    covered = float((unrelit.mask > 0.5).float().mean())
+    if not _MIN_COVERED <= covered <= _MAX_COVERED:
+        note = {**plan.record, "reason": f"object covers {covered:.1%} of the picture"}
+        with atomic_write(out / _REJECTED / f"{plan.name}.json") as stream:
+            stream.write((json.dumps(note) + "\n").encode())
+        return 0
+    maps = lighting.choose(plan.name)
+    relit = lighting.relighter.relight(RelightingInput(plan.name, unrelit.target, unrelit.mask), maps)
+    record = {
+        **plan.record,
+        "group": plan.group,
+        "relighter": lighting.relighter.name,
+        "relighter_licence": lighting.relighter.licence,
+        "lights": [path.name for path in maps],
+    }
+    write_sample(out / plan.name, RelitSample(unrelit.target, unrelit.background, unrelit.mask, relit), record)
+    return 1
+
+
+@dataclass(frozen=True)
+class RelightingOptions:
+    """The relighter and its environment maps."""
+
+    lights: Path = Path("lights")
+    """Folder with .hdr environment maps."""
+    each: int = 4
+    """Lights per image."""
+    relighter: Literal["diffusion-renderer", "stand-in"] = "diffusion-renderer"
+    """The paper's DiffusionRenderer, in your own installation; or a simple stand-in without a learned model."""
+    renderer: Path | None = None
+    """Folder of DiffusionRenderer's code."""
+    renderer_variant: Literal["svd", "cosmos"] = "svd"
+    """Which of its two versions."""
+    renderer_python: Path | None = None
+    """The Python that runs it; the current one where not given."""
+
+    def open(self, seed: int) -> Lighting:
+        """Prepare the relighter and list the maps; `seed` determines the choice of maps.
+
+        Raises:
+            ValueError: the relighter or the maps are missing.
+        """
+        maps = sorted(self.lights.glob("*.hdr")) if self.lights.is_dir() else []
+        if not maps:
+            raise ValueError(f"{self.lights}: expected a folder with .hdr environment maps (--lights), found none")
+        return Lighting(self._relighter(), maps, self.each, seed)
+
+    def _relighter(self) -> Relighter:
+        if self.relighter == "stand-in":
+            return SilhouetteRelighter()
+        if self.renderer is None:
+            raise ValueError(
+                "--renderer: expected the folder of DiffusionRenderer's code, found none; or --relighter stand-in"
+            )
+        return DiffusionRenderer(self.renderer, self.renderer_python or Path(sys.executable), self.renderer_variant)
+
+
+_PIPELINE_BYTES = 36 << 30
+"""GPU memory of bf16 FLUX with both text encoders and its activations. An estimate."""
+
+
+class TextToImage:
+    """A loaded text-to-image pipeline."""
+
+    def __init__(self, pipeline: Any, device: torch.device, size: tuple[int, int], say: Callable[[str], None]) -> None:
+        """Move a pipeline to a device.
+
+        Args:
+            pipeline: a `FluxPipeline`.
+            device: where it runs; its parts stay on the CPU in turn where GPU memory does not suffice.
+            size: width and height of the images, pixels.
+            say: receives a message where parts stay on the CPU.
+        """
+        self._pipeline, self._size = pipeline, size
+        if device.type == "cuda" and torch.cuda.mem_get_info(device)[0] < _PIPELINE_BYTES:
+            say("text to image: parts are fetched from the CPU in turn, since GPU memory does not hold all of them")
+            pipeline.enable_model_cpu_offload()
+        else:
+            pipeline.to(device)
+
+    def generate(self, prompt: str, *, seed: int) -> Float[Tensor, "h w 3"]:
+        """Generate the image of a prompt and a seed, sRGB in [0, 1]."""
+        width, height = self._size
+        image = self._pipeline(
+            prompt,
+            width=width,
+            height=height,
+            num_inference_steps=4,
+            guidance_scale=1.0,
+            generator=torch.Generator().manual_seed(seed),
+        ).images[0]
+        return torch.from_numpy(np.array(image.convert("RGB"))).float() / 255
+
+
+INDEX_FILE = "index.csv"
+COLUMNS = ("image", "mask", "background", "object", "scene")
+LICENCE = "ORIDa, see its own terms"
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One photograph of an object in a scene."""
+
+    image: Path
+    mask: Path
+    background: Path
+    """The scene without the object."""
+    object: str
+    scene: str
+
+    @property
+    def name(self) -> str:
+        """A unique folder name."""
+        return f"{self.object}_{self.scene}_{self.image.stem}".replace("/", "-")
+
+
+def read_orida(root: Path) -> list[Photograph]:
+    """List all photographs of an index.csv with the columns image, mask, background (files), object and scene.
+
+    Raises:
+        ValueError: the file is missing or empty, a row is broken, or a picture is missing.
+    """
+    path, found = root / INDEX_FILE, []
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a table with the columns {', '.join(COLUMNS)}, found no file")
+    with path.open(newline="") as stream:
+        reader = csv.DictReader(stream)
+        if missing := [name for name in COLUMNS if name not in (reader.fieldnames or ())]:
+            raise ValueError(f"{path}: expected the columns {', '.join(COLUMNS)}, found no {missing[0]}")
+        for number, row in enumerate(reader, 2):
+            files = [path.parent / (row[name] or "?") for name in COLUMNS[:3]]
+            if absent := next((file for file in files if not file.is_file()), None):
+                raise ValueError(f"{path}, line {number}: expected existing files, found no {absent}")
+            image, mask, background = files
+            found.append(Photograph(image, mask, background, row["object"], row["scene"]))
+    return sorted(found, key=lambda photograph: photograph.name)
+
+
+def choose_balanced(photographs: list[Photograph], count: int, seed: int) -> list[Photograph]:
+    """Choose `count` photographs, balanced by object and scene; all where there are fewer."""
+    queues: dict[tuple[str, str], list[Photograph]] = defaultdict(list)
+    for photograph in photographs:
+        queues[photograph.object, photograph.scene].append(photograph)
+    for key, queue in queues.items():
+        random.Random(f"orida-{seed}-{key}").shuffle(queue)
+    chosen: list[Photograph] = []
+    objects: dict[str, int] = defaultdict(int)
+    scenes: dict[str, int] = defaultdict(int)
+    number = 0
+    while len(chosen) < count and any(queues.values()):
+        keys = sorted(key for key, queue in queues.items() if queue)
+        random.Random(f"orida-{seed}-round-{number}").shuffle(keys)
+        number += 1
+        while keys and len(chosen) < count:
+            key = min(keys, key=lambda pair: (objects[pair[0]], scenes[pair[1]]))
+            keys.remove(key)
+            chosen.append(queues[key].pop())
+            objects[key[0]] += 1
+            scenes[key[1]] += 1
+    return chosen

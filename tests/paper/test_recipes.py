@@ -1,0 +1,155 @@
+"""Recipes hold the paper's numbers, are printed before anything is loaded, and give way to the user's own options."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from splatgraft.cli import main
+from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
+from splatgraft.harmonization.flux.network import velocity
+from splatgraft_paper.training.recipes import Recipe, TrainingCost, activation_bytes
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+SOURCES = {"pairs": (1900, 51_000), "generated": (1600, 6500), "orida": (2000, 8000)}
+"""Consistent and inconsistent pictures of the paper's three sources (Sec. 5.2)."""
+
+
+def test_the_harmoniser_has_the_paper_s_numbers():
+    recipe = Recipe.read("paper")
+    # Sec. 5.3: 50K iterations, 4 H100, 704 x 496, Adam, 3e-5, total batch size of 4
+    wanted = {"steps": 50_000, "rate": 3e-5, "batch": 4, "size": "704x496"}
+    assert {name: recipe.options[name] for name in wanted} == wanted
+    assert recipe.processes == 4
+    assert {source.option: (source.targets, source.composites) for source in recipe.sources} == SOURCES
+    # Sec. 5: conditioned on composite and mask, the first layer repeated, FLUX.1-schnell
+    assert recipe.options["condition"] == "image-mask"
+    assert recipe.options["first-layer"] == "repeat"
+    assert recipe.options["base"] == "black-forest-labs/FLUX.1-schnell"
+
+
+def test_the_object_removal_has_the_paper_s_numbers():
+    recipe = Recipe.read("removal")
+    # Sec. 5.3: Stable Diffusion 2, a single H100, batch size of 8, 1e-5, 260K iterations, the synthetic data
+    wanted = {"steps": 260_000, "rate": 1e-5, "batch": 8, "base": "stabilityai/stable-diffusion-2"}
+    assert {name: recipe.options[name] for name in wanted} == wanted
+    assert recipe.processes == 1
+    assert [source.option for source in recipe.sources] == ["pairs"]
+
+
+@pytest.mark.parametrize(("name", "left_out"), [("blender", "pairs"), ("flux", "generated"), ("orida", "orida")])
+def test_an_ablation_is_the_paper_s_training_without_one_source(name, left_out):
+    paper, ablation = Recipe.read("paper"), Recipe.read(f"without-{name}")
+    assert ablation.options == paper.options
+    assert ablation.sources == tuple(source for source in paper.sources if source.option != left_out)
+
+
+def test_the_estimate_of_hours_gives_the_paper_its_two_days():
+    cost = TrainingCost(50_000, 4, "704x496", 11_800_000_000, 11_800_000_000, 4)
+    assert cost.hours == pytest.approx(48)
+    assert replace(cost, size="352x248").hours == pytest.approx(12)
+
+
+def test_training_flux_takes_the_paper_s_four_cards():
+    cost = TrainingCost(50_000, 4, "704x496", 11_890_000_000, 11_890_000_000, 4)
+    activations = activation_bytes(tokens=1876, width=3072, blocks=57)
+    # 12 billion weights, gradients and two moments in float32 and a copy in 16 bits: 18 bytes each
+    assert 213e9 < cost.weight_bytes + activations < 218e9
+    assert replace(cost, shards=4).weight_bytes + activations < 80e9
+    assert replace(cost, trained=64 * 3072 * (36 * 19 + 20 * 38)).weight_bytes + activations < 40e9
+    assert replace(cost, ema=True).weight_bytes > cost.weight_bytes
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_the_activations_predicted_are_those_that_are_kept(checkpointing):
+    diffusers = pytest.importorskip("diffusers")
+    width, blocks, kept = 256, 6, []
+    network = diffusers.FluxTransformer2DModel(
+        in_channels=48, out_channels=16, num_layers=2, num_single_layers=4, attention_head_dim=64,
+        num_attention_heads=4, joint_attention_dim=32, pooled_projection_dim=16, axes_dims_rope=(8, 28, 28),
+    )  # fmt: skip
+    if checkpointing:
+        network.enable_gradient_checkpointing()
+    prompt = PromptEmbedding(torch.randn(16, 32), torch.randn(16))
+    weights = {p.untyped_storage().data_ptr() for p in network.parameters()}
+    sides = (16, 32)
+    for side in sides:
+        found = {}
+
+        def note(tensor, found=found):
+            if tensor.untyped_storage().data_ptr() not in weights:
+                found[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            return tensor
+
+        with (
+            torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor),
+            torch.autocast("cpu", torch.bfloat16),
+        ):
+            velocity(network, torch.randn(1, 12, side, side), torch.tensor([0.5]), prompt)
+        kept.append(sum(found.values()))
+    # two sizes, so that copies of weights, which do not grow, fall out
+    tokens = (sides[1] ** 2 - sides[0] ** 2) // 4
+    predicted = activation_bytes(tokens=tokens, width=width, blocks=blocks, checkpointing=checkpointing)
+    # a block that is computed again is not among what is kept through the forward pass
+    predicted -= 54 * tokens * width if checkpointing else 0
+    # ends of the network and odds of a block: some 7 bytes a token and channel with 6 blocks
+    assert 0.95 * predicted < kept[1] - kept[0] < predicted + 12 * tokens * width
+
+
+def test_a_plan_says_what_will_run_and_loads_nothing(tmp_path, capsys):
+    words = ["paper", "train", "flux", str(tmp_path / "out"), "--recipe", "paper", "--plan"]
+    assert main(words) == 0
+    printed = capsys.readouterr().err
+    for line in (
+        "recipe paper: the paper's harmoniser (Sec. 5)",
+        "plan: 50,000 steps of 4 pairs at 704x496, Adam at 3e-05, on 4 GPUs",
+        "hours: about 48 on as many H100",
+        "disk: 47 GB for the model, 426 GB for states, 13 GB for latents",
+        "data: Blender (--pairs), 1,900 targets and 51,000 composites, 35% of the pairs that are drawn",
+        "memory: all weights: 55 GB a device",
+        "licence: FLUX.1-schnell: Apache-2.0",
+        "licence: ORIDa: its own terms",
+    ):
+        assert line in printed
+    assert not (tmp_path / "out").exists()
+    # the user's own words replace those of the recipe
+    assert main([*words, "--steps", "10", "--batch", "8"]) == 0
+    assert "plan: 10 steps of 8 pairs" in capsys.readouterr().err
+    assert main(["paper", "train", "removal", str(tmp_path / "out"), "--recipe", "removal", "--plan"]) == 0
+    printed = capsys.readouterr().err
+    assert "plan: 260,000 steps of 8 pairs at 704x496, Adam at 1e-05, on 1 GPUs" in printed
+    assert "memory: 15.6 GB a device for weights and optimiser" in printed
+    assert "licence: Stable Diffusion 2: CreativeML Open RAIL++-M; has left the hub" in printed
+
+
+def test_weights_are_shared_by_the_folders_of_a_source():
+    recipe = Recipe.read("paper")
+    assert recipe.weights({"pairs": 2, "generated": 1, "orida": 1}) == (0.95, 0.95, 1.6, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (
+            ["--recipe", "paper"],
+            "training data: expected --pairs, --generated, --orida (recipe paper), found no --pairs",
+        ),
+        (["--recipe", "without-orida", "--pairs", "a", "--generated", "b", "--orida", "c"], "--orida: expected none"),
+        (["--recipe", "papper"], "--recipe: expected a file or one of paper, removal, tiny, without-blender,"),
+        (["--recipe", "removal"], "--recipe: expected a recipe of `train flux` (paper, tiny, without-blender,"),
+    ],
+)
+def test_what_does_not_fit_a_recipe_is_one_line(tmp_path, capsys, words, line):
+    assert main(["paper", "train", "flux", str(tmp_path / "out"), *words]) == 2
+    assert line in capsys.readouterr().err
+
+
+def test_a_recipe_of_one_s_own_is_a_file(tmp_path, capsys):
+    path = tmp_path / "mine.toml"
+    path.write_text('title = "mine"\ncommand = "train flux"\nprocesses = 2\n[options]\nsteps = 7\n[sources]\n')
+    assert main(["paper", "train", "flux", str(tmp_path / "out"), "--recipe", str(path), "--plan"]) == 0
+    assert "plan: 7 steps of 4 pairs" in capsys.readouterr().err
+    path.write_text("title = 3\n")
+    assert main(["paper", "train", "flux", str(tmp_path / "out"), "--recipe", str(path), "--plan"]) == 2
+    assert "mine.toml: expected a recipe as shipped ones are, found" in capsys.readouterr().err
