@@ -66,6 +66,7 @@ def test_the_tiny_base_is_flux_of_three_million_weights(tmp_path):
     assert bool(loss.isfinite())
 
 
+@pytest.mark.long
 def test_the_tiny_autoencoder_learns_colours(tmp_path):
     """With the rate of Adam four times as high it shows every picture gray: 96% of the variance is left, now 22%."""
     colors = torch.rand(64, 3, generator=torch.Generator().manual_seed(0))
