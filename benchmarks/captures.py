@@ -32,7 +32,7 @@ from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import read_capture
 from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import render
-from splatgraft.runtime.peak_memory import peak_memory_bytes, reset_peak_memory
+from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 
 EVERY = 8
 FEWEST_PHOTOS = 3

@@ -26,7 +26,7 @@ from splatgraft.fitting.perceptual_losses import ImageLoss, l1, lpips_vgg, windo
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import render
-from splatgraft.runtime.peak_memory import peak_memory_bytes, reset_peak_memory
+from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 
 ROOT = Path(__file__).parents[1]
 LOSSES: dict[str, ImageLoss] = {"fourier": windowed_fourier, "l1-dssim": l1_dssim, "l1": l1}

@@ -39,7 +39,7 @@ from splatgraft.relighting import Light, LightSource, SourceScene, relight
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.rendering import render, view_operator
 from splatgraft.runtime.lazy_sequence import LazySequence
-from splatgraft.runtime.peak_memory import peak_memory_bytes, reset_peak_memory
+from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 from splatgraft.segmentation import LiftOptions, lift_masks
 
 T = TypeVar("T")

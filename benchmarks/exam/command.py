@@ -30,8 +30,8 @@ from exam.rows import ROWS
 from exam.scene_files import read_scene
 from exam.summary import summarize_light, summarize_row, summary_markdown
 from splatgraft.reconstruction import ReconstructOptions
-from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import atomic_write
 from splatgraft_paper.synthesis.benchmark import SCENES
 
 _ROOT = Path(__file__).resolve().parents[2]

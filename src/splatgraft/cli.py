@@ -110,9 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, MemoryError) as error:
         if debug:
             raise
-        from splatgraft.runtime.help_link import help_link_of
-
-        return _fail(" ".join(str(error).split()) or type(error).__name__, 2, help_link_of(error))
+        return _fail(" ".join(str(error).split()) or type(error).__name__, 2)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -191,7 +189,6 @@ def _help(head: str, commands: Mapping[str, str]) -> str:
     return "\n".join([f"{head}\n\ncommands:", *lines])
 
 
-def _fail(sentence: str, code: int, link: str = "") -> int:
-    more = f" (see {link})" if link else ""
-    print(f"splatgraft: {sentence}{more}", file=sys.stderr)
+def _fail(sentence: str, code: int) -> int:
+    print(f"splatgraft: {sentence}", file=sys.stderr)
     return code

@@ -20,9 +20,8 @@ from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft.formats import read_gaussians
 from splatgraft.harmonization import HARMONIZERS, FluxOptions
-from splatgraft.project.checkpoint import FolderCheckpoint
 from splatgraft.project.record import read_record
-from splatgraft.project.step import job_of
+from splatgraft.project.step import FolderCheckpoint, job_of
 from splatgraft.runtime.settings import choices, field_types
 from splatgraft.workflow.flow import read_flow
 
@@ -253,7 +252,7 @@ def test_a_killed_training_goes_on_from_its_checkpoint(project: Path, monkeypatc
     flow = read_flow(project)
     folder, wanted = flow.layout.scene("source"), contents(flow.layout.scene("source"))
     shutil.rmtree(folder)
-    monkeypatch.setattr("splatgraft.fitting.loop._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("splatgraft.reconstruction.fit._CHECKPOINT_SECONDS", 0.0)
     saves = 0
 
     def save(self: FolderCheckpoint, state: dict) -> None:

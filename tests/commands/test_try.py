@@ -10,8 +10,8 @@ from tiny_project import ball, photograph, plane
 
 from splatgraft.cli import main
 from splatgraft.commands.first_try import refinements
-from splatgraft.project.record import Record, StepWarning, read_record, write_record
-from splatgraft.project.remedies import remedy
+from splatgraft.project.record import Record, read_record, write_record
+from splatgraft.runtime.note import Note
 from splatgraft.workflow.flow import read_flow
 
 
@@ -45,7 +45,7 @@ def test_a_first_transfer_needs_nothing_but_two_captures(
     unsure = [line.split(": ")[1] for line in said if line.startswith("unsure: ")]
     flow = read_flow(page.parents[1])
     warnings = {name: record.warnings for name, step in flow if (record := read_record(step.out))}
-    assert unsure == [name for name, said in warnings.items() if not all(one.minor for one in said)] != []
+    assert unsure == [name for name, said in warnings.items() if any(one.in_doubt for one in said)] != []
     assert len([line for line in said if line.startswith("helps most: ") and "splatgraft " in line]) == 1
     assert "splatgraft run images__into_room" in next(line for line in said if line.startswith("finer: "))
     assert f"{page}: opened in the browser" in said
@@ -66,7 +66,10 @@ def test_what_was_mended_is_noted_and_is_not_what_helps_most(
     assert main(["init", str(tmp_path / "p"), "--source", source, "--target", target]) == 0
     flow = read_flow(tmp_path / "p")
     (name, first), (_, second), *_ = flow
-    left_out, doubt = StepWarning("One photo is blurred.", minor=True), StepWarning("Half of it is fog.")
+    left_out, doubt = (
+        Note("One photo is blurred.", "minor"),
+        Note("Half of it is fog.", "warning", "leave the photo out"),
+    )
     for step, warnings in ((first, (left_out, left_out)), (second, (doubt,))):
         step.out.mkdir(parents=True)
         record = Record(type(step).__name__.lower(), "0", {}, {}, (), 0.0, 0, warnings)
@@ -75,7 +78,7 @@ def test_what_was_mended_is_noted_and_is_not_what_helps_most(
     assert lines[0] == f"noted: {name}: One photo is blurred. (and 1 more)"
     assert lines[1].startswith("unsure: ")
     assert lines[1].endswith("Half of it is fog.")
-    assert lines[2] == f"helps most: {remedy(type(second).__name__.lower(), tmp_path / 'p')}"
+    assert lines[2] == "helps most: leave the photo out"
     write_record(second.out, replace(record, warnings=()))
     assert refinements(flow, tmp_path / "p")[1].startswith("no step warned")
 

@@ -178,7 +178,7 @@ import torch
 from conftest import ball, ring
 from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.runtime.lazy_sequence import LazySequence
-from splatgraft.runtime.peak_memory import peak_memory_bytes, reset_peak_memory
+from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 views, cache_bytes = int(sys.argv[1]), int(sys.argv[2])
 scene, size = ball(1000, degree=2, seed=0), 320
 scene = replace(scene, means=3 * scene.means)  # fills the views

@@ -11,14 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from splatgraft.project.checkpoint import FolderCheckpoint
-from splatgraft.project.folder_lock import locked
-from splatgraft.project.job import Job
 from splatgraft.project.layout import Layout
-from splatgraft.project.record import read_record, why_stale
-from splatgraft.project.replacement import replacing
-from splatgraft.project.step import job_of
-from splatgraft.runtime.atomic_folder import atomic_folder
+from splatgraft.project.record import Job, read_record, why_stale
+from splatgraft.project.step import FolderCheckpoint, job_of, locked, replacing
+from splatgraft.runtime.files import atomic_folder
 
 
 def job(folder: Path, files: tuple[Path, ...] = (), **options: object) -> Job:
@@ -155,8 +151,8 @@ def test_missing_input_and_damaged_record_are_told_by_file(tmp_path: Path) -> No
 KILLED_SWAP = """
 import os, signal, sys
 from pathlib import Path
-from splatgraft.project.job import Job
-from splatgraft.project.replacement import replacing
+from splatgraft.project.record import Job
+from splatgraft.project.step import replacing
 from splatgraft.project.step import job_of
 
 fatal, seen = int(sys.argv[2]), 0
@@ -204,7 +200,7 @@ def test_what_a_kill_between_two_renames_left_is_put_back(tmp_path: Path) -> Non
 
 
 def test_one_run_at_a_time_and_the_lock_dies_with_its_holder(tmp_path: Path) -> None:
-    script = "import sys, time; from pathlib import Path; from splatgraft.project.folder_lock import locked\n"
+    script = "import sys, time; from pathlib import Path; from splatgraft.project.step import locked\n"
     script += "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     holder = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "scene")], stdout=subprocess.PIPE)
     try:

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 
 def test_replaces_whole(tmp_path):
@@ -20,7 +20,7 @@ def test_replaces_whole(tmp_path):
 
 
 def test_what_a_kill_left_is_cleared(tmp_path):
-    code = "import os, sys, pathlib, splatgraft.runtime.atomic_file as w\n"
+    code = "import os, sys, pathlib, splatgraft.runtime.files as w\n"
     code += "with w.atomic_write(pathlib.Path(sys.argv[1])) as s: s.write(b'half'); s.flush(); os.kill(os.getpid(), 9)"
     path = tmp_path / "a.bin"
     path.write_bytes(b"before")

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from splatgraft.runtime.child_process import last_line, run_logged
+from splatgraft.runtime.process import last_line, run_logged
 
 
 def python(program: str) -> list[str]:

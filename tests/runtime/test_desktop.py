@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splatgraft.runtime.desktop import open_page
+from splatgraft.runtime.process import open_page
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="xdg-open is of Linux desktops")

@@ -5,7 +5,7 @@ import sys
 
 PROGRAM = """
 import sys, threading, torch
-from splatgraft.runtime.process_end import end_process
+from splatgraft.runtime.process import end_process
 
 begun = threading.Event()
 

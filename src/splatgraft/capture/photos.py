@@ -15,7 +15,7 @@ from splatgraft.core.images import opened, read_mask, read_rgb, shrink_on_decodi
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures.exif import exif_of, read_exposure
 from splatgraft.formats.captures.masks import check_mask
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
 
 _TURNS = {

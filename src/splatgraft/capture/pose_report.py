@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from splatgraft.capture.plausibility import Doubt, Lens
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 POSE_REPORT_FILE = "pose_report.json"
 

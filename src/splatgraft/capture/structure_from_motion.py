@@ -28,7 +28,7 @@ from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import stored_size
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures.masks import PhotoFiles
-from splatgraft.runtime.child_process import last_line, run_attached
+from splatgraft.runtime.process import last_line, run_logged
 from splatgraft.runtime.progress import Progress, silent
 
 _ADVICE = (
@@ -233,7 +233,7 @@ def _run(job: Job, advance: Callable[[int, str], None], say: Callable[[str], Non
             elif first == "-":
                 say(rest)
 
-        code = run_attached([sys.executable, str(program), json.dumps(asdict(job))], log, on_line=hear)
+        code = run_logged([sys.executable, str(program), json.dumps(asdict(job))], log, stdin=None, on_line=hear)
         if code != 0 or not job.output.is_file():
             last = last_line(log) or "no message"
             raise ValueError(f"{job.photos}: expected COLMAP to finish, found exit code {code}: {last}")

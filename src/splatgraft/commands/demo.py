@@ -6,8 +6,8 @@ from pathlib import Path
 
 from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.step import Positional
-from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import atomic_write
 from splatgraft.workflow.run_steps import run_steps
 
 CAPTURES_FOLDER = "captures"

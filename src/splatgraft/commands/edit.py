@@ -20,8 +20,7 @@ from splatgraft.editor.front.project_process import ProcessOptions
 from splatgraft.editor.front.project_states import ProjectStates
 from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.runtime.console import Console
-from splatgraft.runtime.desktop import open_page
-from splatgraft.runtime.process_end import end_process
+from splatgraft.runtime.process import end_process, open_page
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import NoReturn
 
 from splatgraft.editor.access.access_control import LOOPBACK, AccessControl
-from splatgraft.project.folder_lock import locked
+from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
-from splatgraft.runtime.process_end import end_process
+from splatgraft.runtime.process import end_process
 
 _END_SECONDS = 3.0
 """How long the child may take to end by itself."""

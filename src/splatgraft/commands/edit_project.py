@@ -27,8 +27,8 @@ from splatgraft.project.layout import (
     SURROUNDINGS_FILE,
     Side,
 )
-from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import atomic_write
 from splatgraft.workflow.flow import Flow, read_flow
 from splatgraft.workflow.staleness import reasons
 

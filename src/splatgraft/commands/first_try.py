@@ -11,11 +11,10 @@ from splatgraft.commands.steps.segment import Segment
 from splatgraft.editor.session.toml_edit import with_keys
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
 from splatgraft.project.record import read_record
-from splatgraft.project.remedies import remedy
-from splatgraft.project.step import Positional, Step
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.project.step import DEFAULT_REMEDIES, Positional, Step
 from splatgraft.runtime.console import Console
-from splatgraft.runtime.desktop import open_page
+from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.process import open_page
 from splatgraft.runtime.settings import read_toml
 from splatgraft.workflow.flow import Flow, read_flow
 from splatgraft.workflow.run_steps import run_steps
@@ -78,24 +77,25 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
     """
     shown = Path(shlex.quote(str(folder)))
     lines: list[str] = []
-    helps = ""
+    helps: list[str] = []
     for name, step in flow:
         record = read_record(step.out)
         if record is None:
             continue
-        mended = [warning.text for warning in record.warnings if warning.minor]
-        doubts = [*_guesses(step), *(warning.text for warning in record.warnings if not warning.minor)]
+        mended = [note.text for note in record.warnings if not note.in_doubt]
+        doubts = [*_guesses(step), *(note.text for note in record.warnings if note.in_doubt)]
         if mended:
             lines.append(f"noted: {name}: {mended[0]}{_more(mended)}")
         if not doubts:
             continue
         lines.append(f"unsure: {name}: {doubts[0]}{_more(doubts)}")
-        helps = helps or remedy(record.step, shown) or ""
+        remedies = [note.remedy for note in record.warnings if note.in_doubt and note.remedy]
+        helps += remedies[:1] or [DEFAULT_REMEDIES.get(record.step, "")]
     # later steps build on earlier ones: the first that was unsure is the one to mend
     if not any(line.startswith("unsure: ") for line in lines):
         lines.append("no step warned of its result: look at the pictures; a cut that is off is what people mend most")
-        helps = remedy("segment", shown) or ""
-    lines.append(f"helps most: {helps}")
+        helps = [DEFAULT_REMEDIES["segment"]]
+    lines.append(f"helps most: {next(filter(None, helps), '').replace('PROJECT', str(shown))}")
     finer = f'quality = "standard" under [reconstruct] in {shown / PROJECT_FILE}'
     return [*lines, f"finer: {finer}, then splatgraft run {shown}"]
 

@@ -10,8 +10,8 @@ from splatgraft.formats import is_scene
 from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.project_file import TEMPLATE
 from splatgraft.project.step import Positional
-from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import atomic_write
 from splatgraft.workflow.project_reference import full_project_text
 
 

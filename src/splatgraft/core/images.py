@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 from torch import Tensor
 
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 WRITTEN_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})
 IMAGE_SUFFIXES = WRITTEN_SUFFIXES | {".heic", ".heif"}

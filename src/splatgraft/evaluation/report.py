@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatgraft.evaluation.pictures import write_animation
 from splatgraft.evaluation.report_page import ViewFiles, WarningText, page_html
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 
 @dataclass(frozen=True)

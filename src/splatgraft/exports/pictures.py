@@ -16,7 +16,7 @@ from splatgraft.evaluation import write_animation
 from splatgraft.exports.first_view import FirstView
 from splatgraft.exports.turntable_video import FPS, write_video
 from splatgraft.rendering import render
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
 
 

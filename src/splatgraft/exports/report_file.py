@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _LONGEST_PX = 1200
 _QUALITY = 80

@@ -16,7 +16,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.exports.first_view import FirstView
 from splatgraft.formats.scenes.scene_file import SceneMetadata
 from splatgraft.formats.scenes.sog import encode_sog
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:; "

@@ -18,7 +18,7 @@ from splatgraft.core.images import read_mask, read_rgb, write_image
 from splatgraft.formats import read_cameras, write_cameras
 from splatgraft.harmonization import HarmonizerInputs
 from splatgraft.project.layout import CAMERAS_FILE
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _PRIOR_FILE = "prior.json"
 PICTURES = ("composite", "background", "prior", "mask", "normal", "depth")

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Int8
 from torch import Tensor
 
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 
 def read_flags(path: Path) -> Bool[Tensor, "n"]:

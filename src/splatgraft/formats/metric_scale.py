@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatgraft.formats.json_file import excerpt, load, number
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 SCALE_FILE = "scale.json"
 

@@ -22,7 +22,7 @@ from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats.gaussian_flags import read_flags, write_flags
 from splatgraft.formats.json_file import array, excerpt, load, number
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _ERASED_FILE = "erased.npy"
 _DEFAULTS = {"object": None, "scale": 1.0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}

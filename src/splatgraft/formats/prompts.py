@@ -20,7 +20,7 @@ from torch import Tensor
 
 from splatgraft.core.prompts import ViewPrompt
 from splatgraft.formats.json_file import excerpt, load
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.settings import read_toml
 
 _KEYS = ("inside", "outside", "box")

@@ -1,27 +1,72 @@
-"""step.json: what a result was made of, and whether it is still what the step would make."""
+"""Results wanted and finished: a job, the record of its run in step.json, and whether the record still fits the job."""
 
+import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from splatgraft.project.job import Entry, Job, input_entries
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.note import Note
 
 STEP_FILE = "step.json"
+Entry = tuple[str, int, int, str]
+"""Name, size in bytes, modification time in ns, sha256 of one input file."""
 
 
 @dataclass(frozen=True)
-class StepWarning:
-    """Something that may be wrong with a result, as the step said it."""
+class Job:
+    """A wanted result: a step, its folder, its inputs and its options."""
 
-    text: str
-    """One or more sentences."""
-    picture: str | None = None
-    """An image that shows it, relative to the result's folder."""
-    minor: bool = False
-    """Whether the step did what was needed by itself, so that its result is not in doubt."""
+    step: str
+    """The command."""
+    folder: Path
+    """Where the result goes."""
+    inputs: Mapping[str, tuple[Path, ...]]
+    """Files whose content the result depends on, by role."""
+    options: Mapping[str, Any]
+    """Plain JSON values that the result depends on."""
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    """Of the options that have one: what an earlier version did, which did not have the option yet."""
+
+    @cached_property
+    def entries(self) -> Mapping[str, tuple[Entry, ...]]:
+        """The input files at the first access, by role.
+
+        Raises:
+            ValueError: An input file is missing.
+        """
+        return {role: input_entries(files, ()) for role, files in self.inputs.items()}
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the step's name, its options and the content of its inputs.
+
+        Raises:
+            ValueError: An input file is missing.
+        """
+        content = {role: [(e[0], e[3]) for e in entries] for role, entries in self.entries.items()}
+        text = json.dumps([self.step, content, self.options], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def input_entries(files: Iterable[Path], known: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    """One entry per file; the hash is taken from `known` where name, size and modification time are the same."""
+    hashes = {entry[:3]: entry[3] for entry in known}
+    entries: list[Entry] = []
+    for path in files:
+        try:
+            status = path.stat()
+            key = (path.name, status.st_size, status.st_mtime_ns)
+            if key not in hashes:
+                with path.open("rb") as stream:
+                    hashes[key] = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            raise ValueError(f"{path}: expected an input file, found {error.strerror}") from error
+        entries.append((*key, hashes[key]))
+    return tuple(entries)
 
 
 @dataclass(frozen=True)
@@ -42,8 +87,8 @@ class Record:
     """Wall time of the run that finished; earlier, killed runs do not count."""
     peak_memory_bytes: int
     """Largest resident memory while it ran."""
-    warnings: tuple[StepWarning, ...] = ()
-    """What may be wrong with the result, in the order in which it was said."""
+    warnings: tuple[Note, ...] = ()
+    """What may be wrong with the result, in the order in which it was said; pictures are relative to the folder."""
 
 
 def read_record(folder: Path) -> Record | None:
@@ -58,7 +103,7 @@ def read_record(folder: Path) -> Record | None:
     try:
         found: dict[str, Any] = json.loads(path.read_text())
         inputs = {role: tuple(tuple(e) for e in files) for role, files in found.pop("inputs").items()}
-        warnings = tuple(StepWarning(**warning) for warning in found.pop("warnings", ()))
+        warnings = tuple(_note(**warning) for warning in found.pop("warnings", ()))
         return Record(inputs=inputs, outputs=tuple(found.pop("outputs")), warnings=warnings, **found)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected the record of a step, found {type(error).__name__}: {error}") from error
@@ -93,6 +138,18 @@ def why_stale(job: Job) -> str | None:
 
 def write_record(folder: Path, record: Record) -> None:
     """Write step.json into `folder`, one field per line."""
-    lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in asdict(record).items())
+    content = {**vars(record), "warnings": [_plain(note) for note in record.warnings]}
+    lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
     with atomic_write(folder / STEP_FILE) as stream:
         stream.write(f"{{\n{lines}\n}}\n".encode())
+
+
+def _plain(note: Note) -> dict[str, Any]:
+    """A warning in the keys of version 0.1.0, and its remedy where it has one."""
+    picture = None if note.picture is None else str(note.picture)
+    remedy = {"remedy": note.remedy} if note.remedy else {}
+    return {"text": note.text, "picture": picture, "minor": note.level == "minor", **remedy}
+
+
+def _note(text: str, picture: str | None = None, minor: bool = False, remedy: str = "") -> Note:
+    return Note(text, "minor" if minor else "warning", remedy, None if picture is None else Path(picture))

@@ -19,7 +19,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import adam, l1_dssim
 from splatgraft.reconstruction.image_pyramid import Pyramid, View
 from splatgraft.rendering import RenderOptions, render
-from splatgraft.runtime.interruption import interruption_held
+from splatgraft.runtime.process import interruption_held
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 _REPORT_EVERY = 10

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import rich.console
@@ -19,18 +18,6 @@ _LINE_SECONDS = 1.0
 """Least time between two of these lines; a step of a second needs none."""
 
 
-@dataclass(frozen=True)
-class ConsoleWarning:
-    """Something that may be wrong with the result of a step, as it was said."""
-
-    text: str
-    """One or more sentences without line breaks."""
-    picture: Path | None
-    """An image that shows it: below the step's new result folder, or anywhere else."""
-    minor: bool = False
-    """Whether the step did what was needed by itself, so that its result is not in doubt."""
-
-
 class Console:
     """Messages and bars on standard error, paths of results on standard output."""
 
@@ -38,31 +25,22 @@ class Console:
         """Open standard error."""
         self._errors = rich.console.Console(stderr=True, highlight=False)
         self._results = rich.console.Console(highlight=False, soft_wrap=True)
-        self._warned: list[ConsoleWarning] = []
-        self._help = ""
+        self._warned: list[Note] = []
 
     def say(self, sentence: str) -> None:
         """Print one line on standard error."""
         self._errors.print(sentence, markup=False, soft_wrap=True)
 
-    def warn(self, sentence: str, *, picture: Path | None = None, minor: bool = False) -> None:
-        """Print a warning on standard error; inside a step it also goes into step.json and to the top of the report.
-
-        Args:
-            sentence: What may be wrong, on one line.
-            picture: An image that shows it: in the folder that the step writes, or a photo.
-            minor: Whether the step did what was needed by itself.
-        """
-        self.say(f"warning: {sentence}{self._help}")
-        self._warned.append(ConsoleWarning(sentence, picture, minor))
-
     def tell(self, *notes: Note) -> None:
-        """Show notes; warnings also go into step.json and to the top of the report."""
+        """Print notes on standard error; warnings of a step also go into its step.json and to the top of the report."""
         for note in notes:
-            if note.level == "said":
-                self.say(note.text)
-            else:
-                self.warn(f"{note.text} {note.remedy}".rstrip(), picture=note.picture, minor=note.level == "minor")
+            sentence = f"{note.text} {note.remedy}".rstrip()
+            self.say(sentence if note.level == "said" else f"warning: {sentence}")
+            self._warned += [] if note.level == "said" else [note]
+
+    def warn(self, sentence: str, *, picture: Path | None = None, minor: bool = False) -> None:
+        """Print a warning."""
+        self.tell(Note(sentence, "minor" if minor else "warning", picture=picture))
 
     def warn_at_length(self, sentences: Sequence[str], *, minor: bool = False) -> None:
         """Warn with the first sentence, where there is one, and print the others, which explain it."""
@@ -72,21 +50,17 @@ class Console:
             self.say(sentence)
 
     @contextmanager
-    def collecting(self, help_link: str) -> Generator[list[ConsoleWarning]]:
+    def collecting(self) -> Generator[list[Note]]:
         """Collect the warnings of a step.
-
-        Args:
-            help_link: The page that explains them, which is printed behind each.
 
         Yields:
             The warnings so far; the list grows.
         """
-        outer = self._warned, self._help
-        self._warned, self._help = [], f" (see {help_link})"
+        outer, self._warned = self._warned, []
         try:
             yield self._warned
         finally:
-            self._warned, self._help = outer
+            self._warned = outer
 
     def result(self, text: object) -> None:
         """Print one line on standard output."""

@@ -3,10 +3,8 @@
 from pathlib import Path
 
 from splatgraft.commands.steps.capture import Capture, doubt_about
-from splatgraft.project.folder_lock import locked
 from splatgraft.project.record import why_stale
-from splatgraft.project.replacement import clear_leftovers
-from splatgraft.project.step import job_of, perform
+from splatgraft.project.step import clear_leftovers, job_of, locked, perform
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.flow import read_flow
 from splatgraft.workflow.staleness import reasons

@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from splatgraft.project.folder_lock import locked
-from splatgraft.project.step import Positional
+from splatgraft.project.step import Positional, locked
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task, run_tasks

@@ -10,8 +10,7 @@ from typing import Any
 import torch
 
 from splatgraft.core.images import read_mask, read_rgb
-from splatgraft.project.folder_lock import locked
-from splatgraft.project.step import Device, Positional, choose_device
+from splatgraft.project.step import Device, Positional, choose_device, locked
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.image_size import parse_image_size
 from splatgraft_paper.training.generate import (

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import read_rgb, resize, write_image
-from splatgraft.project.folder_lock import locked
-from splatgraft.project.step import Positional
+from splatgraft.project.step import Positional, locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task
 from splatgraft.workflow.image_size import parse_image_size

@@ -4,8 +4,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
-from splatgraft.project.folder_lock import locked
-from splatgraft.project.step import Device
+from splatgraft.project.step import Device, locked
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft_paper.benchmark.methods import Method, MethodSettings

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatgraft.core.images import resize
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.runtime.child_process import last_line, run_logged
+from splatgraft.runtime.process import last_line, run_logged
 from splatgraft_paper.peers.options import MVCoLightOptions
 
 SIDE = 256

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from splatgraft.runtime.child_process import run_logged
+from splatgraft.runtime.process import run_logged
 from splatgraft.runtime.workers import Task
 from splatgraft_paper.synthesis.scene import Camera, Part, Scene, Vector, World
 

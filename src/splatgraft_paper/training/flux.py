@@ -19,7 +19,7 @@ from splatgraft.harmonization.flux.weights.folder import FluxFolder, Variant, fi
 from splatgraft.harmonization.flux.weights.loading import load_autoencoder, load_transformer, widen_transformer
 from splatgraft.harmonization.flux.weights.lora import add_lora, write_lora
 from splatgraft.harmonization.flux.weights.widening import FirstLayer
-from splatgraft.project.folder_lock import locked
+from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
 from splatgraft.workflow.image_size import parse_image_size
 from splatgraft_paper.training.loop import LoopOptions, join_processes

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import resize, write_image
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft_paper.training.pairs import (
     RECORD_FILE,

@@ -40,8 +40,8 @@ from torch.distributed.checkpoint.state_dict import (
 )
 
 from splatgraft.core.images import write_image
-from splatgraft.runtime.atomic_file import atomic_write
-from splatgraft.runtime.interruption import interruption_held
+from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.process import interruption_held
 from splatgraft.runtime.progress import Progress
 
 LOG_FILE = "log.jsonl"

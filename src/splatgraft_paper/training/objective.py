@@ -14,9 +14,9 @@ from torch import Tensor
 
 from splatgraft.core.image_metrics import psnr, ssim
 from splatgraft.harmonization.flux.weights.tensor_file import read_tensors, write_tensors
-from splatgraft.project.folder_lock import locked
-from splatgraft.runtime.atomic_folder import atomic_folder
+from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import atomic_folder
 from splatgraft_paper.training.loop import LoopOptions, Validation, join_processes, train
 from splatgraft_paper.training.pairs import PairFiles, Role, TrainingData, crop_pair_to_size
 

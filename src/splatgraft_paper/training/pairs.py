@@ -21,8 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import read_mask, read_rgb, read_straight_rgb, resize, write_image
-from splatgraft.runtime.atomic_file import atomic_write
-from splatgraft.runtime.atomic_folder import atomic_folder
+from splatgraft.runtime.files import atomic_folder, atomic_write
 from splatgraft.workflow.image_size import parse_image_size
 from splatgraft_paper.synthesis.pairs import composite, match_statistics, read_manifest
 from splatgraft_paper.training.recipes import Recipe

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import linear_from_srgb, read_rgb, resize, srgb_from_linear, write_image
-from splatgraft.runtime.child_process import last_line
+from splatgraft.runtime.process import last_line
 
 
 @dataclass(frozen=True)

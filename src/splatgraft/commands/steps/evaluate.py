@@ -29,9 +29,9 @@ from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.evaluated_scenes import EvaluatedScenes, Pictures, TrueViews, truth_files
 from splatgraft.project.layout import RESULTS_IN_ORDER, SCENE_FILE
-from splatgraft.project.record import Record, StepWarning, read_record
-from splatgraft.project.remedies import remedy, step_help_link
+from splatgraft.project.record import Record, read_record
 from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
+from splatgraft.runtime.note import Note
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def _step_times(project: Path) -> tuple[StepTime, ...]:
     )
 
 
-def _warnings(project: Path | None) -> Iterator[tuple[str, Path, StepWarning]]:
+def _warnings(project: Path | None) -> Iterator[tuple[str, Path, Note]]:
     """All warnings of a project with the names and the folders of the steps that said them."""
     if project is not None:
         for label, folder, record in _records(project):
@@ -192,12 +192,12 @@ def _report_warnings(project: Path | None, best: Pictures) -> tuple[ReportWarnin
     found: list[ReportWarning] = []
     for label, folder, warning in _warnings(project):
         step = label.split(": ")[-1]
-        words = [remedy(step, project) if project else None, f"see {step_help_link(step)}"]
         picture = shown.get(step)
         if warning.picture is not None and (path := folder / warning.picture).is_file():
             picture = read_rgb(path)
         small = None if picture is None else _at_most(picture, _WARNING_PX)
-        found.append(ReportWarning(label, warning.text, "; ".join(word for word in words if word), small))
+        remedy = warning.remedy.replace("PROJECT", str(project))
+        found.append(ReportWarning(label, warning.text, remedy, small))
     return tuple(found)
 
 

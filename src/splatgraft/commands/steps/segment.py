@@ -32,7 +32,7 @@ from splatgraft.formats.gaussian_flags import read_corrections, write_flags
 from splatgraft.formats.prompts import read_prompts
 from splatgraft.project.layout import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.runtime.note import Note
 from splatgraft.segmentation import (

@@ -16,7 +16,7 @@ from typing import Literal, get_args
 
 import filelock
 
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 STATE_FILE, LOG_FILE, LOCK_FILE = "job.json", "job.log", "job.lock"
 Outcome = Literal["starting", "running", "done", "failed", "cancelled", "killed"]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from splatgraft.project.layout import EDITOR_FOLDER, PREVIEW_FILE
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _WIDTH = 640
 """Pixels."""

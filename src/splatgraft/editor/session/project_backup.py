@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _GOOD_FILE, _BROKEN_FOLDER, _ASIDE_FOLDER = "project.toml", "broken", "aside"
 

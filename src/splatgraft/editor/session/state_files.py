@@ -15,7 +15,7 @@ from splatgraft.formats.placement import Placement, read_placement, write_placem
 from splatgraft.formats.prompts import read_prompts, write_prompts
 from splatgraft.project.layout import ERASED_FILE, LIGHT_FILE, PLACEMENT_FILE
 from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.settings import MAX_TEXT_BYTES, read_toml
 
 _PARTS = {"objects": ("objects", "erased")}

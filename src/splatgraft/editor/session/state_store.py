@@ -24,7 +24,7 @@ from splatgraft.editor.session.state_checks import check_state
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.formats.prompts import prompts_from_json, prompts_to_json
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 HISTORY_FILE, STATES_FOLDER = "history.json", "states"
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, EOFError)

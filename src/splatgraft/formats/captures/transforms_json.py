@@ -31,7 +31,7 @@ from splatgraft.formats.captures.views import (
 )
 from splatgraft.formats.json_file import array, excerpt, load, number, text, whole_side
 from splatgraft.formats.scenes.ply import read_points, write_points
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")

@@ -22,7 +22,7 @@ from splatgraft.formats.scenes.quantization import (
     writable,
 )
 from splatgraft.formats.scenes.scene_file import SceneMetadata
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 COMPRESSED_PLY = ".compressed.ply"
 _CHUNK = 256

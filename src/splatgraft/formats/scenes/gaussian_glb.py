@@ -22,7 +22,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.formats.scenes.quantization import SMALLEST_SCALE, bytes_from_unit, writable
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 AXES = "LUF"
 """Left, up, front."""

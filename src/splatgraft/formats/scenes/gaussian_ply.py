@@ -17,7 +17,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes import ply
 from splatgraft.formats.scenes.compressed_ply import is_compressed, read_compressed_ply
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _MEANS = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")

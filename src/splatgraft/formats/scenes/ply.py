@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.formats.scenes.scene_file import SceneMetadata
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _MAX_HEADER_BYTES = 1 << 20
 _ROWS_AT_ONCE = 1 << 12

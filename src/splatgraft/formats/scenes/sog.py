@@ -34,7 +34,7 @@ from splatgraft.formats.scenes.quantization import (
     writable,
 )
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _META_FILE = "meta.json"
 _OWN_KEY = "splatgraft"

@@ -13,7 +13,7 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.quantization import SMALLEST_SCALE, bytes_from_unit, logits_from_bytes, writable
 from splatgraft.formats.scenes.scene_file import SceneFile
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)])
 

@@ -24,7 +24,7 @@ from splatgraft.formats.scenes.quantization import (
     smallest_three,
 )
 from splatgraft.formats.scenes.scene_file import SceneFile
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 SPZ_VERSIONS = (2, 3, 4)
 AXES = "RUB"

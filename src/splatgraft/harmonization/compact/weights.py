@@ -8,7 +8,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 FORMAT = "splatgraft compact 1"
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatgraft.runtime.disk_space import room_on_disk
+from splatgraft.runtime.files import room_on_disk
 from splatgraft.runtime.weights.catalogue import ModelWeights
 from splatgraft.runtime.weights.layout import HubFile, needed_files
 from splatgraft.runtime.weights.store import StoredWeights, check_files, is_whole, sha256_of, write_stored

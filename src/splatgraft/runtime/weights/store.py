@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft.runtime.weights.catalogue import ModelWeights
 from splatgraft.runtime.weights.layout import HubFile, needed_files

@@ -35,7 +35,7 @@ from splatgraft.relighting.shadows.scene_ratio import (
     scene_visibility,
     self_visibility,
 )
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft_paper.benchmark.true_light import light_from_probe
 from splatgraft_paper.synthesis.benchmark import rendered_cameras

@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 from splatgraft.harmonization.flux.baked_modulation import GUIDANCE
 from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
 from splatgraft.harmonization.flux.weights.safetensors_header import read_model_shapes
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.weights.catalogue import ModelWeights
 from splatgraft.runtime.weights.hub import fetch
 from splatgraft.runtime.weights.layout import variant_in

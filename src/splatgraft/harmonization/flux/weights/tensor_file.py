@@ -7,7 +7,7 @@ from pathlib import Path
 from torch import Tensor
 
 from splatgraft.harmonization.flux.weights.diffusers_library import one_line
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

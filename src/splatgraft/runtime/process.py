@@ -1,0 +1,161 @@
+"""Processes: a child with a log, Ctrl-C held back, the end while threads compute, peak memory, opening of a page."""
+
+import logging
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+_OPENERS = {"darwin": "open", "linux": "xdg-open"}
+
+
+def run_logged(
+    command: Sequence[str],
+    log: Path,
+    *,
+    folder: Path | None = None,
+    stdin: str | None = "",
+    on_line: Callable[[str], None] | None = None,
+) -> int:
+    """Run `command` and wait for it; an exception in the meantime, an interrupt included, kills the process.
+
+    Args:
+        command: Program and arguments; no shell is involved.
+        log: File to which standard error is appended, and standard output where `on_line` is None.
+        folder: Working directory of the process; this process's where None.
+        stdin: Text for the standard input. With None it stays open as long as this process lives, so that a program
+            that reads it to the end notices when this process is killed.
+        on_line: Called with each line of the standard output, without its end, as soon as it is written.
+
+    Returns:
+        The exit code; negative where a signal ended the process.
+
+    Raises:
+        ValueError: Where the program cannot be started.
+    """
+    with log.open("ab") as stream, tempfile.TemporaryFile() as given:
+        given.write((stdin or "").encode())
+        given.seek(0)
+        source = subprocess.PIPE if stdin is None else given
+        output = stream if on_line is None else subprocess.PIPE
+        try:
+            process = subprocess.Popen(list(command), stdin=source, stdout=output, stderr=stream, cwd=folder)
+        except OSError as error:
+            raise ValueError(f"{command[0]}: expected a program that starts, found {error.strerror}") from error
+        with process:
+            try:
+                if on_line is not None and process.stdout is not None:
+                    for line in process.stdout:
+                        on_line(line.decode(errors="replace").rstrip("\r\n"))
+                return process.wait()
+            except BaseException:
+                process.kill()
+                raise
+
+
+def last_line(log: Path) -> str:
+    """The last line of `log` that is not blank; empty where there is none."""
+    lines = log.read_text(errors="replace").strip().splitlines() if log.is_file() else []
+    return lines[-1].strip() if lines else ""
+
+
+@contextmanager
+def interruption_held(*, terminate: bool = False) -> Generator[Callable[[], bool]]:
+    """Hold back the first Ctrl-C within the block; the second one acts at once.
+
+    Signals whose handler is not Python's own are left alone, and so are blocks in other threads than the main one.
+
+    Args:
+        terminate: Hold SIGTERM too where nothing handles it, as schedulers of clusters send it.
+
+    Yields:
+        Whether there was one; the block then saves its state and raises KeyboardInterrupt.
+    """
+    requested = False
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        nonlocal requested
+        if requested:
+            raise KeyboardInterrupt
+        requested = True
+
+    held: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in _SIGNALS:
+            before = signal.getsignal(number)
+            unhandled = terminate and number == signal.SIGTERM and before is signal.SIG_DFL
+            if before is signal.default_int_handler or unhandled:
+                held[number] = before
+    for number in held:
+        signal.signal(number, hold)
+    try:
+        yield lambda: requested
+    finally:
+        for number, before in held.items():
+            signal.signal(number, before)
+    if requested:  # in the block's last moments
+        raise KeyboardInterrupt
+
+
+def end_process(status: int) -> NoReturn:
+    """End the process at once with this status, after its output is written.
+
+    At the end of Python itself a thread that returns from torch to Python is unwound through C++ that forbids it, and
+    the process aborts. So who serves previews from threads ends here, with all files closed.
+    """
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(status)
+
+
+def reset_peak_memory() -> None:
+    """Reset the peak; where the system cannot (not Linux), it counts from the start of the process."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # man proc: 5 resets VmHWM
+    except OSError:
+        return
+
+
+def peak_memory_bytes() -> int:
+    """Peak resident memory since the last reset."""
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def open_page(page: Path | str) -> bool:
+    """Open a local page or an address and return at once; False where there is no desktop, or nothing that opens pages.
+
+    Text browsers, which would take over the terminal, are not used.
+    """
+    if sys.platform == "win32":
+        os.startfile(page)
+        return True
+    has_display = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    opener = _OPENERS.get(sys.platform)
+    if not has_display or opener is None:
+        return False
+    quiet = subprocess.DEVNULL
+    try:
+        opened = subprocess.Popen([opener, str(page)], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+    except OSError:
+        return False
+    # some openers last as long as the browser's window
+    threading.Thread(target=opened.wait, daemon=True).start()
+    return True
