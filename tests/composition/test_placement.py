@@ -93,8 +93,16 @@ def ring_of_cameras(center=(0.0, 0, TABLE), count=16, height=0.7, distance=1.6):
     return pinhole(look_at(eyes, torch.tensor(center), UP), 150.0, width=160, height=120)
 
 
-def moved(similarity: Similarity, cameras: Cameras, gaussians: Gaussians):
-    return similarity.cameras(cameras), similarity.gaussians(gaussians)
+def outward(cameras: Cameras) -> Cameras:
+    """The same cameras, turned round."""
+    poses = cameras.world_from_camera.clone()
+    poses[:, :3, [0, 2]] *= -1
+    return replace(cameras, world_from_camera=poses)
+
+
+THING = box((0, 0, 0.15), (0.1, 0.1, 0.15))
+OWN = ring_of_cameras((0.0, 0, 0.15), height=0.5)
+"""An object and the cameras of its capture."""
 
 
 TURN = Similarity(
@@ -120,15 +128,6 @@ def test_a_few_rolled_photos_do_not_turn_up():
     rolled = pinhole(poses, 150.0, width=160, height=120)
     # 3 of 16 photos are upright by 90 degrees of roll; within 2 degrees
     assert float(estimate_up(rolled) @ UP) > math.cos(math.radians(2))
-
-
-def test_outward_looking_cameras_are_refused():
-    inward = ring_of_cameras()
-    poses = inward.world_from_camera.clone()
-    poses[:, :3, 0] *= -1
-    poses[:, :3, 2] *= -1
-    with pytest.raises(ValueError, match="name the place"):
-        focus_point(pinhole(poses, 150.0, width=160, height=120))
 
 
 @pytest.mark.parametrize("start", [TABLE + 0.3, TABLE + 1.0, TABLE, TABLE + 0.01])
@@ -172,12 +171,9 @@ def test_a_floor_below_haze_is_where_it_is():
     assert float(heights.max()) < 0.03
 
 
-def test_support_beside_the_table_is_the_floor():
+def test_support_beside_the_table_is_the_floor_and_nothing_below_is_said():
     found = support_below(room(), torch.tensor([-1.2, 1.0, 1.0]), up=UP, radius=0.15)
     assert abs(float(found.point[2])) < 0.01
-
-
-def test_nothing_below_is_said():
     with pytest.raises(ValueError, match="expected a surface below"):
         support_below(room(), torch.tensor([0.0, 0, -0.5]), up=UP, radius=0.15)
 
@@ -210,42 +206,36 @@ def rubble():
 
 
 def test_where_nothing_is_level_the_nearest_to_it_is_taken_with_the_reason():
-    thing = box((0, 0, 0.15), (0.1, 0.1, 0.15))
-    cameras = ring_of_cameras((0.0, 0, 0.3), height=0.9)
-    own = ring_of_cameras((0.0, 0, 0.15), height=0.5)
-    placed = place_object(rubble(), thing, cameras=(cameras, own), options=PlaceOptions(scale=3.0))
+    cameras = (ring_of_cameras((0.0, 0, 0.3), height=0.9), OWN)
+    placed = place_object(rubble(), THING, cameras=cameras, options=PlaceOptions(scale=3.0))
     assert placed.support.point[:2].abs().max() < 1.0
     assert any("level" in warning.text for warning in placed.warnings)
     named = PlaceOptions(scale=3.0, point=(0.1, 0.1, 0.5))
-    placed = place_object(rubble(), thing, cameras=(cameras, own), options=named)
+    placed = place_object(rubble(), THING, cameras=cameras, options=named)
     assert any("level" in warning.text for warning in placed.warnings)
 
 
 def test_cameras_that_look_outwards_give_a_place_between_them_with_the_reason():
-    thing, inward = box((0, 0, 0.15), (0.1, 0.1, 0.15)), ring_of_cameras(distance=0.4)
-    poses = inward.world_from_camera.clone()
-    poses[:, :3, 0] *= -1
-    poses[:, :3, 2] *= -1
-    outward = pinhole(poses, 150.0, width=160, height=120)
-    own = ring_of_cameras((0.0, 0, 0.15), height=0.5)
-    placed = place_object(room(), thing, cameras=(outward, own), options=PlaceOptions(scale=0.5))
+    cameras = outward(ring_of_cameras(distance=0.4))
+    with pytest.raises(ValueError, match="name the place"):
+        focus_point(cameras)
+    placed = place_object(room(), THING, cameras=(cameras, OWN), options=PlaceOptions(scale=0.5))
     assert any("do not look at one place" in warning.text for warning in placed.warnings)
     # on the table or the floor
     assert min(abs(float(placed.support.point[2]) - z) for z in (0.0, TABLE)) < 0.02
 
 
 def test_nothing_at_all_is_said():
-    thing, cameras = box((0, 0, 0.15), (0.1, 0.1, 0.15)), ring_of_cameras()
     far = sheet((50, 0, 0), (1, 0, 0), (0, 1, 0))
     with pytest.raises(ValueError, match="expected a surface where the cameras look, found none; name a point"):
-        place_object(far, thing, cameras=(cameras, cameras))
+        place_object(far, THING, cameras=(ring_of_cameras(), OWN))
 
 
 def test_base_comes_from_the_surface_where_the_source_has_one():
     table = sheet((0, 0, 0), (1, 0, 0), (0, 1, 0))
     # a hole where the box stood, and 3 cm of the table's top left on the box by its mask
     hole = (table.means[:, :2].abs().amax(-1)) > 0.1
-    thing = concatenate([box((0, 0, 0.15), (0.1, 0.1, 0.15)), sheet((0, 0, -0.02), (0.1, 0, 0), (0, 0.1, 0))])
+    thing = concatenate([THING, sheet((0, 0, -0.02), (0.1, 0, 0), (0, 0.1, 0))])
     own = object_base(thing, up=UP)
     assert own.stands_on == "extent"
     found = object_base(thing, up=UP, surroundings=table.select(hole))
@@ -258,18 +248,19 @@ def test_base_comes_from_the_surface_where_the_source_has_one():
 
 
 def test_a_ledge_above_the_foot_of_what_hangs_is_not_its_ground():
-    thing = box((0, 0, 0.15), (0.1, 0.1, 0.15))
     ledge = sheet((0, 0.22, 0.06), (0.3, 0, 0), (0, 0.11, 0))
-    base = object_base(thing, up=UP, surroundings=ledge)
+    base = object_base(THING, up=UP, surroundings=ledge)
     assert base.stands_on == "extent"
     # the lowest Gaussians reach 2 cm below their centres
     assert abs(float(base.point[2])) < 0.03
+    with pytest.raises(ValueError, match="found an empty one"):
+        object_base(empty(), up=UP)
 
 
 @pytest.mark.parametrize("move", [Similarity.identity(), TURN])
 def test_the_box_rests_upright_with_its_foot_on_the_table_in_any_source_frame(move):
     thing = box((0, 0, 0.15), (0.1, 0.08, 0.15))
-    cameras, turned = moved(move, ring_of_cameras((0.0, 0, 0.15), height=0.5), thing)
+    cameras, turned = move.cameras(OWN), move.gaussians(thing)
     base = object_base(turned, up=estimate_up(cameras))
     where = torch.tensor([0.2, 0.1, TABLE + 0.2])
     found, _ = rest_on_surface(room(), base, point=where, up=UP, options=RestOptions(scale=1 / move.scale))
@@ -297,9 +288,7 @@ def test_yaw_turns_and_offset_shifts():
 
 
 def test_an_automatic_place_is_on_the_table_in_sight_and_free():
-    thing = box((0, 0, 0.15), (0.1, 0.1, 0.15))
-    cameras = ring_of_cameras()
-    placed = place_object(room(), thing, cameras=(cameras, ring_of_cameras((0.0, 0, 0.15), height=0.5)))
+    placed = place_object(room(), THING, cameras=(ring_of_cameras(), OWN))
     assert abs(float(placed.support.point[2]) - TABLE) < 0.015
     assert placed.support.point[:2].abs().max() < 0.5
     assert placed.hidden_fraction < 1 / 6  # the share of the underside
@@ -309,12 +298,10 @@ def test_an_automatic_place_is_on_the_table_in_sight_and_free():
 
 
 def test_a_second_object_finds_another_place():
-    thing = box((0, 0, 0.15), (0.1, 0.1, 0.15))
-    cameras = (ring_of_cameras(), ring_of_cameras((0.0, 0, 0.15), height=0.5))
-    options = PlaceOptions(scale=1.0)
-    first = place_object(room(), thing, cameras=cameras, options=options)
-    both, _ = compose(room(), [thing], target_from_objects=[first.target_from_object]).merged()
-    second = place_object(both, thing, cameras=cameras, options=options)
+    cameras, options = (ring_of_cameras(), OWN), PlaceOptions(scale=1.0)
+    first = place_object(room(), THING, cameras=cameras, options=options)
+    both, _ = compose(room(), [THING], target_from_objects=[first.target_from_object]).merged()
+    second = place_object(both, THING, cameras=cameras, options=options)
     assert abs(float(second.support.point[2]) - TABLE) < 0.02
     apart = (first.support.point - second.support.point).norm()
     assert apart > 0.18  # two boxes 0.2 wide
@@ -335,11 +322,6 @@ def test_an_object_in_the_wall_is_reported():
         options=PlaceOptions(point=(0.0, 0.0, TABLE + 0.3), offset=(0.0, -0.9, -1.2), scale=1.0),
     )
     assert any("hidden from every camera" in warning.text for warning in placed.warnings)
-
-
-def test_an_empty_object_has_no_base():
-    with pytest.raises(ValueError, match="found an empty one"):
-        object_base(empty(), up=UP)
 
 
 def directions(*degrees):
