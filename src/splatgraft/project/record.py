@@ -121,9 +121,9 @@ def why_stale(job: Job) -> str | None:
     if missing := [name for name in record.outputs if not (job.folder / name).is_file()]:
         return f"{missing[0]} was removed"
     options = json.loads(json.dumps(job.options))
-    # an option that came with a later version than the record's was at its default
+    # an option that came with a later version than the record's was at its default; one that has gone says nothing
     before = {**json.loads(json.dumps(job.defaults)), **record.options}
-    for key in sorted({*options, *record.options}):
+    for key in sorted(options):
         if options.get(key) != before.get(key):
             return f"{key} is now {options.get(key)}, was {before.get(key)}"
     for role in sorted({*job.inputs, *record.inputs}):
