@@ -65,7 +65,7 @@ if TYPE_CHECKING:
         select_object,
         solidify_object,
     )
-    from splatgraft.workflow.projects import run_project, stale_steps
+    from splatgraft.workflow.run import run_project, stale_steps
 
 __version__ = "0.1.0"
 
@@ -185,13 +185,13 @@ _SOURCES = {
     "relight": "relighting.relight",
     "render": "rendering.render",
     "render_views": "harmonization.render_views",
-    "run_project": "workflow.projects.run_project",
+    "run_project": "workflow.run.run_project",
     "save": "formats.write_gaussians",
     "save_image": "core.images.write_image",
     "segment": "segmentation.segment",
     "select_object": "segmentation.select_object",
     "solidify_object": "segmentation.solidify_object",
-    "stale_steps": "workflow.projects.stale_steps",
+    "stale_steps": "workflow.run.stale_steps",
     "true_views": "evaluation.true_views",
 }
 """Where each name of `__all__` is defined, below splatgraft; the imports above are for type checkers."""

@@ -8,7 +8,7 @@ from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
-from splatgraft.workflow.run_steps import run_steps
+from splatgraft.workflow.run import run_steps
 
 CAPTURES_FOLDER = "captures"
 """Folder of the two captures in the demo's folder."""

@@ -29,8 +29,7 @@ from splatgraft.project.layout import (
 )
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
-from splatgraft.workflow.flow import Flow, read_flow
-from splatgraft.workflow.staleness import reasons
+from splatgraft.workflow.flow import Flow, read_flow, reasons
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ def main(out: Path | None) -> int:
 
 def _reasons(file: Path, out: Path | None) -> dict[str, str | None]:
     # torch and the steps take seconds to load
-    from splatgraft.workflow.flow import read_flow
-    from splatgraft.workflow.staleness import reasons
+    from splatgraft.workflow.flow import read_flow, reasons
 
     try:
         return reasons(read_flow(file, out))

@@ -11,7 +11,7 @@ from splatgraft.folders.export_source import project_of, read_export_source
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE, Layout
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.projects import stale_steps
+from splatgraft.workflow.run import stale_steps
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.process import open_page
 from splatgraft.runtime.settings import read_toml
 from splatgraft.workflow.flow import Flow, read_flow
-from splatgraft.workflow.run_steps import run_steps
+from splatgraft.workflow.run import run_steps
 
 
 @dataclass(frozen=True)

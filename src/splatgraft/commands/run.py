@@ -5,7 +5,7 @@ from pathlib import Path
 
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.run_steps import run_steps
+from splatgraft.workflow.run import run_steps
 
 
 @dataclass(frozen=True)

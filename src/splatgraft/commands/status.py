@@ -6,8 +6,7 @@ from pathlib import Path
 from splatgraft.project.record import Record, read_record
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.flow import read_flow
-from splatgraft.workflow.staleness import reasons
+from splatgraft.workflow.flow import read_flow, reasons
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ def _choices(kind: type, table: Table) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for field in fields(kind):
         if named := choices(field_types(kind)[field.name]):
-            name = table.values.get(field.name, getattr(_default(field), "name", None))
+            name = table.values.get(field.name, getattr(default_of(field), "name", None))
             if name not in named:
                 wanted = ", ".join(sorted(named))
                 raise ValueError(f"{table.where} {field.name}: expected one of {wanted}; found {name!r}")
@@ -107,7 +107,8 @@ def _keys(kind: type, table: Table) -> set[str]:
     return (set(hints) - set(nested)).union(*(_keys(inner, table) for inner in (*nested.values(), *chosen.values())))
 
 
-def _default(field: "Field[Any]") -> Any:
+def default_of(field: "Field[Any]") -> Any:
+    """The default of a field, `MISSING` where it has none."""
     return field.default_factory() if field.default_factory is not MISSING else field.default
 
 

@@ -100,7 +100,7 @@ def main(arguments: Sequence[str]) -> int:
     out = Path(arguments[4]) if len(arguments) > 4 else None
 
     def work(console: JobConsole) -> Sequence[str]:
-        from splatgraft.workflow.run_steps import run_steps
+        from splatgraft.workflow.run import run_steps
 
         console.write(replace(console.state, plan=_plan(project, out, to)))
         run_steps(project, console, out=out, to=to)
@@ -111,8 +111,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _plan(project: Path, out: Path | None, to: str) -> tuple[PlannedStep, ...]:
     """The steps to be run with their expected durations; empty where the project is invalid."""
-    from splatgraft.workflow.flow import read_flow
-    from splatgraft.workflow.staleness import reasons
+    from splatgraft.workflow.flow import read_flow, reasons
     from splatgraft.workflow.time_estimate import estimate_step_times
 
     try:

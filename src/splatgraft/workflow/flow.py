@@ -1,6 +1,6 @@
-"""The steps of a project as a graph: which step reads the folder of which other."""
+"""The steps of a project as a graph: which step reads the folder of which other, and which are stale."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,8 @@ from splatgraft.project.layout import (
     Side,
 )
 from splatgraft.project.project_file import ProjectFile, read_project_file
-from splatgraft.project.step import Step, path_fields
+from splatgraft.project.record import why_stale
+from splatgraft.project.step import Step, job_of, path_fields
 
 STEPS = (Capture, Reconstruct, Segment, Compose, Relight, Render, Harmonize, Consolidate, Evaluate)
 
@@ -170,3 +171,23 @@ def default_paths(layout: Layout) -> dict[type[Any], dict[str, Path]]:
         Consolidate: consolidate,
         Evaluate: evaluate,
     }
+
+
+def reasons(flow: Flow, wanted: Collection[str] | None = None) -> dict[str, str | None]:
+    """The reason why each step is stale, or None; a step after a stale step waits for that step.
+
+    Args:
+        flow: The steps of a project.
+        wanted: Names of the steps to examine, with all steps that they read from; all steps where None. Inputs of
+            other steps may be missing.
+
+    Raises:
+        ValueError: An input of an examined step is missing.
+    """
+    found: dict[str, str | None] = {}
+    for name, step in flow:
+        if wanted is not None and name not in wanted:
+            continue
+        waits = [other for other in flow.before(name) if found[other] is not None]
+        found[name] = f"waits for {waits[0]}" if waits else why_stale(job_of(step))
+    return found

@@ -12,7 +12,6 @@ import torch
 from splatgraft.core.images import read_mask, read_rgb
 from splatgraft.project.step import Device, Positional, choose_device, locked
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.image_size import parse_image_size
 from splatgraft_paper.training.generate import (
     LICENCE,
     Photograph,
@@ -25,6 +24,7 @@ from splatgraft_paper.training.generate import (
 )
 from splatgraft_paper.training.pairs import crop_to_size
 from splatgraft_paper.training.prompts import prompt
+from splatgraft_paper.training.recipes import parse_image_size
 
 
 @dataclass(frozen=True)

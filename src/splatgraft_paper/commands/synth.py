@@ -14,7 +14,6 @@ from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.project.step import Positional, locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task
-from splatgraft.workflow.image_size import parse_image_size
 from splatgraft_paper.benchmark.true_light_file import TRUE_LIGHT_FILE, write_true_light
 from splatgraft_paper.synthesis import benchmark, pairs
 from splatgraft_paper.synthesis.jobs import copy_shared_takes, render_job
@@ -22,6 +21,7 @@ from splatgraft_paper.synthesis.outdoors import SUPPLIED_MAPS
 from splatgraft_paper.synthesis.rendered_data import RenderWorkers, check_pairs, read_render_size, write_failures
 from splatgraft_paper.synthesis.spheres import render_spheres
 from splatgraft_paper.training.pairs import RECORD_FILE, RelitSample, write_relit_manifest, write_sample
+from splatgraft_paper.training.recipes import parse_image_size
 
 _MAPS = (".hdr", ".exr")
 _MODELS = (".glb", ".gltf", ".obj", ".blend")

@@ -21,11 +21,10 @@ from splatgraft.harmonization.flux.weights.lora import add_lora, write_lora
 from splatgraft.harmonization.flux.weights.widening import FirstLayer
 from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.image_size import parse_image_size
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, save_weights, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, TrainingData, crop_pair_to_size, open_training_data
-from splatgraft_paper.training.recipes import Recipe, TrainingCost, activation_bytes, plan
+from splatgraft_paper.training.recipes import Recipe, TrainingCost, activation_bytes, parse_image_size, plan
 from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
 Times = Literal["uniform", "logit-normal", "schnell"]

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatgraft.workflow.image_size import parse_image_size
-
 _FOLDER = Path(__file__).with_name("recipe_files")
 _GPU_SECONDS_PER_PAIR = 48 * 3600 * 4 / (50_000 * 4)
 """Of FLUX at 704x496 with all weights on an H100: the paper's two days on four for 50K steps of 4 pairs (Sec. 5.3)."""
@@ -218,3 +216,23 @@ def _size(count: int) -> str:
     if count >= 1e8:
         return f"{count / 1e9:.{0 if count >= 1e10 else 1}f} GB"
     return f"{count / 1e6:.0f} MB"
+
+
+def parse_image_size(text: str, *, multiple_of: int = 1) -> tuple[int, int]:
+    """Parse the value of --size.
+
+    Args:
+        text: Such as `704x496`.
+        multiple_of: Both sides must be multiples of this, pixels.
+
+    Returns:
+        Width and height, pixels.
+
+    Raises:
+        ValueError: The text is not of this form.
+    """
+    parts = text.split("x")
+    if len(parts) != 2 or not all(part.isdigit() and int(part) and int(part) % multiple_of == 0 for part in parts):
+        wanted = "WIDTHxHEIGHT" if multiple_of == 1 else f"WIDTHxHEIGHT in multiples of {multiple_of}"
+        raise ValueError(f"--size: expected {wanted}, found {text}")
+    return int(parts[0]), int(parts[1])

@@ -1,4 +1,4 @@
-"""Execution of the stale steps of a project, in order."""
+"""Running a project and reading its state: what the commands `run` and `status` do, also from Python."""
 
 from pathlib import Path
 
@@ -6,8 +6,7 @@ from splatgraft.commands.steps.capture import Capture, doubt_about
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import clear_leftovers, job_of, locked, perform
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.flow import read_flow
-from splatgraft.workflow.staleness import reasons
+from splatgraft.workflow.flow import read_flow, reasons
 from splatgraft.workflow.time_estimate import describe_estimate, estimate_step_times
 
 
@@ -57,3 +56,43 @@ def run_steps(
     for name, path in flow.results():
         if name in wanted:
             console.result(path)
+
+
+def run_project(
+    project: Path | str, *, out: Path | str | None = None, to: str | None = None, force: tuple[str, ...] = ()
+) -> dict[str, Path]:
+    """Perform the stale steps of a project, as the command `run` does; progress goes to standard error.
+
+    Args:
+        project: The project file (docs: `splatgraft init` writes one), or its folder.
+        out: Root of the results; the project's folder where not given.
+        to: The last step wanted, such as "relight", "reconstruct" (both captures) or "source/reconstruct"; all steps
+            where not given.
+        force: Steps that are performed even where they are up to date.
+
+    Returns:
+        The result folder of every wanted step, by step, in their order.
+
+    Raises:
+        ValueError: The project file or an input is bad, or another run works on the project.
+    """
+    root = None if out is None else Path(out)
+    run_steps(Path(project), Console(), out=root, to=to, force=force)
+    return {name: step.out for name, step in read_flow(Path(project), root).up_to(to).items()}
+
+
+def stale_steps(project: Path | str, *, out: Path | str | None = None) -> dict[str, str]:
+    """The steps of a project whose results are not up to date.
+
+    Args:
+        project: The project file, or its folder.
+        out: Root of the results; the project's folder where not given.
+
+    Returns:
+        Why each stale step is stale, by step, in their order.
+
+    Raises:
+        ValueError: The project file or an input is bad.
+    """
+    flow = read_flow(Path(project), None if out is None else Path(out))
+    return {name: reason for name, reason in reasons(flow).items() if reason is not None}
