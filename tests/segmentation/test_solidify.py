@@ -49,8 +49,8 @@ def test_a_coarse_object_gets_as_many_gaussians_as_its_photographs_show(scene, b
         inside = torch.stack(masks)[..., None]
         return solid.count, float((inside * (drawn - torch.stack(pictures))).square().sum() / inside.sum())
 
-    few, before = error(SolidifyOptions(iterations=120, pixels_per_gaussian=0.0))
-    many, after = error(SolidifyOptions(iterations=120, pixels_per_gaussian=2.0))
+    few, before = error(SolidifyOptions(iterations=200, pixels_per_gaussian=0.0))
+    many, after = error(SolidifyOptions(iterations=200, pixels_per_gaussian=2.0))
     assert few == BALL // 8
     median = float(torch.tensor([float(mask.sum()) for mask in masks]).median())
     assert few < many <= median / 2

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
+from splatgraft.formats.metric_scale import MetricScale
 from splatgraft.runtime.progress import Progress, silent
 
 _DICTIONARIES = (
@@ -29,15 +30,11 @@ _DICTIONARIES = (
 """The dictionaries in common use; the first numbers of a family's larger dictionaries are the same markers."""
 
 
-@dataclass(frozen=True)
-class ScaleOptions:
-    """When a scale is refused; values set by hand."""
-
-    most_miss_px: float = 3.0
-    """Mean distance, pixels, of a corner, projected, from where it was found: corners are found to a pixel, poses of a
-    plausible capture are right to one or two."""
-    least_angle: float = 1e-4
-    """Least sum of squared sines of the angles between the rays of a point: a degree between two."""
+_MAX_MISS_PX = 3.0
+"""Mean distance, pixels, of a corner, projected, from where it was found: corners are found to a pixel, poses of a
+plausible capture are right to one or two."""
+_MIN_ANGLE = 1e-4
+"""Least sum of squared sines of the angles between the rays of a point: a degree between two."""
 
 
 @dataclass(frozen=True)
@@ -50,25 +47,12 @@ class Triangulated:
     """Mean distance of its projections from the given pixels."""
 
 
-@dataclass(frozen=True)
-class FoundScale:
-    """A scale and how it was found."""
-
-    metres_per_unit: float
-    """Metres in one world unit."""
-    source: str
-    """How it was found, for messages."""
-
-
-def triangulate(
-    cameras: Cameras, pixels: Float[Tensor, "v 2"], *, options: ScaleOptions = ScaleOptions()
-) -> Triangulated:
+def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> Triangulated:
     """The point nearest to the rays of the cameras through their pixels.
 
     Args:
         cameras: Two or more.
         pixels: x and y, one per camera.
-        options: When rays are parallel.
 
     Raises:
         ValueError: The rays are parallel.
@@ -77,7 +61,7 @@ def triangulate(
     in_camera = torch.linalg.inv(cameras.intrinsics.double()) @ homogeneous
     rays = torch.nn.functional.normalize((cameras.world_from_camera[:, :3, :3].double() @ in_camera)[..., 0], dim=1)
     across = torch.eye(3, dtype=torch.float64) - rays[:, :, None] * rays[:, None, :]
-    if float(torch.linalg.eigvalsh(across.sum(0))[0]) < options.least_angle:
+    if float(torch.linalg.eigvalsh(across.sum(0))[0]) < _MIN_ANGLE:
         names = ", ".join(cameras.names)
         raise ValueError(f"point: expected images from different directions, found almost the same in {names}")
     point = torch.linalg.solve(across.sum(0), (across @ cameras.centers.double()[..., None])[..., 0].sum(0))
@@ -86,7 +70,7 @@ def triangulate(
     return Triangulated(point.float(), float((seen[:, :2] / seen[:, 2:] - pixels).norm(dim=1).mean()))
 
 
-def scale_from_length(ends: tuple[Float[Tensor, "3"], Float[Tensor, "3"]], metres: float) -> FoundScale:
+def scale_from_length(ends: tuple[Float[Tensor, "3"], Float[Tensor, "3"]], metres: float) -> MetricScale:
     """The scale at which the distance of two points is `metres`.
 
     Raises:
@@ -95,7 +79,7 @@ def scale_from_length(ends: tuple[Float[Tensor, "3"], Float[Tensor, "3"]], metre
     distance = float((ends[0] - ends[1]).norm())
     if not (distance > 0 and metres > 0):
         raise ValueError(f"--length: expected two points apart and metres above 0, found {distance:g} and {metres:g}")
-    return FoundScale(metres / distance, f"a length of {metres:g} m between two points")
+    return MetricScale(metres / distance, f"a length of {metres:g} m between two points")
 
 
 def scale_from_marker(
@@ -103,16 +87,14 @@ def scale_from_marker(
     cameras: Cameras,
     side_m: float,
     *,
-    options: ScaleOptions = ScaleOptions(),
     progress: Progress = silent,
-) -> FoundScale:
+) -> MetricScale:
     """The scale at which a square marker that the pictures show has sides of `side_m` metres.
 
     Args:
         images: sRGB in [0, 1], one per camera.
         cameras: Of the pictures.
         side_m: Length of the black square's side, metres.
-        options: When corners do not meet.
         progress: Called per picture.
 
     Raises:
@@ -127,17 +109,15 @@ def scale_from_marker(
     key, views = max(several.items(), key=lambda item: len(item[1]))
     chosen = cameras[sorted(views)]
     corners = torch.stack([torch.from_numpy(views[i]) for i in sorted(views)])
-    found = [triangulate(chosen, corners[:, corner], options=options) for corner in range(4)]
+    found = [triangulate(chosen, corners[:, corner]) for corner in range(4)]
     miss = max(each.miss_px for each in found)
-    if miss > options.most_miss_px:
-        raise ValueError(
-            f"--marker: expected corners that meet within {options.most_miss_px:g} px, found {miss:.1f} px"
-        )
+    if miss > _MAX_MISS_PX:
+        raise ValueError(f"--marker: expected corners that meet within {_MAX_MISS_PX:g} px, found {miss:.1f} px")
     points = torch.stack([each.point for each in found])
     sides = (points - points.roll(-1, 0)).norm(dim=1)
     spread = float((sides.amax() - sides.amin()) / sides.mean())
     name = f"{key[0].removeprefix('DICT_')} marker {key[1]} of {side_m:g} m in {len(views)} images"
-    return FoundScale(side_m / float(sides.mean()), f"{name}, sides alike within {spread:.0%}")
+    return MetricScale(side_m / float(sides.mean()), f"{name}, sides alike within {spread:.0%}")
 
 
 def _marker_corners(

@@ -6,40 +6,74 @@ have one brightness. Sharpness is the perceptual blur metric of Crete-Roffet et 
 is shown: how much the picture loses when it is blurred once more.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from splatgraft.capture.usable_views import MIN_VIEWS
+from splatgraft.core.exposure import Exposure, describe_inconsistency
+from splatgraft.core.posed_images import LeftOut
 from splatgraft.runtime.progress import Progress, silent
 
 SIDE_PX = 640
 """Longest side of the grey versions: that of a draft reconstruction."""
+_FEATURES = 1200
+"""SIFT features per photo, the strongest."""
+_NEIGHBOURS = 3
+"""Photos that follow in the order of names (in a ring) with which each is matched."""
+_RATIO = 0.8
+"""Distance of the best match over that of the second, at most (Lowe 2004)."""
+_EPIPOLAR_PX = 1.5
+"""Distance of a match from its epipolar line, at most."""
+_MIN_MATCHES = 15
+"""Verified matches from which two photos show the same place: what COLMAP demands (min_num_inliers)."""
+_CANDIDATES = 20
+"""Photos elsewhere in the order with which a photo without a neighbour is matched, at most."""
+_STILL_PX = 0.5
+"""Median shift of the matches below which two photos are one: below what a hand can hold still."""
+
+# limits of the findings, measured on the two captures that ship, two public ones and a rendered room
+_FEW = 20
+"""Photos; the 16 of the shipped bananas are near the limit."""
+_BLUR_OF_ALL = 0.5
+"""Median blur. Sharp captures have 0.23 to 0.37; motion by 5 pixels at 640 lifts these to 0.4 to 0.54."""
+_JUMP_STOPS = 0.4
+"""Brightness of a photo against those before and after, as of the exposure settings; captures of fixed exposure have up
+to 0.31."""
+_MIN_TOGETHER = 0.5
+"""Share of the photos that hang together: what structure from motion demands of poses."""
+_NAMED = 6
+"""Photos that a finding names; it counts the others."""
 
 Grey = UInt8[np.ndarray, "h w"]
 """sRGB luma."""
+Level = Literal["good", "doubtful", "unusable"]
 
 
 @dataclass(frozen=True)
-class InspectionOptions:
-    """How photos are matched."""
+class Finding:
+    """What was found on one subject, and what it means for a reconstruction."""
 
-    features: int = 1200
-    """SIFT features per photo, the strongest."""
-    neighbours: int = 3
-    """Photos that follow in the order of names (in a ring) with which each is matched."""
-    ratio: float = 0.8
-    """Distance of the best match over that of the second, at most (Lowe 2004)."""
-    epipolar_px: float = 1.5
-    """Distance of a match from its epipolar line, at most."""
-    link: int = 15
-    """Verified matches from which two photos show the same place: what COLMAP demands (min_num_inliers)."""
-    candidates: int = 20
-    """Photos elsewhere in the order with which a photo without a neighbour is matched, at most."""
-    still_px: float = 0.5
-    """Median shift of the matches below which two photos are one: below what a hand can hold still."""
+    subject: str
+    """One word, such as "overlap"."""
+    level: Level
+    """What it means for a reconstruction."""
+    text: str
+    """What was found, on one line."""
+    remedy: str = ""
+    """What to do, on one line; empty where nothing need be done."""
+    photos: tuple[str, ...] = ()
+    """Names of the photos that it is about."""
+
+    def __str__(self) -> str:
+        """One line for people."""
+        return self.text + (f"; {self.remedy}" if self.remedy else "")
 
 
 @dataclass(frozen=True)
@@ -68,10 +102,6 @@ class Inspection:
     """Pairs of photos that show the same place, as far as they were looked for."""
     groups: tuple[tuple[int, ...], ...]
     """Photos that hang together by links, the largest group first."""
-    jumps: tuple[float, ...]
-    """How much brighter each photo shows surfaces than the photos before and after it do, stops."""
-    same: tuple[tuple[int, int], ...]
-    """Pairs of photos from one place without any movement."""
 
 
 @dataclass(frozen=True)
@@ -81,41 +111,44 @@ class _Features:
     luminance: np.ndarray
 
 
-def inspect_photos(
-    photos: Iterable[Grey], options: InspectionOptions = InspectionOptions(), *, progress: Progress = silent, count: int
-) -> Inspection:
+def inspect_photos(photos: Iterable[Grey], *, progress: Progress = silent, count: int) -> Inspection:
     """Inspect photos in the order in which they were taken.
 
     Args:
         photos: Grey versions, longest side at most `SIDE_PX`; read one at a time.
-        options: How photos are matched.
         progress: Called per photo.
         count: Number of photos.
     """
     blur: list[float] = []
     features: list[_Features] = []
-    sift = cv2.SIFT.create(nfeatures=options.features)
+    sift = cv2.SIFT.create(nfeatures=_FEATURES)
     for index, photo in enumerate(photos):
         blur.append(blur_of(photo))
         features.append(_features(sift, photo))
         progress(index + 1, count, "looking at photos")
     n = len(features)
-    links: dict[tuple[int, int], Link] = {}
+    links: dict[tuple[int, int], Link | None] = {}
 
-    def match(pairs: Iterable[tuple[int, int]]) -> None:
-        for i, j in pairs:
-            if i != j and (i, j) not in links and (found := _link(features, i, j, options)) is not None:
-                links[i, j] = found
+    def match(one: int, other: int) -> None:
+        pair = min(one, other), max(one, other)
+        if one != other and pair not in links:
+            links[pair] = _link(features, *pair)
 
-    steps = range(1, min(options.neighbours, n - 1) + 1)
+    def groups() -> tuple[tuple[int, ...], ...]:
+        return _groups(n, [pair for pair, link in links.items() if link is not None])
+
     for index in range(n):
-        match(_pair(index, (index + step) % n) for step in steps)
+        for step in range(1, min(_NEIGHBOURS, n - 1) + 1):
+            match(index, (index + step) % n)
         progress(index + 1, n, "comparing neighbours")
-    match(_across(groups_of(n, links), options))
-    found = tuple(links.values())
-    groups = groups_of(n, links)
-    same = tuple((link.first, link.second) for link in found if link.shift_px < options.still_px)
-    return Inspection(tuple(blur), found, groups, _jumps(n, found), same)
+    # photos of the smaller groups with photos spread over the rest, which may join them
+    apart = groups()
+    for group in apart[1:]:
+        others = [i for other in apart if other is not group for i in other]
+        for i in group:
+            for j in others[:: max(1, len(others) // _CANDIDATES)]:
+                match(i, j)
+    return Inspection(tuple(blur), tuple(link for link in links.values() if link is not None), groups())
 
 
 def blur_of(photo: Grey) -> float:
@@ -131,7 +164,7 @@ def blur_of(photo: Grey) -> float:
     return max(found)
 
 
-def groups_of(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, ...], ...]:
+def _groups(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, ...], ...]:
     """Connected components of `count` photos, the largest first."""
     label = list(range(count))
 
@@ -148,20 +181,6 @@ def groups_of(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, 
     return tuple(sorted(map(tuple, groups.values()), key=len, reverse=True))
 
 
-def _pair(i: int, j: int) -> tuple[int, int]:
-    return min(i, j), max(i, j)
-
-
-def _across(groups: Sequence[tuple[int, ...]], options: InspectionOptions) -> list[tuple[int, int]]:
-    """Pairs that may join the groups: each photo of a smaller group with photos spread over the rest."""
-    pairs: dict[tuple[int, int], None] = {}
-    for group in groups[1:]:
-        others = [i for other in groups if other is not group for i in other]
-        spread = others[:: max(1, len(others) // options.candidates)]
-        pairs |= {_pair(i, j): None for i in group for j in spread}
-    return list(pairs)
-
-
 def _features(sift: cv2.SIFT, photo: Grey) -> _Features:
     keypoints, descriptors = sift.detectAndCompute(photo, None)
     if descriptors is None or len(keypoints) == 0:
@@ -175,10 +194,10 @@ def _features(sift: cv2.SIFT, photo: Grey) -> _Features:
     return _Features(points, descriptors.astype(np.float32), light[rows, columns])
 
 
-def _link(features: Sequence[_Features], i: int, j: int, options: InspectionOptions) -> Link | None:
+def _link(features: Sequence[_Features], i: int, j: int) -> Link | None:
     """The verified matches of two photos; None where there are too few."""
     one, other = features[i], features[j]
-    if min(len(one.points), len(other.points)) < options.link:
+    if min(len(one.points), len(other.points)) < _MIN_MATCHES:
         return None
     cosine = one.descriptors @ other.descriptors.T
     rows = np.arange(len(cosine))
@@ -187,42 +206,147 @@ def _link(features: Sequence[_Features], i: int, j: int, options: InspectionOpti
     mutual = cosine.argmax(0)[best] == rows
     cosine[rows, best] = -1
     # of unit vectors the squared distance is 2 - 2 cos
-    distinct = 1 - nearest < options.ratio**2 * (1 - cosine.max(1))
+    distinct = 1 - nearest < _RATIO**2 * (1 - cosine.max(1))
     kept = np.flatnonzero(mutual & distinct)
-    if len(kept) < options.link:
+    if len(kept) < _MIN_MATCHES:
         return None
     a, b = one.points[kept], other.points[best[kept]]
-    verified = _verified(a, b, options)
-    if verified.sum() < options.link:
+    verified = _verified(a, b)
+    if verified.sum() < _MIN_MATCHES:
         return None
     shift = float(np.median(np.linalg.norm(a - b, axis=1)[verified]))
     ratio = np.maximum(other.luminance[best[kept]], 1e-4) / np.maximum(one.luminance[kept], 1e-4)
     return Link(i, j, int(verified.sum()), shift, float(np.median(np.log2(ratio[verified]))))
 
 
-def _verified(a: np.ndarray, b: np.ndarray, options: InspectionOptions) -> np.ndarray:
+def _verified(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Which matches lie on their epipolar lines, or do not move at all, for which such lines are not defined."""
-    still = np.linalg.norm(a - b, axis=1) < options.still_px
+    still = np.linalg.norm(a - b, axis=1) < _STILL_PX
     if still.mean() > 0.5:
         return still
     cv2.setRNGSeed(0)
     try:
-        _, inliers = cv2.findFundamentalMat(a, b, cv2.USAC_MAGSAC, options.epipolar_px, 0.999, 2000)
+        _, inliers = cv2.findFundamentalMat(a, b, cv2.USAC_MAGSAC, _EPIPOLAR_PX, 0.999, 2000)
     except cv2.error:  # OpenCV 5 refuses some degenerate sets of points instead of finding nothing
         inliers = None
     return np.zeros(len(a), bool) if inliers is None else inliers[:, 0].astype(bool)
 
 
-def _jumps(n: int, links: Sequence[Link]) -> tuple[float, ...]:
+def find_in_sizes(sizes: Sequence[tuple[int, int]], names: Sequence[str]) -> Finding:
+    """The number of photos of each size."""
+    (width, height), most = Counter(sizes).most_common(1)[0]
+    odd = tuple(name for name, size in zip(names, sizes, strict=True) if size != (width, height))
+    if not odd:
+        return Finding("sizes", "good", f"all {len(sizes)} photos have {width} x {height} px")
+    text = f"{most} of {len(sizes)} photos have {width} x {height} px, {len(odd)} another: {_named(odd)}"
+    return Finding("sizes", "doubtful", text, "leave out those of another camera, zoom or orientation", odd)
+
+
+def find_in_exposures(exposures: Sequence[Exposure]) -> Finding:
+    """What the cameras' settings say."""
+    if all(one.ev100 is None for one in exposures):
+        return Finding("settings", "good", "no exposure settings in EXIF, so that they cannot be compared")
+    differs = describe_inconsistency(exposures)
+    return Finding(
+        "settings",
+        "good" if differs is None else "doubtful",
+        differs or f"one exposure for all photos: {exposures[0]}",
+    )
+
+
+def find_in_count(count: int) -> Finding:
+    """Whether the photos are enough."""
+    text = f"{count} photos"
+    if count < MIN_VIEWS:
+        return Finding("count", "unusable", text, f"take at least {_FEW}, better 40 to 120")
+    if count < _FEW:
+        return Finding("count", "doubtful", f"{text}, which is few", "take 40 to 120 from all sides")
+    return Finding("count", "good", text)
+
+
+def find_in_odd_photos(odd: Sequence[LeftOut], count: int) -> Finding:
+    """The photos that the command `capture` leaves out, of `count`; at least one."""
+    names = tuple(Path(one.name).name for one in odd)
+    level: Level = "unusable" if 2 * len(odd) > count else "doubtful"
+    text = f"capture leaves out {len(odd)} of {count} photos: {_named(names)}"
+    # the reason begins with the file's whole path, which the text has named already
+    why = odd[0].reason.removeprefix(f"{odd[0].name}: ")
+    return Finding("left out", level, text, f"{names[0]}: {why}", names)
+
+
+def find_in_photos(inspection: Inspection, names: Sequence[str], *, has_poses: bool) -> tuple[Finding, ...]:
+    """Sharpness, overlap, movement and brightness.
+
+    Args:
+        inspection: Of n photos.
+        names: Of the photos.
+        has_poses: Whether the photos have poses, so that no matches between them are needed.
+    """
+    overlap = _overlap(inspection, names)
+    if has_poses and overlap.level != "good":
+        overlap = Finding("overlap", "good", f"{overlap.text}; poses are given, which need none", photos=overlap.photos)
+    return _sharpness(inspection), overlap, _movement(inspection, names), _exposure(inspection, names)
+
+
+def _named(photos: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    more = f" and {len(photos) - _NAMED} more" if len(photos) > _NAMED else ""
+    return ", ".join(photos[:_NAMED]) + more
+
+
+def _sharpness(inspection: Inspection) -> Finding:
+    blur = np.array(inspection.blur)
+    middle = float(np.median(blur))
+    if middle > _BLUR_OF_ALL:
+        text = f"most photos are blurred (median blur {middle:.2f}, sharp captures have 0.23 to 0.37)"
+        return Finding("sharpness", "doubtful", text, "photograph again with shorter exposure and in focus")
+    return Finding("sharpness", "good", f"the photos are sharp (blur {blur.min():.2f} to {blur.max():.2f})")
+
+
+def _overlap(inspection: Inspection, names: Sequence[str]) -> Finding:
+    n, largest = len(names), inspection.groups[0]
+    next_to = [link.matches for link in inspection.links if link.second - link.first == 1]
+    middle = f"{np.median(next_to):.0f}" if next_to else "no"
+    if len(largest) == n:
+        return Finding("overlap", "good", f"all photos hang together, {middle} matches between neighbours")
+    apart = tuple(names[i] for group in inspection.groups[1:] for i in group)
+    if len(largest) < _MIN_TOGETHER * n:
+        text = f"only {len(largest)} of {n} photos show one place together; the largest groups have "
+        sizes = ", ".join(str(len(group)) for group in inspection.groups[:4])
+        remedy = "take photos a step apart that share two thirds of the picture, with texture in view, of one place"
+        return Finding("overlap", "unusable", text + sizes, remedy, apart)
+    text = f"{len(apart)} of {n} photos show nothing in common with the rest: {_named(apart)}"
+    return Finding("overlap", "doubtful", text, "leave them out, or take photos between them and the rest", apart)
+
+
+def _movement(inspection: Inspection, names: Sequence[str]) -> Finding:
+    still = {link.second for link in inspection.links if link.shift_px < _STILL_PX}
+    copies = tuple(names[i] for i in sorted(still))
+    if not copies:
+        return Finding("movement", "good", "the camera moves from photo to photo")
+    text = f"{len(copies)} of {len(names)} photos show the same as another from the same place: {_named(copies)}"
+    level: Level = "unusable" if 2 * len(copies) > len(names) else "doubtful"
+    return Finding("movement", level, text, "leave copies out; walk around the subject", copies)
+
+
+def _exposure(inspection: Inspection, names: Sequence[str]) -> Finding:
     """How much brighter each photo shows surfaces than the photos before and after it do, in the mean of both.
 
     Gloss changes smoothly from photo to photo, so that it cancels; a change of exposure does not.
     """
-    before: list[list[float]] = [[] for _ in range(n)]
-    after: list[list[float]] = [[] for _ in range(n)]
-    for link in links:
-        if link.second - link.first <= n // 2:
+    before: list[list[float]] = [[] for _ in names]
+    after: list[list[float]] = [[] for _ in names]
+    for link in inspection.links:
+        if link.second - link.first <= len(names) // 2:
             before[link.second].append(link.stops)
             after[link.first].append(-link.stops)
     pairs = zip(before, after, strict=True)
-    return tuple(0.5 * float(np.median(b) + np.median(a)) if a and b else 0.0 for b, a in pairs)
+    jumps = [abs(0.5 * float(np.median(b) + np.median(a))) if a and b else 0.0 for b, a in pairs]
+    # the largest first
+    odd = tuple(
+        name for jump, name in sorted(zip(jumps, names, strict=True), key=lambda x: -x[0]) if jump > _JUMP_STOPS
+    )
+    if odd:
+        text = f"{len(odd)} photos are up to {max(jumps):.1f} stops off their neighbours in brightness: {_named(odd)}"
+        return Finding("exposure", "doubtful", text, "lock exposure and white balance, or leave them out", odd)
+    return Finding("exposure", "good", f"neighbours agree in brightness within {max(jumps):.2f} stops")

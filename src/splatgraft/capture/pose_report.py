@@ -1,14 +1,60 @@
-"""What structure from motion found, in figures, and its file beside the posed images."""
+"""What structure from motion found, in figures, which of them are not plausible, and the file with them.
+
+A wrong model often has all photos and a small reprojection error, since COLMAP drops what does not fit. The share of
+verified matches that the model explains does not have this weakness: it counts what was dropped.
+"""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-from splatgraft.capture.plausibility import Doubt, Lens
+import numpy as np
+
 from splatgraft.runtime.files import atomic_write
 
 POSE_REPORT_FILE = "pose_report.json"
+
+_FEW_FEATURES = 500
+"""Features; a photo of a usual scene has some thousands, of which one in ten is found again in the next photo."""
+_FEW_MATCHES = 30
+"""Matches that a pose takes (COLMAP: abs_pose_min_num_inliers)."""
+
+# the ranges of the figures of ordinary photos
+_MIN_REGISTERED = 0.9
+"""Share of photos with a pose: one in ten may be blurred or apart from the rest."""
+_MIN_EXPLAINED = 0.5
+"""Share of verified matches: more than half. Models of the shipped room, vase and bananas: 0.59 to 0.87."""
+_MAX_REPROJECTION_PX = 1.0
+"""Pixels: three times the third of a pixel to which SIFT places a feature (Lowe 2004)."""
+_MIN_OBSERVATIONS = 100
+"""Points seen by the median photo: what COLMAP demands of the first pair (init_min_num_inliers)."""
+_FOCAL_IN_SIDES = (0.4, 4.0)
+"""Focal length over the longest side: 14 mm and 140 mm on a sensor of 36 mm."""
+_MAX_CORNER_SHIFT = 0.25
+"""Share of its distance from the middle by which a corner is moved; more is a fisheye, which is not modelled."""
+_MAX_CORNER_SPREAD = 0.1
+"""Difference of corner shift between the 10th and 90th percentile of photos: one lens at a few zoom settings."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera as structure from motion found it, and the photos that share it."""
+
+    photos: tuple[str, ...]
+    """Names, without suffix."""
+    size: tuple[int, int]
+    """Width and height of these photos (shrunk), pixels."""
+    focal_px: float
+    """Focal length, pixels of the (shrunk) photos."""
+    distortion: float
+    """First radial coefficient (k of COLMAP's SIMPLE_RADIAL), for image coordinates over the focal length."""
+
+    @property
+    def corner_shift(self) -> float:
+        """How far distortion moves a corner of the photo, as a signed share of its distance from the middle."""
+        width, height = self.size
+        return self.distortion * (width**2 + height**2) / (2 * self.focal_px) ** 2
 
 
 @dataclass(frozen=True)
@@ -33,10 +79,20 @@ class Unposed:
         return f"{self.name} ({self.features} features, at most {self.matches} matches: {reason})"
 
 
-_FEW_FEATURES = 500
-"""Features; a photo of a usual scene has some thousands, of which one in ten is found again in the next photo."""
-_FEW_MATCHES = 30
-"""Matches that a pose takes (COLMAP: abs_pose_min_num_inliers)."""
+@dataclass(frozen=True)
+class Doubt:
+    """One figure that is out of its range."""
+
+    what: str
+    """What was measured."""
+    found: str
+    """With unit."""
+    expected: str
+    """With unit."""
+
+    def __str__(self) -> str:
+        """A clause for people."""
+        return f"{self.what}: expected {self.expected}, found {self.found}"
 
 
 @dataclass(frozen=True)
@@ -79,28 +135,70 @@ class PoseReport:
         return line + (f"; without a pose: {', '.join(map(str, self.missing))}" if self.missing else "")
 
 
+def find_doubts(
+    photos: int, observations: Sequence[int], *, explained: float, mean_reprojection_px: float, lenses: Sequence[Lens]
+) -> tuple[Doubt, ...]:
+    """All figures that are out of the range of ordinary photos; none where the cameras are plausible.
+
+    Args:
+        photos: Number of photos given.
+        observations: Points seen, per photo with a pose.
+        explained: Share of verified matches that the model explains, in [0, 1].
+        mean_reprojection_px: Pixels of the (shrunk) photos.
+        lenses: Cameras of the photos with a pose.
+    """
+    registered, seen = len(observations), float(np.median(observations)) if observations else 0.0
+    error = f"{mean_reprojection_px:.2f} px"
+    figures = [
+        (
+            registered >= _MIN_REGISTERED * photos,
+            Doubt("photos with a pose", f"{registered} of {photos}", f"at least {_MIN_REGISTERED:.0%}"),
+        ),
+        (
+            explained >= _MIN_EXPLAINED,
+            Doubt("matches that the cameras explain", f"{explained:.0%}", f"at least {_MIN_EXPLAINED:.0%}"),
+        ),
+        (
+            mean_reprojection_px <= _MAX_REPROJECTION_PX,
+            Doubt("mean reprojection error", error, f"at most {_MAX_REPROJECTION_PX:.2f} px"),
+        ),
+        (
+            seen >= _MIN_OBSERVATIONS,
+            Doubt("points seen by the median photo", f"{seen:.0f}", f"{_MIN_OBSERVATIONS}"),
+        ),
+    ]
+    low, high = _FOCAL_IN_SIDES
+    for lens in lenses:
+        of = f"of {lens.photos[0]}" + (f" and {len(lens.photos) - 1} more" if len(lens.photos) > 1 else "")
+        side, shift = max(lens.size), abs(lens.corner_shift)
+        usual = f"{low * side:.0f} to {high * side:.0f} px at {side} px"
+        allowed = f"at most {_MAX_CORNER_SHIFT:.0%} at the corners"
+        figures += [
+            (low <= lens.focal_px / side <= high, Doubt(f"focal length {of}", f"{lens.focal_px:.0f} px", usual)),
+            (shift <= _MAX_CORNER_SHIFT, Doubt(f"distortion {of}", f"{shift:.0%}", allowed)),
+        ]
+    shifts = [lens.corner_shift for lens in lenses for _ in lens.photos]
+    spread = float(np.percentile(shifts, 90) - np.percentile(shifts, 10)) if shifts else 0.0
+    what, allowed = "spread of the distortion between photos", f"at most {_MAX_CORNER_SPREAD:.0%} at the corners"
+    figures.append((spread <= _MAX_CORNER_SPREAD, Doubt(what, f"{spread:.0%}", allowed)))
+    return tuple(doubt for is_good, doubt in figures if not is_good)
+
+
 def write_pose_report(folder: Path, report: PoseReport) -> None:
     """Write pose_report.json into `folder`."""
     with atomic_write(folder / POSE_REPORT_FILE) as stream:
         stream.write((json.dumps(asdict(report), indent=1) + "\n").encode())
 
 
-def read_pose_report(folder: Path) -> PoseReport | None:
-    """The report of a folder whose photos were posed by structure from motion, else None.
+def read_doubts(folder: Path) -> tuple[Doubt, ...]:
+    """The doubts about the poses of a folder; none where structure from motion did not find them.
 
-    Raises: ValueError where the file is damaged.
+    Raises: ValueError where the file with them is damaged.
     """
     path = folder / POSE_REPORT_FILE
     if not path.is_file():
-        return None
+        return ()
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
-        lenses = tuple(
-            Lens(**(lens | {"photos": tuple(lens["photos"]), "size": tuple(lens["size"])}))
-            for lens in found.pop("lenses")
-        )
-        doubts = tuple(Doubt(**doubt) for doubt in found.pop("doubts"))
-        missing = tuple(Unposed(**photo) for photo in found.pop("missing"))
-        return PoseReport(missing=missing, lenses=lenses, doubts=doubts, **found)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return tuple(Doubt(**doubt) for doubt in json.loads(path.read_text())["doubts"])
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected figures of poses, found {type(error).__name__}: {error}") from error

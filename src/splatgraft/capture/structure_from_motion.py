@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from splatgraft.capture.colmap_process.job import Job
-from splatgraft.capture.orientation import upright
+from splatgraft.capture.colmap_process.job import MAX_ERROR_PX, MIN_TRACK, PHASES, Job
 from splatgraft.capture.photos import (
     camera_groups,
     working_copies,
@@ -21,12 +22,15 @@ from splatgraft.capture.photos import (
     write_undistorted,
     write_undistorted_mask,
 )
-from splatgraft.capture.plausibility import Doubt, Found, Lens, find_doubts
-from splatgraft.capture.pose_report import PoseReport, Unposed
+from splatgraft.capture.pose_report import Lens, PoseReport, Unposed, find_doubts
 from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import stored_size
+from splatgraft.core.planes import dominant_level_plane
 from splatgraft.core.posed_images import PosedImages
+from splatgraft.core.rotations import rotation_to_z
+from splatgraft.core.similarity import Similarity
 from splatgraft.formats.captures.masks import PhotoFiles
 from splatgraft.runtime.process import last_line, run_logged
 from splatgraft.runtime.progress import Progress, silent
@@ -35,11 +39,12 @@ _ADVICE = (
     "take more photos, a step apart, with two thirds overlap, sharp, of a still scene with texture around plain or "
     "shiny things, at one zoom setting (or say that each photo has its own camera: lens = each)"
 )
+_EXHAUSTIVE = 80
+"""Most photos of which all pairs are compared unless asked for."""
 _THOROUGH_COST = 20
 """Time of a thorough attempt over that of a quick one: features of affine shape, more of them, guided matching."""
-_SILENT: Callable[[str], None] = lambda sentence: None  # noqa: E731
-_PHASES = 4
-"""Of the COLMAP process."""
+_SECONDS_PER_PHOTO = 2.5
+"""On two idle cores: 73 photos of 800 px took 3 minutes."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,11 @@ class PoseOptions:
     """For the random choices of matching and mapping."""
 
 
+def predict_pose_seconds(photos: int) -> float:
+    """Seconds in which photos get poses on two idle cores, half or twice that; a second, thorough attempt apart."""
+    return _SECONDS_PER_PHOTO * photos
+
+
 def pose_photos(
     photos: PhotoFiles,
     workspace: Path,
@@ -67,7 +77,7 @@ def pose_photos(
     scratch: Path | None = None,
     options: PoseOptions = PoseOptions(),
     progress: Progress = silent,
-    say: Callable[[str], None] = _SILENT,
+    say: Callable[[str], None] = lambda sentence: None,
 ) -> tuple[PosedImages, PoseReport]:
     """Poses, intrinsics and sparse points of `photos`; upright undistorted images are written to `workspace`/images.
 
@@ -94,45 +104,40 @@ def pose_photos(
     if len(photos.paths) < 3:
         raise ValueError(f"{workspace}: expected at least 3 photos to pose, found {len(photos.paths)}")
     efforts = ("quick", "thorough") if options.effort == "auto" else (options.effort,)
-    total = _PHASES * len(efforts) + 1
+    total = len(PHASES) * len(efforts) + 1
     with _folder(scratch, workspace) as kept:
         progress(0, total, "reading photos")
         copies = working_copies(photos.paths, kept / "photos", options.max_size_px)
         masks = working_masks(photos.masks, copies, kept / "masks")
-        models: list[dict[str, Any]] = []
+        found: list[tuple[dict[str, Any], PoseReport]] = []
         for attempt, effort in enumerate(efforts):
 
-            def advance(done: int, message: str, before: int = attempt * _PHASES) -> None:
+            def advance(done: int, message: str, before: int = attempt * len(PHASES)) -> None:
                 progress(before + done, total, message)
 
-            models.append(_run(_job(copies, masks, options, kept / effort), advance, say))
-            say(_times(models[-1]))
-            doubts = _doubts(models[-1], copies)
+            model = _run(_job(copies, masks, options, kept / effort), advance, say)
+            found.append((model, _report(model, copies)))
+            seconds, cpu = (sum(model[name].values()) for name in ("seconds", "cpu_seconds"))
+            parts = ", ".join(f"{phase} {took:.0f}" for phase, took in model["seconds"].items())
+            say(f"structure from motion took {seconds:.0f} s ({parts}), {cpu:.0f} CPU-s")
+            doubts = "; ".join(map(str, found[-1][1].doubts))
             if not doubts:
                 break
             if effort != efforts[-1]:
-                say(_second_attempt(doubts, models[-1]))
-        model = max(models, key=_score)
-        missing = _missing(model, copies)
-        if len(model["images"]) < 0.5 * len(copies):
+                minutes = max(1, round(_THOROUGH_COST * seconds / 60))
+                say(
+                    f"doubtful ({doubts}): all is done once more with more features, which takes about {minutes} min; "
+                    "Ctrl-C ends it, and effort = quick goes on without it"
+                )
+        # by the score of colmap_process/scores.py, where the number of photos is the same for both
+        model, report = max(found, key=lambda pair: pair[1].explained * pair[1].registered)
+        if report.registered < 0.5 * len(copies):
             raise ValueError(
                 f"{photos.paths[0].parent}: expected at least half of {len(copies)} photos to register, "
-                f"found {len(model['images'])}; {_ADVICE}; without a pose: {', '.join(map(str, missing))}"
+                f"found {report.registered}; {_ADVICE}; without a pose: {', '.join(map(str, report.missing))}"
             )
         progress(total - 1, total, "undistorting")
         posed = _posed_images(model, copies[0].parent, masks, workspace)
-        report = PoseReport(
-            photos=len(copies),
-            registered=len(model["images"]),
-            missing=missing,
-            mean_reprojection_px=model["mean_reprojection_px"],
-            points=len(posed.points),
-            models=model["models"],
-            method=model["method"],
-            explained=model["explained"],
-            lenses=_lenses(model, copies[0].parent),
-            doubts=_doubts(model, copies),
-        )
     progress(total, total, str(report))
     return posed, report
 
@@ -148,61 +153,39 @@ def _folder(scratch: Path | None, workspace: Path) -> Generator[Path]:
         yield Path(folder)
 
 
-def _score(model: Mapping[str, Any]) -> float:
-    """As in colmap_process/scores.py, where the number of photos is the same for all."""
-    return model["explained"] * len(model["images"])
-
-
-def _doubts(model: Mapping[str, Any], copies: Sequence[Path]) -> tuple[Doubt, ...]:
-    return find_doubts(
-        Found(
-            photos=len(copies),
-            explained=model["explained"],
-            mean_reprojection_px=model["mean_reprojection_px"],
-            observations=tuple(image["observations"] for image in model["images"]),
-            lenses=_lenses(model, copies[0].parent),
-        )
-    )
-
-
-def _lenses(model: Mapping[str, Any], folder: Path) -> tuple[Lens, ...]:
-    groups: dict[int, list[dict[str, Any]]] = {}
+def _report(model: Mapping[str, Any], copies: Sequence[Path]) -> PoseReport:
+    by_camera: dict[int, list[dict[str, Any]]] = {}
     for image in model["images"]:
-        groups.setdefault(image["camera_id"], []).append(image)
-    return tuple(
+        by_camera.setdefault(image["camera_id"], []).append(image)
+    lenses = tuple(
         Lens(
             photos=tuple(Path(image["name"]).stem for image in images),
-            size=stored_size(folder / images[0]["name"]),
+            size=stored_size(copies[0].with_name(images[0]["name"])),
             focal_px=images[0]["camera"][0],
             distortion=images[0]["camera"][4],
         )
-        for images in sorted(groups.values(), key=len, reverse=True)
+        for images in sorted(by_camera.values(), key=len, reverse=True)
+    )
+    unposed = sorted(model["unposed"], key=lambda photo: photo["name"])
+    figures = {name: model[name] for name in ("explained", "mean_reprojection_px")}
+    observations = [image["observations"] for image in model["images"]]
+    return PoseReport(
+        photos=len(copies),
+        registered=len(model["images"]),
+        missing=tuple(Unposed(Path(p["name"]).stem, p["features"], p["matches"]) for p in unposed),
+        points=len(_good_points(model)),
+        models=model["models"],
+        method=model["method"],
+        lenses=lenses,
+        doubts=find_doubts(len(copies), observations, lenses=lenses, **figures),
+        **figures,
     )
 
 
-def _missing(model: Mapping[str, Any], copies: Sequence[Path]) -> tuple[Unposed, ...]:
-    posed = {image["name"] for image in model["images"]}
-    figures = {found["name"]: found for found in model["unposed"]}
-    return tuple(
-        Unposed(copy.stem, figures[copy.name]["features"], figures[copy.name]["matches"])
-        for copy in sorted(copies)
-        if copy.name not in posed
-    )
-
-
-def _times(model: Mapping[str, Any]) -> str:
-    """Where the time went."""
-    parts = ", ".join(f"{phase} {seconds:.0f}" for phase, seconds in model["seconds"].items())
-    all_seconds, cpu = (sum(model[name].values()) for name in ("seconds", "cpu_seconds"))
-    return f"structure from motion took {all_seconds:.0f} s ({parts}), {cpu:.0f} CPU-s"
-
-
-def _second_attempt(doubts: Sequence[Doubt], model: Mapping[str, Any]) -> str:
-    minutes = max(1, round(_THOROUGH_COST * sum(model["seconds"].values()) / 60))
-    return (
-        f"doubtful ({'; '.join(map(str, doubts))}): all is done once more with more features, which takes about "
-        f"{minutes} min; Ctrl-C ends it, and effort = quick goes on without it"
-    )
+def _good_points(model: Mapping[str, Any]) -> Float[Tensor, "m 8"]:
+    """Sparse points that count: place, colour in bytes, error, and the number of photos that see them."""
+    rows = torch.tensor(model["points"]).reshape(-1, 8)
+    return rows[(rows[:, 7] >= MIN_TRACK) & (rows[:, 6] <= MAX_ERROR_PX)]
 
 
 def _job(copies: Sequence[Path], masks: Mapping[str, Path], options: PoseOptions, scratch: Path) -> Job:
@@ -213,7 +196,7 @@ def _job(copies: Sequence[Path], masks: Mapping[str, Path], options: PoseOptions
         scratch=str(scratch.resolve()),
         thorough=scratch.name == "thorough",
         groups=camera_groups(copies, shared=options.lens == "shared"),
-        exhaustive=options.matching == "exhaustive" or (options.matching == "auto" and len(copies) <= 80),
+        exhaustive=options.matching == "exhaustive" or (options.matching == "auto" and len(copies) <= _EXHAUSTIVE),
         threads=options.threads,
         seed=options.seed,
     )
@@ -266,9 +249,7 @@ def _posed_images(model: Mapping[str, Any], photos: Path, masks: Mapping[str, Pa
         sizes=torch.tensor(sizes),
         names=tuple(path.name for path in paths),
     )
-    rows = torch.tensor(model["points"]).reshape(-1, 8)
-    # a pair of photos makes a point of any false match
-    rows = rows[(rows[:, 7] >= 3) & (rows[:, 6] <= 1.5)]
+    rows = _good_points(model)
     upright_from_sfm = upright(cameras, rows[:, :3])
     return PosedImages(
         image_paths=tuple(paths),
@@ -276,4 +257,26 @@ def _posed_images(model: Mapping[str, Any], photos: Path, masks: Mapping[str, Pa
         points=upright_from_sfm.points(rows[:, :3]),
         point_colors=rows[:, 3:6] / 255,
         mask_paths=tuple(mask_paths) if masks else (),
+    )
+
+
+def upright(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Similarity:
+    """upright_from_world: +z up, the support plane at z = 0 where one is clear, the median point above the origin.
+
+    The median distance of the cameras from the median point becomes 1, since structure from motion has no scale.
+
+    Args:
+        cameras: In any frame.
+        points: Sparse points in the same frame; may be empty.
+    """
+    up = estimate_up(cameras)
+    plane = dominant_level_plane(points, up)
+    up = up if plane is None else plane.normal
+    middle = points.median(0).values if len(points) else cameras.centers.mean(0)
+    height = up @ middle if plane is None else plane.offset
+    distance = (cameras.centers - middle).norm(dim=1).median()
+    scale = float(1 / distance) if distance > 0 else 1.0
+    rotation = rotation_to_z(up)
+    return Similarity(
+        scale=scale, rotation=rotation, translation=-scale * (rotation @ (middle + up * (height - up @ middle)))
     )

@@ -1,20 +1,70 @@
-"""Leaves out photos and masks of a capture that would harm what is made of it, with the reason for each."""
+"""Which photos, masks and views of a capture are of use, and the reason against each of the others.
+
+Photos that do not belong among the others are unreadable, tiny, copies of another, or far more blurred. Blur is
+measured by the fine detail of a photo in relation to its coarse detail, which depends little on what is shown: mean
+square second differences at full size over those at a sixteenth of it, in the direction where this is least, since a
+moving camera blurs in one direction only. Views must be enough, and far enough apart, to reconstruct from.
+"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
+from jaxtyping import Float
+from PIL import ImageOps
+from torch import Tensor
 
-from splatgraft.capture.odd_photos import find_odd_photos, find_unreadable_photos
-from splatgraft.capture.view_coverage import CoverageRule
-from splatgraft.core.images import read_mask, stored_size
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import focus_point
+from splatgraft.core.images import opened, read_mask, shrink_on_decoding, stored_size
 from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.formats.captures.masks import PhotoFiles, check_mask
 from splatgraft.runtime.progress import Progress, silent
 
-LEAST_PHOTOS = CoverageRule().views
-"""Different photos that are needed, with or without poses."""
+MIN_VIEWS = 8
+"""Different photos or views that are needed: a closed ring of 8 has a view every 45 degrees, with which each surface is
+seen by three."""
+_MIN_PARALLAX_DEG = 3.0
+"""Angle at which the outermost cameras see a point. At 3 degrees one pixel of error, at a focal length of 1000 px,
+moves a point by 2% of its distance."""
+_POINTS, _CAMERAS = 256, 128
+"""Most points and cameras that are compared, evenly spaced in their order."""
+_MIN_SIDE_PX = 16
+"""Shorter side; smaller pictures hold no window of SSIM (11 px) and no features."""
+_MEASURED_PX = 800
+"""Longest side at which blur is measured, or the median photo's where that is smaller, so that a photo which is larger
+than the others counts by what is left of it when it is as small."""
+_BLUR_OCTAVES = 1.5
+"""Fine detail below the median, as a power of two, of a blurred photo. In four captures (three photographed, one
+rendered) the softest photo lies 0.4 to 0.8 below; 9 px of motion blur or a Gaussian blur of 2 px take off 1.5 to 3,
+mostly 2.4."""
+_BLUR_DEVIATIONS = 4.0
+"""And this many robust standard deviations (1.4826 median absolute deviations) below it."""
+_COARSE_HALVINGS = 4
+"""A blur that is wide enough to take coarse detail as well must not pass for sharp: a sixteenth holds up to 16 px."""
+_COARSE_PX = 8
+"""Least side at that size for its detail to mean anything."""
+_THUMBNAIL_PX = 64
+_COPY_LEVELS = 4.0
+"""Largest difference between two thumbnails that are of one picture, grey levels of 255: that of a JPEG saved again;
+another viewpoint moves edges by much more."""
+_SAMPLES = 8
+"""Photos that are looked at to tell drawings from photographs, evenly spaced."""
+_EVEN_SHARE = 0.8
+"""Share of neighbours of exactly one colour, above which a picture is no photograph: 0.01 to 0.4 in three photographed
+captures, up to 0.53 in a rendered one, 0.98 in screenshots."""
+
+
+@dataclass(frozen=True)
+class _Photo:
+    path: Path
+    log_detail: float
+    thumbnail: np.ndarray
+    """Grey levels, float32."""
 
 
 def usable_photos(
@@ -31,14 +81,14 @@ def usable_photos(
     Raises:
         ValueError: Where fewer than 8 different photos are left.
     """
-    odd = _odd(photos, keep_odd, progress)
+    odd = find_odd_photos(photos, keep_odd=keep_odd, progress=progress)
     out = {one.name for one in odd}
     kept = [photo for photo in photos if str(photo) not in out]
-    if len(kept) < LEAST_PHOTOS:
+    if len(kept) < MIN_VIEWS:
         found = f"{len(kept)} of {len(photos)}" if odd else f"{len(kept)}"
         first = f"; the first of the others: {odd[0].reason}" if odd else ""
         raise ValueError(
-            f"{name}: expected at least {LEAST_PHOTOS} different photos that can be read (40 or more are usual), "
+            f"{name}: expected at least {MIN_VIEWS} different photos that can be read (40 or more are usual), "
             f"found {found}{first}"
         )
     return kept, odd
@@ -74,25 +124,21 @@ def usable_views(posed: PosedImages, *, keep_odd: bool = False, progress: Progre
     Returns:
         The others; what was left out is added to `left_out`.
     """
-    odd = _odd(posed.image_paths, keep_odd, progress)
-    out = {one.name for one in odd}
-    kept = posed.select(torch.tensor([str(path) not in out for path in posed.image_paths], dtype=torch.bool))
+    kept = _without(posed, find_odd_photos(posed.image_paths, keep_odd=keep_odd, progress=progress))
     names = kept.cameras.names
     masks, empty = _without_useless(kept.image_paths, kept.mask_paths, names, lambda _, mask: _emptiness(mask))
-    return replace(kept, mask_paths=masks, left_out=(*posed.left_out, *odd, *empty))
+    return replace(kept, mask_paths=masks, left_out=(*kept.left_out, *empty))
 
 
 def readable_views(posed: PosedImages, *, progress: Progress = silent) -> PosedImages:
     """The posed views whose files can be decoded to their end; the others are added to `left_out`."""
-    odd = find_unreadable_photos(posed.image_paths, progress=progress)
+    return _without(posed, find_odd_photos(posed.image_paths, keep_odd=True, progress=progress))
+
+
+def _without(posed: PosedImages, odd: Sequence[LeftOut]) -> PosedImages:
     out = {one.name for one in odd}
     kept = posed.select(torch.tensor([str(path) not in out for path in posed.image_paths], dtype=torch.bool))
     return replace(kept, left_out=(*posed.left_out, *odd))
-
-
-def _odd(photos: Sequence[Path], keep_odd: bool, progress: Progress) -> tuple[LeftOut, ...]:
-    find = find_unreadable_photos if keep_odd else find_odd_photos
-    return find(photos, progress=progress)
 
 
 def _without_useless(
@@ -128,5 +174,201 @@ def _emptiness(mask: Path) -> str:
     solid = read_mask(mask) >= 0.5
     if bool(solid.any()) and not bool(solid.all()):
         return ""
-    color = "white" if bool(solid.any()) else "black"
-    return f"{mask}: expected white where the object is, found {color} all over"
+    return f"{mask}: expected white where the object is, found {'white' if bool(solid.any()) else 'black'} all over"
+
+
+def find_odd_photos(
+    photos: Sequence[Path], *, keep_odd: bool = False, progress: Progress = silent
+) -> tuple[LeftOut, ...]:
+    """The photos to leave out, each with the reason; the first of several copies stays.
+
+    Args:
+        photos: Image files, which are each decoded once.
+        keep_odd: Whether to leave out only what cannot be decoded to its end or is too small.
+        progress: Moves a bar.
+
+    Returns:
+        Odd photos by full path, in the order of `photos`.
+    """
+    examined: list[_Photo] = []
+    reasons: dict[Path, str] = {}
+    measured_px = min(_MEASURED_PX, _median_side(photos))
+    for index, photo in enumerate(photos):
+        try:
+            examined.append(_examine(photo, measured_px))
+        except ValueError as error:
+            reasons[photo] = str(error)
+        progress(index + 1, len(photos), "checking photos")
+    if not keep_odd:
+        different, copies = _copies(examined)
+        reasons |= copies | _blurred(different)
+    return tuple(LeftOut(str(photo), reasons[photo]) for photo in photos if photo in reasons)
+
+
+def _median_side(photos: Sequence[Path]) -> int:
+    """Median longest side of the photos whose header can be read, pixels."""
+    sides: list[int] = []
+    for photo in photos:
+        with suppress(ValueError):
+            sides.append(max(stored_size(photo)))
+    return int(np.median(sides)) if sides else 1
+
+
+def _examine(path: Path, measured_px: int) -> _Photo:
+    with opened(path) as image:
+        size = image.size
+        shrink_on_decoding(image, measured_px)
+        grey = np.array(ImageOps.exif_transpose(image).convert("L"), dtype=np.float32)
+    if min(size) < _MIN_SIDE_PX:
+        raise ValueError(f"{path}: expected sides of at least {_MIN_SIDE_PX} px, found {size[0]}x{size[1]}")
+    factor = measured_px / max(grey.shape)
+    if factor < 1:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    thumbnail = cv2.resize(grey, (_THUMBNAIL_PX, _THUMBNAIL_PX), interpolation=cv2.INTER_AREA)
+    return _Photo(path, _log_detail(grey), thumbnail)
+
+
+def _log_detail(grey: np.ndarray) -> float:
+    """Half the binary logarithm of fine over coarse mean square second differences; nan where these are too few."""
+    coarse = grey
+    for _ in range(_COARSE_HALVINGS):
+        coarse = cv2.pyrDown(coarse)
+    if min(coarse.shape) < _COARSE_PX:
+        return float("nan")
+    fine_squares, coarse_squares = _second_differences(grey), _second_differences(coarse)
+    # a tenth of a grey level is less than rounding: nothing to compare
+    if coarse_squares.min() < 0.01:
+        return float("nan")
+    return 0.5 * float(np.log2((fine_squares + 1e-6) / coarse_squares).min())
+
+
+def _second_differences(grey: np.ndarray) -> np.ndarray:
+    """Mean squares along both axes and both diagonals, per pixel of length."""
+    middle = grey[1:-1, 1:-1]
+    across = (
+        grey[1:-1, 2:] + grey[1:-1, :-2],
+        grey[2:, 1:-1] + grey[:-2, 1:-1],
+        grey[2:, 2:] + grey[:-2, :-2],
+        grey[2:, :-2] + grey[:-2, 2:],
+    )
+    lengths = np.array([1.0, 1.0, 2.0, 2.0])
+    return np.array([float(np.mean((both - 2 * middle) ** 2)) for both in across]) / lengths**2
+
+
+def _copies(photos: Sequence[_Photo]) -> tuple[list[_Photo], dict[Path, str]]:
+    """The photos of different pictures, and the reason against each copy."""
+    kept: list[_Photo] = []
+    reasons: dict[Path, str] = {}
+    means = {photo.path: float(photo.thumbnail.mean()) for photo in photos}
+    for photo in photos:
+        near = [other for other in kept if abs(means[other.path] - means[photo.path]) <= _COPY_LEVELS]
+        first = next((p for p in near if np.abs(p.thumbnail - photo.thumbnail).max() <= _COPY_LEVELS), None)
+        if first is None:
+            kept.append(photo)
+        else:
+            reasons[photo.path] = f"{photo.path}: expected another picture than {first.path.name}, found a copy of it"
+    return kept, reasons
+
+
+def _blurred(photos: Sequence[_Photo]) -> dict[Path, str]:
+    """The reason against each blurred photo."""
+    known = np.array([photo.log_detail for photo in photos if np.isfinite(photo.log_detail)])
+    if not len(known):
+        return {}
+    middle = float(np.median(known))
+    spread = 1.4826 * float(np.median(np.abs(known - middle)))
+    limit = middle - max(_BLUR_OCTAVES, _BLUR_DEVIATIONS * spread)
+    return {
+        photo.path: f"{photo.path}: expected about as much fine detail as in the other photos, "
+        f"found {2 ** (photo.log_detail - middle):.0%} of the median: it is blurred"
+        for photo in photos
+        if photo.log_detail < limit
+    }
+
+
+def drawn_pictures(photos: Sequence[Path]) -> str | None:
+    """One sentence where the pictures look like screenshots or drawings, from which no poses follow; else None.
+
+    Args:
+        photos: Readable image files, of which some are decoded.
+    """
+    shares: list[float] = []
+    for index in np.linspace(0, len(photos) - 1, min(_SAMPLES, len(photos))):
+        with opened(photos[int(index)]) as image:
+            pixels = np.array(image.convert("RGB"))
+        shares.append(float((pixels[:, 1:] == pixels[:, :-1]).all(-1).mean()))
+    middle = float(np.median(shares))
+    if middle < _EVEN_SHARE:
+        return None
+    return (
+        f"{photos[0].parent}: expected photographs, found pictures that are even over {middle:.0%} of their area, as "
+        "screenshots and drawings are; poses and surfaces are found from texture"
+    )
+
+
+def require_coverage(capture: PosedImages, name: str) -> None:
+    """Refuse views that are too few or too close together; a good capture has ten times as much.
+
+    Args:
+        capture: Posed views; without points, parallax is measured at the place that the cameras look at.
+        name: The capture, for the message.
+
+    Raises:
+        ValueError: With what is needed, in number and parallax, and what was found.
+    """
+    needed = (
+        f"expected at least {MIN_VIEWS} posed views with a parallax of {_MIN_PARALLAX_DEG:g} degrees or more "
+        f"(40 or more views from all around are usual)"
+    )
+    if len(capture) < MIN_VIEWS:
+        raise ValueError(f"{name}: {needed}, found {len(capture)}")
+    parallax = median_parallax_deg(capture.cameras, capture.points)
+    if parallax is not None and parallax < _MIN_PARALLAX_DEG:
+        raise ValueError(
+            f"{name}: {needed}, found {len(capture)} views with {parallax:.2g} degrees: "
+            "the cameras stand in one place, or their positions are missing"
+        )
+
+
+def median_parallax_deg(cameras: Cameras, points: Float[Tensor, "m 3"]) -> float | None:
+    """The angle between the outermost cameras that see a point, in the median over points; None where unknown.
+
+    Args:
+        cameras: In the points' frame.
+        points: Where there are none that two cameras see, the focus point of the cameras serves; where the cameras look
+            outwards, there is none either, and only cameras in one place are known to have no parallax.
+    """
+    some = cameras.spread(_CAMERAS)
+    centers = some.centers.double()
+    extent = float((centers - centers.mean(0)).norm(dim=1).max())
+    if extent <= 1e-6 * max(1.0, float(centers.abs().max())):
+        return 0.0
+    chosen = points[torch.linspace(0, len(points) - 1, min(_POINTS, len(points))).long()].double()
+    seen = _seen(some, chosen)
+    several = seen.sum(0) >= 2
+    if bool(several.any()):
+        return float(_widest_deg(centers, chosen[several], seen[:, several]).median())
+    try:
+        focus = focus_point(some).double()[None]
+    except ValueError:
+        return None
+    return float(_widest_deg(centers, focus, torch.ones(len(some), 1, dtype=torch.bool))[0])
+
+
+def _seen(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Tensor:
+    """Which camera has which point in its image, (v, m)."""
+    poses = cameras.camera_from_world.double()
+    x = torch.einsum("vij,mj->vmi", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+    pixels = torch.einsum("vij,vmj->vmi", cameras.intrinsics.double(), x)
+    pixels = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-9)
+    inside = (pixels >= 0).all(-1) & (pixels < cameras.sizes[:, None].double()).all(-1)
+    return inside & (x[..., 2] > 0)
+
+
+def _widest_deg(centers: Float[Tensor, "v 3"], points: Float[Tensor, "m 3"], seen: Tensor) -> Float[Tensor, "m"]:
+    """The widest angle at each point between two cameras that see it, degrees."""
+    rays = torch.nn.functional.normalize(centers[:, None] - points, dim=-1)
+    cosines = torch.einsum("vmi,wmi->mvw", rays, rays)
+    both = seen.T[:, :, None] & seen.T[:, None, :]
+    least = torch.where(both, cosines, torch.ones_like(cosines)).flatten(1).min(1).values
+    return torch.rad2deg(torch.acos(least.clamp(-1, 1)))

@@ -1,122 +1,60 @@
-"""Extracts frames of a video at equal steps of motion, each the sharpest of its stretch."""
+"""Frames of a video at equal steps of motion, each the sharpest of its stretch.
+
+How far the picture has moved at each frame, and where the video is cut, is found by tracking corners (Lucas-Kanade)
+from a reference frame, which is renewed after a known displacement: jitter and noise of a camera that stands still do
+not add up. Lengths are over the picture's longest side; constants are set by hand.
+"""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import tee
 from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
-from splatgraft.capture.video_motion import MotionTracker, choose_frames
+from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress, silent
 
-_SHARPNESS_PX = 480
-"""Longest side at which sharpness is measured, so that it does not depend on the resolution."""
-_LEAST_FRAMES = 3
 VIDEO_FRAMES = 120
 """Frames taken of a video, where it has as many and different views."""
+_MIN_FRAMES = 3
+_SHARPNESS_PX = 480
+"""Longest side at which sharpness is measured, so that it does not depend on the resolution."""
 _MISSING_SHARE = 0.02
 """Share of the announced frames that may be missing before the file counts as cut off; containers count roughly."""
+_TRACKED_PX = 320
+"""Longest side at which corners are tracked."""
+_CORNERS = 200
+"""Corners that are tracked."""
+_MIN_CORNERS = 8
+"""Corners below which a frame has nothing to track, such as a black one."""
+_RETURNED_PX = 1.0
+"""Largest error of a corner tracked forth and back."""
+_RENEWED_AFTER = 0.05
+"""Displacement after which another reference frame is taken."""
+_RENEWED_BELOW = 0.6
+"""Share of corners still tracked below which another is taken."""
+_CUT_BELOW = 0.3
+"""Share of corners tracked from the frame before below which it is another shot; blurred motion has 0.6."""
+_MIN_STEP = 0.02
+"""Motion between two frames, at least: 13 pixels of 640, from which structure from motion gains depth."""
+_STRETCH_MARGIN = 0.2
+"""Share of a stretch at either end that is avoided, so that neighbours do not meet there."""
 _WIDE_STEP = 0.15
-"""Motion between frames, over the longest side, above which they may overlap too little."""
+"""Motion between frames above which they may overlap too little."""
 _STANDING_S = 1.0
 """Shortest time of standing still that is mentioned, seconds."""
 _NAMED_CUTS = 5
-
-
-def extract_frames(
-    video: Path,
-    folder: Path,
-    *,
-    count: int = VIDEO_FRAMES,
-    progress: Progress = silent,
-    say: Callable[[str], None] = lambda sentence: None,
-) -> list[Path]:
-    """Write the sharpest frame of each of at most `count` stretches of equal motion of `video`, as PNG.
-
-    Motion is the median displacement of tracked corners, so that a camera that stands still gives one frame however
-    long it does. Sharpness is the variance of the Laplacian of the frame, reduced to 480 px; motion blur lowers it.
-
-    Args:
-        video: Any file that OpenCV can read.
-        folder: Made where it does not exist.
-        count: Frames to write; fewer if the picture moves less than 2% of its longest side between them.
-        progress: Called every 25 frames, in two passes.
-        say: Takes sentences for the user: how the frames were chosen, cuts, a truncated file.
-
-    Returns:
-        The files, in order of time.
-
-    Raises:
-        ValueError: Where `video` cannot be read, or has fewer than three frames or different views.
-    """
-    if count < 1:
-        raise ValueError(f"{video}: expected at least 1 frame to extract, found {count}")
-    with _opened(video) as capture:
-        announced, rate = _announced(capture), capture.get(cv2.CAP_PROP_FPS)
-        rate = rate if math.isfinite(rate) and 1 <= rate <= 1000 else 30.0
-        tracker = MotionTracker()
-        seen = [
-            (*tracker.add(frame), _sharpness(frame)) for frame in _frames(capture, progress, "looking for sharp frames")
-        ]
-    if len(seen) < _LEAST_FRAMES:
-        raise ValueError(f"{video}: expected a video of at least {_LEAST_FRAMES} frames, found {len(seen)}")
-    path, cuts, sharpness = (np.array(values) for values in zip(*seen, strict=True))
-    if len(seen) < (1 - _MISSING_SHARE) * announced:
-        say(f"the file announces {announced} frames and {len(seen)} can be read: it is truncated or damaged")
-    chosen, step = choose_frames(path, sharpness, np.cumsum(cuts), count)
-    if len(chosen) < _LEAST_FRAMES:
-        raise ValueError(
-            f"{video}: expected a camera that moves around, found {len(chosen)} different views in {len(seen)} frames"
-        )
-    for sentence in _report(path, np.flatnonzero(cuts), rate, len(chosen), step):
-        say(sentence)
-    return _write(video, folder, set(chosen), progress)
-
-
-def _report(path: np.ndarray, cuts: np.ndarray, rate: float, chosen: int, step: float) -> list[str]:
-    said = [
-        f"{chosen} of {len(path)} frames, each the sharpest of a stretch in which the picture moves by {step:.1%} of "
-        f"its longest side"
-    ]
-    if step > _WIDE_STEP:
-        said[0] += ": they may overlap too little; film more slowly, or give a shorter video"
-    # a stretch of one second in which the picture moves less than a tenth of a step
-    window = max(1, round(_STANDING_S * rate))
-    if len(path) > window:
-        still = np.abs(path[window:] - path[:-window]) < 0.1 * step
-        seconds = float(still.sum()) / rate
-        if seconds > 0:
-            said.append(f"the camera stands still for about {seconds + _STANDING_S:.0f} s, which give no more frames")
-    if len(cuts):
-        times = ", ".join(f"{cut / rate:.1f} s" for cut in cuts[:_NAMED_CUTS])
-        more = ", ..." if len(cuts) > _NAMED_CUTS else ""
-        said.append(
-            f"the video is cut at {times}{more}: frames before and after belong together only if they show one place"
-        )
-    return said
-
-
-def _write(video: Path, folder: Path, chosen: set[int], progress: Progress) -> list[Path]:
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    with _opened(video) as capture:
-        for index, frame in enumerate(_frames(capture, progress, "writing frames")):
-            if index in chosen:
-                paths.append(folder / f"frame_{index:06d}.png")
-                if not cv2.imwrite(str(paths[-1]), frame):
-                    raise ValueError(f"{paths[-1]}: expected to write a frame here, found no way to")
-    return paths
 
 
 @dataclass(frozen=True)
 class VideoFacts:
     """What a video file says about itself."""
 
-    frames: int
-    """Number of frames as announced; 0 where it announces none."""
     width: int
     """Pixels."""
     height: int
@@ -137,20 +75,190 @@ def read_video_facts(video: Path) -> VideoFacts:
     with _opened(video) as capture:
         is_read, frame = capture.read()
         frames = _announced(capture)
-        if not is_read or 0 < frames < _LEAST_FRAMES:
+        if not is_read or 0 < frames < _MIN_FRAMES:
             found = f"{frames}" if is_read else "none that can be read"
-            raise ValueError(f"{video}: expected a video of at least {_LEAST_FRAMES} frames, found {found}")
+            raise ValueError(f"{video}: expected a video of at least {_MIN_FRAMES} frames, found {found}")
         rate = capture.get(cv2.CAP_PROP_FPS)
         seconds = frames / rate if math.isfinite(rate) and rate > 0 else 0.0
-        return VideoFacts(frames, frame.shape[1], frame.shape[0], seconds)
+        return VideoFacts(frame.shape[1], frame.shape[0], seconds)
+
+
+def extract_frames(
+    video: Path, folder: Path, *, count: int = VIDEO_FRAMES, progress: Progress = silent
+) -> tuple[list[Path], tuple[Note, ...]]:
+    """Write the sharpest frame of each of at most `count` stretches of equal motion of `video`, as PNG.
+
+    Motion is the median displacement of tracked corners, so that a camera that stands still gives one frame however
+    long it does. Sharpness is the variance of the Laplacian of the frame, reduced to 480 px; motion blur lowers it.
+
+    Args:
+        video: Any file that OpenCV can read.
+        folder: Made where it does not exist.
+        count: Frames to write; fewer if the picture moves less than 2% of its longest side between them.
+        progress: Called every 25 frames, in two passes.
+
+    Returns:
+        The files, in order of time, and how the frames were chosen: pauses, cuts, a truncated file.
+
+    Raises:
+        ValueError: Where `video` cannot be read, or has fewer than three frames or different views.
+    """
+    with _opened(video) as capture:
+        announced, rate = _announced(capture), capture.get(cv2.CAP_PROP_FPS)
+        rate = rate if math.isfinite(rate) and 1 <= rate <= 1000 else 30.0
+        tracked, measured = tee(_frames(capture, progress, "looking for sharp frames"))
+        seen = [(*m, s) for m, s in zip(motion(tracked), map(_sharpness, measured), strict=True)]
+    if len(seen) < _MIN_FRAMES:
+        raise ValueError(f"{video}: expected a video of at least {_MIN_FRAMES} frames, found {len(seen)}")
+    path, cuts, sharpness = (np.array(values) for values in zip(*seen, strict=True))
+    chosen, step = choose_frames(path, sharpness, np.cumsum(cuts), count)
+    if len(chosen) < _MIN_FRAMES:
+        raise ValueError(
+            f"{video}: expected a camera that moves around, found {len(chosen)} different views in {len(seen)} frames"
+        )
+    notes = _notes(path, np.flatnonzero(cuts), rate, len(chosen), step)
+    if len(seen) < (1 - _MISSING_SHARE) * announced:
+        text = f"the file announces {announced} frames and {len(seen)} can be read: it is truncated or damaged"
+        notes.insert(0, Note(text))
+    folder.mkdir(parents=True, exist_ok=True)
+    paths, wanted = [], set(chosen)
+    with _opened(video) as capture:
+        for index, frame in enumerate(_frames(capture, progress, "writing frames")):
+            if index in wanted:
+                paths.append(folder / f"frame_{index:06d}.png")
+                if not cv2.imwrite(str(paths[-1]), frame):
+                    raise ValueError(f"{paths[-1]}: expected to write a frame here, found no way to")
+    return paths, tuple(notes)
+
+
+def grey_frames(video: Path, count: int, longest_px: int) -> list[UInt8[np.ndarray, "_ _"]]:
+    """Luma of at most `count` frames spread evenly over a video.
+
+    Args:
+        video: The file.
+        count: Most frames.
+        longest_px: Longest side, pixels.
+
+    Raises:
+        ValueError: Where it cannot be read, or has fewer than three frames.
+    """
+    found: list[np.ndarray] = []
+    with _opened(video) as capture:
+        total = _announced(capture)
+        for k in range(min(count, total)):
+            capture.set(cv2.CAP_PROP_POS_FRAMES, k * total // min(count, total))
+            is_read, frame = capture.read()
+            if is_read:
+                # grey first: `_reduced` of colours rounds otherwise
+                found.append(_reduced(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), longest_px))
+    if len(found) < _MIN_FRAMES:
+        raise ValueError(f"{video}: expected a video of at least {_MIN_FRAMES} frames, found {len(found)}")
+    return found
+
+
+def motion(frames: Iterable[np.ndarray]) -> Iterator[tuple[float, bool]]:
+    """For each frame, the path of the picture so far, over its longest side, and whether a cut comes before it."""
+    # position of the reference frame on the path, and of this frame
+    travelled = here = 0.0
+    reference = before = corners = None
+    for frame in frames:
+        small = cv2.cvtColor(_reduced(frame, _TRACKED_PX), cv2.COLOR_BGR2GRAY)
+        if reference is None or before is None or corners is None or before.shape != small.shape:
+            travelled, reference, before, corners = here, small, small, _corners(small)
+            yield here, False
+            continue
+        moved, share = _moved(reference, corners, small)
+        if share < _RENEWED_BELOW:
+            # too much has left the picture: go on from the frame before
+            travelled, reference, corners = here, before, _corners(before)
+            moved, share = _moved(before, corners, small)
+        tracked = len(corners) >= _MIN_CORNERS
+        is_cut = tracked and share < _CUT_BELOW
+        if tracked and not is_cut:
+            here = travelled + moved
+        if is_cut or not tracked or moved > _RENEWED_AFTER:
+            travelled, reference, corners = here, small, _corners(small)
+        before = small
+        yield here, is_cut
+
+
+def _corners(small: np.ndarray) -> Float[np.ndarray, "n 1 2"]:
+    found = cv2.goodFeaturesToTrack(small, _CORNERS, 0.01, 5)
+    return np.empty((0, 1, 2), np.float32) if found is None else found
+
+
+def _moved(old: np.ndarray, corners: Float[np.ndarray, "n 1 2"], new: np.ndarray) -> tuple[float, float]:
+    """Median displacement of the corners that are found again, and their share."""
+    if len(corners) < _MIN_CORNERS:
+        return 0.0, 0.0
+    there, seen, _ = cv2.calcOpticalFlowPyrLK(old, new, corners, np.empty_like(corners))
+    back, seen_back, _ = cv2.calcOpticalFlowPyrLK(new, old, there, np.empty_like(corners))
+    error = np.linalg.norm(back - corners, axis=-1)[:, 0]
+    good = (seen[:, 0] == 1) & (seen_back[:, 0] == 1) & (error < _RETURNED_PX)
+    if not good.any():
+        return 0.0, 0.0
+    lengths = np.linalg.norm(there - corners, axis=-1)[:, 0][good]
+    return float(np.median(lengths)) / max(new.shape), float(good.mean())
+
+
+def choose_frames(
+    path: Float[np.ndarray, "n"], sharpness: Float[np.ndarray, "n"], shots: np.ndarray, count: int
+) -> tuple[list[int], float]:
+    """The sharpest frame of each of at most `count` stretches of equal motion; shots are not mixed.
+
+    Args:
+        path: Motion up to each frame, over the picture's longest side.
+        sharpness: Of each frame, any unit.
+        shots: Number of the shot of each frame, from 0 up.
+        count: Largest number of frames; one more per shot may come.
+
+    Returns:
+        Positions in order, and the length of a stretch.
+    """
+    total = sum(float(np.ptp(path[shots == shot])) for shot in np.unique(shots))
+    step = max(total / count, _MIN_STEP)
+    chosen = []
+    for shot in np.unique(shots):
+        frames = np.flatnonzero(shots == shot)
+        along = (path[frames] - path[frames].min()) / step
+        # the last frame ends the last stretch, and is none of its own
+        last = max(0, int(np.ceil(along.max() - 1e-6)) - 1)
+        stretches = np.minimum(np.floor(along), last)
+        for stretch in np.unique(stretches):
+            inside = stretches == stretch
+            middle = inside & (np.abs(along - stretch - 0.5) <= 0.5 - _STRETCH_MARGIN)
+            among = frames[middle if middle.any() else inside]
+            chosen.append(int(among[np.argmax(sharpness[among])]))
+    return sorted(chosen), step
+
+
+def _notes(path: np.ndarray, cuts: np.ndarray, rate: float, chosen: int, step: float) -> list[Note]:
+    said = [
+        f"{chosen} of {len(path)} frames, each the sharpest of a stretch in which the picture moves by {step:.1%} of "
+        f"its longest side"
+    ]
+    if step > _WIDE_STEP:
+        said[0] += ": they may overlap too little; film more slowly, or give a shorter video"
+    # a stretch of one second in which the picture moves less than a tenth of a step
+    window = max(1, round(_STANDING_S * rate))
+    if len(path) > window:
+        still = np.abs(path[window:] - path[:-window]) < 0.1 * step
+        seconds = float(still.sum()) / rate
+        if seconds > 0:
+            said.append(f"the camera stands still for about {seconds + _STANDING_S:.0f} s, which give no more frames")
+    if len(cuts):
+        times = ", ".join(f"{cut / rate:.1f} s" for cut in cuts[:_NAMED_CUTS])
+        more = ", ..." if len(cuts) > _NAMED_CUTS else ""
+        said.append(
+            f"the video is cut at {times}{more}: frames before and after belong together only if they show one place"
+        )
+    return [Note(text) for text in said]
 
 
 @contextmanager
 def _opened(video: Path) -> Iterator[cv2.VideoCapture]:
-    if not video.is_file():
-        raise ValueError(f"{video}: expected a video file, found none")
-    if video.stat().st_size == 0:
-        raise ValueError(f"{video}: expected a video file, found an empty one")
+    if not video.is_file() or video.stat().st_size == 0:
+        raise ValueError(f"{video}: expected a video file, found {'an empty one' if video.is_file() else 'none'}")
     capture = cv2.VideoCapture(str(video))
     try:
         if not capture.isOpened():
@@ -169,8 +277,7 @@ def _announced(capture: cv2.VideoCapture) -> int:
 
 
 def _frames(capture: cv2.VideoCapture, progress: Progress, message: str) -> Iterator[np.ndarray]:
-    total = _announced(capture)
-    done = 0
+    total, done = _announced(capture), 0
     while True:
         readable, frame = capture.read()
         if not readable:
@@ -181,7 +288,11 @@ def _frames(capture: cv2.VideoCapture, progress: Progress, message: str) -> Iter
             progress(done, max(done, total), message)
 
 
+def _reduced(frame: np.ndarray, longest_px: int) -> np.ndarray:
+    scale = longest_px / max(frame.shape[:2])
+    return cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else frame
+
+
 def _sharpness(frame: np.ndarray) -> float:
-    scale = _SHARPNESS_PX / max(frame.shape[:2])
-    small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else frame
-    return float(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), cv2.CV_64F).var())
+    grey = cv2.cvtColor(_reduced(frame, _SHARPNESS_PX), cv2.COLOR_BGR2GRAY)
+    return float(cv2.Laplacian(grey, cv2.CV_64F).var())

@@ -1,11 +1,12 @@
 """Virtual cameras for a trained scene that comes without images: its dense part, its up direction, and camera poses.
 
 The dense part is found by trimmed means, up as the normal of the largest plane (RANSAC), the poses on rings around the
-dense part or within it (`camera_positions`).
+dense part or within it, with occluded positions removed by rendering the scene. All constants are set by hand; lengths
+are over the radius of the dense part.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,51 +14,68 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.capture.camera_positions import (
-    HALF_FOV,
-    LEAST_VIEWS,
-    positions_around,
-    positions_within,
-    unoccluded_poses,
-)
-from splatgraft.core.cameras import Cameras, pinhole
+from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.directions import perpendicular
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.planes import least_squares_normal, sample_planes
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering import render
 from splatgraft.runtime.progress import Progress, silent
 
+_HALF_FOV = math.radians(30)
+"""Half the horizontal field of view of the pictures, radians."""
+_MIN_VIEWS = 8
+"""Number of poses that are kept even where they are occluded."""
 
-@dataclass(frozen=True)
-class SceneOrientationOptions:
-    """How dense part and up of a scene are found; lengths over the dense part's radius, values set by hand."""
+# what is solid, and which plane is a floor
+_MIN_OPACITY = 0.3
+"""Opacity above which a Gaussian counts as solid."""
+_MAX_SCALE = 20.0
+"""Scale over the median one from which a Gaussian counts as backdrop."""
+_MAX_POINTS, _MIN_POINTS = 20_000, 20
+"""Solid Gaussians that are used, and that are needed."""
+_TRIM_ROUNDS = 10
+"""Means of the nearer half of the points, each around the one before."""
+_PLANE_POINTS = 4000
+"""Points that planes are fitted to, about the dense part within twice its radius."""
+_TRIALS = 1000
+"""Random planes."""
+_THICKNESS = 0.02
+"""Largest distance of a point that counts as on a plane."""
+_ALIGNED_COS = math.cos(math.radians(25.0))
+"""Cosine of the angle to a customary up direction (y or z of the file) below which a plane is taken for a floor."""
+_UNALIGNED_WEIGHT = 0.6
+"""Factor on the points of other planes: walls are as large as floors."""
+_MIN_SHARE = 0.1
+"""Least share of the points on the plane."""
+_SIDE_RATIO = 3.0
+"""Points on one side of the plane over those on the other, above which the first side is up."""
+_HOLLOW_SHARE = 0.08
+"""Share of points within half the radius below which a scene is hollow: a solid ball has 0.06, a table more."""
 
-    least_opacity: float = 0.3
-    """Opacity above which a Gaussian counts as solid."""
-    largest_scale: float = 20.0
-    """Scale over the median one from which a Gaussian counts as backdrop."""
-    most_points: int = 20_000
-    """Solid Gaussians that are used."""
-    least_points: int = 20
-    """Solid Gaussians that are needed."""
-    trim_rounds: int = 10
-    """Means of the nearer half of the points, each around the one before."""
-    plane_points: int = 4000
-    """Points that planes are fitted to, about the dense part within twice its radius."""
-    trials: int = 1000
-    """Random planes."""
-    thickness: float = 0.02
-    """Largest distance of a point that counts as on a plane."""
-    aligned_deg: float = 25.0
-    """Angle to a customary up direction (y or z of the file) below which a plane is taken for a floor."""
-    unaligned_weight: float = 0.6
-    """Factor on the points of other planes: walls are as large as floors."""
-    least_share: float = 0.1
-    """Least share of the points on the plane."""
-    side_ratio: float = 3.0
-    """Points on one side of the plane over those on the other, above which the first side is up."""
-    hollow_share: float = 0.08
-    """Share of points within half the radius below which a scene is hollow: a solid ball has 0.06, a table more."""
+# candidate positions, and what occludes them
+_DISTANCES = (2.4, 1.7, 3.4, 1.2)
+"""From the centre, around the dense part, the best first: at 2.4 it fills the picture."""
+_ELEVATIONS_DEG = (20.0, 42.0)
+"""Of the rings around the dense part."""
+_CLEAR = 1.1
+"""Distance from the centre towards the eye beyond which anything occludes the dense part."""
+_CLEAR_AT_EDGES = 0.35
+"""Distance from the eye, over that of the centre, below which anything occludes the picture."""
+_HEIGHTS = (0.2, 0.6, 0.0)
+"""Of eyes within the scene above the centre, the best first."""
+_ELEVATIONS_WITHIN_DEG = (0.0, -25.0)
+"""Of views out of the scene."""
+_STEP_BACK = 0.3
+"""Horizontal distance of eyes within the scene from the centre, against the view."""
+_CLEAR_WITHIN, _CLEAR_AT_EDGES_WITHIN = 0.3, 0.15
+"""Distance from an eye within the scene below which anything occludes the middle of the picture, and the picture."""
+_MIN_SEEN_WITHIN = 0.5
+"""Least mean opacity of a picture from within."""
+_OCCLUDED = 0.1
+"""Occluded share from which a position is not taken."""
+_MIDDLE_WEIGHT = 0.3
+"""Factor on the occluded share of the picture's middle against that of the whole picture."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +93,8 @@ class VirtualCameraOptions:
 
     def __post_init__(self) -> None:
         """Raises: ValueError where there would be too few views, or up has no length."""
-        if self.views < LEAST_VIEWS:
-            raise ValueError(f"--views: expected at least {LEAST_VIEWS}, found {self.views}")
+        if self.views < _MIN_VIEWS:
+            raise ValueError(f"--views: expected at least {_MIN_VIEWS}, found {self.views}")
         if self.picture_width < 16:
             raise ValueError(f"--picture-width: expected at least 16, found {self.picture_width}")
         if self.up is not None and not math.hypot(*self.up) > 0:
@@ -97,12 +115,25 @@ class VirtualCameras:
     """Sentences for the user: what was assumed."""
 
 
+@dataclass(frozen=True)
+class _Position:
+    """An eye, the point it looks at, and what occludes it."""
+
+    eye: Float[Tensor, "3"]
+    target: Float[Tensor, "3"]
+    clear: float
+    """Depth below which anything in the middle of the picture occludes it, world units."""
+    clear_at_edges: float
+    """The same for the whole picture."""
+    min_seen: float
+    """Least mean opacity of the picture, in [0, 1]."""
+
+
 def place_virtual_cameras(
     scene: Gaussians,
     options: VirtualCameraOptions,
     *,
     stated_up: tuple[float, float, float] | None = None,
-    orientation: SceneOrientationOptions = SceneOrientationOptions(),
     progress: Progress = silent,
 ) -> VirtualCameras:
     """Place rings of cameras around the scene's dense part or within it, without those whose view is blocked.
@@ -111,34 +142,35 @@ def place_virtual_cameras(
         scene: A trained scene in any frame.
         options: Number, size and kind of the views.
         stated_up: Up direction that the scene's file states; `options.up` goes before it.
-        orientation: How dense part and up are found.
         progress: Called after each view.
 
     Raises:
         ValueError: Where the scene has too few solid Gaussians.
     """
-    solid = _solid(scene, orientation)
-    centre, radius = dense_part(solid.means, orientation.trim_rounds)
+    solid = _solid(scene)
+    centre, radius = dense_part(solid.means)
     given = options.up or stated_up
     if given is None:
-        up, reason = estimate_scene_up(solid.means, centre, radius, options=orientation)
+        up, reason = estimate_scene_up(solid.means, centre, radius)
     else:
         up = torch.nn.functional.normalize(torch.tensor(given), dim=0)
         reason = "as given" if options.up else "as the file's header states; another is named by --up"
-    positions = positions_around if options.look == "around" else positions_within
-    candidates = positions(centre, radius, up=up, views=options.views)
-    poses, dropped = unoccluded_poses(scene, candidates, up=up, progress=progress)
+    positions = _positions_around if options.look == "around" else _positions_within
+    candidates = positions(centre, radius, up, options.views)
+    poses, dropped = _unoccluded_poses(scene, candidates, up, progress)
     width = options.picture_width
-    focal = 0.5 * width / math.tan(HALF_FOV)
+    focal = 0.5 * width / math.tan(_HALF_FOV)
     cameras = pinhole(poses, focal, width=width, height=width * 3 // 4, prefix="look")
+    axis = int(up.abs().argmax())
+    along = f", thus {'xyz'[axis]} {'up' if up[axis] > 0 else 'down'}" if abs(float(up[axis])) >= _ALIGNED_COS else ""
     report = [
         f"a scene without photographs: {len(cameras)} pictures are made of it, from {options.look} {_shown(centre)}",
-        f"up is taken to be {_shown(up)}{_axis(up, orientation)}: {reason}",
+        f"up is taken to be {_shown(up)}{along}: {reason}",
     ]
     if dropped:
         report.append(f"{dropped} of {options.views} views were left out: something stands in their way")
     inner = float(((solid.means - centre).norm(dim=1) < 0.5 * radius).float().mean())
-    if options.look == "around" and inner < orientation.hollow_share:
+    if options.look == "around" and inner < _HOLLOW_SHARE:
         report.append("it is hollow: where it was seen from within, as a room from its middle, say look = within")
     colors = rgb_from_dc(solid.sh[:, 0]).clamp(0, 1)
     return VirtualCameras(cameras, solid.means, colors, tuple(report))
@@ -154,21 +186,26 @@ def render_pictures(
         progress(index + 1, len(found.cameras), "pictures of the scene")
 
 
-def dense_part(points: Float[Tensor, "m 3"], rounds: int = 10) -> tuple[Float[Tensor, "3"], float]:
+def _solid(scene: Gaussians) -> Gaussians:
+    """Opaque Gaussians that are not backdrop, at most `_MAX_POINTS`, evenly taken."""
+    largest = scene.scales.amax(1)
+    which = ((scene.opacities > _MIN_OPACITY) & (largest < _MAX_SCALE * largest.median())).nonzero()[:, 0]
+    if len(which) < _MIN_POINTS:
+        raise ValueError(f"scene: expected at least {_MIN_POINTS} solid Gaussians, found {len(which)} of {scene.count}")
+    return scene.select(which[:: math.ceil(len(which) / _MAX_POINTS)])
+
+
+def dense_part(points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "3"], float]:
     """Centre of the densest half of the points, by iterated trimmed means, and the radius that holds half of them."""
     centre = points.median(0).values
-    for _ in range(rounds):
+    for _ in range(_TRIM_ROUNDS):
         distance = (points - centre).norm(dim=1)
         centre = points[distance <= distance.median()].mean(0)
     return centre, float((points - centre).norm(dim=1).median())
 
 
 def estimate_scene_up(
-    points: Float[Tensor, "m 3"],
-    centre: Float[Tensor, "3"],
-    radius: float,
-    *,
-    options: SceneOrientationOptions = SceneOrientationOptions(),
+    points: Float[Tensor, "m 3"], centre: Float[Tensor, "3"], radius: float
 ) -> tuple[Float[Tensor, "3"], str]:
     """Up direction of a scene: the normal of the largest plane in the dense part, on the side with more points.
 
@@ -179,24 +216,22 @@ def estimate_scene_up(
         points: Centres of solid Gaussians.
         centre: Of the dense part.
         radius: Of the dense part, world units.
-        options: Of the plane.
 
     Returns:
         A unit vector, and the reason for it, for the user.
     """
     near = points[(points - centre).norm(dim=1) < 2 * radius]
-    near = near[:: max(1, len(near) // options.plane_points)]
-    normals, on_plane = sample_planes(near, options.trials, seed=0)
+    near = near[:: max(1, len(near) // _PLANE_POINTS)]
+    normals, on_plane = sample_planes(near, _TRIALS, seed=0)
     # three points on a line span no plane
     spans = normals.norm(dim=1) > 1e-4 * radius**2
     normals, on_plane = torch.nn.functional.normalize(normals[spans], dim=1), on_plane[spans]
     heights = normals @ near.T - (normals * on_plane).sum(1)[:, None]
-    thickness = options.thickness * radius
-    aligned = math.cos(math.radians(options.aligned_deg))
+    thickness = _THICKNESS * radius
     counts = (heights.abs() < thickness).sum(1).float()
-    customary = normals[:, 1:].abs().amax(1) > aligned
-    best = int((counts * torch.where(customary, 1.0, options.unaligned_weight)).argmax())
-    if counts[best] < options.least_share * len(near):
+    customary = normals[:, 1:].abs().amax(1) > _ALIGNED_COS
+    best = int((counts * torch.where(customary, 1.0, _UNALIGNED_WEIGHT)).argmax())
+    if counts[best] < _MIN_SHARE * len(near):
         return torch.tensor([0.0, -1.0, 0.0]), "no level surface was found, and most files have it so"
     inliers = near[heights[best].abs() < thickness]
     middle = inliers.mean(0)
@@ -206,30 +241,89 @@ def estimate_scene_up(
     above = float(((height > 3 * thickness) & (height < radius) & beside).sum())
     below = float(((height < -3 * thickness) & (height > -radius) & beside).sum())
     share = f"the normal of a surface that holds {float(counts[best]) / len(near):.0%} of the dense part"
-    if abs(float(normal[2])) < aligned and max(above, below) > options.side_ratio * min(above, below) + 1:
+    if abs(float(normal[2])) < _ALIGNED_COS and max(above, below) > _SIDE_RATIO * min(above, below) + 1:
         return normal if above > below else -normal, f"{share}, on whose one side most things stand"
     customary_side = float(normal @ torch.tensor([0.0, -1.0, 1.0])) >= 0
     return normal if customary_side else -normal, f"{share}; which of its sides is a guess by custom"
 
 
-def _solid(scene: Gaussians, options: SceneOrientationOptions) -> Gaussians:
-    """Opaque Gaussians that are not backdrop, at most `options.most_points`, evenly taken."""
-    largest = scene.scales.amax(1)
-    which = (
-        (scene.opacities > options.least_opacity) & (largest < options.largest_scale * largest.median())
-    ).nonzero()[:, 0]
-    if len(which) < options.least_points:
-        least = options.least_points
-        raise ValueError(f"scene: expected at least {least} solid Gaussians, found {len(which)} of {scene.count}")
-    return scene.select(which[:: math.ceil(len(which) / options.most_points)])
+def _positions_around(
+    centre: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"], views: int
+) -> list[list[_Position]]:
+    """Per view, positions along one direction from the centre that look at it, the best first."""
+    out = []
+    for direction in _directions(views, up, _ELEVATIONS_DEG):
+        distances = [k * radius for k in _DISTANCES]
+        edges = [_CLEAR_AT_EDGES * d for d in distances]
+        out.append(
+            [
+                _Position(centre + d * direction, centre, d - _CLEAR * radius, edge, 0.0)
+                for d, edge in zip(distances, edges, strict=True)
+            ]
+        )
+    return out
 
 
-def _axis(up: Float[Tensor, "3"], options: SceneOrientationOptions) -> str:
-    """The axis of the file that points up or down, where one does."""
-    axis = int(up.abs().argmax())
-    if abs(float(up[axis])) < math.cos(math.radians(options.aligned_deg)):
-        return ""
-    return f", thus {'xyz'[axis]} {'up' if up[axis] > 0 else 'down'}"
+def _positions_within(
+    centre: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"], views: int
+) -> list[list[_Position]]:
+    """Per view, positions near the centre that look outwards, on the whole slightly down, the best first."""
+    out = []
+    for direction in _directions(views, up, _ELEVATIONS_WITHIN_DEG):
+        flat = torch.nn.functional.normalize(direction - (direction @ up) * up, dim=0)
+        eyes = [centre - _STEP_BACK * radius * flat + k * radius * up for k in _HEIGHTS]
+        clear, edges = _CLEAR_WITHIN * radius, _CLEAR_AT_EDGES_WITHIN * radius
+        out.append([_Position(eye, eye + direction, clear, edges, _MIN_SEEN_WITHIN) for eye in eyes])
+    return out
+
+
+def _unoccluded_poses(
+    scene: Gaussians, views: Sequence[Sequence[_Position]], up: Float[Tensor, "3"], progress: Progress
+) -> tuple[Float[Tensor, "v 4 4"], int]:
+    """Poses at the first position of each view that is not occluded, tested by rendering the scene at 48 x 36 pixels.
+
+    Returns:
+        The poses, and the number of views without such a position. Of these the least occluded poses are added while
+        there are fewer than `_MIN_VIEWS`.
+    """
+    chosen: list[Tensor] = []
+    rejected: list[tuple[float, Tensor]] = []
+    for index, positions in enumerate(views):
+        tried = [_pose_and_occlusion(scene, position, up) for position in positions]
+        free = [pose for pose, occluded in tried if occluded < _OCCLUDED]
+        if free:
+            chosen.append(free[0])
+        else:
+            rejected.append(min(((occluded, pose) for pose, occluded in tried), key=lambda pair: pair[0]))
+        progress(index + 1, len(views), "placing virtual cameras")
+    missing = max(0, _MIN_VIEWS - len(chosen))
+    chosen += [pose for _, pose in sorted(rejected, key=lambda pair: pair[0])[:missing]]
+    return torch.stack(chosen), len(rejected)
+
+
+def _pose_and_occlusion(
+    scene: Gaussians, position: _Position, up: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "4 4"], float]:
+    """A pose, and the occluded share of its picture."""
+    pose = look_at(position.eye[None], position.target, up)
+    small = pinhole(pose, 24 / math.tan(_HALF_FOV), width=48, height=36)
+    rendered = render(scene, small, outputs=frozenset({"depth"}))
+    depth, alpha = rendered.depth[0], rendered.alpha[0]
+    close = float((alpha * (depth < position.clear_at_edges)).mean())
+    hidden = float((alpha * (depth < position.clear))[12:24, 16:32].mean())
+    unseen = 1.0 if float(alpha.mean()) < position.min_seen else 0.0
+    return pose[0], max(close, _MIDDLE_WEIGHT * hidden, unseen)
+
+
+def _directions(views: int, up: Float[Tensor, "3"], elevations_deg: tuple[float, ...]) -> Float[Tensor, "v 3"]:
+    """Unit directions from the centre, evenly spaced in azimuth, at the elevations in turn."""
+    x = -perpendicular(up)
+    y = torch.linalg.cross(up, x)
+    index = torch.arange(views)
+    azimuth = 2 * math.pi * index / views
+    elevation = torch.deg2rad(torch.tensor(elevations_deg))[index % len(elevations_deg)]
+    flat = azimuth.cos()[:, None] * x + azimuth.sin()[:, None] * y
+    return elevation.cos()[:, None] * flat + elevation.sin()[:, None] * up
 
 
 def _shown(vector: Float[Tensor, "3"]) -> str:

@@ -5,20 +5,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import cv2
-
-from splatgraft.capture.duration import predict_pose_seconds
-from splatgraft.capture.odd_photos import find_odd_photos
-from splatgraft.capture.photo_findings import (
+from splatgraft.capture import predict_pose_seconds
+from splatgraft.capture.photo_inspection import (
+    SIDE_PX,
     Finding,
     find_in_count,
     find_in_exposures,
     find_in_odd_photos,
     find_in_photos,
     find_in_sizes,
-    verdict_of,
+    inspect_photos,
 )
-from splatgraft.capture.photo_inspection import SIDE_PX, Grey, inspect_photos
+from splatgraft.capture.usable_views import find_odd_photos
+from splatgraft.capture.video import grey_frames
 from splatgraft.core.images import read_exif, read_grey, stored_size
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture, read_gaussians
@@ -46,7 +45,7 @@ class Check:
     def execute(self, console: Console) -> int:
         """Print one line per subject and a verdict."""
         findings = list(self._findings(console))
-        verdict = verdict_of(findings)
+        verdict = next((level for level in _VERDICTS if level in {finding.level for finding in findings}), "good")
         if self.json:
             found = [asdict(finding) for finding in findings]
             console.result(json.dumps({"capture": str(self.capture), "verdict": verdict, "findings": found}, indent=1))
@@ -84,7 +83,7 @@ class Check:
             found = inspect_photos(greys, count=len(used), progress=progress)
         yield from find_in_photos(found, names, has_poses=posed is not None)
         yield find_in_exposures([read_exposure(path) for path in used])
-        yield self._lens(used)
+        yield _lens(used)
         if posed is not None:
             yield Finding("poses", "good", f"given for {len(posed)} images, with {len(posed.points)} points")
         else:
@@ -93,7 +92,7 @@ class Check:
         yield _time(0 if posed is not None else len(used))
 
     def _of_video(self, console: Console) -> Iterator[Finding]:
-        frames = _frames(self.capture)
+        frames = grey_frames(self.capture, _FRAMES, SIDE_PX)
         with console.bar("check") as progress:
             found = inspect_photos(frames, count=len(frames), progress=progress)
         names = [f"frame {i + 1} of {len(frames)}" for i in range(len(frames))]
@@ -103,18 +102,19 @@ class Check:
         yield _masks(0)
         yield _time(3 * len(frames))
 
-    def _lens(self, photos: Sequence[Path]) -> Finding:
-        known = sum(_FOCAL_LENGTH in read_exif(photo) for photo in photos)
-        if known == len(photos):
-            return Finding("lens", "good", "focal length in EXIF of all photos")
-        return Finding("lens", "good", f"focal length in EXIF of {known} of {len(photos)} photos: else it is estimated")
-
 
 _VERDICTS = {
-    "good": "good to go",
-    "doubtful": "usable, but the doubtful points above may cost quality",
     "unusable": "not usable as it is; mend what is marked unusable first",
+    "doubtful": "usable, but the doubtful points above may cost quality",
+    "good": "good to go",
 }
+"""By the worst level of all findings."""
+
+
+def _lens(photos: Sequence[Path]) -> Finding:
+    known = sum(_FOCAL_LENGTH in read_exif(photo) for photo in photos)
+    estimated = "all photos" if known == len(photos) else f"{known} of {len(photos)} photos: else it is estimated"
+    return Finding("lens", "good", f"focal length in EXIF of {estimated}")
 
 
 def _masks(count: int) -> Finding:
@@ -131,26 +131,6 @@ def _time(photos_to_pose: int) -> Finding:
 
 def _minutes(minutes: float) -> str:
     return f"{minutes:.0f} minutes" if minutes >= 1.5 else "1 minute"
-
-
-def _frames(video: Path) -> list[Grey]:
-    """Grey frames spread evenly over a video."""
-    source = cv2.VideoCapture(str(video))
-    try:
-        total = int(source.get(cv2.CAP_PROP_FRAME_COUNT)) if source.isOpened() else 0
-        found: list[Grey] = []
-        for k in range(min(_FRAMES, max(total, 0))):
-            source.set(cv2.CAP_PROP_POS_FRAMES, k * total // min(_FRAMES, total))
-            is_read, frame = source.read()
-            if is_read:
-                grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-                scale = min(1.0, SIDE_PX / max(grey.shape))
-                found.append(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
-    finally:
-        source.release()
-    if len(found) < 3:
-        raise ValueError(f"{video}: expected a video that OpenCV can read, of at least 3 frames, found {len(found)}")
-    return found
 
 
 COMMAND = Check

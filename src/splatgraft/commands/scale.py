@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatgraft.capture import FoundScale, scale_from_length, scale_from_marker
+from splatgraft.capture import scale_from_length, scale_from_marker
 from splatgraft.folders.picture_points import point_in_world
 from splatgraft.formats import read_capture, read_gaussians
 from splatgraft.formats.metric_scale import MetricScale, write_scale
@@ -33,12 +33,12 @@ class Scale:
     def execute(self, console: Console) -> int:
         """Find the scale, say it and store it."""
         found = self._found(console)
-        path = write_scale(self.capture, MetricScale(found.metres_per_unit, found.source))
+        path = write_scale(self.capture, found)
         console.say(f"{self.capture}: one unit is {found.metres_per_unit:.4g} m, by {found.source}")
         console.result(path)
         return 0
 
-    def _found(self, console: Console) -> FoundScale:
+    def _found(self, console: Console) -> MetricScale:
         given = [name for name in ("factor", "length", "marker") if getattr(self, name) is not None]
         if len(given) != 1 or (self.length is None) != (self.ends is None):
             found = ", ".join(f"--{name}" for name in given) or "none"
@@ -46,7 +46,7 @@ class Scale:
         if self.factor is not None:
             if not 0 < self.factor < float("inf"):
                 raise ValueError(f"--factor: expected metres above 0, found {self.factor:g}")
-            return FoundScale(self.factor, "the factor that was given")
+            return MetricScale(self.factor, "the factor that was given")
         capture = read_capture(self.capture)
         if self.marker is not None:
             if not 0 < self.marker < float("inf"):

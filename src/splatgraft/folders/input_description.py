@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from splatgraft.capture import read_video_facts
-from splatgraft.capture.usable_views import LEAST_PHOTOS
+from splatgraft.capture import MIN_VIEWS, read_video_facts
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture, read_gaussians
 from splatgraft.formats.captures.masks import describe_masks, find_photos
@@ -71,7 +70,7 @@ def _folder_of_photos(path: Path) -> InputDescription:
     if result is not None:
         return InputDescription("nothing", f"a folder of results; name the scene in it: {result}")
     photos = find_photos(path)
-    if len(photos.paths) < LEAST_PHOTOS:
-        raise ValueError(f"{path}: expected at least {LEAST_PHOTOS} photos, found {len(photos.paths)}")
+    if len(photos.paths) < MIN_VIEWS:
+        raise ValueError(f"{path}: expected at least {MIN_VIEWS} photos, found {len(photos.paths)}")
     masks = describe_masks(photos.paths, photos.masks)
     return InputDescription("photos", f"{len(photos.paths)} photos, {masks}: poses are found, and it is trained")

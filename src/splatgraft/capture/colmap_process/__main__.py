@@ -7,4 +7,4 @@ from pathlib import Path
 
 if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[1])
-    import_module("colmap_process.program").main(json.loads(sys.argv[1]))
+    import_module("colmap_process.mapping").main(json.loads(sys.argv[1]))

@@ -1,7 +1,16 @@
-"""What the COLMAP process is told, and its limits."""
+"""What the COLMAP process is told, and what it tells its parent: lines `PHASE MESSAGE` for the bar, `- SENTENCE`."""
 
-from dataclasses import dataclass
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+
+PHASES = ("features", "matching", "mapping", "refinement")
+MIN_TRACK = 3
+"""Photos that must see a point for it to count; two photos make a point of any false match."""
+MAX_ERROR_PX = 1.5
+"""Largest mean reprojection error of a point that counts."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +32,7 @@ class Job:
     threads: int
     """CPU threads."""
     seed: int
-    """For the random choices of matching and mapping."""
+    """Seed of the random choices of matching and mapping."""
 
     @property
     def names(self) -> list[str]:
@@ -41,44 +50,34 @@ class Job:
         return self.folder / "best.json"
 
 
-@dataclass(frozen=True)
-class Search:
-    """What pairs are compared, and when the search for a model ends."""
-
-    preselect_above: int = 24
-    """Photos; up to this many, all pairs are compared with all features."""
-    preselect_features: int = 1000
-    """Largest features of a photo by which its partners are found (preemptive matching: Wu 2013, section 3)."""
-    preselect_partners: int = 8
-    """A photo with fewer partners than this is compared with all others."""
-    min_track: int = 3
-    """Photos that must see a point for it to count; two photos make a point of any false match."""
-    max_error_px: float = 1.5
-    """Largest mean reprojection error of a point that counts."""
-    min_observations: int = 30
-    """Points that a photo must see for its pose to count (COLMAP: abs_pose_min_num_inliers)."""
-    enough_photos: float = 0.9
-    """A model with this share of all photos, and with all that have matches, may end the search."""
-    clear_explained: float = 0.5
-    """It ends the search where it explains this share of all verified matches."""
-    focal_range: tuple[float, float] = (0.35, 5.0)
-    """Focal lengths, in longest sides of the photo, that are believed of the view graph's calibration."""
-    same_focal: float = 0.03
-    """A second start that is closer to the first than this share gives the same model."""
-    poor_share: float = 0.8
-    """A photo with less than this of the median photo's share of matches explained is posed anew."""
-    lens_observations: int = 300
-    """Points that the photos of one camera must see for its whole lens to be solved: 30 for each of its numbers."""
-    lens_rounds: int = 3
-    """How often a lens is solved, each time with the matches that the last one explains."""
-    lens_error: float = 0.9
-    """Share to which the mean reprojection error of these photos must fall for their lenses to be taken."""
-    alike: float = 0.99
-    """Models whose score is above this share of the best one's are compared by their reprojection errors."""
-    adjustments: int = 5
-    """The most bundle adjustments in a row, each followed by dropping outliers (COLMAP: ba_global_max_refinements)."""
-    adjusted_change: float = 0.0005
-    """Share of observations that changed below which they end (COLMAP: ba_global_max_refinement_change)."""
+def say(sentence: str) -> None:
+    """Tell the parent a sentence for people."""
+    print(f"- {sentence}", flush=True)
 
 
-SEARCH = Search()
+@dataclass
+class Clock:
+    """Seconds per phase."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
+    """Wall-clock time."""
+    cpu_seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
+    """Of all threads."""
+    pairs: int = 0
+    """Pairs matched so far."""
+
+    @contextmanager
+    def phase(self, name: str) -> Generator[None]:
+        """Count the time of the block, and say that it begins."""
+        print(f"{PHASES.index(name)} {name}", flush=True)
+        start, cpu_start = time.monotonic(), time.process_time()
+        try:
+            yield
+        finally:
+            self.seconds[name] += time.monotonic() - start
+            self.cpu_seconds[name] += time.process_time() - cpu_start
+
+    @property
+    def seconds_per_pair(self) -> float:
+        """Of matching; 0 where none was measured."""
+        return self.seconds["matching"] / self.pairs if self.pairs else 0.0

@@ -10,36 +10,81 @@ nothing undoes it, not even the right focal length held fixed. Averaging the rot
 import json
 import os
 import shutil
+import threading
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 
-from .features import copy_with_features, inside_masks
-from .focal_lengths import Focals, calibrated_focals, median_focals, with_focals, with_own_cameras
-from .job import SEARCH, Job
-from .matching import levels, match, unmatched_pairs
+from .database import (
+    Focals,
+    calibrated_focals,
+    copy_with_features,
+    find_features,
+    inside_masks,
+    levels,
+    match,
+    median_focals,
+    unmatched_pairs,
+    with_focals,
+    with_own_cameras,
+)
+from .job import Clock, Job, say
 from .refinement import refined
-from .reporting import Clock, say
-from .scores import Answer, best_of, connected_photos
+from .scores import Answer, best_of, connected_photos, unposed
 
 _ALL, _MASKED = "photos", "masked"
 """Names of the databases: with all features, and with those inside the masks."""
+_ENOUGH_PHOTOS = 0.9
+"""A model with this share of all photos, and with all that have matches, may end the search."""
+_CLEAR_EXPLAINED = 0.5
+"""It ends the search where it explains this share of all verified matches."""
+_SAME_FOCAL = 0.03
+"""A second start that is closer to the first than this share gives the same model."""
+
+Mapper = Callable[[Job, Path, Path], list[Any]]
+"""From a job, a database and an empty folder to models."""
+
+
+def main(words: dict[str, Any]) -> None:
+    """The best model of the job in `words` goes to its output, as JSON."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # pyright: ignore[reportAttributeAccessIssue]
+    job, clock = Job(**words), Clock()
+    pycolmap.set_random_seed(job.seed)
+    with clock.phase("features"):
+        find_features(job)
+    best = _Search(job, clock).best()
+    best |= {"unposed": unposed(job.folder / f"{_ALL}.db", best)}
+    _write(job.output, best | {"seconds": clock.seconds, "cpu_seconds": clock.cpu_seconds})
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed closes its end of the standard input; the next run then has the databases to itself."""
+    # not sys.stdin, whose lock ends Python with an error when a thread holds it at the end
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    """Write JSON as a whole or not at all."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(content))
+    os.replace(partial, path)
 
 
 @dataclass(frozen=True)
-class ModelSearch:
+class _Search:
     """What a search for a model needs; what a killed run finished is not made again."""
 
     job: Job
-    """What is posed."""
     clock: Clock
-    """Measures the phases."""
 
     def best(self) -> Answer:
-        """The best model by the score of `best_of`."""
         answers: list[Answer] = []
         for level, answer in self._candidates(answers):
             answers.append(answer)
@@ -54,16 +99,15 @@ class ModelSearch:
         yield first, self._global(_ALL, first)
         if job.masks:
             say(f"{_shortfall(answers, job)}: tried again with the features inside the masks alone")
-            if not _database(job, _MASKED).exists():
-                all_features = _database(job, _ALL)
-                copy_with_features(all_features, _database(job, _MASKED), inside_masks(job, all_features))
+            all_features = self._database(_ALL)
+            copy_with_features(all_features, self._database(_MASKED), inside_masks(job, all_features))
             self._match(_MASKED, first)
             yield first, self._global(_MASKED, first)
         for level in further:
             best = _best(answers)
-            if len(best["images"]) >= SEARCH.enough_photos * len(job.names):
+            if len(best["images"]) >= _ENOUGH_PHOTOS * len(job.names):
                 break
-            pairs, seconds = unmatched_pairs(job, _database(job, best["database"]), level), self.clock.seconds_per_pair
+            pairs, seconds = unmatched_pairs(job, self._database(best["database"])), self.clock.seconds_per_pair
             time = f", about {max(1, round(pairs * seconds / 60))} min" if seconds else ""
             say(f"{_shortfall(answers, job)}: up to {pairs} more pairs of photos are compared{time}")
             self._match(best["database"], level)
@@ -75,17 +119,19 @@ class ModelSearch:
 
     def _is_enough(self, answer: Answer, level: str) -> bool:
         """Whether the search may end; more pairs may connect photos that have too few matches so far."""
-        posed, share = len(answer["images"]), SEARCH.enough_photos
-        connected = connected_photos(_database(self.job, _ALL))
+        posed, job = len(answer["images"]), self.job
         return (
-            answer["explained"] >= SEARCH.clear_explained
-            and posed >= share * connected
-            and (level == levels(self.job)[-1] or posed >= share * len(self.job.names))
+            answer["explained"] >= _CLEAR_EXPLAINED
+            and posed >= _ENOUGH_PHOTOS * connected_photos(self._database(_ALL))
+            and (level == levels(job)[-1] or posed >= _ENOUGH_PHOTOS * len(job.names))
         )
+
+    def _database(self, name: str) -> Path:
+        return self.job.folder / f"{name}.db"
 
     def _match(self, database: str, level: str) -> None:
         with self.clock.phase("matching"):
-            self.clock.pairs += match(self.job, _database(self.job, database), level)
+            self.clock.pairs += match(self.job, self._database(database), level)
 
     def _global(self, database: str, level: str) -> Answer:
         inside = " inside the masks" if database == _MASKED else ""
@@ -97,14 +143,14 @@ class ModelSearch:
         if all(len(names) == 1 for names in self.job.groups):
             yield self._model("incremental", database, start, _incremental_models)
             return
-        medians = self._kept(f"{database}, medians", lambda: self._medians(database))
-        if any(abs(f / start.get(camera, np.inf) - 1) > SEARCH.same_focal for camera, f in _focals(medians).items()):
-            yield self._model("global from medians", database, _focals(medians), _global_models)
-        yield self._model("incremental from medians", database, _focals(medians), _incremental_models)
+        medians = self._focals(f"{database}, medians", lambda: self._medians(database))
+        if any(abs(f / start.get(camera, np.inf) - 1) > _SAME_FOCAL for camera, f in medians.items()):
+            yield self._model("global from medians", database, medians, _global_models)
+        yield self._model("incremental from medians", database, medians, _incremental_models)
 
-    def _model(self, method: str, database: str, focals: Focals, mapper: "Mapper") -> Answer:
+    def _model(self, method: str, database: str, focals: Focals, mapper: Mapper) -> Answer:
         def make() -> Answer:
-            matched = _database(self.job, database)
+            matched = self._database(database)
             with self.clock.phase("mapping"):
                 work = with_focals(matched, self.job.folder / "mapping.db", focals)
                 models = mapper(self.job, work, _fresh_folder(self.job))
@@ -116,56 +162,40 @@ class ModelSearch:
         return self._kept(method, make)
 
     def _start(self, database: str, level: str) -> Focals:
-        def make() -> dict[str, float]:
+        def make() -> Focals:
             with self.clock.phase("mapping"):
-                return {str(i): f for i, f in calibrated_focals(_database(self.job, database), self.job.seed).items()}
+                return calibrated_focals(self._database(database), self.job.seed)
 
-        return _focals(self._kept(f"{database}, {level} pairs, focal lengths", make))
+        return self._focals(f"{database}, {level} pairs, focal lengths", make)
 
-    def _medians(self, database: str) -> dict[str, float]:
+    def _medians(self, database: str) -> Focals:
         with self.clock.phase("mapping"):
-            own = with_own_cameras(_database(self.job, database), self.job.folder / "own.db")
-            models = _incremental_models(self.job, own, _fresh_folder(self.job))
-            return {str(i): f for i, f in median_focals(_database(self.job, database), models).items()}
+            own = with_own_cameras(self._database(database), self.job.folder / "own.db")
+            return median_focals(self._database(database), _incremental_models(self.job, own, _fresh_folder(self.job)))
 
-    def _kept(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def _focals(self, name: str, make: Callable[[], Focals]) -> Focals:
+        # JSON has texts as keys
+        return {int(camera): focal for camera, focal in self._kept(name, make).items()}
+
+    def _kept(self, name: str, make: Callable[[], dict[Any, Any]]) -> dict[str, Any]:
         """What `make` gives, read from the scratch folder where a killed run left it."""
         path = self.job.folder / "answers" / f"{name}.json"
         if not path.is_file():
             path.parent.mkdir(exist_ok=True)
-            path.with_suffix(".partial").write_text(json.dumps(make()))
-            os.replace(path.with_suffix(".partial"), path)
+            _write(path, make())
         return json.loads(path.read_text())
-
-
-Mapper = Callable[[Job, Path, Path], list[Any]]
-"""From a job, a database and an empty folder to models."""
-
-
-def _database(job: Job, name: str) -> Path:
-    return job.folder / f"{name}.db"
 
 
 def _best(answers: list[Answer]) -> Answer:
     """The best score with all features, or with those inside the masks where these pose more photos or explain more.
 
-    Masks leave out what is hardest to explain, so that more than `SEARCH.clear_explained` speaks for neither side; the
+    Masks leave out what is hardest to explain, so that more than `_CLEAR_EXPLAINED` speaks for neither side; the
     background then counts, which makes poses more accurate where the scene is still.
     """
-    by_database = {
-        name: max(found, key=lambda answer: answer["score"])
-        for name in (_ALL, _MASKED)
-        if (found := [answer for answer in answers if answer["database"] == name])
-    }
-    return max(
-        by_database.values(),
-        key=lambda answer: len(answer["images"]) * min(answer["explained"], SEARCH.clear_explained),
-    )
-
-
-def _focals(kept: dict[str, float]) -> Focals:
-    """JSON has texts as keys."""
-    return {int(camera): focal for camera, focal in kept.items()}
+    best: dict[str, Answer] = {}
+    for answer in sorted(answers, key=lambda answer: (answer["database"] == _MASKED, -answer["score"])):
+        best.setdefault(answer["database"], answer)
+    return max(best.values(), key=lambda answer: len(answer["images"]) * min(answer["explained"], _CLEAR_EXPLAINED))
 
 
 def _shortfall(answers: list[Answer], job: Job) -> str:
@@ -182,8 +212,6 @@ def _fresh_folder(job: Job) -> Path:
 
 
 def _global_models(job: Job, database: Path, folder: Path) -> list[Any]:
-    import pycolmap
-
     # one thread: more add sums in another order each time, and save only a tenth of the time
     options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=job.seed, min_model_size=3)
     options.mapper.bundle_adjustment.ceres.use_gpu = False
@@ -192,7 +220,5 @@ def _global_models(job: Job, database: Path, folder: Path) -> list[Any]:
 
 
 def _incremental_models(job: Job, database: Path, folder: Path) -> list[Any]:
-    import pycolmap
-
     options = pycolmap.IncrementalPipelineOptions(num_threads=job.threads, random_seed=job.seed, min_model_size=3)
     return list(pycolmap.incremental_mapping(database, Path(job.photos), folder, options).values())

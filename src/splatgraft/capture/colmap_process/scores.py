@@ -1,17 +1,22 @@
 """Figures of a model, and the one score by which models are compared.
 
 The score is the share of all photos with a pose times the share of verified matches that the model explains: both
-features of a match see one point, which `SEARCH.min_track` photos see with a mean error of at most
-`SEARCH.max_error_px`. It counts what COLMAP dropped, which a reprojection error does not.
+features of a match see one point, which `MIN_TRACK` photos see with a mean error of at most `MAX_ERROR_PX`. It counts
+what COLMAP dropped, which a reprojection error does not.
 """
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 
-from .job import SEARCH
-from .lenses import lens_numbers
+from .job import MAX_ERROR_PX, MIN_TRACK
+
+_MIN_OBSERVATIONS = 30
+"""Points that a photo must see for its pose to count (COLMAP: abs_pose_min_num_inliers)."""
+ALIKE = 0.99
+"""Models whose score is above this share of the best one's are compared by their reprojection errors."""
 
 Answer = dict[str, Any]
 """A model as plain numbers: its images with poses and cameras, its points, and its score."""
@@ -21,8 +26,6 @@ Matches = list[tuple[int, int, np.ndarray]]
 
 def read_matches(database: Path) -> Matches:
     """The verified matches of all pairs."""
-    import pycolmap
-
     with pycolmap.Database.open(database) as opened:
         pairs, geometries = opened.read_two_view_geometries()
     return [
@@ -38,11 +41,11 @@ def best_of(database: Path, models: list[Any], photos: int) -> Answer:
     Where nearly all matches are explained, a model with a wrong lens explains as many as one with the right lens, so
     that among models of about the same score the reprojection error decides.
     """
-    matches = read_matches(database)
     if not models:
         return {"images": [], "points": [], "mean_reprojection_px": 0.0, "explained": 0.0, "score": 0.0}
+    matches = read_matches(database)
     scores = [posed_and_explained(matches, model) for model in models]
-    alike = [i for i, score in enumerate(scores) if score >= SEARCH.alike * max(scores)]
+    alike = [i for i, score in enumerate(scores) if score >= ALIKE * max(scores)]
     best = min(alike, key=lambda i: models[i].compute_mean_reprojection_error())
     return _numbers(matches, models[best]) | {"score": scores[best] / photos}
 
@@ -50,8 +53,7 @@ def best_of(database: Path, models: list[Any], photos: int) -> Answer:
 def posed_and_explained(matches: Matches, model: Any) -> float:
     """The number of photos with a pose that counts times the share of `matches` explained."""
     seen = _seen_points(model)
-    explained = sum(_explained(seen, *match) for match in matches)
-    return len(seen) * explained / max(sum(len(rows) for *_, rows in matches), 1)
+    return len(seen) * _count_explained(seen, matches) / max(sum(len(rows) for *_, rows in matches), 1)
 
 
 def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
@@ -67,7 +69,11 @@ def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
 
 def connected_photos(database: Path) -> int:
     """Photos that can have a pose at all: with enough verified matches to some other photo."""
-    return len({i for *pair, rows in read_matches(database) if len(rows) >= SEARCH.min_observations for i in pair})
+    return len({i for *pair, rows in read_matches(database) if len(rows) >= _MIN_OBSERVATIONS for i in pair})
+
+
+def _count_explained(seen: dict[int, np.ndarray], matches: Matches) -> int:
+    return sum(_explained(seen, *match) for match in matches)
 
 
 def _explained(seen: dict[int, np.ndarray], a: int, b: int, rows: np.ndarray) -> int:
@@ -79,22 +85,19 @@ def _explained(seen: dict[int, np.ndarray], a: int, b: int, rows: np.ndarray) ->
 
 def _seen_points(model: Any) -> dict[int, np.ndarray]:
     """By photo with a pose that counts: for each of its features the number of its point that counts, or -1."""
-    counts = {
-        i for i, p in model.points3D.items() if p.track.length() >= SEARCH.min_track and p.error <= SEARCH.max_error_px
-    }
+    counts = {i for i, p in model.points3D.items() if p.track.length() >= MIN_TRACK and p.error <= MAX_ERROR_PX}
     seen = {
         i: np.array([p.point3D_id if p.point3D_id in counts else -1 for p in image.points2D], dtype=np.int64)
         for i, image in model.images.items()
         if image.has_pose
     }
-    return {i: points for i, points in seen.items() if (points >= 0).sum() >= SEARCH.min_observations}
+    return {i: points for i, points in seen.items() if (points >= 0).sum() >= _MIN_OBSERVATIONS}
 
 
 def _numbers(matches: Matches, model: Any) -> Answer:
     seen = _seen_points(model)
-    explained = sum(_explained(seen, *match) for match in matches)
     return {
-        "explained": explained / max(sum(len(rows) for *_, rows in matches), 1),
+        "explained": _count_explained(seen, matches) / max(sum(len(rows) for *_, rows in matches), 1),
         "mean_reprojection_px": float(model.compute_mean_reprojection_error()),
         "images": [
             {
@@ -114,10 +117,17 @@ def _numbers(matches: Matches, model: Any) -> Answer:
     }
 
 
+def lens_numbers(camera: Any) -> list[float]:
+    """fx, fy, cx, cy, k1, k2, p1, p2 of a camera with a SIMPLE_RADIAL or OPENCV lens."""
+    numbers = camera.params.tolist()
+    if len(numbers) == 8:
+        return numbers
+    f, cx, cy, k = numbers
+    return [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+
+
 def unposed(database: Path, answer: Answer) -> list[dict[str, Any]]:
     """For each photo without a pose: its name, its number of features, and its most matches with one other photo."""
-    import pycolmap
-
     posed = {image["name"] for image in answer["images"]}
     most: dict[int, int] = {}
     for *pair, rows in read_matches(database):

@@ -1,13 +1,31 @@
-"""The command `adopt`: a scene that was trained elsewhere replaces a reconstruction."""
+"""The command `adopt`: a scene that was trained elsewhere replaces a reconstruction.
+
+Where its capture is there, the scene is compared with the points of it, as it is and in other axes.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatgraft.capture import misfit_of
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
 from splatgraft.folders.capture_files import has_poses
-from splatgraft.formats import read_capture, read_scene, scene_files, write_gaussians
+from splatgraft.formats import SceneFile, read_capture, read_scene, scene_files, write_gaussians
+from splatgraft.formats.scenes.axes import rdf_from
 from splatgraft.project.layout import SCENE_FILE
 from splatgraft.project.step import Context, Inputs, Positional
+
+_MAX_DISTANCE = 0.1
+"""Median distance from a point to the nearest Gaussian, over the points' radius, up to which they fit: scenes that were
+trained with these poses have about 0.01."""
+_BETTER = 0.3
+"""Factor on that distance below which other axes are named; set by hand."""
+_MAX_POINTS, _MIN_POINTS = 2000, 20
+"""Points that are compared, and points below which nothing is said."""
+_AXES = ("RDF", "RUB", "LUF", "RFU")
+"""Axes that are tried: structure from motion, OpenGL, glTF, z up."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +55,41 @@ class Adopt:
             if misfit is not None:
                 context.console.say(f"{self.scene}: doubtful: {misfit}")
         write_gaussians(folder / SCENE_FILE, found.gaussians)
+
+
+def misfit_of(scene: SceneFile, points: Float[Tensor, "m 3"]) -> str | None:
+    """One sentence where `scene` does not lie at `points`, with the axes in which it would; None where it does.
+
+    Args:
+        scene: As read.
+        points: Of its capture, in the same frame if they belong together.
+    """
+    means = scene.gaussians.means
+    means = means[means.isfinite().all(1)]
+    points = points[:: max(1, len(points) // _MAX_POINTS)]
+    if min(len(points), len(means)) < _MIN_POINTS:
+        return None
+    tree = KDTree(means.double().numpy())
+    radius = float((points - points.median(0).values).norm(dim=1).median())
+
+    def distance(axes: str) -> float:
+        # turning the points back is the same as turning the scene
+        matrix = rdf_from(axes) @ rdf_from(scene.axes).T
+        near = np.asarray(tree.query((points @ matrix).double().numpy())[0])
+        return float(np.median(near)) / max(radius, 1e-9)
+
+    here = distance(scene.axes)
+    if here <= _MAX_DISTANCE:
+        return None
+    said = (
+        f"half of its capture's points lie more than {here:.2f} times their radius from the nearest Gaussian, "
+        f"where scenes of these poses have about 0.01"
+    )
+    others = {axes: distance(axes) for axes in _AXES if axes != scene.axes}
+    best = min(others, key=lambda axes: others[axes])
+    if others[best] < _BETTER * here and others[best] <= _MAX_DISTANCE:
+        return f'{said}; with --axes {best} it would be {others[best]:.2f}: set axes = "{best}"'
+    return f"{said}; give the poses that it was trained with, as nerfstudio's export is in another frame than its poses"
 
 
 COMMAND = Adopt

@@ -1,7 +1,7 @@
 """The command `capture`: photos, a video, a posed capture or a trained scene become a folder with transforms.json."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from splatgraft.capture import (
@@ -11,7 +11,7 @@ from splatgraft.capture import (
     extract_frames,
     place_virtual_cameras,
     pose_photos,
-    read_pose_report,
+    read_doubts,
     render_pictures,
     require_coverage,
     usable_masks,
@@ -33,6 +33,7 @@ from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, 
 from splatgraft.formats.captures.given_poses import pose_files, read_given_poses
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.project.step import Context, Inputs, Positional
+from splatgraft.runtime.note import Note
 
 _FEW = 4
 """Photos kept per photo left out from which on the capture is not in doubt; set by hand."""
@@ -99,8 +100,7 @@ class Capture:
                 say=lambda sentence: context.console.say(f"{self.capture}: {sentence}"),
             )
             context.console.say(f"{self.capture}: {report}")
-            for doubt in report.doubts:
-                context.console.warn(f"{self.capture}: doubtful: {doubt}")
+            context.console.tell(*(Note(f"{self.capture}: doubtful: {d}", "warning") for d in report.doubts))
             write_pose_report(folder, report)
         require_coverage(posed, str(self.capture))
         write_capture(folder, posed.limited(self.max_side) if self.max_side > 0 else posed)
@@ -111,14 +111,16 @@ class Capture:
         masks = describe_masks(given.image_paths, given.mask_paths)
         context.console.say(f"{self.capture}: {len(given)} posed images, {len(given.points)} points; {masks}")
         if (warning := describe_unposed(self.capture, given)) is not None:
-            context.console.warn(warning)
+            context.console.tell(Note(warning, "warning"))
         posed = usable_views(given, keep_odd=self.keep_odd, progress=context.progress)
         self._say_left_out(len(posed), posed.left_out, context)
         return posed
 
     def _say_left_out(self, kept: int, left_out: Sequence[LeftOut], context: Context) -> None:
-        few = _FEW * len(left_out) <= kept
-        context.console.warn_at_length(describe_left_out(self.capture, kept, left_out), minor=few)
+        level = "minor" if _FEW * len(left_out) <= kept else "warning"
+        head, *reasons = describe_left_out(self.capture, kept, left_out) or [""]
+        if head:
+            context.console.tell(Note(head, level), *map(Note, reasons))
 
     def _with_given_poses(self, poses: Path, context: Context) -> PosedImages:
         """Photos with the poses of another program."""
@@ -153,23 +155,18 @@ class Capture:
         )
 
     def _warn_of_exposures(self, photos: Sequence[Path], context: Context) -> None:
-        for warning in exposure_warnings(self.capture, photos):
-            context.console.warn(warning, minor=True)
+        context.console.tell(*(Note(warning, "minor") for warning in exposure_warnings(self.capture, photos)))
 
     def _photos(self, folder: Path, context: Context) -> PhotoFiles:
         if not self.capture.is_dir():
-            frames = extract_frames(
-                self.capture,
-                folder / "frames",
-                progress=context.progress,
-                say=lambda sentence: context.console.say(f"{self.capture}: {sentence}"),
-            )
+            frames, notes = extract_frames(self.capture, folder / "frames", progress=context.progress)
+            context.console.tell(*(replace(note, text=f"{self.capture}: {note.text}") for note in notes))
             return PhotoFiles(tuple(frames))
         found = find_photos(self.capture)
         kept, odd = usable_photos(found.paths, str(self.capture), keep_odd=self.keep_odd, progress=context.progress)
         self._say_left_out(len(kept), odd, context)
         if (warning := drawn_pictures(kept)) is not None:
-            context.console.warn(warning)
+            context.console.tell(Note(warning, "warning"))
         photos, empty = usable_masks(found.only(kept))
         self._say_left_out(len(kept), empty, context)
         masks = describe_masks(photos.paths, photos.masks)
@@ -183,11 +180,11 @@ def doubt_about(step: Capture) -> str | None:
     Raises:
         ValueError: Where its pose_report.json is damaged.
     """
-    report = read_pose_report(step.out)
-    if report is None or not report.doubts or step.accept_doubtful:
+    doubts = read_doubts(step.out)
+    if not doubts or step.accept_doubtful:
         return None
     return (
-        f"{step.out}: expected plausible poses, found doubtful ones ({'; '.join(str(d) for d in report.doubts)}); take "
+        f"{step.out}: expected plausible poses, found doubtful ones ({'; '.join(map(str, doubts))}); take "
         f'more photos with more overlap, or set effort = "thorough", or lens = "each" where zoom or focus '
         f"changed, or give poses (a COLMAP folder or transforms.json); to go on with these poses, which are kept, set "
         f"accept_doubtful = true for this capture or use run --accept-doubtful"
