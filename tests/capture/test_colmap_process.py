@@ -1,4 +1,4 @@
-"""Capture, the COLMAP process as it is called: masks where the background does not move, and runs that are killed."""
+"""The COLMAP process as it is called: masks where the background does not move, and runs that are killed."""
 
 import json
 import random
@@ -15,8 +15,9 @@ import pytest
 from made_up_photos import FOCAL, turntable
 
 from splatgraft.capture import colmap_process
-from splatgraft.capture.colmap_process.job import SEARCH, Job
+from splatgraft.capture.colmap_process.job import Job
 
+PROGRAM = Path(colmap_process.__file__).parent
 pytestmark = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is an optional extra")
 
 
@@ -37,7 +38,7 @@ def job_of(folder: Path, scratch: str, *, masks: bool = False) -> Job:
 
 
 def start(job: Job) -> subprocess.Popen[bytes]:
-    command = [sys.executable, str(Path(colmap_process.__file__).parent), json.dumps(asdict(job))]
+    command = [sys.executable, str(PROGRAM), json.dumps(asdict(job))]
     with (job.folder / "log").open("wb") as log:
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
 
@@ -49,10 +50,6 @@ def finish(job: Job) -> dict[str, Any]:
     return {key: value for key, value in best.items() if not key.endswith("seconds")}
 
 
-def camera_centers(model: dict[str, Any]) -> np.ndarray:
-    return np.array([image["world_from_camera"] for image in model["images"]])[:, :, 3]
-
-
 def error_after_alignment(found: np.ndarray, truth: np.ndarray) -> float:
     """Largest distance after the best similarity transform (Umeyama 1991)."""
     x, y = found - found.mean(0), truth - truth.mean(0)
@@ -62,31 +59,30 @@ def error_after_alignment(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(y - scale * x @ (u @ sign @ vt).T, axis=1).max())
 
 
+@pytest.mark.long
 def test_an_object_on_a_turntable_is_posed_by_its_masks(tmp_path: Path) -> None:
     truth = turntable(tmp_path, 12, 15)
     job = job_of(tmp_path, "masked", masks=True)
     masked = finish(job)
     whole = json.loads((job.folder / "answers" / "global, all pairs.json").read_text())
-    assert whole["explained"] < SEARCH.clear_explained  # what the still wall says is another motion
+    assert whole["explained"] < 0.5  # what the still wall says is another motion
     assert masked["database"] == "masked"
     assert len(masked["images"]) == 12
     assert masked["images"][0]["camera"][0] == pytest.approx(FOCAL, rel=0.03)
+    centers = np.array([image["world_from_camera"] for image in masked["images"]])[:, :, 3]
     # a third of a pixel (SIFT) at a focal length of 500 px and a distance of 4.5 is 3 mm; hundreds of points share it,
     # while focal length and distance trade against each other: one percent of 4.5
-    assert error_after_alignment(camera_centers(masked), truth[:, :3, 3]) < 0.045
+    assert error_after_alignment(centers, truth[:, :3, 3]) < 0.045
 
 
-def test_a_still_scene_is_posed_by_all_its_features(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_killed_runs_go_on_to_the_result_of_one_that_was_not_by_all_features_of_a_still_scene(tmp_path: Path) -> None:
     turntable(tmp_path, 6, 12, wall=False)
-    assert finish(job_of(tmp_path, "masked", masks=True))["database"] == "photos"
-
-
-def test_killed_runs_go_on_to_the_result_of_one_that_was_not(tmp_path: Path) -> None:
-    turntable(tmp_path, 6, 12, wall=False)
-    whole = job_of(tmp_path, "whole")
+    whole = job_of(tmp_path, "whole", masks=True)
     began = time.monotonic()
     expected = finish(whole)
     took = time.monotonic() - began
+    assert expected["database"] == "photos"
     assert all(sum(point[3:6]) > 0 for point in expected["points"])  # those of the refinement have colours, too
     job, chance = replace(whole, scratch=str(tmp_path / "killed")), random.Random(0)
     job.folder.mkdir()
@@ -108,8 +104,47 @@ def test_the_process_ends_with_its_parent(tmp_path: Path) -> None:
         assert process.wait() == 1
 
 
+JOIN = """
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+sys.path.insert(0, sys.argv[1])
+from colmap_process.job import Job
+from colmap_process.refinement import joined, refined
+
+folder = Path(sys.argv[2])
+pycolmap.set_random_seed(0)
+options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=10, num_points3D=300)
+with pycolmap.Database.open(folder / "photos.db") as opened:
+    truth = pycolmap.synthesize_dataset(options, opened)
+pycolmap.synthesize_images(pycolmap.SyntheticImageOptions(), truth, folder)
+photos = sorted(truth.reg_image_ids())
+
+def part(kept):
+    model = pycolmap.Reconstruction(truth)
+    for i in set(photos) - set(kept):
+        model.deregister_frame(model.images[i].frame_id)
+    return model
+
+large, small = part(photos[:7]), part(photos[4:])
+small.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0.1, 0.2, 0.3])), np.array([1.0, 2, 3])))
+whole = joined([small, large])
+assert whole.num_reg_images() == 10
+centers = [(whole.images[i].projection_center(), truth.images[i].projection_center()) for i in photos]
+assert max(np.linalg.norm(a - b) for a, b in centers) < 1e-9  # float64 rounding
+assert joined([part(photos[:4]), part(photos[6:])]) is None  # no photo is shared
+job = Job(str(folder), "", str(folder), False, [[truth.images[i].name for i in photos]], True, 1, 0)
+assert refined(job, folder / "photos.db", [small, large]).num_reg_images() == 10
+# photos that no model holds are posed from the points of the others
+assert refined(job, folder / "photos.db", [part(photos[:7])]).num_reg_images() == 10
+"""
+"""Two parts of a synthetic model, of which one is moved, turned and scaled; pycolmap shares no process with Pillow."""
+
+
 def test_models_that_share_photos_are_joined_and_missing_photos_are_posed(tmp_path: Path) -> None:
-    program = Path(__file__).with_name("join_synthetic_models.py")
-    command = [sys.executable, str(program), str(Path(colmap_process.__file__).parents[1]), str(tmp_path)]
+    command = [sys.executable, "-c", JOIN, str(PROGRAM.parent), str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

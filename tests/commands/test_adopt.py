@@ -1,4 +1,4 @@
-"""adopt and capture of a scene that another tool wrote: what is printed, and what --axes and the capture change."""
+"""`adopt` of a scene that another tool wrote: what is printed, and what --axes and the capture change."""
 
 from pathlib import Path
 
@@ -7,7 +7,9 @@ import torch
 
 from splatgraft import formats
 from splatgraft.cli import main
+from splatgraft.commands.steps.adopt import misfit_of
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.workflow.flow import read_flow
 
 TOOLS = Path(__file__).parents[1] / "formats" / "golden" / "tools"
@@ -46,3 +48,29 @@ def test_a_project_names_the_axes_once(tmp_path):
     steps = read_flow(tmp_path).steps
     for name in ("source/capture", "source/reconstruct", "target/reconstruct"):
         assert steps[name].axes == "RDF"
+
+
+def table(n: int = 3000) -> Gaussians:
+    """A surface without symmetry: a wide plate and a tower off its middle."""
+    g = torch.Generator().manual_seed(0)
+    means = torch.rand(n, 3, generator=g) * torch.tensor([4.0, 0.1, 2.0])
+    means[: n // 4] = torch.rand(n // 4, 3, generator=g) * torch.tensor([0.3, -2.0, 0.4]) + torch.tensor([0.5, 0, 0.2])
+    return Gaussians(
+        means=means,
+        log_scales=torch.full((n, 3), -4.0),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4).clone(),
+        opacity_logits=torch.zeros(n),
+        sh=torch.zeros(n, 1, 3),
+    )
+
+
+def test_a_scene_that_lies_elsewhere_than_its_capture_is_said_to_with_the_axes_in_which_it_would_fit():
+    scene = table()
+    points = scene.means[::7]
+    assert misfit_of(formats.SceneFile(scene), points + 0.005) is None
+    for axes in ("RUB", "LUF", "RFU"):
+        wrong = change_axes(scene, rdf_from(axes).T)  # read as RDF, though it is `axes`
+        assert f'set axes = "{axes}"' in (misfit_of(formats.SceneFile(wrong), points) or "")
+    assert "another frame" in (misfit_of(formats.SceneFile(scene), 10 * points + 3) or "")
+    # few points say nothing
+    assert misfit_of(formats.SceneFile(scene), torch.randn(5, 3) * 100) is None

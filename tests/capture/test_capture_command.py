@@ -1,0 +1,328 @@
+"""`capture` on broken and unusual captures: goes on and says so, or refuses in one line and keeps what was there."""
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from made_captures import SIZE, disc, texture, write_photos, write_posed
+from PIL import Image
+
+from splatgraft.capture import read_doubts, structure_from_motion
+from splatgraft.cli import main
+from splatgraft.commands.steps.reconstruct import far_worse
+from splatgraft.core import images
+from splatgraft.core.exposure import Exposure
+from splatgraft.formats import read_capture
+from splatgraft.formats.captures.exif import exif_of, read_exposure
+
+LARGE = (SIZE[0] * 8, SIZE[1] * 8)
+
+
+@pytest.fixture
+def capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Runs the command on c/ and gives its exit status and what it said."""
+
+    def run(*more: str) -> tuple[int, str]:
+        capsys.readouterr()
+        status = main(["capture", str(tmp_path / "c"), "--out", str(tmp_path / "out"), *more])
+        return status, capsys.readouterr().err
+
+    return run
+
+
+def change(folder: Path, **keys: object) -> None:
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | keys))
+
+
+def change_frame(folder: Path, index: int, **keys: object) -> None:
+    path = folder / "transforms.json"
+    meta = json.loads(path.read_text())
+    meta["frames"][index] |= keys
+    path.write_text(json.dumps(meta))
+
+
+def test_what_is_not_usable_is_named_counted_and_left_out(tmp_path: Path, capture) -> None:
+    photos = write_posed(tmp_path / "c", 14)
+    photos[1].unlink()
+    photos[2].write_bytes(photos[2].read_bytes()[:5000])
+    Image.new("RGB", (1, 1)).save(photos[3])
+    change_frame(tmp_path / "c", 4, transform_matrix=[[float("nan")] * 4] * 4)
+    Image.fromarray(texture(0)).save(photos[5])
+    status, said = capture()
+    assert status == 0
+    assert read_capture(tmp_path / "out").cameras.names == tuple(p.name for p in (photos[0], *photos[6:]))
+    head = next(line for line in said.splitlines() if "warning" in line)
+    assert "goes on with 9 of 14 images" in head
+    assert all(f"{i:04d}.png" in head for i in range(1, 6))
+    for reason in ("found none in", "truncated", "found 1x1", "finite numbers", "a copy of it"):
+        assert reason in said
+
+
+def test_fewer_than_half_are_refused_and_the_earlier_result_stays(tmp_path: Path, capture) -> None:
+    photos = write_posed(tmp_path / "c", 12)
+    assert capture()[0] == 0
+    earlier = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    for photo in photos[:7]:
+        photo.unlink()
+    status, said = capture()
+    assert status == 2
+    assert "transforms.json: expected at least 50% of 12 images to be usable, found 5" in said.splitlines()[-1]
+    # found only while the step works
+    for photo in photos:
+        Image.fromarray(texture(0)).save(photo)
+    status, said = capture()
+    assert status == 2
+    assert "expected at least 8 posed views with a parallax of 3 degrees" in said
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()} == earlier
+    assert not (tmp_path / ".out.new").exists()
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [({"fl_x": 0, "fl_y": 0}, "focal length above 0"), ({"fl_x": float("nan")}, "finite number for 'fl_x', found nan")],
+)
+def test_intrinsics_of_zero_or_nan_are_refused_in_one_line(tmp_path: Path, capture, keys, expected: str) -> None:
+    write_posed(tmp_path / "c")
+    change(tmp_path / "c", **keys)
+    status, said = capture()
+    assert status == 2
+    (line,) = said.splitlines()
+    assert "c/transforms.json" in line
+    assert expected in line
+
+
+def test_images_without_a_pose_are_counted(tmp_path: Path, capture) -> None:
+    write_posed(tmp_path / "c", 30)
+    frames = json.loads((tmp_path / "c" / "transforms.json").read_text())["frames"]
+    change(tmp_path / "c", frames=frames[::3])
+    status, said = capture()
+    assert status == 0
+    assert "only 10 of the 30 images in" in said
+    change(tmp_path / "c", frames=frames[:3])
+    status, said = capture()
+    assert status == 2
+    assert "are usual), found 3" in said.splitlines()[-1]
+
+
+def test_masks_of_one_colour_or_another_size_are_left_out(tmp_path: Path, capture) -> None:
+    photos = write_posed(tmp_path / "c", 10, masks=True)
+    masks = [tmp_path / "c" / "masks" / photo.name for photo in photos]
+    Image.fromarray(np.zeros_like(disc())).save(masks[1])
+    Image.fromarray(np.full_like(disc(), 255)).save(masks[2])
+    Image.fromarray(disc()).resize((50, 50)).save(masks[3])
+    Image.fromarray(disc()).resize((SIZE[0] // 2, SIZE[1] // 2)).save(masks[4])  # the same shape
+    status, said = capture()
+    assert status == 0
+    found = read_capture(tmp_path / "out")
+    assert [path is None for path in found.mask_paths] == [False, True, True, True, *[False] * 6]
+    assert "goes on with 10 of 10 images, without the mask of images/0003.png, the mask of 0001.png" in said
+    assert "0001.png: expected white where the object is, found black all over" in said
+    assert "0002.png: expected white where the object is, found white all over" in said
+    assert "0003.png: expected 160x120 px" in said
+    for mask in masks:
+        Image.fromarray(np.zeros_like(disc())).save(mask)
+    status, said = capture()
+    assert status == 0
+    assert read_capture(tmp_path / "out").mask_paths == ()
+    assert "and 2 more" in said
+
+
+def test_large_photos_are_reduced_once_with_masks_and_exposure(tmp_path: Path, capture) -> None:
+    photos = write_posed(tmp_path / "c", 10, masks=True)
+    large = photos[3].with_suffix(".jpg")
+    photos[3].unlink()
+    exif = exif_of(Exposure(1 / 60, 8.0, 100.0))
+    Image.fromarray(texture(3)).resize(LARGE, Image.Resampling.BICUBIC).save(large, quality=97, exif=exif)
+    change_frame(tmp_path / "c", 3, file_path="images/0003.jpg")
+    assert capture("--max-side", "200")[0] == 0
+    found, given = read_capture(tmp_path / "out"), read_capture(tmp_path / "c")
+    # the others are referred to where they are
+    inside = [path.resolve().is_relative_to(tmp_path / "out") for path in found.image_paths]
+    assert inside == [i == 3 for i in range(10)]
+    assert images.stored_size(found.image_paths[3]) == SIZE
+    assert read_exposure(found.image_paths[3]).shutter_s == pytest.approx(1 / 60)
+    assert torch.equal(found.cameras.intrinsics, given.cameras.intrinsics)
+    # JPEG of quality 95 rounds this noise by 3 grey levels in the mean, which add to those of the photo
+    assert float((found.image(3) - given.image(3)).abs().mean()) < 6 / 255
+    truth, mask = given.mask(3), found.mask(3)
+    assert truth is not None
+    assert mask is not None
+    assert torch.equal(mask > 0.5, truth > 0.5)
+
+
+def test_distorted_large_photos_are_reduced_without_distortion(tmp_path: Path, capture) -> None:
+    write_posed(tmp_path / "c", 10)
+    change(tmp_path / "c", k1=-0.1)
+    assert capture("--max-side", "80")[0] == 0
+    found, given = read_capture(tmp_path / "out"), read_capture(tmp_path / "c").limited(80)
+    assert found.distortions == ()
+    torch.testing.assert_close(found.cameras.intrinsics, given.cameras.intrinsics)
+    # reduced before and after the distortion is removed; JPEG
+    for i in range(10):
+        assert float((found.image(i) - given.image(i)).abs().mean()) < 6 / 255
+
+
+def test_small_photos_are_not_shrunk_with_large_ones(tmp_path: Path, capture) -> None:
+    photos = write_posed(tmp_path / "c", 10)
+    Image.fromarray(texture(3)).resize(LARGE, Image.Resampling.BICUBIC).save(photos[3])
+    for index in range(10):
+        factor = 8 if index == 3 else 1
+        size = {"w": 160, "h": 120, "fl_x": 150, "fl_y": 150, "cx": 80, "cy": 60}
+        change_frame(tmp_path / "c", index, **{key: value * factor for key, value in size.items()})
+    assert capture("--max-side", "320")[0] == 0
+    assert read_capture(tmp_path / "out").cameras.sizes.tolist() == [[160, 120]] * 3 + [[320, 240]] + [[160, 120]] * 6
+
+
+def test_photos_without_poses_that_are_one_photo_are_refused(tmp_path: Path, capture) -> None:
+    for photo in write_photos(tmp_path / "c", 12):
+        Image.fromarray(texture(0)).save(photo)
+    status, said = capture()
+    assert status == 2
+    line = said.splitlines()[-1]
+    assert line.startswith(f"splatgraft: {tmp_path / 'c'}: expected at least 8 different photos")
+    assert "found 1 of 12" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_heic_without_its_reader_says_how_to_install_it(tmp_path: Path, capture, monkeypatch) -> None:
+    monkeypatch.setattr(images, "find_spec", lambda name: None)
+    (tmp_path / "c").mkdir()
+    for i in range(9):
+        (tmp_path / "c" / f"IMG_{i}.HEIC").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    status, said = capture()
+    assert status == 2
+    assert "IMG_0.HEIC" in said.splitlines()[-1]
+    assert "pip install 'splatgraft[heic]'" in said.splitlines()[-1]
+
+
+@pytest.mark.skipif(find_spec("pillow_heif") is None, reason="pillow-heif is an optional extra")
+def test_heic_is_read(tmp_path: Path) -> None:
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    pixels = texture(1)[..., :1].repeat(3, -1)  # HEIC halves the resolution of colour alone
+    Image.fromarray(pixels).save(tmp_path / "a.heic", quality=95)
+    assert images.list_images(tmp_path) == [tmp_path / "a.heic"]
+    # lossy, but close to what was written
+    assert float((images.read_rgb(tmp_path / "a.heic") - torch.from_numpy(pixels).float() / 255).abs().mean()) < 0.03
+    assert images.stored_size(tmp_path / "a.heic") == SIZE
+
+
+def write_poses(folder: Path, names: list[str]) -> Path:
+    """Poses of another program on a line, in which the photos have other folders and suffixes."""
+    folder.mkdir()
+    frames = []
+    for i, name in enumerate(names):
+        pose = np.eye(4)
+        pose[0, 3] = i
+        frames.append({"file_path": f"somewhere/{name}", "transform_matrix": pose.tolist()})
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({"w": SIZE[0], "h": SIZE[1], "fl_x": 130.0, "frames": frames}))
+    return path
+
+
+def test_given_poses_and_masks_come_together_and_what_has_no_partner_is_named(tmp_path: Path, capture) -> None:
+    photos = write_photos(tmp_path / "c" / "images", 14, ".jpg")
+    masks = {0: disc(), 1: 0 * disc(), 2: 0 * disc() + 255, 3: disc()[:, 20:140]}
+    for index, mask in masks.items():
+        Image.fromarray(mask).save(photos[index].with_name(f"{photos[index].stem}_mask.png"))
+    posed = [i for i in range(14) if i != 5]
+    poses = write_poses(tmp_path / "theirs", [*(f"{i:04d}.png" for i in posed), "99.png"])
+    for given in (poses, poses.parent):
+        status, said = capture("--poses", str(given))
+        assert status == 0
+        found = read_capture(tmp_path / "out")
+        assert [path.name for path in found.image_paths] == [f"{i:04d}.jpg" for i in posed]
+        assert found.cameras.world_from_camera[:, 0, 3].tolist() == list(range(13))
+        assert [path and path.name for path in found.mask_paths] == ["0000_mask.png", *[None] * 12]
+        for expected in (
+            "poses of 13 of 14 photos",
+            "without a pose, left out: 0005.jpg",
+            "99.png",
+            "1 of 14 photos have masks",
+            "the mask of 0001.jpg, the mask of 0002.jpg, the mask of 0003.jpg",
+            "0001_mask.png: expected white where the object is, found black all over",
+            "0003_mask.png: expected 160x120 px",
+        ):
+            assert expected in said
+
+
+def test_poses_beside_a_video_are_refused(tmp_path: Path, capture) -> None:
+    (tmp_path / "c").touch()
+    status, said = capture("--poses", str(write_poses(tmp_path / "theirs", ["0.png"])))
+    assert status == 2
+    assert "expected a folder of photos beside --poses" in said
+
+
+@pytest.fixture
+def doubtful(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A project, and a COLMAP that answers with all photos and an error of 1.05 px; every call is noted."""
+    calls: list[str] = []
+
+    def answer(job, advance, say):
+        calls.append(job.photos)
+        images = [
+            {
+                "name": name,
+                "world_from_camera": (torch.eye(4)[:3] + torch.tensor([0, 0, 0, float(i)])).tolist(),
+                "camera": [150.0, 150.0, 80.0, 60.0, 0.0, 0.0, 0.0, 0.0],
+                "camera_id": 1,
+                "observations": 500,
+            }
+            for i, name in enumerate(name for group in job.groups for name in group)
+        ]
+        fixed = {"models": 1, "method": "global", "explained": 0.7, "seconds": {}, "cpu_seconds": {}, "unposed": []}
+        points = [[0.0, 0.0, 5.0, 255, 0, 0, 0.3, 4]]
+        return fixed | {"mean_reprojection_px": 1.05, "images": images, "points": points}
+
+    monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: object())
+    monkeypatch.setattr(structure_from_motion, "_run", answer)
+    for side in ("source", "target"):
+        write_photos(tmp_path / side / "photos", 8)
+    write_project(tmp_path)
+    return calls
+
+
+def write_project(folder: Path, key: str = "") -> None:
+    side = '[{0}]\ncapture = "{0}/photos"\neffort = "quick"\n' + key + "\n"
+    (folder / "project.toml").write_text(side.format("source") + side.format("target"))
+
+
+def test_run_stops_at_doubtful_poses_with_one_line_that_says_what_and_how_to_go_on(
+    tmp_path: Path, doubtful: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(tmp_path), "--to", "source/reconstruct"]) == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    for expected in ("mean reprojection error", "at most 1.00 px", "1.05 px", "more photos", "accept_doubtful = true"):
+        assert expected in last
+    assert not (tmp_path / "source" / "scene").exists()
+    assert [doubt.found for doubt in read_doubts(tmp_path / "source" / "capture")] == ["1.05 px"]
+    assert (tmp_path / "source" / "capture" / "transforms.json").is_file()
+
+
+def test_it_stops_again_without_work_and_goes_on_with_the_same_poses_when_told_to(
+    tmp_path: Path, doubtful: list[str]
+) -> None:
+    words = ["run", str(tmp_path), "--to", "capture"]
+    assert main(words) == 2
+    assert main(words) == 2
+    assert len(doubtful) == 1
+    assert main([*words, "--accept-doubtful"]) == 0
+    assert len(doubtful) == 2  # the source's are kept; the target's are made
+    write_project(tmp_path, key="accept_doubtful = true")
+    assert main(words) == 0
+    assert len(doubtful) == 2
+
+
+def test_held_out_views_far_below_the_rest_are_named() -> None:
+    usual = {f"photo_{i}": 25 + 0.3 * (i % 4) for i in range(9)}
+    assert far_worse(usual) == {}
+    worse = far_worse(usual | {"odd": 14.0, "turned": 11.0})
+    assert list(worse) == ["turned", "odd"]
+    assert all(name in sentence for name, sentence in worse.items())
+    # where views differ a lot all in all, the deviation is 1.4826 x 3 dB, and three of them lie below every view
+    assert far_worse({f"photo_{i}": 18.0 + i for i in range(13)}) == {}
