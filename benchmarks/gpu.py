@@ -164,13 +164,12 @@ def harmonize_plain(setting: Setting) -> list[Row]:
     """Stock diffusers one view at a time, then ours in batches."""
     from harmonize import parts
 
-    from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
+    from splatgraft.harmonization.flux.baked_modulation import bake
     from splatgraft.harmonization.flux.sampling import schnell_levels
 
     network, size = _network(setting)
     rows: list[Row] = [{"kind": "stock, batch 1", **parts(network, 1, size, setting.repeats)}]
     bake(network.transformer, network.prompt, schnell_levels()[:-1])
-    fuse_projections(network.transformer)
     for batch in (1, 2) if setting.toy else (1, 2, 4, 8):
         rows.append({"kind": f"ours, batch {batch}", **parts(network, batch, size, setting.repeats)})
     return [{**row, "peak_gb": setting.peak_gb()} for row in rows]
@@ -191,12 +190,11 @@ def harmonize_compiled(setting: Setting) -> list[Row]:
     """Ours after torch.compile; the toy compiles with the backend that traces and generates no code."""
     from harmonize import parts
 
-    from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
+    from splatgraft.harmonization.flux.baked_modulation import bake
     from splatgraft.harmonization.flux.sampling import schnell_levels
 
     network, size = _network(setting)
     bake(network.transformer, network.prompt, schnell_levels()[:-1])
-    fuse_projections(network.transformer)
     network.transformer.compile_repeated_blocks(**({"backend": "eager"} if setting.toy else {}))
     batch = 1 if setting.toy else 4
     found = parts(network, batch, size, setting.repeats)
@@ -206,7 +204,7 @@ def harmonize_compiled(setting: Setting) -> list[Row]:
 def lora_step(setting: Setting) -> list[Row]:
     """Seconds of forward, backward and Adam on a low-rank adaptation, frozen weights in bf16."""
     from splatgraft.harmonization.flux.network import velocity
-    from splatgraft.harmonization.flux.weights.lora import add_lora
+    from splatgraft_paper.training.flux_objective import add_lora
 
     network, (width, height) = _network(setting)
     layers = add_lora(network.transformer, 4 if setting.toy else 16, seed=0)
@@ -247,14 +245,16 @@ def _network(setting: Setting) -> tuple[Any, tuple[int, int]]:
     """The harmoniser with random weights, of the real size or tiny, and the size of its images."""
     from harmonize import AUTOENCODER, REAL, TINY, TINY_AUTOENCODER, TOKENS, random_network
 
-    from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
+    from splatgraft.harmonization.flux.loading import diffusers_library
     from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork
-    from splatgraft.harmonization.flux.weights.diffusers_library import autoencoder_class, flux_transformer_class
+    from splatgraft.harmonization.flux.prompt import PromptEmbedding
 
     dtype = torch.float32 if setting.toy else torch.bfloat16
-    transformer = random_network(flux_transformer_class(), TINY if setting.toy else REAL, setting.device, dtype)
+    transformer = random_network(
+        diffusers_library().FluxTransformer2DModel, TINY if setting.toy else REAL, setting.device, dtype
+    )
     weights = TINY_AUTOENCODER if setting.toy else AUTOENCODER
-    autoencoder = Autoencoder(random_network(autoencoder_class(), weights, setting.device, dtype))
+    autoencoder = Autoencoder(random_network(diffusers_library().AutoencoderKL, weights, setting.device, dtype))
     tokens = 8 if setting.toy else TOKENS
     prompt = PromptEmbedding(torch.randn(tokens, 4096), torch.randn(768)).to(setting.device, dtype)
     network = FluxNetwork(transformer, autoencoder, prompt, "image-mask", setting.device, dtype)

@@ -5,7 +5,7 @@ the real size (nothing is downloaded), 704x496. `--tiny` runs the same code with
 its times are not those of the real model.
 
 stock    both text encoders for each view's prompt, the transformer as it is, one view at a time
-ours     no text encoder, modulations from a table, projections fused, --batch views at once
+ours     no text encoder, modulations from a table, --batch views at once
 compiled ours after torch.compile
 """
 
@@ -18,14 +18,13 @@ from typing import Any
 
 import torch
 
-from splatgraft.harmonization import HarmonizerInputs
-from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
-from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
-from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer, FluxSettings
-from splatgraft.harmonization.flux.latents import pad_by_reflection
-from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork, velocity
+from splatgraft.harmonization import FluxOptions, HarmonizerInputs
+from splatgraft.harmonization.flux.baked_modulation import bake
+from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer
+from splatgraft.harmonization.flux.loading import diffusers_library
+from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork, pad_by_reflection, velocity
+from splatgraft.harmonization.flux.prompt import PromptEmbedding
 from splatgraft.harmonization.flux.sampling import noise, sample, schnell_levels
-from splatgraft.harmonization.flux.weights.diffusers_library import autoencoder_class, flux_transformer_class
 
 REAL = {"in_channels": 192, "out_channels": 64}
 TINY = {
@@ -110,7 +109,7 @@ def parts(network: FluxNetwork, batch: int, size: tuple[int, int], repeats: int)
     flat = torch.zeros(height, width)
     image = pictures[0].permute(1, 2, 0).contiguous()
     view = HarmonizerInputs(image, image, flat, flat, torch.zeros(height, width, 3), image)
-    harmonizer = FluxHarmonizer(network, FluxSettings(at_once=batch))
+    harmonizer = FluxHarmonizer(network, FluxOptions(batch=batch))
     work: dict[str, Callable[[], object]] = {
         "encode": lambda: network.autoencoder.encode(padded),
         "steps": lambda: sample(step, start, schnell_levels()),
@@ -135,9 +134,11 @@ def main() -> None:
     width, height = map(int, options.size.split("x"))
     card = "cpu, tiny model" if options.tiny else torch.cuda.get_device_name(device)
 
-    transformer = random_network(flux_transformer_class(), TINY if options.tiny else REAL, device, dtype)
+    transformer = random_network(
+        diffusers_library().FluxTransformer2DModel, TINY if options.tiny else REAL, device, dtype
+    )
     settings = TINY_AUTOENCODER if options.tiny else AUTOENCODER
-    autoencoder = Autoencoder(random_network(autoencoder_class(), settings, device, dtype))
+    autoencoder = Autoencoder(random_network(diffusers_library().AutoencoderKL, settings, device, dtype))
     prompt = PromptEmbedding(torch.randn(TOKENS, 4096), torch.randn(768)).to(device, dtype)
     network = FluxNetwork(transformer, autoencoder, prompt, "image-mask", device, dtype)
     rows: dict[str, dict[str, float]] = {}
@@ -152,7 +153,6 @@ def main() -> None:
     rows["stock"] = stock
 
     bake(transformer, prompt, schnell_levels()[:-1])
-    fuse_projections(transformer)
     rows["ours, one view at a time"] = parts(network, 1, (width, height), options.repeats)
     rows[f"ours, {options.batch} views at once"] = parts(network, options.batch, (width, height), options.repeats)
     if not options.no_compile and not options.tiny:

@@ -48,7 +48,7 @@ def tiny_autoencoder(seed=1, channels=CHANNELS):
 
 
 def tiny_prompt(seed=2):
-    from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
+    from splatgraft.harmonization.flux.prompt import PromptEmbedding
 
     g = torch.Generator().manual_seed(seed)
     return PromptEmbedding(torch.randn(3, TEXT, generator=g), torch.randn(POOLED, generator=g))
@@ -56,7 +56,7 @@ def tiny_prompt(seed=2):
 
 def flux_folder(folder: Path, in_channels=CHANNELS * 4, variant=None, seed=0) -> Path:
     """FLUX.1-schnell's layout (transformer/, vae/), tiny; 48 input channels make it a harmoniser."""
-    from splatgraft.harmonization.flux.empty_prompt import write_prompt
+    from splatgraft.harmonization.flux.prompt import write_prompt
 
     tiny_transformer(in_channels, seed).save_pretrained(folder / "transformer")
     tiny_autoencoder().save_pretrained(folder / "vae")
@@ -70,7 +70,7 @@ def removal_folder(folder: Path) -> Path:
     """Stable Diffusion 2's layout (unet/, vae/), tiny."""
     from diffusers import UNet2DConditionModel
 
-    from splatgraft.harmonization.flux.weights.tensor_file import write_tensors
+    from splatgraft.harmonization.flux.prompt import write_tensors
 
     torch.manual_seed(3)
     UNet2DConditionModel(

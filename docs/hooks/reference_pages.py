@@ -16,7 +16,6 @@ from mkdocs.structure.files import File, Files
 
 import splatgraft
 from splatgraft.cli import commands
-from splatgraft.runtime.weights.catalogue import CATALOGUE
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOT_PAGES = {f"{name.lower()}.md": f"{name}.md" for name in ("CHANGELOG", "ARCHITECTURE", "CONTRIBUTING")}
@@ -29,7 +28,6 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     pages = {name: _root_page(ROOT / path) for name, path in ROOT_PAGES.items()}
     pages["reference/commands.md"] = "\n".join(_commands_page())
     pages["reference/project.md"] = "\n".join(_project_page())
-    pages["reference/weights.md"] = "\n".join(_weights_page())
     pages["reference/api.md"] = "\n".join(_api_page())
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
@@ -56,51 +54,6 @@ def _commands_page() -> Iterator[str]:
     for name, purpose in ((name, one.summary) for name, one in commands().items()):
         yield f"\n## splatgraft {name} {{#{_anchor(name)}}}\n"
         yield from _parser_section(_parser(name), purpose)
-
-
-def _weights_page() -> Iterator[str]:
-    yield "# Weights\n"
-    yield (
-        "The networks of other people that the package can load. None comes with it, and none is fetched unless a"
-        " command that you gave needs it or `splatgraft weights fetch NAME` asks for it. Made from the table in"
-        " `runtime/weights/catalogue.py`; what is not known stands as a question mark. Sizes are of what is fetched."
-    )
-    yield "\n```sh\nsplatgraft weights list              # this table, and what is on this machine"
-    yield "splatgraft weights fetch birefnet    # what is needed of it and no more; continues after an interruption"
-    yield "splatgraft weights verify            # every file against the hub's size and SHA-256"
-    yield "splatgraft doctor --online           # what is still on the hub, and whether you have access\n```\n"
-    yield "| name | from | licence | access | size | for |\n| --- | --- | --- | --- | --- | --- |"
-    for model in CATALOGUE:
-        access = {True: "gated: agree to its terms", False: "free", None: "?"}[model.gated]
-        size = "?" if model.gigabytes is None else f"{model.gigabytes:g} GB"
-        place = "/".join(filter(None, (model.repository, model.folder))) or ", ".join(model.urls)
-        files = ", ".join(f"{part}/" for part in model.parts) or ", ".join(model.files if model.repository else ())
-        what = f" ({files})" if files not in ("", "*") else ""
-        note = f"; {model.note}" if model.note else ""
-        yield f"| `{model.name}` | `{place}`{what}{note} | {model.licence} | {access} | {size} | {model.purpose} |"
-    yield (
-        "\nDiffusionRenderer's cosmos version fetches its own 56 GB by a program of its own. The compact harmoniser's"
-        " weights come with the package."
-    )
-    yield "\n## Where they are\n"
-    yield (
-        "In `~/.cache/splatgraft/weights/OWNER--NAME`, as plain files named as in the repository, with `weights.json`:"
-        " repository, commit, licence, and the size and SHA-256 of every file. Of several forms of the same weights one"
-        " is taken: `.safetensors`, in bfloat16 where there is one (`*.bf16.safetensors`), else the plain one."
-        " An autoencoder at the root of a repository (`vae/`) serves its networks."
-        " `splatgraft train embed` writes the empty prompt's embeddings there too, where `harmonize` and `train` look."
-        " LPIPS's and Inception's files are named to a command with their folder."
-    )
-    yield "\n## Without a network\n"
-    yield (
-        "Fetch on a machine that has one, copy the folder to the same place, or anywhere and name it (`--weights`,"
-        " `--base`, `--birefnet`); `splatgraft weights verify FOLDER` checks the copy."
-    )
-    yield "\n## Gated repositories\n"
-    yield (
-        "Agree to the terms on the page of the repository, make a token with read access at"
-        " <https://huggingface.co/settings/tokens> and enter it after `hf auth login`; or set `HF_TOKEN`."
-    )
 
 
 def _parser(name: str) -> Any:

@@ -33,14 +33,8 @@ _TABLE = (
     ("consolidate", "steps.consolidate", "fit the colours of the scene to the harmonised views"),
     ("evaluate", "steps.evaluate", "compare, picture and report"),
     ("export", "export", "write a scene or a result as a page, for another program, or as pictures"),
-    ("weights list", "weights.list", "say which networks there are, their licences, sizes, and what is fetched"),
-    ("weights fetch", "weights.fetch", "fetch the weights of a network"),
-    ("weights verify", "weights.verify", "compare fetched weights with their hashes"),
     ("doctor", "doctor", "say what is installed, what is missing and how to get it"),
 )
-
-GROUPS = {"weights": "weights of the networks of other people"}
-"""First words that are no commands by themselves, with what their commands have in common."""
 
 _RENAMED = {
     "evaluate benchmark": "paper benchmark",
@@ -166,7 +160,7 @@ def _group(words: list[str]) -> int:
     if wants_help and first == words[:-1]:
         group = " ".join(first)
         usage = f"usage: splatgraft {group} COMMAND [OPTIONS]; `splatgraft {group} COMMAND --help` says more"
-        print(_help("\n\n".join(filter(None, (usage, GROUPS.get(group)))), inner))
+        print(_help(usage, inner))
         return 0
     found = " ".join(words[: len(first) + 1]) or "nothing"
     raise ValueError(f"splatgraft: expected a command among {', '.join(inner)}; found {found}")

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from splatgraft.harmonization.compact.weights import read_weights, write_weights
 
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.harmonization import CompactOptions, HarmonizerInputs, make_harmonizer
 from splatgraft.harmonization.compact.features import apply_output, compact_input
 from splatgraft.harmonization.compact.harmonizer import Compact
 from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
-from splatgraft.harmonization.compact.weights import read_weights, write_weights
 
 TINY = CompactSize(widths=(8, 8, 16, 16), blocks=(1, 1, 1, 1), heads=2)
 

@@ -1,4 +1,4 @@
-"""Packing, padding, sampling, widening, baking, adaptations: exact against references, on tiny models."""
+"""Packing, padding, sampling, widening, baking, choice of the precision: exact against references, on tiny models."""
 
 import pytest
 import torch
@@ -7,14 +7,10 @@ pytest.importorskip("diffusers")
 
 from tiny_models import CHANNELS, quiet, tiny_prompt, tiny_transformer
 
-from splatgraft.harmonization.flux.baked_modulation import bake, fuse_projections
-from splatgraft.harmonization.flux.latents import pack, pad_by_reflection, positions, unpack
-from splatgraft.harmonization.flux.network import velocity
+from splatgraft.harmonization.flux.baked_modulation import bake
+from splatgraft.harmonization.flux.loading import choose_precision, widen_transformer, working_bytes
+from splatgraft.harmonization.flux.network import pack, pad_by_reflection, positions, unpack, velocity, widen_layer
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
-from splatgraft.harmonization.flux.weights.loading import widen_transformer
-from splatgraft.harmonization.flux.weights.lora import LowRankLinear, add_lora, merge_lora, write_lora
-from splatgraft.harmonization.flux.weights.lora_file import read_lora
-from splatgraft.harmonization.flux.weights.widening import widen_layer
 
 pytestmark = list(quiet)
 
@@ -30,8 +26,6 @@ def test_unpacking_undoes_packing_and_a_token_is_a_block_of_four():
     assert torch.equal(unpack(tokens, 6, 8), latents)
     assert torch.equal(tokens[0, 5], latents[0, :, 2:4, 2:4].reshape(-1))  # row 1, column 1
 
-
-def test_packing_is_that_of_flux():
     latents = random(2, 16, 6, 8)
     # FLUX's order: channel, row, column of the block, which is pixel_unshuffle's
     assert torch.equal(pack(latents), torch.nn.functional.pixel_unshuffle(latents, 2).flatten(2).mT)
@@ -49,6 +43,7 @@ def test_joining_then_packing_is_packing_then_joining():
 def test_padding_reaches_a_multiple_of_16_by_mirroring(h, w):
     image = random(1, 3, h, w)
     padded = pad_by_reflection(image)
+    assert (padded is image) == (h % 16 == w % 16 == 0)
     assert padded.shape[2] % 16 == padded.shape[3] % 16 == 0
     assert torch.equal(padded[..., :h, :w], image)
     if h % 16 and h > 16:
@@ -56,11 +51,6 @@ def test_padding_reaches_a_multiple_of_16_by_mirroring(h, w):
     if h > 8 and w > 8:
         reference = torch.nn.functional.pad(image, (0, -w % 16, 0, -h % 16), mode="reflect")
         assert torch.equal(padded, reference)
-
-
-def test_a_size_that_fits_is_not_touched():
-    image = random(1, 3, 32, 48)
-    assert pad_by_reflection(image) is image
 
 
 def test_sampling_takes_the_steps_of_diffusers_scheduler():
@@ -82,6 +72,10 @@ def test_the_true_velocity_leads_to_the_clean_latents_in_any_number_of_steps():
         # 7 additions of float32 values below 8: half an ulp of 4.8e-7 each
         assert torch.allclose(sample(lambda z, level: eps - clean, eps, schnell_levels(steps)), clean, atol=4e-6)
     assert torch.equal(noisy(clean, eps, torch.tensor([0.0, 1.0])), torch.stack([clean[0], eps[1]]))
+    with pytest.raises(ValueError, match="--sampling-steps: expected at least 1, found 0"):
+        schnell_levels(0)
+    with pytest.raises(ValueError, match=r"strength: expected a noise level above 0 and at most 1, found 0\.0"):
+        schnell_levels(4, start=0.0)
 
 
 def test_noise_does_not_depend_on_what_else_is_made():
@@ -114,7 +108,7 @@ def test_a_layer_widened_by_zeros_ignores_its_conditions():
     assert wide.config.out_channels == CHANNELS * 4
 
 
-def test_baked_and_fused_gives_the_same():
+def test_baked_gives_the_same():
     stock, baked = tiny_transformer(CHANNELS * 12), tiny_transformer(CHANNELS * 12)
     prompt, levels = tiny_prompt(), schnell_levels()[:-1]
     gone = bake(baked, prompt, levels)
@@ -127,12 +121,6 @@ def test_baked_and_fused_gives_the_same():
         t = torch.tensor([level])
         with torch.no_grad():
             assert torch.equal(velocity(baked, latents, t, prompt), velocity(stock, latents, t, prompt))
-    fuse_projections(baked)
-    assert not any(name.endswith(("to_q.weight", "add_k_proj.weight")) for name, _ in baked.named_parameters())
-    with torch.no_grad():
-        t = torch.tensor([0.25])
-        # one product of 96 columns instead of three of 32 may round otherwise
-        assert torch.allclose(velocity(baked, latents, t, prompt), velocity(stock, latents, t, prompt), atol=1e-5)
 
 
 def test_baked_in_bfloat16_and_in_batches_finds_its_rows():
@@ -162,27 +150,16 @@ def test_the_share_that_baking_saves_is_that_of_the_real_model():
     assert real.x_embedder.weight.shape == (3072, 192)
 
 
-def test_an_adaptation_begins_at_nothing_and_merges_to_what_it_was(tmp_path):
-    stock, adapted = tiny_transformer(CHANNELS * 12), tiny_transformer(CHANNELS * 12)
-    count = add_lora(adapted, 2, seed=5)
-    assert count == (8 + 4) + 2 * (3 + 2)  # a double block's attention and MLPs; two single blocks
-    latents, prompt, t = random(1, CHANNELS * 3, 4, 4), tiny_prompt(), torch.tensor([0.5])
-    with torch.no_grad():
-        assert torch.equal(velocity(adapted, latents, t, prompt), velocity(stock, latents, t, prompt))
-        for module in adapted.modules():
-            if isinstance(module, LowRankLinear):
-                module.lora_B.normal_(0, 0.1, generator=torch.Generator().manual_seed(1))
-        wanted = velocity(adapted, latents, t, prompt)
-    write_lora(tmp_path / "lora.safetensors", adapted.state_dict(), {})
-    assert merge_lora(stock, read_lora(tmp_path / "lora.safetensors")) == count
-    with torch.no_grad():
-        # W x + B A x against (W + B A) x: float32 rounding over three blocks
-        assert torch.allclose(velocity(stock, latents, t, prompt), wanted, atol=1e-4)
+GB = 10**9
 
 
-def test_an_adaptation_of_another_network_is_refused(tmp_path):
-    adapted = tiny_transformer(CHANNELS * 12)
-    add_lora(adapted, 2)
-    write_lora(tmp_path / "lora.safetensors", adapted.state_dict(), {})
-    with pytest.raises(ValueError, match=r"lora.safetensors: expected a network whose x_embedder.weight is \(32, 48\)"):
-        merge_lora(tiny_transformer(), read_lora(tmp_path / "lora.safetensors"))
+def test_the_best_precision_that_fits_is_taken():
+    working = working_bytes(pixels=704 * 496, views=1, width=3072)
+    for free, precision in ((80, "bf16"), (24, "bf16"), (16, "fp8"), (8, "offload")):
+        found, reason = choose_precision(parameters=8_640_000_000, working=working, free=free * GB)
+        assert found == precision
+        assert reason.endswith(f"of {free}.0 GB free")
+    with pytest.raises(ValueError, match=r"GPU memory: expected \d.\d GB free even with blocks on the CPU, found 1.0"):
+        choose_precision(parameters=8_640_000_000, working=working, free=GB)
+    # 64 views need more than twice what a card of 24 GB has left
+    assert working_bytes(pixels=704 * 496, views=64, width=3072) > 14 * GB

@@ -12,10 +12,8 @@ import torch
 from ball_pairs import write_ball_pairs
 
 from splatgraft.cli import main
-from splatgraft.harmonization.compact.factory import SHIPPED
 from splatgraft.harmonization.compact.features import apply_output
-from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
-from splatgraft.harmonization.compact.weights import read_weights
+from splatgraft.harmonization.compact.network import SHIPPED, CompactNetwork, CompactSize, read_weights
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
 from splatgraft.relighting.shading.irradiance import KNOWN_LIGHTS, shade_ratio
 from splatgraft_paper.synthesis.pairs import write_manifest

@@ -10,16 +10,11 @@ import torch
 
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.optional_dependencies import OPTIONAL_DEPENDENCIES
-from splatgraft.runtime.weights.catalogue import CATALOGUE
-from splatgraft.runtime.weights.hub import describe, may_read
 
 
 @dataclass(frozen=True)
 class Doctor:
     """Say what is installed, what is missing and how to install it."""
-
-    online: bool = False
-    """Ask the Hugging Face hub about every model: whether it is still there, gated, and open to you."""
 
     def execute(self, console: Console) -> int:
         """Print one line per item; a missing optional dependency is no error."""
@@ -41,23 +36,7 @@ class Doctor:
             there = [f"{package} {_version(package)}" for package in extra.packages.values() if _version(package)]
             state = "there:   " + ", ".join(there) if not missing else f"missing: pip install 'splatgraft[{name}]'"
             console.result(f"{name:<12} {extra.purpose}\n{'':<12} {state}")
-        if self.online:
-            console.result("\nweights on the hub:")
-            for repository in dict.fromkeys(model.repository for model in CATALOGUE if model.repository):
-                console.result(f"{repository:<44} {_on_the_hub(repository)}")
         return 0
-
-
-def _on_the_hub(repository: str) -> str:
-    """Licence and access of a repository as the hub has them now, or why that is not known."""
-    try:
-        found = describe(repository)
-        if not found.gated:
-            return f"there; licence {found.licence}; free access"
-        access = "gated, open to you" if may_read(repository) else "gated, closed to you"
-        return f"there; licence {found.licence}; {access}: https://huggingface.co/{repository}"
-    except ValueError as error:
-        return str(error).removeprefix(f"{repository}: ")
 
 
 def _version(package: str) -> str | None:

@@ -1,18 +1,16 @@
-"""Harmonisation of a folder's views in this process, by several on this machine (torchrun), or anywhere (Ray).
+"""Harmonisation of the views of a folder, with one image file per finished view; by one process, several, or by Ray.
 
-Every finished view has an image file, so a part can be started again after a kill or by another process.
+A view is finished when its image exists, so a part can be started again after a kill or by another process.
 """
 
 import os
-import pickle
-import subprocess
-import sys
-import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing import active_children, get_context
 from pathlib import Path
 
 import torch
@@ -32,17 +30,10 @@ from splatgraft.runtime.progress import Progress, silent
 from splatgraft.runtime.workers import Task, run_tasks
 
 _READERS, _WRITERS = 2, 2
-"""Threads that decode and encode images beside the model. Set by hand: about 0.09 s a view of 704x496 in one thread."""
+"""Threads that decode and encode images beside the model: about 0.09 s a view of 704x496 in one thread."""
 _WAITING_GROUPS = 2
 """Groups of finished views that may wait to be written."""
-_CPU_METHODS = ("none", "reinhard", "mv-colight", "image-editing")
-"""Methods that use no device of this process."""
-
-_JOB_FILE = "job.pickle"
-_LOG_FILE = "parts.log"
 _POLL_SECONDS = 0.5
-_REPORT = "process "
-"""First word of the line that each process writes when its views are done."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +49,7 @@ class Part:
     number: int = 0
     of: int = 1
     device: str = "auto"
-    """As in `choose_device`: auto, cpu or cuda."""
-    assigned_device: str | None = None
-    """The device that a launcher assigned to this process; replaces `device`."""
-    key: str | None = None
-    """Of a service."""
+    """As in `choose_device`: auto, cpu or cuda; or the device that was assigned to this part, such as cuda:1."""
 
     def missing(self, views: ViewFolder) -> list[int]:
         """Indices of the part's views that are not finished."""
@@ -81,8 +68,11 @@ def finished(kept: Path, views: ViewFolder) -> set[int]:
     return {i for i, stem in enumerate(views.stems) if (kept / "images" / f"{stem}.png").is_file()}
 
 
-def harmonize_part(part: Part, say: Callable[[str], None] = lambda sentence: None, progress: Progress = silent) -> None:
+def harmonize_part(part: Part, say: Callable[[str], None] = lambda sentence: None, progress: Progress = silent) -> int:
     """Harmonise the views of the part that are not finished.
+
+    Returns:
+        Their number.
 
     Raises:
         ValueError: The method's weights or packages are missing, or a view is damaged.
@@ -90,8 +80,11 @@ def harmonize_part(part: Part, say: Callable[[str], None] = lambda sentence: Non
     views = ViewFolder.open(part.views)
     missing = part.missing(views)
     if not missing:
-        return
-    harmonizer = make_harmonizer(part.method, _context(part, views, missing, say))
+        return 0
+    device = choose_device(part.device, Console()) if part.device in ("auto", "cuda") else torch.device(part.device)
+    width, height = stored_size(views.path("composite", missing[0]))
+    context = HarmonizerContext(device=device, views=len(missing), pixels=width * height, say=say)
+    harmonizer = make_harmonizer(part.method, context)
     at_once = harmonizer.views_at_once if isinstance(harmonizer, BatchHarmonizer) else 1
     done = len(views) - len(missing) if part.of == 1 else 0
     groups = _groups(views, missing, at_once)
@@ -113,16 +106,46 @@ def harmonize_part(part: Part, say: Callable[[str], None] = lambda sentence: Non
             progress(done, len(views), views.stems[indices[-1]])
         for writing in written:
             writing.result()
+    return len(missing)
 
 
-def _context(part: Part, views: ViewFolder, missing: list[int], say: Callable[[str], None]) -> HarmonizerContext:
-    device = part.assigned_device
-    if device is None:
-        device = "cpu" if part.method.name in _CPU_METHODS else choose_device(part.device, Console()).type
-    width, height = stored_size(views.path("composite", missing[0]))
-    return HarmonizerContext(
-        device=torch.device(device), views=len(missing), pixels=width * height, key=part.key, say=say
-    )
+def harmonize_with_processes(whole: Part, processes: int, *, say: Callable[[str], None], progress: Progress) -> None:
+    """Split the views over processes on this machine, one per GPU where there are GPUs.
+
+    Raises:
+        ValueError: A process failed.
+    """
+    gpus = 0 if whole.device == "cpu" else torch.cuda.device_count()
+    devices = [f"cuda:{number % gpus}" if gpus else "cpu" for number in range(processes)]
+    parts = [replace(whole, number=i, of=processes, device=device) for i, device in enumerate(devices)]
+    views, threads = ViewFolder.open(whole.views), max(1, (os.cpu_count() or 1) // processes)
+    with ProcessPoolExecutor(processes, get_context("spawn"), torch.set_num_threads, (threads,)) as pool:
+        try:
+            running = [pool.submit(harmonize_part, part) for part in parts]
+            while wait(running, _POLL_SECONDS).not_done:
+                progress(len(finished(whole.kept, views)), len(views), f"{processes} processes")
+            counts = [one.result() for one in running]
+        except BrokenProcessPool as error:
+            raise ValueError(f"{whole.views}: expected processes that live, found one that was killed") from error
+        except BaseException:
+            for process in active_children():
+                process.terminate()
+            raise
+    for number, (device, count) in enumerate(zip(devices, counts, strict=True), 1):
+        say(f"process {number} of {processes} on {device}: {count} views")
+
+
+def harmonize_with_ray(whole: Part, parts: int, *, address: str, progress: Progress) -> None:
+    """Split the views into parts that Ray's workers harmonise, each with a GPU unless the device is cpu.
+
+    Raises:
+        ValueError: A part failed.
+    """
+    split = [replace(whole, number=i, of=parts) for i in range(parts)]
+    tasks = [Task(f"part {part.number}", partial(harmonize_part, part)) for part in split]
+    gpus = 0 if whole.device == "cpu" else 1
+    if failures := run_tasks(tasks, ray_address=address, progress=progress, gpus_each=gpus):
+        raise ValueError(failures[0])
 
 
 def _groups(views: ViewFolder, indices: list[int], at_once: int) -> list[list[int]]:
@@ -141,68 +164,3 @@ def _write(kept: Path, stem: str, result: Harmonized) -> None:
     if result.confidence is not None:
         write_image(kept / "confidence" / f"{stem}.png", result.confidence)
     write_image(kept / "images" / f"{stem}.png", result.image)  # last: the view counts as finished
-
-
-def harmonize_with_processes(whole: Part, processes: int, *, console: Console, progress: Progress) -> None:
-    """Split the views over processes on this machine, one per GPU where there are GPUs.
-
-    Raises:
-        ValueError: A process failed.
-    """
-    job = whole.kept / _JOB_FILE
-    job.write_bytes(pickle.dumps(whole))
-    views, log = ViewFolder.open(whole.views), whole.kept / _LOG_FILE
-    with log.open("wb") as stream:
-        launch = [*_launcher(processes), "-m", __name__, str(job)]
-        worker = subprocess.Popen(launch, stdout=stream, stderr=stream, env=_environment(processes))
-        try:
-            while worker.poll() is None:
-                progress(len(finished(whole.kept, views)), len(views), f"{processes} processes")
-                time.sleep(_POLL_SECONDS)
-        finally:
-            worker.terminate()
-            worker.wait()
-    job.unlink()
-    if worker.returncode != 0:
-        lines = [line for line in log.read_text(errors="replace").splitlines() if "Error: " in line]
-        raise ValueError((lines or [f"{log}: expected all parts to succeed, found one that failed"])[0].strip())
-    for line in sorted(line for line in log.read_text(errors="replace").splitlines() if line.startswith(_REPORT)):
-        console.say(line)
-
-
-def harmonize_with_ray(whole: Part, parts: int, *, address: str, progress: Progress) -> None:
-    """Split the views into parts that Ray's workers harmonise, each with a GPU unless the device is cpu.
-
-    Raises:
-        ValueError: A part failed.
-    """
-    split = [replace(whole, number=i, of=parts) for i in range(parts)]
-    tasks = [Task(f"part {part.number}", partial(harmonize_part, part)) for part in split]
-    gpus = 0 if whole.device == "cpu" else 1
-    if failures := run_tasks(tasks, ray_address=address, progress=progress, gpus_each=gpus):
-        raise ValueError(failures[0])
-
-
-def _launcher(processes: int) -> list[str]:
-    return [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]
-
-
-def _environment(processes: int) -> dict[str, str]:
-    """The processes share the cores; torchrun would give each of them one."""
-    return {"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // processes)), **os.environ}
-
-
-def _main(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
-    """Harmonise this process's share; torchrun starts several of them, one per GPU where there are GPUs."""
-    whole: Part = pickle.loads(Path(arguments[0]).read_bytes())
-    number, count = int(environment["RANK"]), int(environment["WORLD_SIZE"])
-    gpus = 0 if whole.device == "cpu" else torch.cuda.device_count()
-    device = f"cuda:{number % gpus}" if gpus else "cpu"
-    part = replace(whole, number=number, of=count, assigned_device=device)
-    missing = len(part.missing(ViewFolder.open(part.views)))
-    harmonize_part(part)
-    print(f"{_REPORT}{number + 1} of {count} on {device}: {missing} views", flush=True)
-
-
-if __name__ == "__main__":
-    _main(sys.argv[1:], os.environ)

@@ -1,21 +1,22 @@
 """Harmonization of rendered views: an image model corrects the light on an inserted object, one view at a time."""
 
-from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize
-from splatgraft.harmonization.inputs import render_views
+from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize, render_views
 from splatgraft.harmonization.interface import (
     BatchHarmonizer,
     Harmonized,
     Harmonizer,
+    HarmonizerContext,
     HarmonizerInputs,
     NoisyStartHarmonizer,
 )
-from splatgraft.harmonization.methods import HARMONIZERS, harmonizer_options, make_harmonizer
-from splatgraft.harmonization.options import (
+from splatgraft.harmonization.methods import (
+    HARMONIZERS,
     CompactOptions,
     FluxOptions,
-    HarmonizerContext,
     HarmonizerOptions,
     NoneOptions,
+    harmonizer_options,
+    make_harmonizer,
 )
 
 __all__ = [

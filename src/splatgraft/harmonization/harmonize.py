@@ -1,14 +1,72 @@
-"""Harmonisation of all views of a composite with one method."""
+"""Harmonisation of all views of a composite with one method, and the renders that it takes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
 from splatgraft.harmonization.methods import make_harmonizer
+from splatgraft.rendering import RenderOptions, render
+from splatgraft.rendering.interface import Output
+from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.runtime.progress import Progress, silent
+
+_OUTPUTS: frozenset[Output] = frozenset({"color", "depth", "normal"})
+
+
+def render_views(
+    composite: Gaussians,
+    is_object: Bool[Tensor, "n"],
+    cameras: Cameras,
+    *,
+    prior: Gaussians | None = None,
+    prior_confidence: float = 0.0,
+    options: RenderOptions = RenderOptions(),
+) -> LazySequence[HarmonizerInputs]:
+    """Render what a harmoniser takes of every view of a composite.
+
+    Args:
+        composite: n Gaussians, the object as it was captured: the first result of `Composite.bake`.
+        is_object: Which of them belong to an object: its second result.
+        cameras: v cameras of the target; sizes may differ.
+        prior: The scene after light transfer, as `Relit.bake` gives it; the composite itself where not given.
+        prior_confidence: How reliable the light behind `prior` is, in [0, 1] (`Relit.confidence`).
+        options: How the scenes are drawn.
+
+    Returns:
+        The pictures of each camera, on the CPU. A view is rendered each time it is read, so that memory holds one.
+
+    Raises:
+        ValueError: `is_object` has another length than `composite`.
+    """
+    if len(is_object) != composite.count:
+        expected = f"one flag for each of {composite.count} Gaussians"
+        raise ValueError(f"is_object: expected {expected}, found {len(is_object)}")
+    background, coverage = composite.select(~is_object), is_object[:, None].float()
+
+    def draw(scene: Gaussians, camera: Cameras) -> Tensor:
+        return render(scene, camera, options=options).color[0].cpu().clamp(0, 1)
+
+    def view(index: int) -> HarmonizerInputs:
+        camera = cameras[index]
+        full = render(composite, camera, outputs=_OUTPUTS, features=coverage, options=options)
+        color = full.color[0].cpu().clamp(0, 1)
+        return HarmonizerInputs(
+            composite=color,
+            background=draw(background, camera),
+            mask=full.features[0, ..., 0].cpu().clamp(0, 1),
+            depth=full.depth[0].cpu(),
+            normal=full.normal[0].cpu(),
+            prior=color if prior is None or prior is composite else draw(prior, camera),
+            prior_confidence=prior_confidence,
+            camera_from_world=camera.camera_from_world[0, :3, :3].cpu(),
+        )
+
+    return LazySequence(len(cameras), view)
 
 
 @dataclass(frozen=True)
@@ -32,7 +90,7 @@ def harmonize(
     Args:
         views: v views, as `render_views` gives them; each is read once.
         method: Name of a method with its default options (`none` keeps the light prior, `compact` is the shipped
-            network, `reinhard` a baseline, `flux` the paper's model), or a harmoniser made by `make_harmonizer`.
+            network, `flux` the paper's model), or a harmoniser made by `make_harmonizer`.
         progress: Called after every view with views done, v, and the number of the view.
 
     Returns:

@@ -1,9 +1,10 @@
 """Inputs and outputs of all harmonisers, and the protocols that they implement."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -73,3 +74,19 @@ class BatchHarmonizer(Protocol):
     def harmonize_all(self, views: Sequence[HarmonizerInputs]) -> list[Harmonized]:
         """Harmonise `views`, all of one size; results are in the same order."""
         ...
+
+
+@dataclass(frozen=True)
+class HarmonizerContext:
+    """Where a harmoniser runs and how much it will be asked to do."""
+
+    device: torch.device = torch.device("cpu")  # noqa: RUF009
+    """Where the network runs."""
+    views: int = 1
+    """How many views will be harmonised: the price of a service."""
+    pixels: int = 704 * 496
+    """Pixels per view: the memory of a network."""
+    strengths: tuple[float, ...] = (1.0,)
+    """Noise levels that views will be started from, in (0, 1]."""
+    say: Callable[[str], None] = lambda sentence: None
+    """Takes messages for the user, one line each."""

@@ -1,30 +1,111 @@
-"""The harmonisation methods: the options class of each by name, and the harmoniser that options make."""
+"""The harmonisation methods: the options of each, by name, which make its harmoniser."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import get_args
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar, Literal, Protocol
 
-from splatgraft.harmonization.compact.factory import make_compact
-from splatgraft.harmonization.flux.factory import make_flux
-from splatgraft.harmonization.identity import IdentityHarmonizer
-from splatgraft.harmonization.interface import Harmonizer
-from splatgraft.harmonization.options import (
-    CompactOptions,
-    FluxOptions,
-    HarmonizerContext,
-    HarmonizerOptions,
-    NoneOptions,
-)
+from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
 
-HARMONIZERS: dict[str, type[HarmonizerOptions]] = {kind.name: kind for kind in get_args(HarmonizerOptions)}
-"""Name of a method to its options."""
 
-_FACTORIES: dict[type, Callable[..., Harmonizer]] = {
-    NoneOptions: lambda options, context: IdentityHarmonizer(),
-    CompactOptions: make_compact,
-    FluxOptions: make_flux,
+class HarmonizerOptions(Protocol):
+    """Options of one method; heavy libraries are imported only when they make the harmoniser."""
+
+    name: ClassVar[str]
+    """The method's name."""
+
+    def make(self, context: HarmonizerContext) -> Harmonizer:
+        """Make the harmoniser.
+
+        Raises:
+            ValueError: An option is out of range, or weights or packages are missing.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class NoneOptions:
+    """Keep the light transfer's result: no image model."""
+
+    name: ClassVar[str] = "none"
+
+    def make(self, context: HarmonizerContext) -> Harmonizer:
+        """Make the harmoniser."""
+        return _Identity()
+
+
+class _Identity:
+    """Returns the prior unchanged."""
+
+    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+        """Return the tensor `view.prior` itself."""
+        return Harmonized(image=view.prior)
+
+
+@dataclass(frozen=True)
+class CompactOptions:
+    """Correct the light transfer with the shipped network of 2.4 M parameters; runs on any CPU."""
+
+    name: ClassVar[str] = "compact"
+
+    weights: str | None = None
+    """A compact.safetensors, or the folder of a training; the shipped weights where not given."""
+    strength: float = 1.0
+    """How much of the correction is applied, in [0, 1]."""
+
+    def make(self, context: HarmonizerContext) -> Harmonizer:
+        """Load the compact network."""
+        from splatgraft.harmonization.compact.harmonizer import Compact
+        from splatgraft.harmonization.compact.network import SHIPPED, read_weights
+
+        if not 0 <= self.strength <= 1:
+            raise ValueError(f"--strength: expected a number from 0 to 1, found {self.strength}")
+        path = SHIPPED if self.weights is None else Path(self.weights)
+        network = read_weights(path / SHIPPED.name if path.is_dir() else path)
+        return Compact(network, device=context.device, strength=self.strength)
+
+
+@dataclass(frozen=True)
+class FluxOptions:
+    """The paper's image model: FLUX.1-schnell fine-tuned on pairs (Sec. 5)."""
+
+    name: ClassVar[str] = "flux"
+
+    weights: str | None = None
+    """Folder or hub id of the weights, such as nviolante/dot3d/image-mask; must be given."""
+    base: str | None = None
+    """Folder or hub id of the model that the weights were trained from, for the parts that they lack."""
+    lora: Path | None = None
+    """A low-rank adaptation (lora.safetensors) to merge into the weights."""
+    variant: Literal["auto", "image-mask", "image-background"] = "auto"
+    """The network's input beside the composite; auto reads it from the weights' folder."""
+    seed: int = 0
+    """Seed of the noise, shared by all views."""
+    sampling_steps: int = 4
+    """Steps of the diffusion sampling."""
+    precision: Literal["auto", "bf16", "fp8", "offload", "float32"] = "auto"
+    """How the weights are kept: fp8 in 8 bits, offload on the CPU; auto takes the best that fits the free memory."""
+    batch: int = 1
+    """Views per pass."""
+    compile: bool = False
+    """Compile the network first; worth it from about twenty views on."""
+
+    def make(self, context: HarmonizerContext) -> Harmonizer:
+        """Load the network."""
+        if self.weights is None:
+            raise ValueError(
+                "harmonizer flux: expected --weights FOLDER or a hub id such as nviolante/dot3d/image-mask (24 GB, by "
+                "the paper's authors under their own licence), found none"
+            )
+        from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer
+        from splatgraft.harmonization.flux.loading import load_flux
+
+        return FluxHarmonizer(load_flux(self, context), self)
+
+
+HARMONIZERS: dict[str, type[HarmonizerOptions]] = {
+    kind.name: kind for kind in (NoneOptions, CompactOptions, FluxOptions)
 }
-"""Options to the factory function, which imports its heavy libraries only when it is called."""
+"""Name of a method to its options."""
 
 
 def make_harmonizer(method: str | HarmonizerOptions, context: HarmonizerContext = HarmonizerContext()) -> Harmonizer:
@@ -39,8 +120,7 @@ def make_harmonizer(method: str | HarmonizerOptions, context: HarmonizerContext 
             missing.
     """
     options = harmonizer_options(method) if isinstance(method, str) else method
-    make = getattr(options, "make", None)  # options of other packages make their harmoniser themselves
-    return make(context) if make else _FACTORIES[type(options)](options, context)
+    return options.make(context)
 
 
 def harmonizer_options(name: str, *, weights: str | None = None) -> HarmonizerOptions:
@@ -56,6 +136,4 @@ def harmonizer_options(name: str, *, weights: str | None = None) -> HarmonizerOp
     if name not in HARMONIZERS:
         raise ValueError(f"harmonizer: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
     options = HARMONIZERS[name]()
-    if weights is None or isinstance(options, NoneOptions):
-        return options
-    return replace(options, weights=weights)
+    return replace(options, weights=weights) if weights is not None and hasattr(options, "weights") else options  # pyright: ignore

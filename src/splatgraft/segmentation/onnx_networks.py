@@ -22,9 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import resize
-from splatgraft.runtime.weights.catalogue import ModelWeights
-from splatgraft.runtime.weights.hub import fetch
-from splatgraft.runtime.weights.store import folder_of, is_stored
+from splatgraft.runtime.hub import hub_file
 from splatgraft.segmentation.cut_object import Evidence
 
 BIREFNET_REPOSITORY = "onnx-community/BiRefNet-ONNX"
@@ -197,15 +195,11 @@ def _points(evidence: Evidence) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndar
 
 
 def _from_hub(repository: str) -> Path:
-    folder = folder_of(repository)
-    model = ModelWeights(repository, "masks", repository, files=(_BIREFNET_FILE,))
-    if not is_stored(folder, model):
-        _require("huggingface_hub", "birefnet")
-        try:
-            fetch(model, folder, say=lambda sentence: None)
-        except ValueError as error:  # network, repository or file is missing
-            raise ValueError(f"{error}; or give the path of an .onnx file, or use grabcut") from error
-    return folder / _BIREFNET_FILE
+    _require("huggingface_hub", "birefnet")
+    try:
+        return hub_file(repository, _BIREFNET_FILE)
+    except ValueError as error:  # network, repository or file is missing
+        raise ValueError(f"{error}; or give the path of an .onnx file, or use grabcut") from error
 
 
 def _opened(path: Path, method: str, threads: int | None) -> Any:

@@ -36,7 +36,7 @@ from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft_paper.benchmark.scene import ComposedScene, perform_if_stale
 from splatgraft_paper.benchmark.transplat import RelightByIrradianceRatio
 from splatgraft_paper.benchmark.true_light_file import read_true_light
-from splatgraft_paper.peers.options import method_options
+from splatgraft_paper.peers.methods import method_options
 
 Prior = Literal["off", "gain", "transplat", "transfer", "true-light"]
 Loss = Literal["fourier", "l1-dssim", "lpips", "paper"]

@@ -1,1 +1,1 @@
-"""Harmonisers by other authors, for comparison: LBM, IC-Light, MV-CoLight and an image-editing service."""
+"""Harmonisers by other authors and a baseline, for the paper's comparison."""

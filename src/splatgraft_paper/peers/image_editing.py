@@ -6,10 +6,11 @@ The protocol is that of Google's `generateContent` (the paper's Nano Banana is g
 import base64
 import io
 import json
+import os
 import urllib.error
 import urllib.request
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -18,9 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from splatgraft.core.images import resize
-from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.harmonization.options import HarmonizerContext
-from splatgraft_paper.peers.options import ImageEditingOptions
+from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
 
 KEY_VARIABLE = "SPLATGRAFT_IMAGE_EDITING_KEY"
 DOLLARS_PER_VIEW = 0.04
@@ -36,6 +35,35 @@ PROMPT = (
     "than the composited object."
 )
 """The paper's prompt, verbatim."""
+
+
+@dataclass(frozen=True)
+class ImageEditingOptions:
+    """An image-editing service over HTTP with the paper's prompt (Sec. 7); your pictures leave this machine."""
+
+    name: ClassVar[str] = "image-editing"
+
+    weights: str = _URL
+    """Address of the service; the paper's where not given."""
+    max_cost: float = 0.0
+    """US dollars that may be spent at most."""
+
+    def make(self, context: HarmonizerContext) -> Harmonizer:
+        """Say what it costs; the key stays in the environment, since options are recorded in step.json.
+
+        Raises:
+            ValueError: The key is missing, or the expected cost exceeds `max_cost`.
+        """
+        url = self.weights
+        if not url.startswith(("https://", "http://127.0.0.1", "http://localhost")):
+            raise ValueError(f"harmonizer image-editing: expected --weights https://..., found {url}")
+        cost = context.views * DOLLARS_PER_VIEW
+        context.say(f"image-editing: {context.views} views to {url}, about {cost:.2f} US dollars; they are uploaded")
+        if cost > self.max_cost:
+            raise ValueError(f"--max-cost: expected at least {cost:.2f} US dollars, found {self.max_cost:.2f}")
+        if not (key := os.environ.get(KEY_VARIABLE)):
+            raise ValueError(f"harmonizer image-editing: expected a key in {KEY_VARIABLE}, found none")
+        return ImageEditing(url, key)
 
 
 @dataclass(frozen=True)
@@ -81,24 +109,6 @@ class ImageEditing:
             raise ValueError(f"{self.url}: expected an answer, found status {error.code}: {found}") from error
         except (OSError, ValueError) as error:
             raise ValueError(f"{self.url}: expected an answer, found {error}") from error
-
-
-def connect_image_editing(options: ImageEditingOptions, context: HarmonizerContext) -> ImageEditing:
-    """The service at `options.weights` (a URL), or the paper's.
-
-    Raises:
-        ValueError: the key is missing, or the expected cost exceeds `options.max_cost`.
-    """
-    url = options.weights or _URL
-    if not url.startswith(("https://", "http://127.0.0.1", "http://localhost")):
-        raise ValueError(f"harmonizer image-editing: expected --weights https://..., found {url}")
-    cost = context.views * DOLLARS_PER_VIEW
-    context.say(f"image-editing: {context.views} views to {url}, about {cost:.2f} US dollars; your images are uploaded")
-    if cost > options.max_cost:
-        raise ValueError(f"--max-cost: expected at least {cost:.2f} US dollars, found {options.max_cost:.2f}")
-    if not context.key:
-        raise ValueError(f"harmonizer image-editing: expected a key in {KEY_VARIABLE}, found none")
-    return ImageEditing(url, context.key)
 
 
 def _png(picture: Float[Tensor, "h w 3"]) -> str:

@@ -6,7 +6,9 @@ squares cover the view and their changes are blended. Untested with the real cod
 """
 
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -14,14 +16,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import resize
-from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-from splatgraft.runtime.process import last_line, run_logged
-from splatgraft_paper.peers.options import MVCoLightOptions
+from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
+from splatgraft.runtime.child_process import last_line, run_logged
 
 SIDE = 256
 """Pixels: the size that the network was trained at."""
 RATIO_OFFSET = 0.02
-"""sRGB, added to both sides of the network's output over its input, against noise in the dark. Set by hand."""
+"""sRGB, added to both sides of the network's output over its input, against noise in the dark."""
 
 # runs in the other project's Python, in its folder, as `python - MODEL_FOLDER INPUT.npy OUTPUT.npy`
 _PROGRAM = """
@@ -45,12 +46,46 @@ np.save(out, np.stack([one.reshape(3, *one.shape[-2:]).float().cpu().numpy() for
 """
 
 
+@dataclass(frozen=True)
+class MVCoLightOptions:
+    """MV-CoLight's network for single pictures (Ren et al. 2025), run in your own checkout of its code."""
+
+    name: ClassVar[str] = "mv-colight"
+
+    weights: str | None = None
+    """Folder with config.py and model_step_N.pt; must be given."""
+    checkout: Path | None = None
+    """Folder of its code; must be given."""
+
+    def make(self, context: HarmonizerContext) -> Harmonizer:
+        """Find the folders.
+
+        Raises:
+            ValueError: One is missing.
+        """
+        if self.checkout is None or not (self.checkout / "registry.py").is_file():
+            raise ValueError(
+                "harmonizer mv-colight: expected --checkout with the code of github.com/InternRobotics/MV-CoLight, "
+                f"found {self.checkout or 'none'}"
+            )
+        weights = Path(self.weights or "")
+        if not (weights / "config.py").is_file() or not list(weights.glob("model_step_*.pt")):
+            raise ValueError(
+                "harmonizer mv-colight: expected --weights FOLDER with config.py and model_step_N.pt, found "
+                f"{self.weights or 'none'}"
+            )
+        interpreter = self.checkout / ".venv" / "bin" / "python"
+        return MVCoLight(self.checkout, weights.resolve(), interpreter if interpreter.is_file() else Path("python"))
+
+
+@dataclass(frozen=True)
 class MVCoLight:
     """The network, in a new process for each view."""
 
-    def __init__(self, checkout: Path, weights: Path, python: Path) -> None:
-        """Use the code in `checkout` and the weights in `weights`, run by the interpreter `python`."""
-        self._checkout, self._weights, self._python = checkout, weights, python
+    checkout: Path
+    weights: Path
+    python: Path
+    """The interpreter that runs it."""
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
         """Apply the network's change, as a ratio at its own size, to the composite.
@@ -63,13 +98,13 @@ class MVCoLight:
         with tempfile.TemporaryDirectory() as name:
             given, out = Path(name) / "input.npy", Path(name) / "output.npy"
             np.save(given, small.numpy())
-            command = [str(self._python), "-", str(self._weights), str(given), str(out)]
+            command = [str(self.python), "-", str(self.weights), str(given), str(out)]
             log = Path(name) / "log"
             # standard output stays out of the log, whose last line is to be that of the error
-            code = run_logged(command, log, folder=self._checkout, stdin=_PROGRAM, on_line=lambda _: None)
+            code = run_logged(command, log, folder=self.checkout, stdin=_PROGRAM, on_line=lambda _: None)
             if code != 0 or not out.is_file():
                 last = last_line(log) or "no output"
-                raise ValueError(f"{self._checkout}: expected MV-CoLight to make a picture, found {last[:200]}")
+                raise ValueError(f"{self.checkout}: expected MV-CoLight to make a picture, found {last[:200]}")
             made = torch.from_numpy(np.load(out)).clamp(0, 1)
         ratio = (made + RATIO_OFFSET) / (small[:, :3] + RATIO_OFFSET)
         return Harmonized((view.composite * resize(_joined(ratio, height, width), width, height)).clamp(0, 1))
@@ -109,24 +144,3 @@ def _joined(squares: Float[Tensor, "k 3 256 256"], height: int, width: int) -> F
         total[:, y : y + SIDE, x : x + SIDE] += weight * square
         weights[y : y + SIDE, x : x + SIDE] += weight
     return (total / weights).permute(1, 2, 0)
-
-
-def load_mv_colight(options: MVCoLightOptions) -> MVCoLight:
-    """The adaptor, its folders found.
-
-    Raises:
-        ValueError: one is missing.
-    """
-    checkout, weights = options.checkout, Path(options.weights or "")
-    if checkout is None or not (checkout / "registry.py").is_file():
-        raise ValueError(
-            "harmonizer mv-colight: expected --checkout with the code of github.com/InternRobotics/MV-CoLight, found "
-            f"{checkout or 'none'}"
-        )
-    if options.weights is None or not (weights / "config.py").is_file() or not list(weights.glob("model_step_*.pt")):
-        raise ValueError(
-            "harmonizer mv-colight: expected --weights FOLDER with config.py and model_step_N.pt, found "
-            f"{options.weights or 'none'}"
-        )
-    interpreter = checkout / ".venv" / "bin" / "python"
-    return MVCoLight(checkout, weights.resolve(), interpreter if interpreter.is_file() else Path("python"))

@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE, PromptEmbedding, write_prompt
-from splatgraft.harmonization.flux.weights.diffusers_library import autoencoder_class, flux_transformer_class
-from splatgraft.runtime.files import atomic_folder
+from splatgraft.harmonization.flux.loading import diffusers_library
+from splatgraft.harmonization.flux.prompt import PROMPT_FILE, PromptEmbedding, write_prompt
+from splatgraft.runtime.atomic_folder import atomic_folder
 from splatgraft.runtime.progress import Progress
 
 _LATENTS, _TEXT, _POOLED = 16, 32, 32
@@ -84,7 +84,7 @@ def write_tiny_base(
 
 
 def _autoencoder(widths: tuple[int, ...]) -> Any:
-    return autoencoder_class()(
+    return diffusers_library().AutoencoderKL(
         block_out_channels=widths,
         down_block_types=("DownEncoderBlock2D",) * len(widths),
         up_block_types=("UpDecoderBlock2D",) * len(widths),
@@ -101,7 +101,7 @@ def _autoencoder(widths: tuple[int, ...]) -> Any:
 
 def _transformer(options: TinyBaseOptions) -> Any:
     width = options.head_width
-    return flux_transformer_class()(
+    return diffusers_library().FluxTransformer2DModel(
         in_channels=_LATENTS * 4,
         num_layers=options.double_blocks,
         num_single_layers=options.single_blocks,

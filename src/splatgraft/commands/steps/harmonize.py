@@ -1,6 +1,5 @@
 """The command `harmonize`: rendered views become harmonised views, one image each."""
 
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,15 +17,11 @@ from splatgraft.folders.harmonized_views import (
     picture_folders,
 )
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import (
-    HARMONIZERS,
-    CompactOptions,
-    FluxOptions,
-    NoneOptions,
-)
+from splatgraft.harmonization import HARMONIZERS, CompactOptions, FluxOptions, NoneOptions
 from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
 
-_KEY_VARIABLE = "SPLATGRAFT_IMAGE_EDITING_KEY"
+_REMOVED = {"detail": 0.0}
+"""Options of version 0.1.0 that are gone, as its records have them where they were not used."""
 
 
 @dataclass(frozen=True)
@@ -63,17 +58,17 @@ class Harmonize:
     def recorded_options(self) -> dict[str, Any]:
         """The options in step.json: those of all methods, so that results made by version 0.1.0 stay up to date."""
         defaults = {key: value for kind in HARMONIZERS.values() for key, value in vars(kind()).items()}
-        return plain_options({"method": self.method.name, **defaults, **vars(self.method)})
+        return plain_options({"method": self.method.name, **_REMOVED, **defaults, **vars(self.method)})
 
     def write(self, folder: Path, context: Context) -> None:
         """Make one image per view."""
         kept, views = context.checkpoint.folder, ViewFolder.open(self.views)
         picture_folders(kept)
-        whole = Part(self.views, self.method, kept, device=self.device, key=os.environ.get(_KEY_VARIABLE))
+        whole = Part(self.views, self.method, kept, device=self.device)
         if self.ray is not None:
             harmonize_with_ray(whole, self.processes, address=self.ray, progress=context.progress)
         elif self.processes > 1:
-            harmonize_with_processes(whole, self.processes, console=context.console, progress=context.progress)
+            harmonize_with_processes(whole, self.processes, say=context.console.say, progress=context.progress)
         else:
             harmonize_part(whole, context.console.say, context.progress)
         missing = len(views) - len(finished(kept, views))

@@ -1,7 +1,8 @@
 """Precomputed adaLN modulations: with one prompt and fixed noise levels they are constants, kept in a table.
 
 FLUX uses 3.27 of its 11.89 billion parameters in layers that map (prompt, noise level) to scales and shifts. A table
-with one row per noise level replaces them (8.62 billion parameters remain) with bit-identical results.
+with one row per noise level replaces them with bit-identical results: 17.2 GB in bf16 instead of 23.8, which a card of
+24 GB holds.
 """
 
 from typing import Any, no_type_check
@@ -10,10 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
-
-GUIDANCE = 3.5
-"""Of guidance-distilled networks (FLUX.1-dev): the default of diffusers' pipeline and of its training scripts."""
+from splatgraft.harmonization.flux.prompt import PromptEmbedding
 
 
 class BakedLevels(nn.Module):
@@ -41,9 +39,9 @@ class BakedModulation(nn.Module):
         """Keep `norm` and `table`.
 
         Args:
-            norm: the normalisation without modulation.
-            table: output of the linear layer, one row per noise level.
-            parts: outputs per row: 6 for AdaLayerNormZero, 3 for AdaLayerNormZeroSingle, 2 for AdaLayerNormContinuous.
+            norm: The normalisation without modulation.
+            table: Output of the linear layer, one row per noise level.
+            parts: Outputs per row: 6 for AdaLayerNormZero, 3 for AdaLayerNormZeroSingle, 2 for AdaLayerNormContinuous.
         """
         super().__init__()
         self.norm, self.parts = norm, parts
@@ -61,14 +59,13 @@ class BakedModulation(nn.Module):
 
 
 @torch.no_grad()
-def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...], *, guidance: float | None = None) -> int:
+def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...]) -> int:
     """Replace the modulation layers of a `FluxTransformer2DModel` in place.
 
     Args:
-        transformer: the network.
-        prompt: the only prompt that will be used.
-        levels: all noise levels that will be used, in [0, 1].
-        guidance: what a guidance-distilled network is told; `GUIDANCE` where not given, nothing without distillation.
+        transformer: The network.
+        prompt: The only prompt that will be used.
+        levels: All noise levels that will be used, in [0, 1].
 
     Returns:
         The number of parameters removed.
@@ -76,14 +73,9 @@ def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...], *
     before = sum(p.numel() for p in transformer.parameters())
     weight = transformer.x_embedder.weight
     pooled = prompt.pooled.to(weight.device, weight.dtype)[None]
-    told = ()
-    if transformer.config.guidance_embeds:
-        told = (torch.tensor([GUIDANCE if guidance is None else guidance], device=weight.device),)
     # one row at a time, as in a call with one picture: a matrix product's rounding depends on its shape
     rows = [
-        transformer.time_text_embed(
-            *(x.to(weight.dtype) * 1000 for x in (torch.tensor([level], device=weight.device), *told)), pooled
-        )
+        transformer.time_text_embed(torch.tensor([level], device=weight.device).to(weight.dtype) * 1000, pooled)
         for level in levels
     ]
 
@@ -96,15 +88,4 @@ def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...], *
         block.norm = baked(block.norm, 3)
     transformer.norm_out = baked(transformer.norm_out, 2)
     transformer.time_text_embed = BakedLevels(levels, weight.device)
-    transformer.register_to_config(guidance_embeds=False)  # it is in the tables
     return before - sum(p.numel() for p in transformer.parameters())
-
-
-def fuse_projections(transformer: Any) -> None:
-    """Fuse the query, key and value projections in place and delete the separate layers, which diffusers keeps."""
-    transformer.fuse_qkv_projections()
-    for module in transformer.modules():
-        if getattr(module, "fused_projections", False):
-            for name in ("to_q", "to_k", "to_v", "add_q_proj", "add_k_proj", "add_v_proj"):
-                if hasattr(module, name):
-                    delattr(module, name)

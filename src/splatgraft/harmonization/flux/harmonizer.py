@@ -2,48 +2,30 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.harmonization.flux.detail import limit_material_change, restore_detail
-from splatgraft.harmonization.flux.latents import pad_by_reflection
-from splatgraft.harmonization.flux.network import FluxNetwork, velocity
+from splatgraft.harmonization.flux.network import FluxNetwork, pad_by_reflection, velocity
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
-
-
-@dataclass(frozen=True)
-class FluxSettings:
-    """Options of sampling and post-processing."""
-
-    seed: int = 0
-    """Of the initial noise, which is the same for all views."""
-    steps: int = 4
-    """Sampling steps."""
-    strength: float = 1.0
-    """Factor on the change of the object's material, in [0, 1]; see `detail.limit_material_change`."""
-    detail: float = 0.0
-    """Weight of the restored detail, in [0, 1]; see `detail.restore_detail`."""
-    at_once: int = 1
-    """Views per pass."""
+from splatgraft.harmonization.methods import FluxOptions
 
 
 class FluxHarmonizer:
-    """The paper's image model as a `BatchHarmonizer`."""
+    """The paper's image model as a `BatchHarmonizer` and a `NoisyStartHarmonizer`."""
 
-    def __init__(self, network: FluxNetwork, settings: FluxSettings) -> None:
-        """Use a loaded network with these options."""
-        self.network, self.settings = network, settings
-        self.views_at_once = settings.at_once
+    def __init__(self, network: FluxNetwork, options: FluxOptions) -> None:
+        """Use a loaded network with the seed, the steps and the batch of these options."""
+        self.network, self._options = network, options
+        self.views_at_once = options.batch
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
         """Harmonise one view.
 
         Raises:
-            ValueError: memory does not suffice, or the network's output is not finite.
+            ValueError: Memory does not suffice, or the network's output is not finite.
         """
         return self.harmonize_all([view])[0]
 
@@ -51,7 +33,7 @@ class FluxHarmonizer:
         """Harmonise several views of one size in one pass.
 
         Raises:
-            ValueError: memory does not suffice, or the network's output is not finite.
+            ValueError: Memory does not suffice, or the network's output is not finite.
         """
         return self.harmonize_from(views, 1.0)
 
@@ -62,20 +44,19 @@ class FluxHarmonizer:
         rectified flow). The condition is the composite at every level (paper, Iterative Dataset Update).
 
         Raises:
-            ValueError: the network was not loaded for this level, memory does not suffice, or the network's output is
+            ValueError: The network was not loaded for this level, memory does not suffice, or the network's output is
                 not finite.
         """
         if not any(math.isclose(strength, prepared, abs_tol=1e-6) for prepared in self.network.strengths):
             prepared = ", ".join(f"{level:g}" for level in self.network.strengths)
             raise ValueError(f"harmonizer flux: expected to start at a noise level of {prepared}, found {strength:g}")
         try:
-            images = self._generate(views, strength)
+            return [Harmonized(image) for image in self._generate(views, strength)]
         except torch.OutOfMemoryError as error:
             raise ValueError(
                 f"harmonizer flux: expected memory for {len(views)} views at once, found too little; finished views "
                 "are kept: try --batch 1 or --precision fp8"
             ) from error
-        return [Harmonized(self._post_processed(image, view)) for image, view in zip(images, views, strict=True)]
 
     @torch.no_grad()
     def _generate(self, views: Sequence[HarmonizerInputs], strength: float) -> Float[Tensor, "b h w 3"]:
@@ -84,7 +65,7 @@ class FluxHarmonizer:
         encoded = net.autoencoder.encode(pad_by_reflection(images).to(net.device))
         conditions = torch.cat(encoded.chunk(2), 1)
         b, _, h, w = conditions.shape
-        start = noise((net.autoencoder.channels, h, w), self.settings.seed).to(net.device).expand(b, -1, -1, -1)
+        start = noise((net.autoencoder.channels, h, w), self._options.seed).to(net.device).expand(b, -1, -1, -1)
         if strength < 1:
             priors = pad_by_reflection(_stack([view.prior for view in views])).to(net.device)
             start = noisy(net.autoencoder.encode(priors), start, torch.full((b,), strength, device=net.device))
@@ -93,7 +74,7 @@ class FluxHarmonizer:
             joined = torch.cat([latents, conditions], 1).to(net.dtype)
             return velocity(net.transformer, joined, torch.full((b,), level, device=net.device), net.prompt)
 
-        latents = sample(step, start, schnell_levels(self.settings.steps, start=strength))
+        latents = sample(step, start, schnell_levels(self._options.sampling_steps, start=strength))
         if not bool(latents.isfinite().all()):
             raise ValueError(
                 "harmonizer flux: expected finite latents, found NaN; check the weights, or try a higher --precision"
@@ -105,10 +86,6 @@ class FluxHarmonizer:
             return _stack([view.background for view in views])
         # the network was trained on binary masks
         return _stack([(view.mask > 0.5).float()[..., None].expand(-1, -1, 3) for view in views])
-
-    def _post_processed(self, image: Float[Tensor, "h w 3"], view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
-        limited = limit_material_change(image, view.composite, view.mask, strength=self.settings.strength)
-        return restore_detail(limited, view.composite, amount=self.settings.detail)
 
 
 def _stack(images: Sequence[Float[Tensor, "h w 3"]]) -> Float[Tensor, "b 3 h w"]:

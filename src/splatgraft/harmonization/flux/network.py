@@ -1,16 +1,21 @@
-"""The loaded FLUX harmoniser: transformer, autoencoder and prompt embeddings, and the calls into them."""
+"""The parts of the FLUX harmoniser and the calls into them: autoencoder, transformer, layout of the latents."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from splatgraft.harmonization.flux.baked_modulation import GUIDANCE
-from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
-from splatgraft.harmonization.flux.latents import pack, positions, unpack
-from splatgraft.harmonization.flux.weights.folder import Variant
+from splatgraft.harmonization.flux.prompt import PromptEmbedding
+
+Variant = Literal["image-mask", "image-background"]
+"""The second condition beside the composite: the object's mask, or the scene without the object."""
+FirstLayer = Literal["repeat", "zero"]
+MULTIPLE = 16
+"""Image sides are multiples of this, pixels: 8 for the autoencoder times 2 for the packing (paper, Sec. 5.3)."""
+Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
 
 
 @dataclass(frozen=True)
@@ -30,14 +35,18 @@ class Autoencoder:
         """Encode sRGB images in [0, 1] to latents of an eighth of the size; the mean of the posterior, not a sample."""
         weight = next(self.network.parameters())
         mean = self.network.encode((images * 2 - 1).to(weight)).latent_dist.mode().float()
-        return (mean - _shift(self.network)) * self.network.config.scaling_factor
+        return (mean - self._shift) * self.network.config.scaling_factor
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "b c i j"]) -> Float[Tensor, "b 3 h w"]:
         """Decode latents to sRGB images in [0, 1]."""
         weight = next(self.network.parameters())
-        plain = latents / self.network.config.scaling_factor + _shift(self.network)
+        plain = latents / self.network.config.scaling_factor + self._shift
         return (self.network.decode(plain.to(weight), return_dict=False)[0].float() / 2 + 0.5).clamp(0, 1)
+
+    @property
+    def _shift(self) -> float:
+        return self.network.config.shift_factor or 0.0
 
 
 @dataclass(frozen=True)
@@ -52,14 +61,12 @@ class FluxNetwork:
     device: torch.device
     dtype: torch.dtype
     """Of the transformer's arithmetic."""
-    steps: int = 4
-    """Sampling steps that its modulations are precomputed for."""
     strengths: tuple[float, ...] = (1.0,)
     """Noise levels to start from that its modulations are precomputed for."""
 
 
 def velocity(
-    transformer: Any,
+    transformer: Callable[..., Any],
     latents: Float[Tensor, "b k h w"],
     level: Float[Tensor, " b"],
     prompt: PromptEmbedding,
@@ -67,19 +74,16 @@ def velocity(
     """Predict the velocity eps - z_0.
 
     Args:
-        transformer: a `FluxTransformer2DModel`; one that was distilled with guidance is told `GUIDANCE`.
-        latents: noisy latent, composite and condition, concatenated along channels (paper, Sec. 5); k = 3 c.
-        level: noise levels in [0, 1].
-        prompt: text embeddings, the same for all samples.
+        transformer: A `FluxTransformer2DModel`.
+        latents: Noisy latent, composite and condition, concatenated along channels (paper, Sec. 5); k = 3 c.
+        level: Noise levels in [0, 1].
+        prompt: Text embeddings, the same for all samples.
     """
     b, _, h, w = latents.shape
     text = prompt.tokens
-    config = _unwrapped(transformer).config
-    guidance = torch.full((b,), GUIDANCE, device=latents.device) if config.guidance_embeds else None
     tokens = transformer(
         hidden_states=pack(latents),
         timestep=level,
-        guidance=guidance,
         encoder_hidden_states=text.expand(b, -1, -1),
         pooled_projections=prompt.pooled.expand(b, -1),
         txt_ids=torch.zeros(text.shape[0], 3, device=latents.device),
@@ -89,12 +93,63 @@ def velocity(
     return unpack(tokens, h, w)
 
 
-def _unwrapped(network: Any) -> Any:
-    """The network within DistributedDataParallel and other wrappers of several processes."""
-    while hasattr(network, "module"):
-        network = network.module
-    return network
+def pack(latents: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n d"]:
+    """Pack blocks of 2x2 latent pixels into tokens, n = h w / 4, d = 4 c.
+
+    The values of a channel stay together, so that packing commutes with concatenation along channels.
+    """
+    b, c, h, w = latents.shape
+    blocks = latents.reshape(b, c, h // 2, 2, w // 2, 2).permute(0, 2, 4, 1, 3, 5)
+    return blocks.reshape(b, h // 2 * (w // 2), c * 4)
 
 
-def _shift(network: Any) -> float:
-    return network.config.shift_factor or 0.0
+def unpack(tokens: Float[Tensor, "b n d"], height: int, width: int) -> Float[Tensor, "b c {height} {width}"]:
+    """Invert `pack` for latents of `height` x `width`."""
+    b, _, d = tokens.shape
+    blocks = tokens.reshape(b, height // 2, width // 2, d // 4, 2, 2).permute(0, 3, 1, 4, 2, 5)
+    return blocks.reshape(b, d // 4, height, width)
+
+
+def positions(height: int, width: int, device: torch.device) -> Float[Tensor, "n 3"]:
+    """Position of each token of latents of `height` x `width`: 0 (the text coordinate), row, column."""
+    rows, columns = torch.arange(height // 2, device=device), torch.arange(width // 2, device=device)
+    row, column = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack([torch.zeros_like(row), row, column], -1).reshape(-1, 3).float()
+
+
+def pad_by_reflection(images: Float[Tensor, "b c h w"], multiple: int = MULTIPLE) -> Float[Tensor, "b c i j"]:
+    """Pad at the bottom and the right by reflection, repeated where needed, to multiples of `multiple` pixels."""
+    h, w = images.shape[-2:]
+    rows, columns = (_reflected_indices(size, -size % multiple + size).to(images.device) for size in (h, w))
+    return images if len(rows) == h and len(columns) == w else images[..., rows, :][..., columns]
+
+
+def _reflected_indices(size: int, length: int) -> Tensor:
+    """Indices 0, 1, .., size-1, size-2, .., 0, 1, .. of that length."""
+    period = max(2 * size - 2, 1)
+    index = torch.arange(length) % period
+    return torch.where(index < size, index, period - index)
+
+
+def widen_layer(layer: Layer, times: int, init: FirstLayer = "repeat") -> Layer:
+    """Make a layer for `times` as many input channels, with the same bias and the same weights for the first input.
+
+    Args:
+        layer: The first layer.
+        times: Number of inputs, each with as many channels as `layer` takes.
+        init: Weights of the further inputs: `repeat` copies them (the paper, after DEGS), `zero` sets them to 0, so
+            that the widened network ignores its conditions at first (diffusers' control training).
+    """
+    weight = layer.weight.detach()
+    further = weight if init == "repeat" else torch.zeros_like(weight)
+    settings = {"device": weight.device, "dtype": weight.dtype, "bias": layer.bias is not None}
+    if isinstance(layer, nn.Linear):
+        wider = nn.Linear(layer.in_features * times, layer.out_features, **settings)
+    else:
+        shape = {"stride": layer.stride, "padding": layer.padding}
+        wider = nn.Conv2d(layer.in_channels * times, layer.out_channels, layer.kernel_size, **shape, **settings)  # pyright: ignore
+    with torch.no_grad():
+        wider.weight.copy_(torch.cat([weight, *[further] * (times - 1)], 1))
+        if layer.bias is not None:
+            wider.bias.copy_(layer.bias)  # pyright: ignore
+    return wider  # pyright: ignore

@@ -1,4 +1,4 @@
-"""Harmonisers by other authors: their published settings, stand-ins of their parts, missing parts named in one line."""
+"""Harmonisers by other authors and the baseline: stand-ins of their parts, missing parts named in one line."""
 
 import base64
 import io
@@ -14,18 +14,19 @@ import torch
 from PIL import Image
 
 from splatgraft.harmonization import HarmonizerContext, HarmonizerInputs, make_harmonizer
-from splatgraft_paper.peers.image_editing import PROMPT
+from splatgraft_paper.peers.image_editing import KEY_VARIABLE, PROMPT, ImageEditingOptions
+from splatgraft_paper.peers.methods import method_options
 from splatgraft_paper.peers.mv_colight import MVCoLight, network_input
-from splatgraft_paper.peers.options import ImageEditingOptions, method_options
 
 
 def view(h=40, w=60):
     g = torch.Generator().manual_seed(0)
-    background = torch.rand(h, w, 3, generator=g)
+    background = 0.3 + 0.2 * torch.rand(h, w, 3, generator=g)
     mask = torch.zeros(h, w)
-    mask[10:20, 20:40] = 1
+    mask[12:28, 20:40] = 1
     composite = torch.where(mask[..., None] > 0, torch.rand(h, w, 3, generator=g), background)
-    return HarmonizerInputs(composite, background, mask, torch.rand(h, w, generator=g), torch.zeros(h, w, 3), composite)
+    depth = torch.rand(h, w, generator=g)
+    return HarmonizerInputs(composite, background, mask, depth, torch.zeros(h, w, 3), 0.9 * composite)
 
 
 MISSING = {
@@ -33,6 +34,7 @@ MISSING = {
     "mv-colight": "harmonizer mv-colight: expected --checkout with the code of",
     "image-editing": "--max-cost: expected at least 0.04 US dollars, found 0.00",
     "flux": "harmonizer flux: expected --weights FOLDER or a hub id",
+    "magic": "expected one of compact, flux, image-editing, lbm, mv-colight, none, reinhard, found 'magic'",
 }
 
 
@@ -41,6 +43,19 @@ def test_what_is_missing_is_one_line(name):
     with pytest.raises(ValueError, match=MISSING[name]) as error:
         make_harmonizer(method_options(name))
     assert "\n" not in str(error.value)
+
+
+def test_reinhard_changes_the_object_alone_and_brings_it_near_its_surroundings():
+    shown = view()
+    image = make_harmonizer(method_options("reinhard")).harmonize(shown).image
+    inside = shown.mask > 0.5
+    assert torch.equal(image[~inside], shown.prior[~inside])
+    # the grey uniform background spans 0.3-0.5: matched log statistics put the mean within a tenth of that of 0.4
+    assert (image[inside].mean(0) - 0.4).abs().max() < 0.04
+    # and its deviation, 0.2/sqrt(12) = 0.058, replaces the object's of 0.26
+    assert image[inside].std(0).max() < 0.09
+    nothing = HarmonizerInputs(**{**shown.__dict__, "mask": torch.zeros(40, 60)})
+    assert torch.equal(make_harmonizer(method_options("reinhard")).harmonize(nothing).image, shown.prior)
 
 
 def test_lbm_is_asked_and_kept_inside_the_object(monkeypatch):
@@ -78,7 +93,7 @@ class Service(BaseHTTPRequestHandler):
 @pytest.fixture
 def service():
     server = HTTPServer(("127.0.0.1", 0), Service)
-    thread = threading.Thread(target=server.serve_forever)
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
     Service.asked, Service.status = [], 200
     yield f"http://127.0.0.1:{server.server_port}/edit"
@@ -87,10 +102,10 @@ def service():
     server.server_close()
 
 
-def test_an_editing_service_is_sent_the_paper_s_prompt_composite_and_mask(service):
-    said = []
-    options = ImageEditingOptions(weights=service, max_cost=0.2)
-    image = make_harmonizer(options, HarmonizerContext(key="secret", views=3, say=said.append)).harmonize(view()).image
+def test_an_editing_service_is_sent_the_paper_s_prompt_composite_and_mask(service, monkeypatch):
+    said, options = [], ImageEditingOptions(weights=service, max_cost=0.2)
+    monkeypatch.setenv(KEY_VARIABLE, "secret")
+    image = make_harmonizer(options, HarmonizerContext(views=3, say=said.append)).harmonize(view()).image
     assert (image - view().composite).abs().max() < 1 / 255  # the stand-in sends the composite back, in 8 bits
     key, body = Service.asked[0]
     text, _, mask = body["contents"][0]["parts"]
@@ -102,15 +117,16 @@ def test_an_editing_service_is_sent_the_paper_s_prompt_composite_and_mask(servic
     assert "0.12 US dollars" in said[0]
 
 
-def test_an_editing_service_that_fails_or_has_no_key_is_one_line(service):
-    Service.status = 429
-    options, context = ImageEditingOptions(weights=service, max_cost=1.0), HarmonizerContext(key="secret")
-    with pytest.raises(ValueError, match=r"expected an answer, found status 429: .*quota"):
-        make_harmonizer(options, context).harmonize(view())
+def test_an_editing_service_that_fails_or_has_no_key_is_one_line(service, monkeypatch):
+    options = ImageEditingOptions(weights=service, max_cost=1.0)
     with pytest.raises(ValueError, match="expected a key in SPLATGRAFT_IMAGE_EDITING_KEY, found none"):
-        make_harmonizer(ImageEditingOptions(weights=service, max_cost=1.0))
+        make_harmonizer(options)
     with pytest.raises(ValueError, match="expected --weights https://"):
         make_harmonizer(ImageEditingOptions(weights="ftp://x", max_cost=1.0))
+    monkeypatch.setenv(KEY_VARIABLE, "secret")
+    Service.status = 429
+    with pytest.raises(ValueError, match=r"expected an answer, found status 429: .*quota"):
+        make_harmonizer(options).harmonize(view())
 
 
 @pytest.fixture
@@ -128,11 +144,18 @@ def other_python(tmp_path):
 
 
 def test_mv_colight_runs_in_its_own_python_and_its_change_is_laid_on_the_composite(other_python, tmp_path):
-    halves = "import sys, numpy as np; np.save(sys.argv[4], np.load(sys.argv[3])[:, :3] * 0.5)"
-    image = other_python(halves).harmonize(view()).image
-    bright = view().composite.amin(-1) > 0.3
-    # (x / 2 + 0.02) / (x + 0.02) at the network's size, above a half by less than 0.04 for x > 0.3
-    assert ((image / view().composite)[bright] - 0.5).median() < 0.04
+    # each square is darkened by a factor of its own; between them the factor changes smoothly
+    program = (
+        "import sys, numpy as np; given = np.load(sys.argv[3])[:, :3]; "
+        "np.save(sys.argv[4], given * np.linspace(1, 0.5, len(given))[:, None, None, None].astype('float32'))"
+    )
+    flat = torch.full((64, 96, 3), 0.5)
+    shown = HarmonizerInputs(flat, flat, torch.ones(64, 96), torch.ones(64, 96), torch.zeros(64, 96, 3), flat)
+    row = other_python(program).harmonize(shown).image[32, :, 0]
+    assert float(row[0]) == pytest.approx(0.5, abs=0.01)
+    assert float(row[-1]) < 0.3
+    # the change of a factor of two is spread over half a square: 32 of these pixels
+    assert float((row[1:] - row[:-1]).abs().max()) < 0.03
     (tmp_path / "python").write_text("#!/bin/sh\necho 'ModuleNotFoundError: mmengine' >&2\nexit 1\n")
     with pytest.raises(ValueError, match="expected MV-CoLight to make a picture, found ModuleNotFoundError: mmengine"):
         MVCoLight(tmp_path, tmp_path, tmp_path / "python").harmonize(view())
@@ -154,18 +177,3 @@ def test_mv_colight_sees_squares_whose_shorter_side_has_its_size_and_nothing_is_
     # the disc of a quarter of the height is as wide as it is high, if all of it is in the first square
     assert abs(int(rows) - 128) <= 2
     assert abs(int(columns) - 128) <= 2
-
-
-def test_mv_colight_s_squares_leave_no_seam(other_python):
-    # each square is darkened by a factor of its own; between them the factor changes smoothly
-    program = (
-        "import sys, numpy as np; given = np.load(sys.argv[3])[:, :3]; "
-        "np.save(sys.argv[4], given * np.linspace(1, 0.5, len(given))[:, None, None, None].astype('float32'))"
-    )
-    flat = torch.full((64, 96, 3), 0.5)
-    view = HarmonizerInputs(flat, flat, torch.ones(64, 96), torch.ones(64, 96), torch.zeros(64, 96, 3), flat)
-    row = other_python(program).harmonize(view).image[32, :, 0]
-    assert float(row[0]) == pytest.approx(0.5, abs=0.01)
-    assert float(row[-1]) < 0.3
-    # the change of a factor of two is spread over half a square: 32 of these pixels
-    assert float((row[1:] - row[:-1]).abs().max()) < 0.03

@@ -1,4 +1,4 @@
-"""Views of a composite: what `render_views` renders of it, and `harmonize` on all of them."""
+"""Views of a composite, and methods by name: `none` keeps the prior, all views are harmonised as each alone."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import torch
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.spherical_harmonics import dc_from_rgb
-from splatgraft.harmonization import harmonize, make_harmonizer, render_views
+from splatgraft.harmonization import CompactOptions, harmonize, harmonizer_options, make_harmonizer, render_views
 from splatgraft.harmonization.harmonize import _batches
 from splatgraft.rendering import render
 
@@ -52,25 +52,26 @@ def test_a_view_shows_composite_background_object_and_prior() -> None:
         assert view.prior_confidence == 0.4
 
 
-def test_without_a_prior_it_is_the_composite() -> None:
-    for view in render_views(*scene(), cameras()):
+def test_without_a_prior_it_is_the_composite_and_other_flags_are_refused() -> None:
+    composite, is_object = scene()
+    for view in render_views(composite, is_object, cameras()):
         assert torch.equal(view.prior, view.composite)
         assert view.prior_confidence == 0
-
-
-def test_flags_of_another_scene_are_refused() -> None:
-    composite, is_object = scene()
     with pytest.raises(ValueError, match="expected one flag for each of 60 Gaussians, found 59"):
         render_views(composite, is_object[1:], cameras())
 
 
-@pytest.mark.parametrize(("name", "has_confidence"), [("none", False), ("reinhard", False), ("compact", True)])
+@pytest.mark.parametrize(("name", "has_confidence"), [("none", False), ("compact", True)])
 def test_all_views_are_harmonised_as_each_alone(name: str, has_confidence: bool) -> None:
-    views, harmonizer = render_views(*scene(), cameras()), make_harmonizer(name)
+    composite, is_object = scene()
+    views = render_views(composite, is_object, cameras(), prior=replace(composite, sh=composite.sh - 0.1))
+    harmonizer = make_harmonizer(name)
     calls: list[tuple[int, int]] = []
     found = harmonize(views, name, progress=lambda done, total, text: calls.append((done, total)))
     expected = [harmonizer.harmonize(view) for view in views]
     assert all(torch.equal(image, one.image) for image, one in zip(found.images, expected, strict=True))
+    if name == "none":
+        assert all(torch.equal(image, view.prior) for image, view in zip(found.images, views, strict=True))
     assert (found.confidence is not None) == has_confidence
     for weight, one in zip(found.confidence or (), expected, strict=has_confidence):
         assert one.confidence is not None
@@ -86,6 +87,7 @@ def test_batches_hold_consecutive_views_of_one_size() -> None:
     assert [view.composite.shape[1] for batch in batches for view in batch] == [20, 20, 20, 40, 20, 20, 20]
 
 
-def test_an_unknown_method_is_refused_with_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"expected one of .*compact.*found 'magic'"):
-        harmonize(render_views(*scene(), cameras()), "magic")
+def test_names_that_there_are_not_are_refused_with_those_that_there_are() -> None:
+    assert harmonizer_options("compact", weights="mine") == CompactOptions(weights="mine")
+    with pytest.raises(ValueError, match="expected one of compact, flux, none, found 'magic'"):
+        harmonize([], "magic")

@@ -1,1 +1,0 @@
-"""The commands `weights list`, `weights fetch` and `weights verify`."""

@@ -1,0 +1,347 @@
+"""Loads the FLUX harmoniser from a folder or the hub, in a precision that fits the memory of its device.
+
+    transformer/config.json, diffusion_pytorch_model*.safetensors   (or these in the folder itself; also .bf16.)
+    vae/  empty_prompt.safetensors  harmonizer.json                 (or beside the folder, or the base's)
+
+harmonizer.json is written by `train flux`: {"variant": "image-mask"}. The authors' folders are named by their variant.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import torch
+
+from splatgraft.harmonization.flux.baked_modulation import bake
+from splatgraft.harmonization.flux.network import Autoencoder, FirstLayer, FluxNetwork, Variant, widen_layer
+from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, one_line, read_prompt
+from splatgraft.harmonization.flux.sampling import schnell_levels
+from splatgraft.harmonization.interface import HarmonizerContext
+from splatgraft.harmonization.methods import FluxOptions
+from splatgraft.runtime.hub import hub_folder
+
+Say = Callable[[str], None]
+VARIANTS: tuple[str, ...] = get_args(Variant)
+INPUTS = 3
+"""Latents that a harmoniser's first layer takes: the noisy one, the composite's and the condition's."""
+DESCRIPTION_FILE = "harmonizer.json"
+_PREFIX = "transformer."
+BASE = "black-forest-labs/FLUX.1-schnell"
+_AUTHORS = "nviolante/dot3d"
+_BYTES = {"bf16": 2.0, "fp8": 1.0, "offload": 0.1}
+"""Of a parameter on the device, best first; offload holds the two blocks in use."""
+_RESERVED_BYTES = 1.2e9
+"""For the autoencoder, the CUDA context, kernels and fragmentation. An estimate."""
+
+
+def diffusers_library() -> Any:
+    """The package diffusers without its own messages: errors are reported by this package."""
+    import diffusers
+
+    diffusers.utils.logging.set_verbosity_error()
+    return diffusers
+
+
+def local_folder(weights: str, say: Say, *, parts: Sequence[str] = ("transformer",)) -> Path:
+    """Resolve `weights` to a local folder; what is needed of a hub id is fetched once.
+
+    Args:
+        weights: A folder, or a hub id OWNER/NAME or OWNER/NAME/FOLDER.
+        say: Takes the repository and where its licence is.
+        parts: Folders of the model that are needed; vae/ is taken too.
+
+    Raises:
+        ValueError: It is neither, or the download fails.
+    """
+    folder = Path(weights)
+    if folder.is_dir():
+        return folder
+    names = weights.split("/")
+    if folder.exists() or folder.is_absolute() or weights.startswith(".") or len(names) not in (2, 3) or not all(names):
+        raise ValueError(
+            f"{weights}: expected a folder with transformer/ or a hub id such as {_AUTHORS}/image-mask, found "
+            f"{'a file' if folder.exists() else 'none'}"
+        )
+    repository, inner = "/".join(names[:2]), "".join(names[2:])
+    if repository == _AUTHORS and not inner:
+        inner = "image-mask"
+    wanted = [f"{inner}/*"] if inner else [f"{part}/*" for part in parts]
+    return hub_folder(repository, [*wanted, "vae/*", DESCRIPTION_FILE, PROMPT_FILE], say) / inner
+
+
+@dataclass(frozen=True)
+class FluxFolder:
+    """A model folder with a FLUX transformer."""
+
+    folder: Path
+    """The model folder."""
+    transformer: Path
+    """Where the transformer's config.json is."""
+    config: dict[str, Any]
+    """The transformer's config.json, with diffusers' defaults where it leaves sizes out."""
+
+    @staticmethod
+    def open(folder: Path) -> "FluxFolder":
+        """Read the transformer's config.
+
+        Raises:
+            ValueError: It is missing, or of another model.
+        """
+        below = folder / "transformer"
+        transformer = below if (below / "config.json").is_file() else folder
+        config = read_config(transformer / "config.json", "FluxTransformer2DModel")
+        if config.get("guidance_embeds"):
+            raise ValueError(f"{transformer}: expected a network made of FLUX.1-schnell, found one with guidance (dev)")
+        latent = config.get("out_channels") or 64
+        if config.get("in_channels", 64) not in (latent, INPUTS * latent):
+            raise ValueError(
+                f"{transformer}: expected in_channels of {latent} (FLUX) or {INPUTS * latent} (a harmoniser) in "
+                f"config.json, found {config.get('in_channels')}"
+            )
+        return FluxFolder(folder, transformer, config)
+
+    @property
+    def is_harmonizer(self) -> bool:
+        """Whether the first layer takes composite and condition; FLUX itself takes the noisy latent alone."""
+        return self.config.get("in_channels", 64) != (self.config.get("out_channels") or 64)
+
+    @property
+    def width(self) -> int:
+        """Channels of a token."""
+        return self.config.get("num_attention_heads", 24) * self.config.get("attention_head_dim", 128)
+
+    def variant(self, requested: str) -> Variant:
+        """Determine the variant: `requested`, or for `auto` that of harmonizer.json or of the folder's name.
+
+        Raises:
+            ValueError: It cannot be determined, contradicts `requested`, or the folder is FLUX itself.
+        """
+        if not self.is_harmonizer:
+            raise ValueError(
+                f"{self.transformer}: expected a harmoniser, found FLUX itself; train one by `splatgraft paper train "
+                "flux` or give --lora"
+            )
+        names = (self.folder.name, self.folder.resolve().name, self.transformer.resolve().parent.name)
+        declared = declared_variant(self.folder) or next((name for name in names if name in VARIANTS), None)
+        if requested != "auto" and declared not in (None, requested):
+            raise ValueError(f"{self.folder}: expected {requested} (--variant), found {declared}")
+        return _known(declared if requested == "auto" else requested, self.folder)
+
+
+def declared_variant(folder: Path) -> str | None:
+    """Read the variant from harmonizer.json in `folder`; None where there is no such file.
+
+    Raises:
+        ValueError: The file is broken.
+    """
+    path = folder / DESCRIPTION_FILE
+    if not path.is_file():
+        return None
+    try:
+        return _known(json.loads(path.read_text())["variant"], path)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected a variant, {' or '.join(VARIANTS)}, found {one_line(error)}") from error
+
+
+def _known(variant: str | None, place: Path) -> Variant:
+    if variant not in VARIANTS:
+        raise ValueError(
+            f"{place}: expected {DESCRIPTION_FILE} or a folder called {' or '.join(VARIANTS)}, found "
+            f"{variant or 'neither'}; choose by --variant"
+        )
+    return variant  # pyright: ignore
+
+
+def read_config(path: Path, kind: str) -> dict[str, Any]:
+    """Read the diffusers config of a model of class `kind`.
+
+    Raises:
+        ValueError: It is missing, broken or of another class.
+    """
+    try:
+        config = json.loads(path.read_text())
+        found = config["_class_name"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected the config of a {kind}, found {one_line(error)}") from error
+    if found != kind:
+        raise ValueError(f"{path}: expected the config of a {kind}, found {found}")
+    return config
+
+
+def load_transformer(checked: FluxFolder, *, dtype: torch.dtype) -> Any:
+    """Load the transformer on the CPU.
+
+    Raises:
+        ValueError: The weights are missing, damaged, or do not fit the config.
+    """
+    return _load(diffusers_library().FluxTransformer2DModel, checked.transformer, dtype)
+
+
+def load_autoencoder(folder: Path) -> Autoencoder:
+    """Load the autoencoder in float32 on the CPU.
+
+    Raises:
+        ValueError: The folder has none.
+    """
+    return Autoencoder(_load(diffusers_library().AutoencoderKL, folder, torch.float32))
+
+
+def _load(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
+    variant = "bf16" if any(folder.glob("*.bf16*")) else None
+    try:
+        model, about = kind.from_pretrained(folder, torch_dtype=dtype, variant=variant, output_loading_info=True)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{folder}: expected weights of {kind.__name__}, found {one_line(error)}") from error
+    if missing := sorted(about["missing_keys"]):  # of which diffusers only warns
+        raise ValueError(
+            f"{folder}: expected all weights of config.json, found {len(missing)} missing: {missing[0]} ..."
+        )
+    return model
+
+
+def widen_transformer(transformer: Any, init: FirstLayer = "repeat") -> None:
+    """Widen the first layer for composite and condition, in place; the config is updated too (paper, Sec. 5)."""
+    out = transformer.proj_out.out_features
+    transformer.x_embedder = widen_layer(transformer.x_embedder, INPUTS, init)
+    transformer.register_to_config(in_channels=transformer.x_embedder.in_features, out_channels=out)
+
+
+def merge_lora(transformer: Any, path: Path) -> int:
+    """Add a low-rank adaptation to the weights in place, as diffusers and PEFT load it.
+
+    Args:
+        transformer: The network.
+        path: File of `train flux --lora`, or another in a form that diffusers reads. Parameters that it holds whole,
+            such as those of the widened first layer, replace the network's.
+
+    Returns:
+        The number of layers changed by low-rank products.
+
+    Raises:
+        ValueError: The file is broken, or belongs to another network.
+    """
+    diffusers_library()
+    from diffusers.loaders.lora_pipeline import FluxLoraLoaderMixin  # pyright: ignore
+
+    loader: Any = FluxLoraLoaderMixin
+    try:
+        state, alphas, metadata = loader.lora_state_dict(
+            str(path.parent), weight_name=path.name, return_alphas=True, return_lora_metadata=True
+        )
+        low_rank = {name: tensor for name, tensor in state.items() if name.startswith(_PREFIX) and ".lora_" in name}
+        layers = {name.removeprefix(_PREFIX).split(".lora_")[0] for name in low_rank}
+        modules = {name for name, _ in transformer.named_modules()}
+        if not layers or not layers <= modules:
+            raise ValueError(f"{len(layers)} layers, among them {min(layers - modules, default='none')}")
+        whole = {name.removeprefix(_PREFIX): tensor for name, tensor in state.items() if name not in low_rank}
+        for name, parameter in transformer.named_parameters():
+            if name in whole:
+                parameter.data.copy_(whole[name].view(parameter.shape))
+        loader.load_lora_into_transformer(low_rank, network_alphas=alphas, transformer=transformer, metadata=metadata)
+        transformer.fuse_lora()
+        transformer.unload_lora()
+    except Exception as error:  # the library's converters fail with KeyError, NotImplementedError and more
+        raise ValueError(f"{path}: expected a low-rank adaptation of this network, found {one_line(error)}") from error
+    return len(layers)
+
+
+def load_flux(options: FluxOptions, context: HarmonizerContext) -> FluxNetwork:
+    """Load the network, with precomputed modulations.
+
+    Raises:
+        ValueError: A folder is of another kind, a file is broken, or memory does not suffice.
+    """
+    say, device = context.say, context.device
+    folder = local_folder(str(options.weights), say)
+    checked = FluxFolder.open(folder)
+    if options.lora is not None and not checked.is_harmonizer:
+        found = declared_variant(options.lora.parent) if options.variant == "auto" else options.variant
+        variant = _known(found, options.lora)
+    else:
+        variant = checked.variant(options.variant)
+    places = [folder, *([Path(options.base)] if options.base else []), folder.parent]  # or image-mask/ beside vae/
+    prompt = read_prompt(
+        find_prompt(options.base or BASE, *places),
+        tokens_width=checked.config.get("joint_attention_dim", 4096),
+        pooled_width=checked.config.get("pooled_projection_dim", 768),
+    )
+    vae = next((place / "vae" for place in places if (place / "vae").is_dir()), None)
+    autoencoder = load_autoencoder(vae or local_folder(options.base or BASE, say, parts=()) / "vae")
+    precision, reason = options.precision, f"as requested, on {device}"
+    if precision == "auto":
+        precision, reason = _best_precision(checked, context, views=options.batch)
+    say(f"flux: {precision}, {reason}")
+    dtype = torch.float32 if precision == "float32" else torch.bfloat16
+    transformer = load_transformer(checked, dtype=dtype)
+    if options.lora is not None:
+        if not checked.is_harmonizer:
+            widen_transformer(transformer, "zero")  # as diffusers does for a low-rank first layer; ours is whole
+        say(f"lora: {merge_lora(transformer, options.lora)} layers adapted by {options.lora}")
+    transformer.eval().requires_grad_(False)
+    prompt = prompt.to(torch.device("cpu"), dtype)
+    starts = context.strengths
+    levels = {level for start in starts for level in schnell_levels(options.sampling_steps, start=start)[:-1]}
+    removed = bake(transformer, prompt, tuple(sorted(levels)))
+    say(f"flux: {removed / 1e9:.2f} billion parameters of modulation replaced by a table")
+    if precision == "offload":
+        transformer.enable_group_offload(device, offload_type="block_level", num_blocks_per_group=1, use_stream=True)
+    else:
+        if precision == "fp8":
+            transformer.enable_layerwise_casting(storage_dtype=torch.float8_e4m3fn, compute_dtype=dtype)
+        transformer.to(device)
+    autoencoder.network.to(device, dtype).eval().requires_grad_(False)
+    if options.compile:
+        transformer.compile_repeated_blocks()
+    return FluxNetwork(transformer, autoencoder, prompt.to(device, dtype), variant, device, dtype, starts)
+
+
+def _best_precision(checked: FluxFolder, context: HarmonizerContext, *, views: int) -> tuple[str, str]:
+    """The best precision that fits the free memory of the device, and why it is taken."""
+    if context.device.type != "cuda":
+        return "float32", f"on {context.device}; minutes per view at FLUX's size"
+    doubles, singles = checked.config.get("num_layers", 19), checked.config.get("num_single_layers", 38)
+    return choose_precision(
+        # without modulation: 12 width^2 per single block and per stream of a double block
+        parameters=checked.width**2 * (24 * doubles + 12 * singles),
+        working=working_bytes(pixels=context.pixels, views=views, width=checked.width),
+        free=torch.cuda.mem_get_info(context.device)[0],
+    )
+
+
+def working_bytes(*, pixels: int, views: int, width: int) -> int:
+    """Estimate the largest activations of one pass.
+
+    Args:
+        pixels: Of one view; a token covers 256 of them, and text adds 512 tokens.
+        views: Per pass.
+        width: Channels of a token.
+    """
+    tokens = views * (pixels // 256 + 512) * width * 2 * 40  # about 40 bf16 copies of the transformer's tokens
+    return max(tokens, views * pixels * 256 * 2 * 3)  # the decoder has three copies of 256 channels at full size
+
+
+def choose_precision(*, parameters: int, working: int, free: int) -> tuple[str, str]:
+    """Choose the best precision that fits.
+
+    Args:
+        parameters: Of the transformer.
+        working: Bytes of activations, see `working_bytes`.
+        free: Bytes of the device.
+
+    Returns:
+        The precision, and why it was chosen.
+
+    Raises:
+        ValueError: Not even fetching blocks from the CPU fits.
+    """
+    need = 0.0
+    for precision, each in _BYTES.items():
+        need = parameters * each + working + _RESERVED_BYTES
+        if need <= free:
+            return precision, f"needs {need / 1e9:.1f} of {free / 1e9:.1f} GB free"
+    raise ValueError(
+        f"GPU memory: expected {need / 1e9:.1f} GB free even with blocks on the CPU, found {free / 1e9:.1f} GB; "
+        "close other programs, use smaller views or --batch 1"
+    )

@@ -1,0 +1,95 @@
+"""The empty prompt's text embeddings, read from a file so that no text encoder is loaded; .safetensors files."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from splatgraft.runtime.atomic_file import atomic_write
+
+PROMPT_FILE = "empty_prompt.safetensors"
+
+
+@dataclass(frozen=True)
+class PromptEmbedding:
+    """Text embeddings that FLUX takes."""
+
+    tokens: Float[Tensor, "n d"]
+    """T5's last hidden states."""
+    pooled: Float[Tensor, " p"]
+    """CLIP's pooled output."""
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> "PromptEmbedding":
+        """Move to a device and dtype."""
+        return PromptEmbedding(self.tokens.to(device, dtype), self.pooled.to(device, dtype))
+
+
+def prompt_file(base: str) -> Path:
+    """Where `train embed` writes the embeddings of a base: in its folder, or for a hub id in the user's cache."""
+    if Path(base).is_dir():
+        return Path(base) / PROMPT_FILE
+    return Path.home() / ".cache" / "splatgraft" / "prompts" / base.replace("/", "--") / PROMPT_FILE
+
+
+def find_prompt(base: str, *folders: Path) -> Path:
+    """The embeddings in the first of `folders` that has them, else where `train embed` writes those of `base`."""
+    return next((folder / PROMPT_FILE for folder in folders if (folder / PROMPT_FILE).is_file()), prompt_file(base))
+
+
+def write_prompt(path: Path, prompt: PromptEmbedding, source: str) -> None:
+    """Write the embeddings; `source` names the text encoders, for the file's header."""
+    write_tensors(path, {"tokens": prompt.tokens, "pooled": prompt.pooled}, {"text": "", "source": source})
+
+
+def read_prompt(path: Path, *, tokens_width: int, pooled_width: int) -> PromptEmbedding:
+    """Read the embeddings and check their widths.
+
+    Args:
+        path: File of `write_prompt`.
+        tokens_width: Width of T5's hidden states that the network takes.
+        pooled_width: Width of CLIP's pooled output that the network takes.
+
+    Raises:
+        ValueError: The file is missing, broken or made by other text encoders.
+    """
+    if not path.is_file():
+        raise ValueError(
+            f"{path}: expected the empty prompt's embeddings, found none; `splatgraft paper train embed` makes them"
+        )
+    found = read_tensors(path)
+    shapes = {name: tuple(tensor.shape) for name, tensor in found.items()}
+    if {name: shape[-1:] for name, shape in shapes.items()} != {"tokens": (tokens_width,), "pooled": (pooled_width,)}:
+        raise ValueError(f"{path}: expected tokens (n, {tokens_width}) and pooled ({pooled_width},), found {shapes}")
+    return PromptEmbedding(found["tokens"], found["pooled"])
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Read all tensors of a .safetensors file.
+
+    Raises:
+        ValueError: The file is missing, truncated or of another format.
+    """
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise ValueError(f"{path}: expected a whole .safetensors file, found {one_line(error)}") from error
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, str] | None = None) -> None:
+    """Write a .safetensors file atomically; `about` goes into its metadata, as JSON."""
+    # one key: safetensors writes several in an order that differs from run to run
+    metadata = {"splatgraft": json.dumps(dict(about), sort_keys=True)} if about else None
+    content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, metadata)
+    with atomic_write(path) as stream:
+        stream.write(content)
+
+
+def one_line(error: Exception) -> str:
+    """Type and message of an error in one line; the message is cut at 200 characters."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

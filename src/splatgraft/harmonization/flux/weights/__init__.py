@@ -1,1 +1,0 @@
-"""Weights of the FLUX harmoniser: model folders, downloads, low-rank adaptations, precision, text embeddings."""

@@ -1,0 +1,68 @@
+"""Files of the Hugging Face hub, fetched once into its client's own cache (`HF_HOME`) by the client itself.
+
+The client continues interrupted downloads, checks hashes, and takes what is in its cache where there is no network.
+"""
+
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+Say = Callable[[str], None]
+_OTHER_FORMS = ("*.bin", "*.ckpt", "*.msgpack", "*.fp16.*")
+"""Weights that repositories hold beside the same ones as .safetensors; FLUX overflows in fp16."""
+
+
+def hub_folder(repository: str, patterns: Sequence[str], say: Say) -> Path:
+    """Fetch the files of a repository that match any of the patterns.
+
+    Args:
+        repository: OWNER/NAME.
+        patterns: Of paths in the repository, as in `fnmatch`.
+        say: Takes where the licence is, before anything is fetched.
+
+    Returns:
+        The repository's folder in the cache.
+
+    Raises:
+        ValueError: There is no such repository, it is gated, or there is no network and nothing in the cache.
+    """
+    with _one_line(repository):
+        from huggingface_hub import snapshot_download
+
+        say(f"weights: {repository} of the Hugging Face hub; its licence: https://huggingface.co/{repository}")
+        found = snapshot_download(repository, allow_patterns=list(patterns), ignore_patterns=list(_OTHER_FORMS))
+    return Path(found)
+
+
+def hub_file(repository: str, name: str) -> Path:
+    """Fetch one file of a repository.
+
+    Raises:
+        ValueError: As `hub_folder`.
+    """
+    with _one_line(repository):
+        from huggingface_hub import hf_hub_download
+
+        return Path(hf_hub_download(repository, name))
+
+
+@contextmanager
+def _one_line(repository: str) -> Generator[None]:
+    """Turn what the client raises into one line that says how to mend it."""
+    try:
+        yield
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:
+        from huggingface_hub.errors import GatedRepoError
+
+        if isinstance(error, GatedRepoError):
+            raise ValueError(
+                f"{repository}: expected access to a gated repository, found none; agree to its terms on "
+                f"https://huggingface.co/{repository} and enter a token by `hf auth login`"
+            ) from error
+        found = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
+        raise ValueError(
+            f"{repository}: expected a folder here or a repository of the Hugging Face hub, found {found}; without a "
+            f"network, run `hf download {repository}` elsewhere and give its folder"
+        ) from error

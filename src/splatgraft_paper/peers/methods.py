@@ -1,0 +1,139 @@
+"""Methods that the benchmark compares with, by name; here LBM and the colour transfer of Reinhard et al."""
+
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from PIL import Image
+from torch import Tensor
+
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.harmonization import HARMONIZERS, HarmonizerContext, HarmonizerOptions, harmonizer_options
+from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerInputs
+from splatgraft_paper.peers.image_editing import ImageEditingOptions
+from splatgraft_paper.peers.mv_colight import MVCoLightOptions
+
+_LMS_FROM_RGB = torch.tensor([[0.3811, 0.5783, 0.0402], [0.1967, 0.7244, 0.0782], [0.0241, 0.1288, 0.8444]])
+_LAB_FROM_LOG_LMS = torch.diag(torch.tensor([3.0, 6.0, 2.0]).rsqrt()) @ torch.tensor(
+    [[1.0, 1, 1], [1, 1, -2], [1, -1, 0]]
+)
+_DARKEST = 3e-4
+"""Linear light to which smaller values are raised: 1/255 in sRGB; below, the logarithm amplifies quantisation."""
+_FLAT_DEVIATION = 1e-4
+"""Deviation in l-alpha-beta below which a channel of the object is shifted but not scaled."""
+_RING_WIDTH, _MIN_RING_PX = 0.5, 3
+"""Width of the ring around the object, as a share of the root of the object's area, and at least in pixels."""
+
+
+@dataclass(frozen=True)
+class ReinhardOptions:
+    """Match the object's colour statistics to its surroundings (Reinhard et al. 2001); a baseline."""
+
+    name: ClassVar[str] = "reinhard"
+
+    def make(self, context: HarmonizerContext) -> Harmonizer:
+        """Make the harmoniser."""
+        return Reinhard()
+
+
+class Reinhard:
+    """Matches mean and deviation per channel in l-alpha-beta to those in a ring around the object; adds no shadow."""
+
+    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+        """Shift the object's colours in the prior; unchanged where object or ring has fewer than two pixels."""
+        inside = view.mask > 0.5
+        around = _ring(inside)
+        if int(inside.sum()) < 2 or int(around.sum()) < 2:
+            return Harmonized(image=view.prior)
+        lab = _lab_from_srgb(view.prior)
+        source, surroundings = lab[inside], _lab_from_srgb(view.background)[around]
+        flat = source.std(0) <= _FLAT_DEVIATION
+        scale = torch.where(flat, 1.0, surroundings.std(0) / source.std(0).clamp_min(_FLAT_DEVIATION))
+        matched = _srgb_from_lab((lab - source.mean(0)) * scale + surroundings.mean(0)).clamp(0, 1)
+        return Harmonized(image=torch.lerp(view.prior, matched, view.mask[..., None].clamp(0, 1)))
+
+
+def _ring(inside: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Pixels around the object, outside of it."""
+    width = max(_MIN_RING_PX, round(float(inside.sum()) ** 0.5 * _RING_WIDTH))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * width + 1, 2 * width + 1))
+    dilated = torch.from_numpy(cv2.dilate(inside.numpy().astype(np.uint8), kernel)) > 0
+    return dilated & ~inside
+
+
+def _lab_from_srgb(image: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    lms = linear_from_srgb(image).clamp_min(_DARKEST) @ _LMS_FROM_RGB.T
+    return lms.log10() @ _LAB_FROM_LOG_LMS.T
+
+
+def _srgb_from_lab(lab: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    lms = 10 ** (lab @ torch.linalg.inv(_LAB_FROM_LOG_LMS).T)
+    return srgb_from_linear(lms @ torch.linalg.inv(_LMS_FROM_RGB).T)
+
+
+@dataclass(frozen=True)
+class LbmOptions:
+    """LBM relighting (Chadebec et al. 2025), run through your own installation of its package (licence CC BY-NC)."""
+
+    name: ClassVar[str] = "lbm"
+
+    weights: str = "jasperai/LBM_relighting"
+    """Folder or hub id of the weights."""
+
+    def make(self, context: HarmonizerContext) -> Harmonizer:
+        """Load the network.
+
+        Raises:
+            ValueError: The package is missing.
+        """
+        if find_spec("lbm") is None:
+            raise ValueError(
+                "harmonizer lbm: expected the package lbm (pip install git+https://github.com/gojasper/LBM, licence "
+                "CC BY-NC 4.0), found none"
+            )
+        from lbm.inference import evaluate, get_model  # pyright: ignore
+
+        context.say(f"lbm: {self.weights}, licence CC BY-NC 4.0")
+        return Lbm(get_model(self.weights, torch_dtype=torch.bfloat16, device=str(context.device)), evaluate)
+
+
+@dataclass(frozen=True)
+class Lbm:
+    """Latent bridge matching in one step from the composite; untested with the real package and weights."""
+
+    model: Any
+    evaluate: Any
+    """The function of that name in `lbm.inference`."""
+
+    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+        """Relight the composite; pixels outside the object keep the composite's colours, as in the authors' code."""
+        given = Image.fromarray((view.composite * 255).round().to(torch.uint8).numpy())
+        made = self.evaluate(self.model, given, 1).convert("RGB").resize(given.size, Image.Resampling.BICUBIC)
+        image = torch.from_numpy(np.array(made)).float() / 255
+        return Harmonized(torch.lerp(view.composite, image, view.mask[..., None].clamp(0, 1)))
+
+
+PEERS = {kind.name: kind for kind in (ReinhardOptions, LbmOptions, MVCoLightOptions, ImageEditingOptions)}
+"""Name of a method to its options."""
+
+
+def method_options(name: str, *, weights: str | None = None) -> HarmonizerOptions:
+    """Give the default options of a method, ours or another project's.
+
+    Args:
+        name: A key of `HARMONIZERS` or of `PEERS`.
+        weights: Replaces the default weights; ignored by methods without weights.
+
+    Raises:
+        ValueError: There is no method of that name.
+    """
+    if name in PEERS:
+        options = PEERS[name]()
+        return replace(options, weights=weights) if weights is not None and hasattr(options, "weights") else options
+    if name not in HARMONIZERS:
+        raise ValueError(f"harmonizer: expected one of {', '.join(sorted([*HARMONIZERS, *PEERS]))}, found {name!r}")
+    return harmonizer_options(name, weights=weights)
