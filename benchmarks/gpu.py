@@ -204,7 +204,7 @@ def harmonize_compiled(setting: Setting) -> list[Row]:
 def lora_step(setting: Setting) -> list[Row]:
     """Seconds of forward, backward and Adam on a low-rank adaptation, frozen weights in bf16."""
     from splatgraft.harmonization.flux.network import velocity
-    from splatgraft_paper.training.flux_objective import add_lora
+    from splatgraft_paper.training.flux import add_lora
 
     network, (width, height) = _network(setting)
     layers = add_lora(network.transformer, 4 if setting.toy else 16, seed=0)

@@ -165,11 +165,9 @@ def test_the_recorded_options_of_harmonize_are_those_of_version_0_1_0(finished: 
         "base": None,
         "lora": None,
         "variant": "auto",
-        "checkout": None,
         "seed": 0,
         "sampling_steps": 4,
         "strength": 1.0,
-        "detail": 0.0,
         "precision": "auto",
     }
 

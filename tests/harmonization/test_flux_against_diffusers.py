@@ -22,7 +22,7 @@ from splatgraft.harmonization.flux.loading import BASE, merge_lora, widen_transf
 from splatgraft.harmonization.flux.network import Autoencoder, pack, velocity
 from splatgraft.harmonization.flux.prompt import prompt_file, read_prompt
 from splatgraft.harmonization.flux.sampling import sample, schnell_levels
-from splatgraft_paper.training.flux_objective import add_lora, write_lora
+from splatgraft_paper.training.flux import add_lora, write_lora
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 START = torch.randn(1, CHANNELS, 4, 6, generator=torch.Generator().manual_seed(3))

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from splatgraft.cli import main
-from splatgraft.harmonization.flux.empty_prompt import PromptEmbedding
 from splatgraft.harmonization.flux.network import velocity
+from splatgraft.harmonization.flux.prompt import PromptEmbedding
 from splatgraft_paper.training.recipes import Recipe, TrainingCost, activation_bytes
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")

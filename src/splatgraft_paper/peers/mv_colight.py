@@ -17,7 +17,7 @@ from torch import Tensor
 
 from splatgraft.core.images import resize
 from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
-from splatgraft.runtime.child_process import last_line, run_logged
+from splatgraft.runtime.process import last_line, run_logged
 
 SIDE = 256
 """Pixels: the size that the network was trained at."""

@@ -1,5 +1,6 @@
 """Training of FLUX as a harmoniser: rectified flow matching on the velocity (paper, Sec. 5, Eq. 1)."""
 
+import json
 import math
 import shutil
 from collections.abc import Callable, Sequence
@@ -11,16 +12,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE, read_prompt
-from splatgraft.harmonization.flux.network import velocity
+from splatgraft.harmonization.flux.loading import (
+    DESCRIPTION_FILE,
+    FluxFolder,
+    diffusers_library,
+    load_autoencoder,
+    load_transformer,
+    local_folder,
+    widen_transformer,
+)
+from splatgraft.harmonization.flux.network import FirstLayer, Variant, velocity
+from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, read_prompt, write_tensors
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
-from splatgraft.harmonization.flux.weights.diffusers_library import flux_transformer_class
-from splatgraft.harmonization.flux.weights.folder import FluxFolder, Variant, find_part, local_folder, write_description
-from splatgraft.harmonization.flux.weights.loading import load_autoencoder, load_transformer, widen_transformer
-from splatgraft.harmonization.flux.weights.lora import add_lora, write_lora
-from splatgraft.harmonization.flux.weights.widening import FirstLayer
 from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import atomic_write
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, save_weights, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, TrainingData, crop_pair_to_size, open_training_data
@@ -36,6 +42,11 @@ _RESERVED_BYTES = 1 << 30
 """For the CUDA context, kernels and fragmentation. An estimate."""
 _TEXT_TOKENS = 512
 """At most."""
+_LORA_TARGETS = (
+    r"(single_)?transformer_blocks\..*"
+    r"\.(to_[qkv]|to_out\.0|add_[qkv]_proj|to_add_out|proj_mlp|proj_out|ff(_context)?\.net\.(0\.proj|2))"
+)
+"""Attention and feed-forward layers of all blocks."""
 
 
 @dataclass(frozen=True)
@@ -81,24 +92,23 @@ class FluxObjective:
         checked = FluxFolder.open(folder)
         self._folder, self._options = folder, options
         config = checked.config
-        self._prompt_path = find_part(PROMPT_FILE, folder)
+        self._prompt_path = find_prompt(options.base, folder)
         self.prompt = read_prompt(
             self._prompt_path,
             tokens_width=config.get("joint_attention_dim", 4096),
             pooled_width=config.get("pooled_projection_dim", 768),
         )
-        self.autoencoder = load_autoencoder(find_part("vae", folder))
+        self.autoencoder = load_autoencoder(folder / "vae")
         self.autoencoder.network.eval().requires_grad_(False)
         dtype = torch.bfloat16 if options.loop.precision == "bf16" and options.lora else torch.float32
         self.network = load_transformer(checked, dtype=dtype)
-        if checked.inputs == 1:
-            widen_transformer(self.network, options.first_layer)
-        else:
+        if checked.is_harmonizer:
             checked.variant(options.condition)
+        else:
+            widen_transformer(self.network, options.first_layer)
         if options.lora:
             count = add_lora(self.network, options.lora, seed=options.loop.seed)
             say(f"lora: {count} layers of rank {options.lora} are trained")
-            self.network.x_embedder.float()
         else:
             self.network.requires_grad_(True)
         if not options.no_checkpointing:
@@ -147,16 +157,44 @@ class FluxObjective:
             "base": str(self._folder),
             "first_layer": self._options.first_layer,
         }
-        write_description(folder, description)
+        with atomic_write(folder / DESCRIPTION_FILE) as stream:
+            stream.write((json.dumps(description, indent=1) + "\n").encode())
         if self._options.lora:
             write_lora(folder / "lora.safetensors", state, {"rank": str(self._options.lora), "base": str(self._folder)})
             return
-        save_weights(flux_transformer_class(), self.network.config, state, folder / "transformer")
+        save_weights(diffusers_library().FluxTransformer2DModel, self.network.config, state, folder / "transformer")
         self.autoencoder.network.save_pretrained(folder / "vae")
         shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
 
     def _conditions(self, latents: Latents) -> Float[Tensor, "b k h w"]:
         return torch.cat([latents[role] for role in self.roles[1:]], 1)
+
+
+def add_lora(network: Any, rank: int, *, seed: int) -> int:
+    """Freeze `network` and add trainable low-rank matrices to its linear layers, in place, by PEFT.
+
+    All weights of the first layer stay trainable, since it is new where it was widened.
+
+    Returns:
+        The number of adapted layers.
+    """
+    from peft import LoraConfig
+
+    network.requires_grad_(False)
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(seed)
+        network.add_adapter(LoraConfig(r=rank, lora_alpha=rank, target_modules=_LORA_TARGETS))
+    network.x_embedder.requires_grad_(True)
+    for parameter in network.parameters():
+        if parameter.requires_grad:
+            parameter.data = parameter.data.float()
+    return sum(name.endswith("lora_A") for name, _ in network.named_modules())
+
+
+def write_lora(path: Path, state: dict[str, Tensor], about: dict[str, str]) -> None:
+    """Write the low-rank matrices under diffusers' names, and the whole first layer."""
+    named = {f"transformer.{name.replace('.default.', '.')}": tensor for name, tensor in state.items()}
+    write_tensors(path, {name: one for name, one in named.items() if ".lora_" in name or ".x_embedder." in name}, about)
 
 
 def _level(times: Times, generator: torch.Generator) -> Float[Tensor, ""]:

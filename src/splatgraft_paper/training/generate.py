@@ -19,6 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import resize, write_image
+from splatgraft.harmonization.flux.loading import diffusers_library
+from splatgraft.harmonization.flux.prompt import one_line
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft_paper.training.pairs import (
@@ -189,6 +191,18 @@ class RelightingOptions:
 
 _PIPELINE_BYTES = 36 << 30
 """GPU memory of bf16 FLUX with both text encoders and its activations. An estimate."""
+
+
+def text_to_image_pipeline(base: str) -> Any:
+    """Load the stock FLUX pipeline with its text encoders in bfloat16; needs transformers too.
+
+    Raises:
+        ValueError: `base` is no such pipeline.
+    """
+    try:
+        return diffusers_library().FluxPipeline.from_pretrained(base, torch_dtype=torch.bfloat16)
+    except OSError as error:
+        raise ValueError(f"{base}: expected a FLUX pipeline with its text encoders, found {one_line(error)}") from error
 
 
 class TextToImage:

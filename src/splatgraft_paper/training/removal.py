@@ -13,15 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.harmonization.flux.ddim import NoiseSchedule, ddim
-from splatgraft.harmonization.flux.empty_prompt import PROMPT_FILE
-from splatgraft.harmonization.flux.latents import pad_by_reflection
+from splatgraft.harmonization.flux.loading import diffusers_library, load_autoencoder, local_folder, read_config
+from splatgraft.harmonization.flux.network import pad_by_reflection, widen_layer
+from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, read_tensors
 from splatgraft.harmonization.flux.sampling import noise
-from splatgraft.harmonization.flux.weights.diffusers_library import unet_class
-from splatgraft.harmonization.flux.weights.folder import find_part, local_folder, read_config
-from splatgraft.harmonization.flux.weights.loading import load_autoencoder
-from splatgraft.harmonization.flux.weights.tensor_file import read_tensors
-from splatgraft.harmonization.flux.weights.widening import widen_layer
 from splatgraft.runtime.console import Console
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, save_weights, train_objective
@@ -71,16 +66,16 @@ class RemovalObjective:
         Raises:
             ValueError: a folder is of another kind or broken.
         """
-        folder = local_folder(base, say, parts=("unet", "vae"))
+        self.folder = folder = local_folder(base, say, parts=("unet",))
         config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
-        self._prompt_path = find_part(PROMPT_FILE, folder)
+        self._prompt_path = find_prompt(base, folder)
         if not self._prompt_path.is_file():
             raise ValueError(
-                f"{self._prompt_path}: expected the empty prompt's embeddings, found none; `splatgraft train embed "
-                f"{self._prompt_path} --kind stable-diffusion --base {base}` makes them once"
+                f"{self._prompt_path}: expected the empty prompt's embeddings, found none; `splatgraft paper "
+                f"train embed --kind stable-diffusion --base {base}` makes them once"
             )
         self.tokens = read_tensors(self._prompt_path)["tokens"]
-        self.autoencoder = load_autoencoder(find_part("vae", folder))
+        self.autoencoder = load_autoencoder(folder / "vae")
         self.autoencoder.network.eval().requires_grad_(False)
         channels = self.autoencoder.channels
         if config["in_channels"] not in (channels, channels * (CONDITIONS + 1)):
@@ -89,7 +84,7 @@ class RemovalObjective:
                 f"{channels * (CONDITIONS + 1)} (object removal), found {config['in_channels']}"
             )
         try:
-            self.network = unet_class().from_pretrained(folder / "unet")
+            self.network = diffusers_library().UNet2DConditionModel.from_pretrained(folder / "unet")
         except (OSError, ValueError, RuntimeError) as error:
             found = " ".join(str(error).split())[:200]
             raise ValueError(f"{folder / 'unet'}: expected weights that fit config.json, found {found}") from error
@@ -98,7 +93,15 @@ class RemovalObjective:
             self.network.register_to_config(in_channels=self.network.conv_in.in_channels)
         if checkpointing:
             self.network.enable_gradient_checkpointing()
-        self._schedule = NoiseSchedule.stable_diffusion()
+        # the scheduler_config.json of Stable Diffusion 2
+        self._schedule = diffusers_library().DDIMScheduler(
+            beta_start=0.00085,
+            beta_end=0.012,
+            beta_schedule="scaled_linear",
+            prediction_type="v_prediction",
+            clip_sample=False,
+            timestep_spacing="trailing",  # begins at pure noise
+        )
 
     def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
         """Encode sRGB images in [0, 1] to latents."""
@@ -118,25 +121,25 @@ class RemovalObjective:
             steps.append(torch.randint(1000, (), generator=generator))
             eps.append(torch.randn(clean.shape[1:], generator=generator))
         step, drawn = torch.stack(steps).to(clean.device), torch.stack(eps).to(clean.device)
-        predicted = self._velocity(network, self._schedule.noisy(clean, drawn, step), latents, step)
-        return ((predicted.float() - self._schedule.velocity(clean, drawn, step)) ** 2).mean()
+        predicted = self._velocity(network, self._schedule.add_noise(clean, drawn, step), latents, step)
+        return ((predicted.float() - self._schedule.get_velocity(clean, drawn, step)) ** 2).mean()
 
+    @torch.no_grad()
     def predict(self, network: Network, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
         """Generate the images without the object."""
         target = latents["target"]
         size = tuple(target.shape[1:])
-        start = noise(size, seed).to(target.device).expand(target.shape[0], -1, -1, -1)  # pyright: ignore
-
-        def velocity_at(z: Tensor, step: int) -> Tensor:
-            return self._velocity(network, z, latents, torch.full((z.shape[0],), step, device=z.device))
-
-        clean = ddim(velocity_at, start, self._schedule, steps=_SAMPLING_STEPS, predicts="velocity")
-        return self.autoencoder.decode(clean)
+        latent = noise(size, seed).to(target.device).expand(target.shape[0], -1, -1, -1)  # pyright: ignore
+        self._schedule.set_timesteps(_SAMPLING_STEPS)
+        for step in self._schedule.timesteps:
+            predicted = self._velocity(network, latent, latents, step.expand(len(latent)).to(latent.device))
+            latent = self._schedule.step(predicted.float(), step, latent).prev_sample
+        return self.autoencoder.decode(latent)
 
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
         """Write unet/, vae/ and the prompt embeddings."""
         folder.mkdir(parents=True, exist_ok=True)
-        save_weights(unet_class(), self.network.config, state, folder / "unet")
+        save_weights(diffusers_library().UNet2DConditionModel, self.network.config, state, folder / "unet")
         self.autoencoder.network.save_pretrained(folder / "vae")
         shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
 
@@ -211,6 +214,5 @@ def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) 
         if options.plan:
             return None
     data = open_training_data(options.data, loop.seed, recipe)
-    folder = local_folder(options.base, console.say, parts=("unet", "vae"))
-    objective = RemovalObjective(str(folder), console.say, checkpointing=not options.no_checkpointing)
-    return train_objective(objective, data, out, loop, base=folder, console=console)
+    objective = RemovalObjective(options.base, console.say, checkpointing=not options.no_checkpointing)
+    return train_objective(objective, data, out, loop, base=objective.folder, console=console)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatgraft.harmonization.flux.loading import diffusers_library
 from splatgraft.harmonization.flux.prompt import PROMPT_FILE, PromptEmbedding, write_prompt
-from splatgraft.runtime.atomic_folder import atomic_folder
+from splatgraft.runtime.files import atomic_folder
 from splatgraft.runtime.progress import Progress
 
 _LATENTS, _TEXT, _POOLED = 16, 32, 32

@@ -20,9 +20,6 @@ from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.harmonization import HARMONIZERS, CompactOptions, FluxOptions, NoneOptions
 from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
 
-_REMOVED = {"detail": 0.0}
-"""Options of version 0.1.0 that are gone, as its records have them where they were not used."""
-
 
 @dataclass(frozen=True)
 class Harmonize:
@@ -58,7 +55,7 @@ class Harmonize:
     def recorded_options(self) -> dict[str, Any]:
         """The options in step.json: those of all methods, so that results made by version 0.1.0 stay up to date."""
         defaults = {key: value for kind in HARMONIZERS.values() for key, value in vars(kind()).items()}
-        return plain_options({"method": self.method.name, **_REMOVED, **defaults, **vars(self.method)})
+        return plain_options({"method": self.method.name, **defaults, **vars(self.method)})
 
     def write(self, folder: Path, context: Context) -> None:
         """Make one image per view."""

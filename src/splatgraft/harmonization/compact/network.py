@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from splatgraft.harmonization.compact.features import CHANNELS, GRID_BINS, SH_COUNT, CompactOutput
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 SHIPPED = Path(__file__).parent / "compact.safetensors"
 _FORMAT = "splatgraft compact 1"

@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 PROMPT_FILE = "empty_prompt.safetensors"
 
