@@ -30,7 +30,7 @@ from splatgraft.core.cameras import look_at
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.rotations import quaternion_from_rotation
-from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.formats import write_gaussians
 
 WIDTH, HEIGHT, REPEATS, HANG_LIMIT = 1280, 720, 5, 600.0

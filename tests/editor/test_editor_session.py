@@ -17,7 +17,7 @@ from splatgraft.editor.session import placement_operations
 from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.session import Session
 from splatgraft.editor.session.state_files import read_state, state_files, write_state
-from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.formats import read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.project.record import read_record

@@ -26,7 +26,7 @@ from splatgraft.editor.session.edit_state import EditState
 from splatgraft.editor.session.session import Session
 from splatgraft.editor.session.state_checks import MASK_SOURCES
 from splatgraft.editor.session.state_files import read_state
-from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.folders.object_masks import MaskSource
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.relighting import LayerWeights

@@ -13,7 +13,7 @@ from waiting import wait_until
 
 from splatgraft.editor.session.project_access import RenderedViews
 from splatgraft.editor.session.state_files import read_state
-from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.folders.input_description import describe_input
 from splatgraft.formats import write_gaussians
 

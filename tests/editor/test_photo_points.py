@@ -14,7 +14,7 @@ from splatgraft.core.prompts import ViewPrompt
 from splatgraft.editor.session.photo_points import PhotoView, prompt_of, with_click
 from splatgraft.editor.session.session import Session
 from splatgraft.editor.session.state_files import read_state
-from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.formats.prompts import read_prompts
 
 __all__ = ["made", "project", "session"]

@@ -13,7 +13,7 @@ from test_scenes_without_photos import AROUND_THE_BALL
 from tiny_project import ball, plane
 
 from splatgraft.core.gaussians import concatenate
-from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.relighting import light_to_json
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient

@@ -8,12 +8,12 @@ import torch
 from tiny_project import ball, plane
 
 from splatgraft.cli import main
-from splatgraft.commands.edit_project import FlowProject
+from splatgraft.editor.project import Project
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import concatenate
-from splatgraft.editor.session.project_access import RenderedViews
-from splatgraft.editor.session.session import Session
-from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.editor.project import RenderedViews
+from splatgraft.editor.session import Session
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
 from splatgraft.runtime.settings import read_toml
@@ -66,7 +66,7 @@ def test_a_box_alone_segments_and_the_whole_scene_may_be_the_object(tmp_path: Pa
     scene = read_gaussians(tmp_path / "source.spz")
     assert read_gaussians(project.parent / "object" / "object.ply").count == scene.count
     assert read_gaussians(project.parent / "object" / "surroundings.ply").count == 0
-    session = Session(FlowProject(project))
+    session = Session(Project(project))
     assert session.files.without_photos == (True, True)
     assert session.placeable_object(0).base.stands_on == "extent"
     # reading .spz rotates the axes, and the cameras rotate with them
@@ -78,7 +78,7 @@ def test_a_box_alone_segments_and_the_whole_scene_may_be_the_object(tmp_path: Pa
 
 def test_up_can_be_set_and_is_no_undo_step(tmp_path: Path) -> None:
     project = scene_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, mask_source="box")
-    session = Session(FlowProject(project))
+    session = Session(Project(project))
     session.set_view("target", RenderedViews(up=(0.0, 0.0, -1.0)))
     assert not session.reload()
     assert not session.undo()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from splatgraft.commands.init import Init
 from splatgraft.commands.steps.segment import Segment
-from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
 from splatgraft.project.record import read_record
 from splatgraft.project.step import DEFAULT_REMEDIES, Positional, Step

@@ -5,7 +5,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatgraft.editor.session.toml_edit import with_keys
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.formats import is_scene
 from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.project_file import TEMPLATE

@@ -1,5 +1,4 @@
 """The web editor: select and place objects and adjust their light in the browser.
 
-Only `page/` imports viser. A `Project` (session/project_access.py) connects the editor to the steps; long work runs in
-child processes.
+Only `page/` imports viser. Everything else is a project's state and its files, previews, and jobs in child processes.
 """

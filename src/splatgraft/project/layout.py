@@ -21,9 +21,7 @@ METRICS_FILE = "metrics.json"
 EXPORTS_FOLDER = "export"
 """Folder of shared files, below the project's results."""
 EDITOR_FOLDER = ".editor"
-"""Folder of the editor's own files, below the project's results: history, jobs, preview."""
-PREVIEW_FILE = "preview.jpg"
-"""In the editor's folder: what the canvas showed last."""
+"""Folder of the editor's own files, below the project's results: history, jobs."""
 
 Side = Literal["source", "target"]
 

@@ -9,7 +9,7 @@ from splatgraft.commands.steps.capture import Capture
 from splatgraft.commands.steps.reconstruct import Reconstruct
 from splatgraft.core.cameras import Cameras, pinhole
 from splatgraft.core.images import stored_size
-from splatgraft.editor.jobs.jobs import PlannedStep
+from splatgraft.editor.jobs import PlannedStep
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture
 from splatgraft.formats.captures.masks import find_photos

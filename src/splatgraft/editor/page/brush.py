@@ -1,9 +1,6 @@
 """A brush in the 3D view that selects Gaussians by clicks and drags."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,12 +8,10 @@ import viser
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.page.context import PageContext
 from splatgraft.editor.page.scene_view import Color
-from splatgraft.editor.previews.latest_only_worker import LatestOnlyWorker
-from splatgraft.editor.session.picking import Ray, brush_selection, interpolate_rays
-
-if TYPE_CHECKING:
-    from splatgraft.editor.page.page import Page
+from splatgraft.editor.picking import Ray, brush_selection, interpolate_rays
+from splatgraft.editor.worker import LatestOnlyWorker
 
 _CANVAS, _STROKE = "/brush/canvas", "/source/stroke"
 
@@ -24,22 +19,24 @@ _CANVAS, _STROKE = "/brush/canvas", "/source/stroke"
 class Brush:
     """While active, the left mouse button paints; the selection is shown during the stroke."""
 
-    def __init__(self, page: Page, *, on_stroke: Callable[[Tensor], None], color: Callable[[], Color]) -> None:
+    def __init__(
+        self, context: PageContext, *, on_stroke: Callable[[Tensor], None], color: Callable[[], Color]
+    ) -> None:
         """Start inactive.
 
         Args:
-            page: The page.
+            context: The page's.
             on_stroke: Called with the selected Gaussians at the end of a stroke.
             color: Gives the colour in which the selection is shown.
         """
-        self._page, self._on_stroke, self._color = page, on_stroke, color
+        self._context, self._on_stroke, self._color = context, on_stroke, color
         self._scene: Gaussians | None = None
         self._size = 0.1
         self._canvas: viser.IcosphereHandle | None = None
         self._rays: tuple[Ray, ...] = ()
         self._rays_done, self._selected = 0, torch.zeros(0, dtype=torch.bool)
-        self._worker = LatestOnlyWorker(self._paint, lambda error: page.say(" ".join(str(error).split()), bad=True))
-        page.on_close.append(self._worker.close)
+        self._worker = LatestOnlyWorker(self._paint, context.say_error)
+        context.on_close.append(self._worker.close)
 
     def activate(self, scene: Gaussians, *, size: float) -> None:
         """Paint on `scene`; `size` is the diameter of the brush over the distance of the hit point."""
@@ -48,7 +45,7 @@ class Brush:
             return
         centre = scene.means.median(0).values
         # an invisible sphere around camera and scene receives the drags
-        self._canvas = self._page.server.scene.add_icosphere(
+        self._canvas = self._context.server.scene.add_icosphere(
             _CANVAS,
             radius=1000 * float((scene.means - centre).norm(dim=1).median()) + 1e-6,
             position=centre.numpy(),
@@ -60,12 +57,12 @@ class Brush:
         )
         self._canvas.on_drag("left")(self._dragged)
         # clicks are taken from the scene: viser outlines a clickable node under the pointer
-        self._page.server.scene.on_click()(self._clicked)
+        self._context.server.scene.on_click()(self._clicked)
 
     def deactivate(self) -> None:
         """Stop painting; the left mouse button rotates the view again."""
         if self._canvas is not None:
-            self._page.server.scene.remove_click_callback(self._clicked)
+            self._context.server.scene.remove_click_callback(self._clicked)
             self._canvas.remove()
             self._canvas = None
 
@@ -92,12 +89,12 @@ class Brush:
         changed = not torch.equal(selected, self._selected)
         self._selected = selected
         if ended:
-            self._page.callback(lambda _: self._finish_stroke(selected))(None)
+            self._context.callback(lambda _: self._finish_stroke(selected))(None)
         elif changed:
-            self._page.view.show_splats(_STROKE, scene.select(selected), tint=self._color())
+            self._context.view.show_splats(_STROKE, scene.select(selected), tint=self._color())
 
     def _finish_stroke(self, selected: Tensor) -> None:
-        self._page.view.remove_splats(_STROKE)
+        self._context.view.remove_splats(_STROKE)
         if not bool(selected.any()):
             raise ValueError("brush: expected a surface under the stroke, found none")
         self._on_stroke(selected)

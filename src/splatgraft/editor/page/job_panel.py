@@ -1,26 +1,21 @@
 """The panel of the running job: step, progress, remaining time and a cancel button."""
 
-from __future__ import annotations
-
 import html
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import viser
 
-from splatgraft.editor.jobs.jobs import JobState, seconds_left, seconds_left_in_job
-
-if TYPE_CHECKING:
-    from splatgraft.editor.page.page import Page
+from splatgraft.editor.jobs import JobState, seconds_left, seconds_left_in_job
+from splatgraft.editor.page.context import PageContext, note
 
 
 class JobPanel:
     """Visible while a job of this project runs, also one that an earlier page started."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, context: PageContext) -> None:
         """Build the controls."""
-        self._page, gui = page, page.gui
+        self._context, gui = context, context.gui
         self._last_seen = ""
         self.on_progress: Callable[[JobState], None] = lambda state: None
         """Called with the state of the running job, a few times a second."""
@@ -29,7 +24,7 @@ class JobPanel:
         self._text = gui.add_html("", visible=False)
         self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="red", visible=False)
-        self._cancel.on_click(page.callback(lambda _: self._stop()))
+        context.on(self._cancel, self._stop)
 
     def refresh(self) -> None:
         """Update the panel; redraw the page when a step has ended.
@@ -37,7 +32,7 @@ class JobPanel:
         Raises:
             ValueError: If the job's state cannot be read.
         """
-        state = None if self._page.session is None else self._page.session.job()
+        state = None if self._context.session is None else self._context.session.job()
         live = state is not None and state.live
         self._text.visible = self._bar.visible = self._cancel.visible = live
         if state is None:
@@ -51,7 +46,7 @@ class JobPanel:
         ended, self._last_seen = bool(self._last_seen) and not live, current
         if ended or state.outcome == "killed":
             self._say_end(state)
-        self._page.redraw()
+        self._context.refresh()
         if ended:
             self.on_end(state)
 
@@ -64,11 +59,8 @@ class JobPanel:
         names = [step.name for step in state.plan]
         if state.step in names:
             rest += f" &middot; step {names.index(state.step) + 1} of {len(names)}"
-        self._text.content = (
-            f'<div class="sg-job" style="font-size:.85em;line-height:1.45;padding:2px 12px">'
-            f"<b>{html.escape(state.title)}</b><br>"
-            f"{html.escape(state.step or 'starting')}: {html.escape(state.message or '...')}<br>{rest}</div>"
-        )
+        step, message = html.escape(state.step or "starting"), html.escape(state.message or "...")
+        self._text.content = note(f"<b>{html.escape(state.title)}</b><br>{step}: {message}<br>{rest}", kind="job")
         self._bar.value = 100 * state.fraction
 
     def _say_end(self, state: JobState) -> None:
@@ -79,11 +71,11 @@ class JobPanel:
             "killed": "the process ended unexpectedly; start it again, it resumes from where it was",
         }
         bad = state.outcome in ("failed", "killed")
-        self._page.say(f"{state.title}: {sentences.get(state.outcome, state.outcome)}", bad=bad)
+        self._context.say(f"{state.title}: {sentences.get(state.outcome, state.outcome)}", bad=bad)
 
     def _stop(self) -> None:
-        self._page.require_session().jobs.cancel()
-        self._page.say("stopping")
+        self._context.require_session().jobs.cancel()
+        self._context.say("stopping")
 
 
 def _minutes(seconds: float) -> str:

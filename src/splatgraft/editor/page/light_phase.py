@@ -1,22 +1,21 @@
 """The phase `Light`: light sources as draggable arrows, and the strength of each layer of the light transfer."""
 
-from __future__ import annotations
-
 import html
+import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import viser
+from jaxtyping import Float
+from torch import Tensor
 
-from splatgraft.editor.page.place_phase import NO_NAMES, hide_target, show_target
-from splatgraft.editor.previews.light_handles import arrow_points, uncertainty_ring_points, with_direction
-from splatgraft.editor.session.edit_state import EditState
-from splatgraft.relighting import LayerWeights, Light
-
-if TYPE_CHECKING:
-    from splatgraft.editor.page.page import Page
+from splatgraft.core.directions import tangents
+from splatgraft.editor.page.context import PageContext, note
+from splatgraft.editor.page.handles import add_handle
+from splatgraft.editor.page.preview_panel import PreviewPanel
+from splatgraft.editor.session import Session
+from splatgraft.relighting import LayerWeights, Light, LightSource
 
 _LAYERS = (
     ("shade", "Shade", (0.0, 2.0), "Light and dark sides of the object; 1 is as computed"),
@@ -27,21 +26,22 @@ _LAYERS = (
     ("gloss", "Gloss", (0.0, 2.0), "Reflections on the object; 1 is as computed"),
 )
 """Field of `LayerWeights`, label, range of the slider and hint."""
+_NO_NAMES: tuple[str, ...] = ("1",)
 _MAX_SOURCES = 4
 _HANDLE_PX = 70.0
 """Length of the handle's arrows on the screen, pixels."""
+_RING_SEGMENTS = 48
 
 
 class LightPhase:
     """The controls of the phase, and the light sources in the 3D view."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, context: PageContext, preview: PreviewPanel) -> None:
         """Build the controls."""
-        self._page, gui = page, page.gui
-        self._is_active = False
+        self._context, self._preview, gui = context, preview, context.gui
         self._text = gui.add_html("")
         self._estimate_button = gui.add_button("Estimate the light", icon=viser.Icon.SUN)
-        self._source_choice = gui.add_dropdown("Source", NO_NAMES, initial_value=NO_NAMES[0], visible=False)
+        self._source_choice = gui.add_dropdown("Source", _NO_NAMES, visible=False)
         self._strength = gui.add_slider("Strength", 0.0, 3.0, 0.05, 1.0, visible=False)
         usual = LayerWeights()
         self._sliders = {
@@ -51,159 +51,117 @@ class LightPhase:
         self._reset = gui.add_button("Back to the estimate", color="gray")
         self._handle: viser.TransformControlsHandle | None = None
         self._dragged_light: Light | None = None
-        callback = page.callback
-        self._estimate_button.on_click(callback(lambda _: self._show_estimate()))
-        self._source_choice.on_update(callback(lambda _: self._remove_handle()))
-        self._strength.on_update(callback(lambda _: self._scale_source()))
-        self._reset.on_click(callback(lambda _: self._reset_to_estimate()))
+        context.on(self._estimate_button, self._show_estimate)
+        context.on(self._source_choice, self._remove_handle)
+        context.on(self._strength, self._scale_source)
+        context.on(self._reset, self._reset_to_estimate)
         for slider in self._sliders.values():
-            slider.on_update(callback(lambda _: self._set_weights()))
+            context.on(slider, self._set_weights)
 
     def enter(self) -> None:
-        """Show the target and the light sources."""
-        self._is_active = True
-        session = self._page.session
-        if session is not None and session.files.target_scene.is_file():
-            show_target(self._page)
-        self.refresh()
+        """Nothing is to be done once."""
 
     def leave(self) -> None:
-        """Hide them."""
-        self._is_active = False
-        hide_target(self._page)
+        """Hide the light sources."""
         self._remove_handle()
         self._hide_arrows()
 
     def refresh(self) -> None:
-        """Update arrows, description and strengths."""
-        session = self._page.session
-        if session is None or not self._is_active:
+        """Update the target, the arrows, description and strengths."""
+        session = self._context.session
+        if session is None:
             return
-        weights = session.state.weights
+        self._context.show_target()
         for key, slider in self._sliders.items():
-            slider.value = float(getattr(weights, key))
+            slider.value = float(getattr(session.state.weights, key))
+        objects = session.objects()
         # the arrows stand at the object
-        is_read = self._page.loading.has(session, session.scenes.base_files(session.objects()))
-        light = self._light() if is_read else None
-        is_known = light is not None and bool(session.objects())
-        self._estimate_button.visible = session.files.transfers_light and not is_known and bool(session.objects())
+        light = self._light(session) if objects and session.scenes.at_hand(session.scenes.base_files(objects)) else None
+        self._estimate_button.visible = session.files.transfers_light and light is None and bool(objects)
         self._reset.disabled = session.state.light is None
-        self._source_choice.visible = self._strength.visible = is_known and bool(light and light.sources)
-        if light is None or not session.objects():
-            self._text.content = _box(html.escape(self._missing_reason()))
+        self._source_choice.visible = self._strength.visible = light is not None and bool(light.sources)
+        if light is None:
+            self._text.content = note(html.escape(_missing_reason(session)), kind="light")
             return
         names = tuple(f"{i + 1}: {s.name}" for i, s in enumerate(light.sources[:_MAX_SOURCES]))
         if names and tuple(self._source_choice.options) != names:
             self._source_choice.options = names
-        self._text.content = _box(html.escape(_description(session.state, light, self._page.require_session().up())))
-        self._draw(light)
+        by = "Set by hand: " if session.state.light is not None else "Estimated: "
+        self._text.content = note(html.escape(by + light.describe(session.up())), kind="light")
+        self._draw(session, light)
 
-    def _light(self) -> Light | None:
+    def _light(self, session: Session) -> Light | None:
         """The light set by hand, else the last estimate of the preview."""
-        session = self._page.session
-        if session is None or not session.objects():
-            return None
         if session.state.light is not None:
             return session.state.light
         state = session.placed_state()
-        return session.relighting.relit(state).light if session.relighting.is_relit(state) else None
-
-    def _missing_reason(self) -> str:
-        session = self._page.require_session()
-        if not self._page.loading.has(session, session.scenes.base_files(session.objects())):
-            return "The object is being read."
-        if not session.files.transfers_light:
-            return f"The physical light transfer is off: {session.relighting.light_mode_note()}."
-        if not session.objects():
-            return "No object is placed yet: see Place."
-        state = session.placed_state()
-        return (
-            " ".join(session.relighting.relit(state).report)
-            if session.relighting.is_relit(state)
-            else "Estimating the light."
-        )
+        is_known = session.files.transfers_light and session.relighting.is_relit(state)
+        return session.relighting.relit(state).light if is_known else None
 
     def _show_estimate(self) -> None:
-        session = self._page.require_session()
-        relit = session.relighting.relit(session.placed_state())
-        for sentence in relit.report[:1]:
-            self._page.say(sentence)
+        session = self._context.require_session()
+        for sentence in session.relighting.relit(session.placed_state()).report[:1]:
+            self._context.say(sentence)
 
     def _set_weights(self) -> None:
-        session = self._page.require_session()
+        session = self._context.require_session()
         weights = LayerWeights(**{key: float(slider.value) for key, slider in self._sliders.items()})
         session.change(replace(session.state, weights=weights))
-        self._page.preview.update()
 
     def _reset_to_estimate(self) -> None:
-        session = self._page.require_session()
+        session = self._context.require_session()
         session.change(replace(session.state, light=None))
 
     def _index(self) -> int:
         return list(self._source_choice.options).index(self._source_choice.value)
 
     def _scale_source(self) -> None:
-        session, light = self._page.require_session(), self._light()
+        session = self._context.require_session()
+        light = self._light(session) if session.objects() else None
         if light is None:
             return
         index, factor = self._index(), float(self._strength.value)
         source = light.sources[index]
         r, g, b = (factor * value for value in source.irradiance)
-        sources = (*light.sources[:index], replace(source, irradiance=(r, g, b)), *light.sources[index + 1 :])
-        session.change(replace(session.placed_state(), light=replace(light, sources=sources)))
+        edited = _with_source(light, index, replace(source, irradiance=(r, g, b)))
+        session.change(replace(session.placed_state(), light=edited))
         self._strength.value = 1.0
 
     # arrows
 
-    def _centre(self) -> torch.Tensor:
-        session = self._page.require_session()
-        base = session.placeable_object(0).base
-        return session.objects()[0].target_from_object.points(base.point + 0.5 * base.height * base.up)
+    def _centre_and_length(self, session: Session) -> tuple[Float[Tensor, "3"], float]:
+        """Where the arrows point, and how far away they begin."""
+        base, placed = session.placeable_object(0).base, session.objects()[0].target_from_object
+        length = 4.0 * placed.scale * max(base.height, base.radius)
+        return placed.points(base.point + 0.5 * base.height * base.up), length
 
-    def _arrow_length(self) -> float:
-        session = self._page.require_session()
-        base, scale = session.placeable_object(0).base, session.objects()[0].target_from_object.scale
-        return 4.0 * scale * max(base.height, base.radius)
-
-    def _draw(self, light: Light) -> None:
-        centre, length, scene = self._centre(), self._arrow_length(), self._page.server.scene
-        self._hide_arrows(keep=len(light.sources[:_MAX_SOURCES]))
+    def _draw(self, session: Session, light: Light) -> None:
+        (centre, length), scene = self._centre_and_length(session), self._context.server.scene
+        sources = light.sources[:_MAX_SOURCES]
+        self._hide_arrows(keep=len(sources))
         brightest = max((s.luminance for s in light.sources), default=1.0)
-        for index, source in enumerate(light.sources[:_MAX_SOURCES]):
+        for index, source in enumerate(sources):
             thickness = 0.25 + 0.75 * (source.luminance / max(brightest, 1e-9)) ** 0.5
             color = np.array(source.irradiance) / max(*source.irradiance, 1e-9)
-            rgb = tuple(int(255 * float(c)) for c in color.clip(0, 1) ** (1 / 2.2))
+            r, g, b = (int(255 * float(c)) for c in color.clip(0, 1) ** (1 / 2.2))
             scene.add_arrows(
                 f"/light/{index}/arrow",
                 points=arrow_points(source, centre, length).numpy()[None],
-                colors=(rgb[0], rgb[1], rgb[2]),
+                colors=(r, g, b),
                 shaft_radius=0.012 * length * thickness,
                 head_radius=0.035 * length * thickness,
                 head_length=0.1 * length,
             )
-            scene.add_line_segments(
-                f"/light/{index}/uncertainty",
-                points=uncertainty_ring_points(source, centre, length).numpy(),
-                colors=(rgb[0], rgb[1], rgb[2]),
-            )
+            ring = uncertainty_ring_points(source, centre, length).numpy()
+            scene.add_line_segments(f"/light/{index}/uncertainty", points=ring, colors=(r, g, b))
         if light.sources and self._dragged_light is None:
-            self._show_handle(light)
-
-    def _show_handle(self, light: Light) -> None:
-        index = min(self._index(), len(light.sources) - 1)
-        position = arrow_points(light.sources[index], self._centre(), self._arrow_length())[0].numpy()
-        if self._handle is None:
-            self._handle = self._page.server.scene.add_transform_controls(
-                "/light/handle",
-                scale=_HANDLE_PX,
-                fixed=True,
-                depth_test=False,
-                disable_rotations=True,
-                position=position,
-            )
-            self._handle.on_update(self._dragged)
-        else:
-            self._handle.position = position
+            index = min(self._index(), len(light.sources) - 1)
+            tail = arrow_points(light.sources[index], centre, length)[0]
+            if self._handle is None:
+                self._handle = add_handle(self._context.server, "/light/handle", tail, size_px=_HANDLE_PX)
+                self._handle.on_update(self._dragged)
+            else:
+                self._handle.position = tail.numpy()
 
     def _remove_handle(self) -> None:
         if self._handle is not None:
@@ -213,26 +171,65 @@ class LightPhase:
     def _hide_arrows(self, keep: int = 0) -> None:
         for index in range(keep, _MAX_SOURCES):
             for part in ("arrow", "uncertainty"):
-                self._page.view.remove(f"/light/{index}/{part}")
+                self._context.view.remove(f"/light/{index}/{part}")
 
     async def _dragged(self, event: viser.TransformControlsEvent) -> None:
-        session, handle, light = self._page.session, self._handle, self._dragged_light or self._light()
-        if session is None or handle is None or light is None or event.phase == "start":
+        session, handle = self._context.session, self._handle
+        if session is None or handle is None or event.phase == "start":
             return
-        towards = torch.tensor(np.asarray(handle.position), dtype=torch.float32) - self._centre()
-        self._dragged_light = with_direction(light, self._index(), towards)
-        ended = event.phase == "end"
-        edited = replace(session.placed_state(), light=self._dragged_light)
-        self._draw(self._dragged_light)
+        light = self._dragged_light or self._light(session)
+        if light is None:
+            return
+        position = torch.tensor(np.asarray(handle.position), dtype=torch.float32)
+        dragged = with_direction(light, self._index(), position - self._centre_and_length(session)[0])
+        self._dragged_light, ended = dragged, event.phase == "end"
+        edited = replace(session.placed_state(), light=dragged)
+        self._draw(session, dragged)
         if ended:
             self._dragged_light = None
-            self._page.callback(lambda _: session.change(edited))(None)
-        self._page.preview.set_dragged_state(None if ended else edited)
+            self._context.callback(lambda _: session.change(edited))(None)
+        self._preview.set_dragged_state(None if ended else edited)
 
 
-def _description(state: EditState, light: Light, up: torch.Tensor) -> str:
-    return ("Set by hand: " if state.light is not None else "Estimated: ") + light.describe(up)
+def arrow_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "2 3"]:
+    """Tail and head of the arrow of a source: from `length` away towards `centre`, ending at 0.3 `length`."""
+    direction = torch.tensor(source.direction)
+    return torch.stack([centre + length * direction, centre + 0.3 * length * direction])
 
 
-def _box(text: str) -> str:
-    return f'<div class="sg-light" style="font-size:.85em;line-height:1.5;padding:2px 12px">{text}</div>'
+def uncertainty_ring_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "s 2 3"]:
+    """Line segments of a circle around the arrow's tail; its angular radius is the uncertainty of the direction."""
+    direction = torch.tensor(source.direction)
+    across, along = tangents(direction)
+    radius = length * math.tan(math.radians(min(60.0, max(0.5, source.uncertainty_deg))))
+    angle = torch.linspace(0, 2 * math.pi, _RING_SEGMENTS + 1)
+    points = centre + length * direction + radius * (angle.cos()[:, None] * across + angle.sin()[:, None] * along)
+    return torch.stack([points[:-1], points[1:]], 1)
+
+
+def with_direction(light: Light, index: int, towards: Float[Tensor, "3"]) -> Light:
+    """The light with one source's direction set by hand, hence without uncertainty."""
+    length = float(towards.norm())
+    if length < 1e-9:
+        return light
+    x, y, z = (towards / length).tolist()
+    source = replace(light.sources[index], direction=(x, y, z), uncertainty_deg=0.0, confidence=1.0)
+    return _with_source(light, index, source)
+
+
+def _with_source(light: Light, index: int, source: LightSource) -> Light:
+    return replace(light, sources=(*light.sources[:index], source, *light.sources[index + 1 :]))
+
+
+def _missing_reason(session: Session) -> str:
+    """Why there is no light to show."""
+    state = session.placed_state()
+    if not session.scenes.at_hand(session.scenes.base_files(session.objects())):
+        return "The object is being read."
+    if not session.files.transfers_light:
+        return f"The physical light transfer is off: {session.relighting.light_mode_note()}."
+    if not session.objects():
+        return "No object is placed yet: see Place."
+    if not session.relighting.is_relit(state):
+        return "Estimating the light."
+    return " ".join(session.relighting.relit(state).report)

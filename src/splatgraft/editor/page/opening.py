@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from splatgraft.editor.session.scene_sample import SceneSample, View, read_first_view, read_sample
+from splatgraft.editor.scene_sample import SceneSample, View, read_first_view, read_sample
 from splatgraft.project.layout import CAMERAS_FILE, ERASED_FILE, OBJECT_FILE, SCENE_FILE, Layout, Side
 
 COARSE_NODE = "/coarse"

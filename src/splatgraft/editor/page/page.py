@@ -1,54 +1,64 @@
-"""The editor's page: header, phases, undo buttons, job panel and preview panel, and what the phases share."""
+"""The editor's page: header, phases, undo buttons, job panel and preview panel, laid out in one panel."""
 
-import contextlib
 import html
 import threading
 import time
-import traceback
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import viser
 
-from splatgraft.editor.jobs.exports import served_file
-from splatgraft.editor.page.history_controls import HistoryControls
+from splatgraft.editor.page.context import HISTORY_ORDER, PageContext, note
 from splatgraft.editor.page.job_panel import JobPanel
-from splatgraft.editor.page.keys import Keys
 from splatgraft.editor.page.light_phase import LightPhase
 from splatgraft.editor.page.open_phase import OpenPhase
 from splatgraft.editor.page.opening import Opening, set_theme
 from splatgraft.editor.page.place_phase import PlacePhase
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.page.run_phase import RunPhase
-from splatgraft.editor.page.scene_loading import SceneLoading
-from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.select_phase import SelectPhase
 from splatgraft.editor.page.server import GuardedServer
-from splatgraft.editor.page.style import style_sheet
-from splatgraft.editor.page.upload_forms import UploadForms
-from splatgraft.editor.page.windows import Windows
-from splatgraft.editor.session.project_access import Project
-from splatgraft.editor.session.scene_sample import typical_distance
-from splatgraft.editor.session.session import Session, backup_of
+from splatgraft.editor.project import Project
+from splatgraft.editor.session import Session
+from splatgraft.editor.sharing import served_file
 
-PHASES = ("Open", "Select", "Place", "Light", "Run")
 _POLL_SECONDS = 0.4
 _CURRENT_MARK = "\u25cf "
-_TEXT_STYLE = "font-size:.85em;line-height:1.45;padding:2px 12px"
+_KEYS = (
+    ("1 to 5", "Open, Select, Place, Light, Run"),
+    ("Ctrl+Z, Ctrl+Shift+Z", "undo, redo"),
+    ("Left, Right", "previous and next camera of the scene"),
+    ("B", "Select: brush on or off"),
+    ("Shift and drag", "Select: a rectangle"),
+    ("G", "Place: drop the object to the surface"),
+    ("S", "Place: snap on or off"),
+    ("D, Delete", "Place: duplicate or delete the object"),
+    ("?", "this list"),
+)
+_CSS = """<style>
+div:has(> * > label[for="{steps}"]) {{ display: none; }}
+@media (max-width: 36em) {{
+  div[style*="position: fixed"][style*="width: 20em"],
+  div[style*="position: fixed"][style*="width: 20em"] div[style*="width: 20em"] {{ width: 100% !important; }}
+  div[style*="position: fixed"][style*="width: 20em"] {{ max-height: 48% !important; }}
+}}
+</style>"""
+"""The label of the steps is hidden, so that five buttons fit in one row. In a window as narrow as a phone's the panel
+takes the whole width, so that numbers are legible, and less than half of the height, so that the scene is seen."""
+_WATCH_NOTE = (
+    "<b>Read-only:</b> another window edits this project; close it to edit here. The controls below have no effect."
+)
 
 
-@runtime_checkable
 class Phase(Protocol):
     """One phase of the editing workflow: its controls and its part of the 3D view."""
 
     def enter(self) -> None:
-        """Show its part of the 3D view."""
+        """Begin what holds while the phase is shown."""
         ...
 
     def leave(self) -> None:
-        """Hide its part of the 3D view."""
+        """End it, and hide what belongs to the phase alone."""
         ...
 
     def refresh(self) -> None:
@@ -56,315 +66,223 @@ class Phase(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class PageOptions:
-    """Options of the command line."""
-
-    budget: int
-    """Maximum number of Gaussians per scene that is sent to a browser."""
-    inside: Path | None
-    """Folder to which typed paths are restricted; None: no restriction."""
-    start_page: str | None = None
-    """Address of the page that lists all projects; None: there is none."""
-
-
 class Page:
     """The page; all windows show the same one."""
 
     def __init__(
-        self, guarded: GuardedServer, project: Project, options: PageOptions, *, opening: Opening | None = None
+        self, guarded: GuardedServer, project: Project, *, budget: int, opening: Opening | None = None
     ) -> None:
-        """Build the page for a project that exists or is about to be created; `opening` is what windows show by now."""
-        self.guarded, self.project, self.options = guarded, project, options
-        self.server = guarded.viser
-        self.session: Session | None = None
-        self.problem: str | None = None
-        """Why project.toml could not be opened; None where it could, or where there is none."""
-        self._seen_project: tuple[int, int] | None = None
+        """Build the page for a project that exists or is about to be created.
+
+        Args:
+            guarded: The server.
+            project: The project.
+            budget: Maximum number of Gaussians per scene that is sent to a browser.
+            opening: What the windows show by now.
+        """
         if opening is None:
-            set_theme(self.server)
-        self._try_session()
-        self.view = SceneView(self.server, budget=options.budget, coarse=None if opening is None else opening.scene)
-        self.loading = SceneLoading(self.scenes_read)
-        self.phase = "Open"
-        self._lock = threading.RLock()
-        self._open = True
-        self.on_close: list[Callable[[], None]] = []
-        self.windows = Windows(self)
-        self.uploads = UploadForms(self)
-        self._build()
-        self.windows.connect(frozenset() if opening is None else opening.close())
-        guarded.files = lambda name: None if self.session is None else served_file(self.session.files, name)
-        self.show_phase(self._first_phase())
-        self.say_notice()
-        self.uploads.open()
+            set_theme(guarded.viser)
+        shown = None if opening is None else opening.scene
+        self.context = context = PageContext(guarded, project, budget=budget, shown=shown)
+        context.refresh, context.reopened = self.refresh, self._reopened
+        gui = context.gui
+        self._header = gui.add_html("")
+        self._notices: dict[int, viser.GuiHtmlHandle] = {}
+        self._views: dict[str, tuple[Any, ...]] = {}
+        self._list_of_keys: Any = None
+        self._phase_buttons = gui.add_button_group("Step", ("Open", "Select", "Place", "Light", "Run"))
+        gui.add_html(_CSS.format(steps=self._phase_buttons._impl.uuid))
+        job = self._job = JobPanel(context)
+        preview = self.preview = PreviewPanel(context)
+        preview.light_ready = self._light_ready
+        makers: dict[str, Callable[[], Phase]] = {
+            "Open": lambda: OpenPhase(context),
+            "Select": lambda: SelectPhase(context),
+            "Place": lambda: PlacePhase(context, preview),
+            "Light": lambda: LightPhase(context, preview),
+            "Run": lambda: RunPhase(context, preview, job),
+        }
+        self._folders = {name: gui.add_folder(name, visible=False) for name in makers}
+        self.phases: dict[str, Phase] = {}
+        for number, (name, make) in enumerate(makers.items(), start=1):
+            with self._folders[name]:
+                self.phases[name] = make()
+            # viser's page takes any key of the browser; its types name letters, digits and a few others
+            key: Any = str(number)
+            context.on(gui.add_command(f"Step {name}", hotkey=key), lambda name=name: self.show_phase(name))
+        self._history = gui.add_button_group("History", ("Undo", "Redo"), order=HISTORY_ORDER)
+        undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
+        redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
+        question: Any = "?"
+        context.on(gui.add_command("List of keys", hotkey=question, modifier="shift"), self._show_keys)
+        context.on(self._phase_buttons, lambda: self.show_phase(self._phase_buttons.value.removeprefix(_CURRENT_MARK)))
+        context.on(self._history, lambda: self._undo() if self._history.value == "Undo" else self._redo())
+        context.on(undo, self._undo)
+        context.on(redo, self._redo)
+        # windows that keep their view, as their user has moved it
+        self._keep_view = frozenset[int]() if opening is None else opening.close()
+        guarded.on_windows_changed = self._windows_changed
+        context.server.on_client_connect(self._connected)
+        guarded.files = lambda name: None if context.session is None else served_file(context.session.files, name)
+        self.phases["Open"].enter()
+        self._reopened()
         threading.Thread(target=self._poll_loop, daemon=True).start()
-
-    # for the phases
-
-    @property
-    def gui(self) -> viser.GuiApi:
-        """viser's interface for adding controls."""
-        return self.server.gui
-
-    def require_session(self) -> Session:
-        """The open project.
-
-        Raises:
-            ValueError: If there is none.
-        """
-        if self.session is None:
-            raise ValueError("project: expected one, found none; name two captures and start")
-        return self.session
-
-    def callback(self, work: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Wrap an event handler: errors are shown in the status line, and the page is refreshed afterwards.
-
-        Events that the program itself causes, by setting a control, are ignored.
-        """
-
-        def call(event: Any) -> None:
-            if getattr(event, "client_id", 0) is None:
-                return
-            with self._lock:
-                with self.reported():
-                    work(event)
-                self.refresh()
-
-        return call
-
-    @contextlib.contextmanager
-    def reported(self) -> Iterator[None]:
-        """Show an error of the block in the status line instead of raising it."""
-        try:
-            yield
-        except (ValueError, OSError) as error:
-            self.say(" ".join(str(error).split()), bad=True)
-        except Exception as error:  # a programming error must be visible and must not end the page
-            traceback.print_exc()
-            self.say(f"{type(error).__name__}: {error} (traceback in the terminal)", bad=True)
-
-    def say(self, sentence: str, *, bad: bool = False) -> None:
-        """Show one sentence in the status line."""
-        color = "#e8590c" if bad else "inherit"
-        self._status.content = (
-            f'<div class="sg-status" style="{_TEXT_STYLE};color:{color}">{html.escape(sentence)}</div>'
-        )
-
-    def say_notice(self) -> None:
-        """Show what was found on opening, in the status line; nothing where all is well."""
-        if self.session is not None and self.session.notice is not None:
-            self.say(self.session.notice, bad=True)
-        elif self.problem is not None:
-            self.say(self.problem, bad=True)
 
     def refresh(self) -> None:
         """Update the current phase, the preview, the header and the undo buttons."""
-        with self._lock:
-            with self.reported():
-                self._phases[self.phase].refresh()
+        context = self.context
+        with context.lock:
+            with context.reported():
+                self.phases[context.phase].refresh()
                 self.preview.update()
-            self._header.content = self._header_html()
-            self._history.refresh()
-
-    def open_project(self) -> None:
-        """Open the project that was just created or corrected."""
-        self._try_session()
-        self.preview.reset()
-        self.show_phase(self._first_phase())
-        self.say_notice()
+            session = context.session
+            where = "no project yet" if session is None else session.files.file.parent.name
+            saved = "" if session is None else '<span style="opacity:.6;float:right">all changes are saved</span>'
+            self._header.content = note(f'<b style="font-size:1.1em">{html.escape(where)}</b>{saved}', kind="header")
+            self._history.visible = session is not None and session.has_steps()
 
     def show_phase(self, phase: str) -> None:
         """Switch to another phase."""
-        with self._lock:
-            scene = self._shown_scene()
-            self.windows.save_view(scene)
-            self._phases[self.phase].leave()
-            self._folders[self.phase].visible = False
-            self.phase = phase
+        context = self.context
+        with context.lock:
+            scene = context.scene_side
+            self._save_view(scene)
+            self.phases[context.phase].leave()
+            self._folders[context.phase].visible = False
+            context.phase = phase
             self._folders[phase].visible = True
-            self._phase_buttons.options = tuple(f"{_CURRENT_MARK}{name}" if name == phase else name for name in PHASES)
-            if self._shown_scene() != scene:
+            self._phase_buttons.options = tuple(
+                f"{_CURRENT_MARK}{name}" if name == phase else name for name in self.phases
+            )
+            if context.scene_side != scene:
+                context.view.hide_splats(f"/{scene}")
                 self.preview.scene_changed()
-                self.windows.restore_view(self._shown_scene())
-            self._status.content = ""
-            with self.reported():
-                self.view.keep_coarse(self._shown_file())
-                self._phases[phase].enter()
+                self._restore_view(context.scene_side)
+            context.status.content = ""
+            with context.reported():
+                context.view.keep_coarse(context.scene_file())
+                self.phases[phase].enter()
             self.refresh()
-
-    def run(self, to: str, title: str) -> None:
-        """Start a job that runs the stale steps up to `to`.
-
-        Raises:
-            ValueError: If a job is running.
-        """
-        self.require_session().run(to, title)
-        self.say(f"{title}: started; it continues if you close this page")
-        self.job.refresh()
-
-    def parse_path(self, text: str) -> Path:
-        """The path in a text field.
-
-        Raises:
-            ValueError: If it is empty or outside of the permitted folder.
-        """
-        if not text.strip():
-            raise ValueError("path: expected one, found nothing")
-        path = Path(text.strip()).expanduser()
-        path = path if path.is_absolute() else Path.cwd() / path
-        if self.options.inside is not None and not path.resolve().is_relative_to(self.options.inside.resolve()):
-            raise ValueError(f"{path}: expected a path in the project's folder, found one outside; upload the file")
-        return path
-
-    def redraw(self) -> None:
-        """Show the phase again after files have changed."""
-        self._phases[self.phase].enter()
-        self.refresh()
-
-    def scenes_read(self) -> None:
-        """Show scenes that have been read in the background."""
-        with self._lock, self.reported():
-            if self._open and self.session is not None:
-                self.redraw()
-
-    def light_ready(self) -> None:
-        """Update the light phase after the preview has estimated the light."""
-        with self._lock:
-            if self.phase == "Light":
-                self._phases["Light"].refresh()
-
-    def scene_scale(self) -> float:
-        """Typical distance between cameras and content: the median distance of the cameras from their mean."""
-        session = self.session
-        files = None if session is None else session.files
-        path = None if files is None else (files.source_cameras if self.phase == "Select" else files.target_cameras)
-        if session is None or path is None or not path.is_file():
-            return 1.0
-        return typical_distance(session.scenes.cameras(path).centers.numpy())
 
     def close(self) -> None:
         """End all threads."""
-        self._open = False
-        for end in (self.preview.close, *self.on_close):
+        self.context.is_open = False
+        for end in self.context.on_close:
             end()
 
-    def restore_project(self) -> None:
-        """Put the last project.toml that opened back, and open it.
+    def _reopened(self) -> None:
+        """Show a project that has been opened, in the phase that comes next, and say what is wrong with it."""
+        session, context = self.context.session, self.context
+        self.preview.reset()
+        context.view.hide_splats("/")
+        files = None if session is None else session.files
+        if files is None or not files.source_scene.is_file() or not files.target_scene.is_file():
+            self.show_phase("Open")
+        else:
+            self.show_phase("Place" if files.object.is_file() else "Select")
+        self._say_notice()
 
-        Raises:
-            ValueError: If none was kept.
-        """
-        backup_of(self.project.file).restore()
-        self.open_project()
-        if self.session is not None:
-            self.say("the last project.toml that opened is back; the other one is in .editor/broken")
+    def _say_notice(self) -> None:
+        session = self.context.session
+        notice = self.context.problem if session is None else session.notice
+        if notice is not None:
+            self.context.say(notice, bad=True)
 
-    def leave_project(self) -> None:
-        """Set the project's edits aside, so that other captures can be named; `return_to_project` puts them back.
+    def _light_ready(self) -> None:
+        """Update the light phase after the preview has estimated the light."""
+        with self.context.lock:
+            if self.context.phase == "Light":
+                self.phases["Light"].refresh()
 
-        Raises:
-            ValueError: If a job is running.
-        """
-        self.require_session().set_aside()
-        self._phases[self.phase].leave()
-        self.open_project()
+    # undo and keys
 
-    def return_to_project(self) -> None:
-        """Open the project that was set aside.
+    def _undo(self) -> None:
+        self._step(Session.undo, "undone", "nothing to undo")
 
-        Raises:
-            ValueError: If there is none.
-        """
-        backup_of(self.project.file).bring_back()
-        self.open_project()
+    def _redo(self) -> None:
+        self._step(Session.redo, "redone", "nothing to redo")
 
-    def _try_session(self) -> None:
-        """Open the project where there is one; what prevents it is kept as `problem`."""
-        self.session, self.problem = None, None
-        self._seen_project = _stamp(self.project.file)
-        try:
-            if self.project.files() is not None:
-                self.session = Session(self.project)
-        except (ValueError, OSError) as error:
-            self.problem = " ".join(str(error).split())
+    def _step(self, move: Callable[[Session], bool], done: str, nothing: str) -> None:
+        session = self.context.require_session()
+        session.notice = None
+        self.context.say(done if move(session) else nothing)
+        self._say_notice()
 
-    # construction
+    def _show_keys(self) -> None:
+        shown, self._list_of_keys = self._list_of_keys, None
+        if shown is not None:
+            shown.close()
+            return
+        gui = self.context.gui
+        self._list_of_keys = gui.add_modal("Keys")
+        with self._list_of_keys:
+            rows = "\n".join(f"| {key} | {meaning} |" for key, meaning in _KEYS)
+            gui.add_markdown(f"| key | what it does |\n| --- | --- |\n{rows}")
+            self.context.on(gui.add_button("Close"), self._show_keys)
 
-    def _build(self) -> None:
-        gui = self.gui
-        self._header = gui.add_html("")
-        self._phase_buttons = gui.add_button_group("Step", PHASES)
-        self._phase_buttons.on_click(
-            self.callback(lambda event: self.show_phase(event.target.value.removeprefix(_CURRENT_MARK)))
-        )
-        gui.add_html(style_sheet(self._phase_buttons._impl.uuid))
-        self.job = JobPanel(self)
-        self._folders: dict[str, Any] = {}
-        self._phases: dict[str, Phase] = {}
-        kinds: dict[str, Callable[[Page], Phase]] = {
-            "Open": OpenPhase,
-            "Select": SelectPhase,
-            "Place": PlacePhase,
-            "Light": LightPhase,
-            "Run": RunPhase,
-        }
-        for name in PHASES:
-            self._folders[name] = gui.add_folder(name, visible=False)
-            with self._folders[name]:
-                self._phases[name] = kinds[name](self)
-        self._status = gui.add_html("")
-        self.uploads.add_progress()
-        self._history = HistoryControls(self)
-        self._keys = Keys(self, PHASES)
-        self.preview = PreviewPanel(self)
+    # windows and their views
 
-    def _first_phase(self) -> str:
-        if self.session is None:
-            return "Open"
-        files = self.session.files
-        if not files.source_scene.is_file() or not files.target_scene.is_file():
-            return "Open"
-        return "Place" if self.session.can_place() else "Select"
+    def _connected(self, window: viser.ClientHandle) -> None:
+        window.camera.on_update(lambda _: self._moved(window))
+        camera = self.context.cameras()
+        if window.client_id not in self._keep_view and camera is not None:
+            # the reconstruction covers what the first photograph shows
+            self.context.look_through(window, camera[0])
+        self._windows_changed()
 
-    def _shown_scene(self) -> str:
-        return "source" if self.phase == "Select" else "target"
+    def _moved(self, window: viser.ClientHandle) -> None:
+        editing = self.context.guarded.editing()
+        if editing is not None and window.client_id == editing.client_id:
+            self.preview.camera_moved()
+            for call in self.context.on_moved:
+                call()
 
-    def _shown_file(self) -> Path | None:
-        if self.session is None:
-            return None
-        return self.session.files.source_scene if self.phase == "Select" else self.session.files.target_scene
+    def _windows_changed(self) -> None:
+        """Say in each window but the oldest that it is read-only, and show the picture in the one that edits."""
+        watching = {window.client_id: window for window in self.context.guarded.watching()}
+        for number in [number for number in self._notices if number not in watching]:
+            notice = self._notices.pop(number)
+            if number in self.context.server.get_clients():
+                notice.remove()
+        for number, window in watching.items():
+            if number not in self._notices:
+                self._notices[number] = window.gui.add_html(note(_WATCH_NOTE, kind="watch"), order=-1.0)
+        self.preview.update()
 
-    def _header_html(self) -> str:
-        where = "no project yet" if self.session is None else str(self.session.files.file.parent.name)
-        saved = "all changes are saved" if self.session else ""
-        home = self.options.start_page
-        link = f'<a style="color:#ffa94d" href="{home}">All projects</a><br>' if home else ""
-        return (
-            f'<div class="sg-header" style="{_TEXT_STYLE}">{link}<b style="font-size:1.1em">{html.escape(where)}</b>'
-            f'<span style="opacity:.6;float:right">{saved}</span></div>'
-        )
+    def _save_view(self, scene: str) -> None:
+        window = self.context.guarded.editing()
+        if window is not None:
+            camera = window.camera
+            self._views[scene] = (camera.position, camera.look_at, camera.up_direction, camera.fov)
+
+    def _restore_view(self, scene: str) -> None:
+        """Restore the editing window's view of a scene; the first time, look through its first camera."""
+        window, view, cameras = self.context.guarded.editing(), self._views.get(scene), self.context.cameras()
+        if window is None:
+            return
+        if view is None and cameras is not None:
+            self.context.look_through(window, cameras[0])
+        elif view is not None:
+            with window.atomic():
+                window.camera.up_direction = view[2]
+                window.camera.position, window.camera.look_at, window.camera.fov = view[0], view[1], view[3]
 
     # polling of files and jobs
 
     def _poll_loop(self) -> None:
-        while self._open:
+        while self.context.is_open:
             time.sleep(_POLL_SECONDS)
-            with self._lock, self.reported():
-                self._poll()
+            with self.context.lock, self.context.reported():
+                self.poll()
 
-    def _poll(self) -> None:
-        session = self.session
-        if session is None:
-            if self.problem is not None and _stamp(self.project.file) != self._seen_project:
-                self.open_project()
+    def poll(self) -> None:
+        """Load what was changed outside the editor, and show how far the job is."""
+        context = self.context
+        if context.session is None:
+            if context.is_corrected():
+                context.open_project()
             return
-        if session.reload():
-            self.say("the project's files were changed outside the editor and were loaded again")
+        if context.session.reload():
+            context.say("the project's files were changed outside the editor and were loaded again")
             self.refresh()
-        self.job.refresh()
-
-
-def _stamp(file: Path) -> tuple[int, int] | None:
-    """Time and size of a file; None where there is none."""
-    return (file.stat().st_mtime_ns, file.stat().st_size) if file.is_file() else None
+        self._job.refresh()

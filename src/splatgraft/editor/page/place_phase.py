@@ -1,66 +1,66 @@
 """The phase `Place`: place objects in the target by gizmo, numbers and named operations; erase parts of the target."""
 
-from __future__ import annotations
-
+import html
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 import viser
 
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.page.box_handles import BoxHandles
-from splatgraft.editor.page.object_gizmo import SNAP_DEGREES, ObjectGizmo
-from splatgraft.editor.page.size_controls import SizeControls
-from splatgraft.editor.session import placement_operations
-from splatgraft.editor.session.edit_state import EditState
-from splatgraft.editor.session.gizmo import (
+from splatgraft.editor.page.context import PageContext, note, parse_path
+from splatgraft.editor.page.handles import SNAP_DEGREES, BoxHandles, ObjectGizmo
+from splatgraft.editor.page.preview_panel import PreviewPanel
+from splatgraft.editor.placement import (
     Gizmo,
+    ObjectSize,
+    align_up,
     degrees_from_quaternion,
+    drop_to_surface,
     gizmo_from_similarity,
+    place_beside,
+    plausible_scale,
     quaternion_from_degrees,
+    rescale,
     similarity_from_gizmo,
+    suggest_placement,
 )
-from splatgraft.editor.session.object_size import true_scale
-from splatgraft.editor.session.session import Session
-from splatgraft.editor.session.state_checks import check_numbers, check_state
-from splatgraft.editor.uploads.upload_checks import SCENES
-from splatgraft.formats import read_gaussians
+from splatgraft.editor.session import Session
+from splatgraft.editor.state import check_numbers, check_state
+from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.segmentation import Box
 
-if TYPE_CHECKING:
-    from splatgraft.editor.page.page import Page
-
-NO_NAMES: tuple[str, ...] = ("1",)
+_NO_NAMES: tuple[str, ...] = ("1",)
 """Options of a dropdown while there is nothing to choose."""
 _SAVE_EVERY = 0.25
 """Seconds between saves during a drag."""
 _SNAP_NEAR = 0.5
 """Distance from the surface, over the object's height, within which a drag ends on it."""
+_SCALES = ("its capture", "the place")
+_SAME = 0.002
+"""Relative difference below which two sizes count as one."""
 
 
 class PlacePhase:
     """The controls of the phase, and the target with its objects in the 3D view."""
 
-    def __init__(self, page: Page) -> None:
+    def __init__(self, context: PageContext, preview: PreviewPanel) -> None:
         """Build the controls."""
-        self._page, gui = page, page.gui
-        self._chosen = 0
-        self._dragging = False
+        self._context, self._preview, gui = context, preview, context.gui
+        self._chosen, self._dragging, self._saved = 0, False, 0.0
         self._shown: Gizmo | None = None
         """What the fields of numbers show; as `SelectPhase._shown_box`."""
-        self._saved = 0.0
-        self._is_active = False
         self._note = gui.add_html("", visible=False)
         self._suggest = gui.add_button("Find a place", icon=viser.Icon.WAND)
-        self._object_choice = gui.add_dropdown("Object", NO_NAMES, initial_value=NO_NAMES[0])
+        self._object_choice = gui.add_dropdown("Object", _NO_NAMES)
         self._position = gui.add_vector3("Position", (0.0, 0.0, 0.0), step=0.001)
         self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=0.01, hint="Degrees about x, y, z")
         self._scale = gui.add_number("Scale", 1.0, min=1e-4, step=0.001)
-        self._size = SizeControls(page)
+        self._size = SizeControls(context)
         self._operations = gui.add_button_group("Move", ("Drop", "Upright", "Fit size"))
         self._snap = gui.add_checkbox(
             "Snap",
@@ -71,52 +71,55 @@ class PlacePhase:
         with gui.add_folder("Another object", expand_by_default=False):
             self._path = gui.add_text("File", "", hint="A trained scene (.ply, .spz, .sog, ...) of the object alone")
             self._add = gui.add_button("Add this file", icon=viser.Icon.PLUS, color="gray")
-            page.uploads.add("Upload a file", SCENES, self._add_file)
+            context.add_upload("Upload a file", SCENE_SUFFIXES, self._add_file)
         with gui.add_folder("Erase from the target", expand_by_default=False):
             self._show_box = gui.add_checkbox("Show the box", False)
             self._erase = gui.add_button("Erase inside the box", icon=viser.Icon.ERASER, color="gray")
             self._restore = gui.add_button("Restore all erased", color="gray")
-        self._handles = BoxHandles(page.server, page.view, "/target/box", color=(240, 70, 70))
-        self._gizmo = ObjectGizmo(page.server, self._dragged)
-        self._connect()
+        self._handles = BoxHandles(context.server, context.view, "/target/box", color=(240, 70, 70))
+        self._gizmo = ObjectGizmo(context.server, self._dragged)
+        context.on(self._suggest, self._find_place)
+        context.on(self._object_choice, self._choose)
+        for control in (self._position, self._degrees, self._scale):
+            context.on(control, self._numbers_changed)
+        context.on(self._operations, lambda: self._apply_operation(self._operations.value))
+        context.on(self._object_buttons, self._object_button)
+        context.on(self._add, lambda: self._add_file(parse_path(self._path.value)))
+        context.on(self._show_box, self._toggle_box)
+        context.on(self._erase, self._erase_box)
+        context.on(self._restore, self._restore_all)
+        self._add_key("Drop to the surface", "G", lambda: self._apply_operation("Drop"))
+        self._add_key("Duplicate the object", "D", self._duplicate)
+        self._add_key("Delete the object", "delete", self._delete)
+        self._add_key("Snap on or off", "S", self._toggle_snap)
 
     def enter(self) -> None:
-        """Show the target and the placed objects."""
-        self._is_active = True
-        self.refresh()
+        """Nothing is to be done once."""
 
     def leave(self) -> None:
-        """Hide them."""
-        self._is_active = False
-        hide_target(self._page)
+        """Hide the handles."""
         self._handles.hide()
         self._gizmo.remove()
 
     def refresh(self) -> None:
-        """Update the list of objects, the numbers and the gizmo."""
-        session = self._page.session
-        if session is None or not self._is_active:
+        """Update the 3D view, the list of objects, the numbers and the gizmo."""
+        session = self._context.session
+        if session is None:
             return
+        has_target = session.files.target_scene.is_file()
+        objects = session.objects() if has_target else ()
         problem = None
-        if not session.files.target_scene.is_file():
+        if not has_target:
             problem = "The target is not reconstructed yet: see Open."
-        elif not session.objects() and not session.files.object.is_file():
+        elif not objects and not session.files.object.is_file():
             problem = "There is no object yet: cut one out in Select, or add one from a file."
-        objects = session.objects() if session.files.target_scene.is_file() else ()
         self._suggest.visible = not objects and problem is None
-        if session.files.target_scene.is_file() and not show_target(self._page):
+        if not self._context.show_target() and has_target:
             problem = problem or session.scenes.reading_note(session.files.target_scene)
-        self._note.visible, self._note.content = problem is not None, f'<div style="padding:2px 12px">{problem}</div>'
-        is_usable = bool(objects) and self._page.loading.has(session, session.scenes.base_files(objects))
-        for control in (
-            self._object_choice,
-            self._position,
-            self._degrees,
-            self._scale,
-            self._operations,
-            self._snap,
-            self._object_buttons,
-        ):
+        self._note.visible, self._note.content = problem is not None, note(problem or "")
+        is_usable = bool(objects) and session.scenes.at_hand(session.scenes.base_files(objects))
+        fields = (self._object_choice, self._position, self._degrees, self._scale)
+        for control in (*fields, self._operations, self._snap, self._object_buttons):
             control.visible = is_usable
         self._chosen = max(0, min(self._chosen, len(objects) - 1))
         if is_usable:
@@ -138,29 +141,9 @@ class PlacePhase:
         self._erase.disabled = not self._show_box.value
         self._restore.disabled = session.state.erased is None
 
-    def _connect(self) -> None:
-        callback = self._page.callback
-        self._suggest.on_click(callback(lambda _: self._find_place()))
-        self._object_choice.on_update(callback(lambda _: self._choose()))
-        for control in (self._position, self._degrees, self._scale):
-            control.on_update(callback(lambda _: self._numbers_changed()))
-        self._operations.on_click(callback(lambda event: self._apply_operation(event.target.value)))
-        self._object_buttons.on_click(
-            callback(lambda event: self._duplicate() if event.target.value == "Duplicate" else self._delete())
-        )
-        self._add.on_click(callback(lambda _: self._add_file(self._page.parse_path(self._path.value))))
-        self._show_box.on_update(callback(lambda _: self._toggle_box()))
-        self._erase.on_click(callback(lambda _: self._erase_box()))
-        self._restore.on_click(callback(lambda _: self._restore_all()))
-        gui = self._page.gui
-        drop = gui.add_command("Drop to the surface", hotkey="G")
-        duplicate = gui.add_command("Duplicate the object", hotkey="D")
-        delete = gui.add_command("Delete the object", hotkey="delete")
-        snap = gui.add_command("Snap on or off", hotkey="S")
-        snap.on_trigger(callback(lambda _: self._toggle_snap() if self._is_active else None))
-        drop.on_trigger(callback(lambda _: self._apply_operation("Drop") if self._is_active else None))
-        duplicate.on_trigger(callback(lambda _: self._duplicate() if self._is_active else None))
-        delete.on_trigger(callback(lambda _: self._delete() if self._is_active else None))
+    def _add_key(self, label: str, key: Any, work: Callable[[], object]) -> None:
+        command = self._context.gui.add_command(label, hotkey=key)
+        self._context.on(command, lambda: work() if self._context.phase == "Place" else None)
 
     def _toggle_snap(self) -> None:
         self._snap.value = not self._snap.value
@@ -168,118 +151,12 @@ class PlacePhase:
     # placement
 
     def _current(self) -> Gizmo:
-        session = self._page.require_session()
+        session = self._context.require_session()
         item = session.objects()[self._chosen]
         return gizmo_from_similarity(item.target_from_object, session.placeable_object(self._chosen).base.point)
 
     def _set_placement(self, target_from_object: Similarity) -> None:
-        self._page.require_session().set_placement(self._chosen, target_from_object)
-
-    def _numbers_changed(self) -> None:
-        session = self._page.require_session()
-        self._shown = None  # so that the fields go back to the state where these numbers are refused
-        check_numbers((*self._position.value, *self._degrees.value, self._scale.value), "position, rotation, scale")
-        gizmo = Gizmo(self._position.value, quaternion_from_degrees(self._degrees.value), float(self._scale.value))
-        self._set_placement(similarity_from_gizmo(gizmo, session.placeable_object(self._chosen).base.point))
-        self._shown = self._current()
-
-    def _apply_operation(self, name: str) -> None:
-        session = self._page.require_session()
-        item, placed = session.placeable_object(self._chosen), session.objects()[self._chosen].target_from_object
-        target, up = session.scenes.composite(session.placed_state()).target, session.up()
-        cameras = session.scenes.cameras(session.files.target_cameras)
-        if name == "Drop":
-            self._set_placement(placement_operations.drop_to_surface(target, item, placed, up=up))
-            self._page.say("dropped: it stands upright on the surface below")
-        elif name == "Upright":
-            self._set_placement(placement_operations.align_up(item, placed, up=up))
-        else:
-            scale = placement_operations.plausible_scale(target, item, placed, cameras)
-            self._set_placement(placement_operations.rescale(item, placed, scale))
-            self._page.say("scaled to about a third of the views' height, which is a guess")
-
-    def _find_place(self) -> None:
-        session = self._page.require_session()
-        item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity()))
-        cameras = session.scenes.cameras(session.files.target_cameras)
-        options = session.files.place_options
-        # as `compose` does
-        options = replace(options, scale=true_scale(session)) if options.scale is None else options
-        placed = placement_operations.suggest_placement(
-            session.scenes.gaussians(session.files.target_scene), item, cameras, options
-        )
-        session.change(replace(session.state, objects=(ObjectPlacement(placed),)))
-        self._page.say("placed on a level, visible surface; drag it, or type numbers")
-
-    def _choose(self) -> None:
-        self._chosen = list(self._object_choice.options).index(self._object_choice.value)
-        self._gizmo.remove()
-
-    def _duplicate(self) -> None:
-        session = self._page.require_session()
-        item = session.objects()[self._chosen]
-        # objects that are placed already count as part of the scene
-        scene = session.scenes.composite(session.placed_state()).merged()[0]
-        placed, is_supported = placement_operations.place_beside(
-            scene, session.placeable_object(self._chosen), item.target_from_object, up=session.up()
-        )
-        objects = (*session.objects(), replace(item, target_from_object=placed))
-        session.change(replace(session.state, objects=objects))
-        self._chosen = len(objects) - 1
-        self._gizmo.remove()
-        if not is_supported:
-            self._page.say("duplicated; no surface at this height was found beside it: move it, then Drop", bad=True)
-
-    def _delete(self) -> None:
-        session = self._page.require_session()
-        objects = session.objects()
-        if objects:
-            rest = (*objects[: self._chosen], *objects[self._chosen + 1 :])
-            session.change(replace(session.state, objects=rest))
-            self._gizmo.remove()
-
-    def _add_file(self, path: Path) -> None:
-        session = self._page.require_session()
-        read_gaussians(path)
-        item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity(), path))
-        cameras = session.scenes.cameras(session.files.target_cameras)
-        # objects that are placed already count as part of the scene
-        scene = session.scenes.composite(session.placed_state()).merged()[0]
-        placed = placement_operations.suggest_placement(scene, item, cameras)
-        objects = (*session.objects(), ObjectPlacement(placed, path))
-        session.change(replace(session.state, objects=objects))
-        self._chosen = len(objects) - 1
-        self._gizmo.remove()
-
-    # erase
-
-    def _toggle_box(self) -> None:
-        if not self._show_box.value:
-            return
-        session = self._page.require_session()
-        objects = session.objects()
-        centre = torch.tensor(self._current().position) if objects else self._middle(session)
-        half = 0.25 * self._page.scene_scale()
-        self._handles.show(Box(centre - half, centre + half))
-
-    def _erase_box(self) -> None:
-        session, box = self._page.require_session(), self._handles.box
-        if box is None:
-            raise ValueError("box: expected one in view, found none")
-        inside = box.contains(session.scenes.gaussians(session.files.target_scene).means)
-        erased_before = session.state.erased
-        erased = inside if erased_before is None else erased_before | inside
-        session.change(replace(session.placed_state(), erased=erased))
-        self._page.say(f"erased: {int(inside.sum()):,} Gaussians of the target")
-
-    def _restore_all(self) -> None:
-        session = self._page.require_session()
-        session.change(replace(session.placed_state(), erased=None))
-
-    def _middle(self, session: Session) -> torch.Tensor:
-        return session.scenes.gaussians(session.files.target_scene).means.median(0).values
-
-    # the gizmo
+        self._context.require_session().set_placement(self._chosen, target_from_object)
 
     def _show_numbers(self, gizmo: Gizmo) -> None:
         if gizmo == self._shown:
@@ -291,37 +168,140 @@ class PlacePhase:
         self._degrees.value = (x, y, z)
         self._scale.value = gizmo.scale
 
+    def _numbers_changed(self) -> None:
+        session = self._context.require_session()
+        self._shown = None  # so that the fields go back to the state where these numbers are refused
+        check_numbers((*self._position.value, *self._degrees.value, self._scale.value), "position, rotation, scale")
+        gizmo = Gizmo(self._position.value, quaternion_from_degrees(self._degrees.value), float(self._scale.value))
+        self._set_placement(similarity_from_gizmo(gizmo, session.placeable_object(self._chosen).base.point))
+        self._shown = self._current()
+
+    def _apply_operation(self, name: str) -> None:
+        session = self._context.require_session()
+        item, placed = session.placeable_object(self._chosen), session.objects()[self._chosen].target_from_object
+        target, up = session.scenes.composite(session.placed_state()).target, session.up()
+        if name == "Drop":
+            self._set_placement(drop_to_surface(target, item, placed, up=up))
+            self._context.say("dropped: it stands upright on the surface below")
+        elif name == "Upright":
+            self._set_placement(align_up(item, placed, up=up))
+        else:
+            cameras = session.scenes.cameras(session.files.target_cameras)
+            self._set_placement(rescale(item, placed, plausible_scale(target, item, placed, cameras)))
+            self._context.say("scaled to about a third of the views' height, which is a guess")
+
+    def _find_place(self) -> None:
+        session = self._context.require_session()
+        item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity()))
+        cameras = session.scenes.cameras(session.files.target_cameras)
+        options = session.files.place_options
+        # as `compose` does
+        options = replace(options, scale=session.true_scale()) if options.scale is None else options
+        target = session.scenes.gaussians(session.files.target_scene)
+        placed = suggest_placement(target, item, cameras, options)
+        session.change(replace(session.state, objects=(ObjectPlacement(placed),)))
+        self._context.say("placed on a level, visible surface; drag it, or type numbers")
+
+    def _choose(self) -> None:
+        self._chosen = list(self._object_choice.options).index(self._object_choice.value)
+        self._gizmo.remove()
+
+    def _object_button(self) -> None:
+        if self._object_buttons.value == "Duplicate":
+            self._duplicate()
+        else:
+            self._delete()
+
+    def _duplicate(self) -> None:
+        session = self._context.require_session()
+        item = session.objects()[self._chosen]
+        # objects that are placed already count as part of the scene
+        scene = session.scenes.composite(session.placed_state()).merged()[0]
+        object_ = session.placeable_object(self._chosen)
+        placed, is_supported = place_beside(scene, object_, item.target_from_object, up=session.up())
+        self._append(replace(item, target_from_object=placed))
+        if not is_supported:
+            self._context.say("duplicated; no surface at this height was found beside it: move it, then Drop", bad=True)
+
+    def _delete(self) -> None:
+        session = self._context.require_session()
+        objects = session.objects()
+        if objects:
+            rest = (*objects[: self._chosen], *objects[self._chosen + 1 :])
+            session.change(replace(session.state, objects=rest))
+            self._gizmo.remove()
+
+    def _add_file(self, path: Path) -> None:
+        session = self._context.require_session()
+        read_gaussians(path)
+        item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity(), path))
+        # objects that are placed already count as part of the scene
+        scene = session.scenes.composite(session.placed_state()).merged()[0]
+        placed = suggest_placement(scene, item, session.scenes.cameras(session.files.target_cameras))
+        self._append(ObjectPlacement(placed, path))
+
+    def _append(self, item: ObjectPlacement) -> None:
+        session = self._context.require_session()
+        objects = (*session.objects(), item)
+        session.change(replace(session.state, objects=objects))
+        self._chosen = len(objects) - 1
+        self._gizmo.remove()
+
+    # erase
+
+    def _toggle_box(self) -> None:
+        if self._show_box.value:
+            session, half = self._context.require_session(), 0.25 * self._context.scene_scale()
+            target = session.scenes.gaussians(session.files.target_scene)
+            is_placed = bool(session.objects())
+            centre = torch.tensor(self._current().position) if is_placed else target.means.median(0).values
+            self._handles.show(Box(centre - half, centre + half))
+
+    def _erase_box(self) -> None:
+        session, box = self._context.require_session(), self._handles.box
+        if box is None:
+            raise ValueError("box: expected one in view, found none")
+        inside, before = box.contains(session.scenes.gaussians(session.files.target_scene).means), session.state.erased
+        session.change(replace(session.placed_state(), erased=inside if before is None else before | inside))
+        self._context.say(f"erased: {int(inside.sum()):,} Gaussians of the target")
+
+    def _restore_all(self) -> None:
+        session = self._context.require_session()
+        session.change(replace(session.placed_state(), erased=None))
+
+    # the gizmo
+
     def _dragged(self, placed: Similarity, ended: bool) -> None:
         """Show and save a placement during a drag; a drag is one undo step and is saved repeatedly while it lasts."""
-        session = self._page.session
+        session = self._context.session
         if session is None or self._chosen >= len(session.objects()):
             return
-        with self._page.reported():
+        with self._context.reported():
             if ended and self._snap.value:
                 placed = self._snapped_to_surface(session, placed)
             item = session.objects()[self._chosen]
-            self._page.view.set_transform(f"/target/objects/{self._chosen}", placed)
+            self._context.view.set_transform(f"/target/objects/{self._chosen}", placed)
             edited = session.placed_state().with_object(self._chosen, replace(item, target_from_object=placed))
             check_state(edited)
             now = time.monotonic()
             if not self._dragging:
                 self._dragging, self._saved = True, now
-                self._page.callback(lambda _: session.change(edited))(None)
+                self._context.callback(lambda _: session.change(edited))(None)
             elif ended or now - self._saved > _SAVE_EVERY:
                 self._saved = now
                 session.amend(edited)
-            self._page.preview.set_dragged_state(None if ended else edited)
+            self._preview.set_dragged_state(None if ended else edited)
         if ended:
             self._dragging = False
-            self._page.preview.set_dragged_state(None)
-            self._page.refresh()
+            self._preview.set_dragged_state(None)
+            self._context.refresh()
 
     def _snapped_to_surface(self, session: Session, placed: Similarity) -> Similarity:
         """The placement with its foot on the surface below or just above, where there is one near."""
         item, up = session.placeable_object(self._chosen), session.up()
         target = session.scenes.composite(session.placed_state()).target
         try:
-            fallen = placement_operations.drop_to_surface(target, item, placed, up=up)
+            fallen = drop_to_surface(target, item, placed, up=up)
         except ValueError:
             return placed
         rise = float((fallen.points(item.base.point) - placed.points(item.base.point)) @ up)
@@ -329,43 +309,85 @@ class PlacePhase:
         return replace(placed, translation=placed.translation + rise * up) if abs(rise) < near else placed
 
 
-def show_target(page: Page) -> bool:
-    """Show the target and the placed objects in the 3D view, or a sample of a target that is being read.
+class SizeControls:
+    """A height in centimetres where the target's scale is known, and a folder that sets both scales."""
 
-    Returns:
-        Whether all of them are shown.
-    """
-    session = page.require_session()
-    state, view, path = session.placed_state(), page.view, session.files.target_scene
-    objects = state.objects or ()
-    if page.loading.has(session, [path]):
-        _show_kept(page, session, state)
-        view.remove_coarse()
-    elif not view.is_shown("/target/scene"):
-        sample = session.scenes.sample(path)
-        flags = None if state.erased is None else state.erased.numpy()
-        view.show_coarse(path, sample if flags is None or sample is None else sample.without(flags))
-    for index, item in enumerate(objects):
-        if page.loading.has(session, [session.scenes.object_path(item)]):
-            gaussians = session.scenes.gaussians(session.scenes.object_path(item))
-            view.show_splats(f"/target/objects/{index}", gaussians, transform=item.target_from_object)
-    for name in [n for n in view.shown if n.startswith("/target/objects/") and int(n.split("/")[-1]) >= len(objects)]:
-        view.remove_splats(name)
-    return page.loading.has(session, session.placed_scenes())
+    def __init__(self, context: PageContext) -> None:
+        """Build the controls in the current folder of the panel."""
+        self._context, gui = context, context.gui
+        self._index = 0
+        self._shown: float | None = None
+        """What the field of the height shows; as `SelectPhase._shown_box`."""
+        self._height = gui.add_number("Height, cm", 0.0, min=0.0, step=0.01, hint="Of the object, in the target")
+        self._true_size = gui.add_button("As tall as it truly is", color="gray", visible=False)
+        self._note = gui.add_html("")
+        self._folder = gui.add_folder("Set the scale", expand_by_default=False)
+        with self._folder:
+            self._known = gui.add_number("True height, cm", 0.0, min=0.0, step=0.1, hint="Of the object, as measured")
+            self._set = gui.add_button_group("Scale of", _SCALES)
+        context.on(self._height, self._typed)
+        context.on(self._true_size, self._to_true_size)
+        context.on(self._set, lambda: self._set_scale(self._set.value))
+
+    def hide(self) -> None:
+        """Hide all."""
+        self._height.visible = self._true_size.visible = self._note.visible = self._folder.visible = False
+
+    def show(self, index: int) -> None:
+        """Show the size of one placed object."""
+        self._index = index
+        self._note.visible = self._folder.visible = True
+        try:
+            size = self._context.require_session().size(index)
+        except ValueError as error:
+            self._height.visible = self._true_size.visible = False
+            self._note.content = note(html.escape(str(error)), kind="size", faint=True)
+            return
+        here, true = size.here_cm, size.true_cm
+        self._height.visible = here is not None
+        self._true_size.visible = here is not None and true is not None and abs(here / true - 1) > _SAME
+        if here is not None and here != self._shown:
+            self._shown = here
+            self._height.value = round(here, 2)
+        self._note.content = note(html.escape(_about(size)), kind="size", faint=True)
+
+    def _typed(self) -> None:
+        self._shown = None  # so that the field goes back where this number is refused
+        self._resize(float(self._height.value))
+
+    def _to_true_size(self) -> None:
+        true = self._context.require_session().size(self._index).true_cm
+        if true is not None:
+            self._resize(true)
+
+    def _resize(self, here_cm: float) -> None:
+        session = self._context.require_session()
+        scale, placed = session.size(self._index).scale_at(here_cm), session.objects()[self._index].target_from_object
+        session.set_placement(self._index, rescale(session.placeable_object(self._index), placed, scale))
+
+    def _set_scale(self, of: str) -> None:
+        session, cm = self._context.require_session(), float(self._known.value)
+        if of == _SCALES[0]:
+            path = session.set_own_scale(self._index, cm)
+            if session.size(self._index).place is not None:
+                self._resize(cm)
+        else:
+            path = session.set_place_scale(self._index, cm)
+        self._context.say(f"stored in {path}, as `splatgraft scale` does; Undo leaves it")
 
 
-def _show_kept(page: Page, session: Session, state: EditState) -> None:
-    """The target without its erased Gaussians."""
-    target = session.scenes.gaussians(session.files.target_scene)
-    if state.erased is not None and len(state.erased) != target.count:
-        raise ValueError(
-            f"erased.npy: expected one flag per Gaussian of the target, {target.count:,}; found {len(state.erased):,}; "
-            "restore all erased, or undo"
+def _about(size: ObjectSize) -> str:
+    """What is known of an object's size, and how to tell the rest."""
+    parts = []
+    if size.true_cm is not None and size.own is not None:
+        parts.append(f"In its own capture it is {size.true_cm:.4g} cm tall, by {size.own.source}.")
+    if size.place is not None:
+        parts.append(f"The place has its scale from {size.place.source}.")
+    if size.place is None:
+        parts.append(
+            "Its size in cm is not known, as the place has no scale: its size here is a guess. Set the scale below, "
+            "by the object's true height, or by `splatgraft scale`."
         )
-    shown = None if state.erased is None else session.scenes.complement("erased", state.erased)
-    page.view.show_splats("/target/scene", target, which=shown)
-
-
-def hide_target(page: Page) -> None:
-    """Hide them."""
-    page.view.hide_splats("/target")
+    elif size.own is None:
+        parts.append("How tall it truly is, is not known: set the scale of its capture below.")
+    return " ".join(parts)

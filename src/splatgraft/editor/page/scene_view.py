@@ -1,13 +1,16 @@
-"""The 3D view: Gaussian splats, boxes and cameras as viser scene nodes."""
+"""The 3D view: Gaussian splats, boxes and cameras as viser scene nodes, and pictures in place of the splats."""
 
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 import viser
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
+from viser import _messages
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
@@ -15,14 +18,19 @@ from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_qu
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import C0
 from splatgraft.editor.page.opening import COARSE_NODE, add_coarse
-from splatgraft.editor.previews.level_of_detail import largest_coverage_indices
-from splatgraft.editor.session.gizmo import gizmo_from_similarity
-from splatgraft.editor.session.scene_sample import SceneSample
+from splatgraft.editor.placement import gizmo_from_similarity
+from splatgraft.editor.relit_preview import largest_coverage_indices
+from splatgraft.editor.scene_sample import SceneSample
 from splatgraft.segmentation import Box
 
 Color = tuple[float, float, float]
 TINT: Color = (1.0, 0.45, 0.1)
 _EDGES = np.array([[i, j] for i in range(8) for j in range(i) if bin(i ^ j).count("1") == 1])
+_JPEG_QUALITY = 90
+_DEPTH_SHARE = 0.5
+"""Resolution of the depth behind the gizmos over that of the picture."""
+_MAX_DEPTH = 167.0
+"""World units; viser stores no more."""
 
 
 @dataclass(frozen=True)
@@ -46,20 +54,18 @@ class SceneView:
             budget: Maximum number of Gaussians per node.
             coarse: The scene of which a sample is shown already.
         """
-        self._server, self._scene = server, server.scene
-        self._budget = budget
+        self._server, self._scene, self._budget, self._coarse = server, server.scene, budget, coarse
         self._splats: dict[str, tuple[tuple[object, ...], viser.GaussianSplatHandle | None, ShownCount]] = {}
         self._references: dict[str, object] = {}
         self._units: dict[str, float] = {}
         self.shown: dict[str, ShownCount] = {}
-        self._coarse = coarse
+        """The nodes of splats that are shown."""
 
     def show_coarse(self, scene: Path, sample: SceneSample | None) -> None:
         """Show a sample of a scene until `remove_coarse`; None shows what was shown before."""
-        if scene == self._coarse or sample is None or not len(sample.means):
-            return
-        add_coarse(self._server, sample)
-        self._coarse = scene
+        if scene != self._coarse and sample is not None and len(sample.means):
+            add_coarse(self._server, sample)
+            self._coarse = scene
 
     def keep_coarse(self, scene: Path | None) -> None:
         """Remove the sample unless it is of this scene."""
@@ -112,8 +118,7 @@ class SceneView:
 
     def visible_splats(self) -> tuple[str, ...]:
         """Names of the nodes of splats that are shown."""
-        names = [name for name, (_, handle, _) in self._splats.items() if handle is not None and handle.visible]
-        return (*names, *(() if self._coarse is None else (COARSE_NODE,)))
+        return (*filter(self.is_shown, self._splats), *(() if self._coarse is None else (COARSE_NODE,)))
 
     def is_shown(self, name: str) -> bool:
         """Whether a node of splats is shown."""
@@ -135,8 +140,7 @@ class SceneView:
 
     def show_box(self, name: str, box: Box, color: tuple[int, int, int]) -> None:
         """The edges of a box."""
-        corners = box.corners.numpy()
-        self._scene.add_line_segments(name, points=corners[_EDGES], colors=color)
+        self._scene.add_line_segments(name, points=box.corners.numpy()[_EDGES], colors=color)
 
     def remove(self, name: str) -> None:
         """Remove any other node; nothing where there is none."""
@@ -150,10 +154,9 @@ class SceneView:
             return
         quaternions = quaternion_from_rotation(cameras.world_from_camera[:, :3, :3])
         for index, (camera, wxyz) in enumerate(zip(cameras, quaternions.numpy(), strict=True)):
-            fov = 2 * float(torch.atan(camera.height / (2 * camera.intrinsics[0, 1, 1])))
             self._scene.add_camera_frustum(
                 f"/cameras/{index}",
-                fov=fov,
+                fov=2 * float(torch.atan(camera.height / (2 * camera.intrinsics[0, 1, 1]))),
                 aspect=camera.width / camera.height,
                 scale=size,
                 color=(90, 140, 200),
@@ -175,11 +178,10 @@ class SceneView:
         colors = (0.5 + C0 * shown.sh[:, 0]).clamp(0, 1)
         if tint is not None:
             colors = 0.45 * colors + 0.55 * torch.tensor(tint)
-        covariances = (shown.covariances / unit**2).clamp(-6e4, 6e4)
         handle = self._scene.add_gaussian_splats(
             name,
             centers=(shown.means / unit).numpy(),
-            covariances=covariances.numpy(),
+            covariances=(shown.covariances / unit**2).clamp(-6e4, 6e4).numpy(),
             rgbs=colors.numpy(),
             opacities=shown.opacities[:, None].numpy(),
         )
@@ -193,6 +195,59 @@ class SceneView:
         handle.scale = gizmo.scale * unit
 
 
+class Canvas:
+    """Shows a picture with its depth in one window, behind the gizmos, or the splats again."""
+
+    def __init__(self, server: viser.ViserServer, view: SceneView) -> None:
+        """Show the splats of `view` in all windows of a server."""
+        self._server, self._view = server, view
+        self._window: viser.ClientHandle | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a window shows a picture."""
+        return self._window is not None
+
+    def show(
+        self, window: viser.ClientHandle, pixels: UInt8[np.ndarray, "h w 3"], depth: Float[np.ndarray, "h w"] | None
+    ) -> None:
+        """Show a picture in place of the splats of one window.
+
+        Args:
+            window: The window.
+            pixels: The picture, of the window's camera.
+            depth: Depth along the optical axis, world units; None: gizmos are drawn over all.
+        """
+        if depth is not None:
+            size = (max(1, round(depth.shape[1] * _DEPTH_SHARE)), max(1, round(depth.shape[0] * _DEPTH_SHARE)))
+            depth = cv2.resize(np.minimum(depth, _MAX_DEPTH), size, interpolation=cv2.INTER_NEAREST)
+        with self._lock:
+            if self._window is not None and self._window.client_id != window.client_id:
+                self._show_splats()
+            self._window = window
+            with window.atomic():
+                window.scene.set_background_image(pixels, format="jpeg", jpeg_quality=_JPEG_QUALITY, depth=depth)
+                self._set_splats_visible(window, False)
+
+    def clear(self) -> None:
+        """Show the splats again."""
+        with self._lock:
+            self._show_splats()
+
+    def _show_splats(self) -> None:
+        window, self._window = self._window, None
+        if window is not None and window.client_id in self._server.get_clients():
+            with window.atomic():
+                window.scene.set_background_image(None)
+                self._set_splats_visible(window, True)
+
+    def _set_splats_visible(self, window: viser.ClientHandle, visible: bool) -> None:
+        # to this window alone: others show splats
+        for name in self._view.visible_splats():
+            window._websock_connection.queue_message(_messages.SetSceneNodeVisibilityMessage(name, visible))
+
+
 def camera_from_viser(camera: viser.CameraHandle, *, width: int, min_aspect: float = 0.0) -> Cameras:
     """The camera of a window as `Cameras`.
 
@@ -204,13 +259,8 @@ def camera_from_viser(camera: viser.CameraHandle, *, width: int, min_aspect: flo
     aspect = max(min_aspect, camera.aspect if camera.aspect > 0 else 1.5)
     height = max(16, round(width / aspect))
     pose = torch.eye(4)
-    pose[:3, :3] = viser_rotation(camera.wxyz)
+    pose[:3, :3] = rotation_from_quaternion(torch.tensor(np.asarray(camera.wxyz), dtype=torch.float32)[None])[0]
     pose[:3, 3] = torch.tensor(np.asarray(camera.position), dtype=torch.float32)
     focal = height / (2 * np.tan(camera.fov / 2))
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
     return Cameras(pose[None], intrinsics[None], torch.tensor([[width, height]]), ("window",))
-
-
-def viser_rotation(wxyz: np.ndarray) -> Float[Tensor, "3 3"]:
-    """The rotation matrix of a viser quaternion."""
-    return rotation_from_quaternion(torch.tensor(np.asarray(wxyz), dtype=torch.float32)[None])[0]

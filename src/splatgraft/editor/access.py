@@ -1,0 +1,77 @@
+"""Access control for the editor's HTTP and websocket requests, by Host, Origin and a token.
+
+The Origin header identifies requests of other sites' pages, which can reach a server on loopback. The Host header
+identifies foreign names that resolve to this machine (DNS rebinding). Programs of other users of this machine can send
+any header; they do not know the token.
+"""
+
+import hmac
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from urllib.parse import parse_qs, parse_qsl, urlencode, urlsplit
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+@dataclass(frozen=True)
+class AccessDecision:
+    """The decision on one request."""
+
+    allowed: bool
+    """Whether the request is accepted."""
+    reason: str = ""
+    """Why it is refused, as a message for the user."""
+    cookie: str | None = None
+    """Set-Cookie header that stores the token in the browser; None: no header."""
+
+
+def check_access(token: str, headers: Mapping[str, str], path: str) -> AccessDecision:
+    """Decide on a request.
+
+    Args:
+        token: What each request must carry: in the address, or as a cookie afterwards.
+        headers: Request headers, names in canonical capitalisation; a repeated header is joined by commas.
+        path: Request path with its query.
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    if _name(host) not in LOOPBACK:
+        return AccessDecision(False, "expected the name of this machine in the address, found another")
+    if origin is not None and origin.lower().partition("://")[2] != host.lower():
+        return AccessDecision(False, "expected a request of the editor's own page, found one of another site")
+    if headers.get("Upgrade", "").lower() == "websocket" and origin is None:
+        return AccessDecision(False, "expected a websocket of a browser, with an Origin header, found none")
+    given = parse_qs(urlsplit(path).query).get("token", [""])[0]
+    if hmac.compare_digest(given.encode(), token.encode()):
+        return AccessDecision(True, cookie=f"{cookie_name(host)}={token}; HttpOnly; SameSite=Strict; Path=/")
+    pairs = (pair.strip().partition("=") for pair in headers.get("Cookie", "").split(";"))
+    kept = [value.strip('"') for key, _, value in pairs if key == cookie_name(host)]
+    if any(hmac.compare_digest(value.encode(), token.encode()) for value in kept):
+        return AccessDecision(True)
+    return AccessDecision(False, "expected the token that `splatgraft edit` printed: open the complete address")
+
+
+def cookie_name(host: str) -> str:
+    """Name of the cookie for a Host header: browsers send the cookies of all ports of a host to each of them."""
+    port = re.search(r":([0-9]+)$", host)
+    return f"splatgraft_token_{port[1] if port else 'default'}"
+
+
+def allowed_query(path: str) -> str | None:
+    """The query with which a page is to be opened instead, with its question mark; None where it can stay.
+
+    Only the token is allowed: viser's page takes the address of another server from its query, whose controls may
+    hold scripts.
+
+    Args:
+        path: Request path with its query.
+    """
+    given = parse_qsl(urlsplit(path).query, keep_blank_values=True)
+    allowed = [(key, value) for key, value in given if key == "token"]
+    return None if allowed == given else f"?{urlencode(allowed)}"
+
+
+def _name(host: str) -> str:
+    """The name in a Host header; empty where the header is malformed."""
+    found = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(:[0-9]+)?", host)
+    return found[1].strip("[]").lower() if found else ""

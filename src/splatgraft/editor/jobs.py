@@ -1,0 +1,231 @@
+"""Jobs: child processes that outlive the page and the server and report progress in a state file.
+
+A lock file shows whether the process of a job is alive.
+"""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import filelock
+
+from splatgraft.runtime.files import atomic_write
+
+_STATE_FILE, _LOG_FILE, _LOCK_FILE = "job.json", "job.log", "job.lock"
+Outcome = Literal["starting", "running", "done", "failed", "cancelled", "killed"]
+_MIN_SPENT = 2.0
+"""Seconds after which a counter's rate is taken for measured."""
+
+
+@dataclass(frozen=True)
+class PlannedStep:
+    """A step of a job's plan."""
+
+    name: str
+    """Name of the step."""
+    seconds: float
+    """Expected duration."""
+    is_measured: bool
+    """Whether `seconds` is the duration of an earlier run of this step, rather than a default."""
+
+
+@dataclass(frozen=True)
+class JobState:
+    """Progress of a job, as last written by its process."""
+
+    title: str
+    """Title for the user."""
+    command: tuple[str, ...]
+    """Arguments of the equivalent `splatgraft` command."""
+    pid: int
+    """Process id; the process leads its own process group."""
+    outcome: Outcome
+    """`killed`: the process ended without writing an outcome."""
+    started: float
+    """Time of the start, seconds since 1970."""
+    step: str = ""
+    """The running step."""
+    done: int = 0
+    """Finished units of the running step."""
+    total: int = 0
+    """Total units of the running step; 0 where not known yet."""
+    message: str = ""
+    """Progress message of the step."""
+    step_started: float = 0.0
+    """Start of the running step, seconds since 1970."""
+    begun: int = 0
+    """Units that an earlier, killed run had finished when counting began."""
+    begun_at: float = 0.0
+    """When counting began, seconds since 1970; a step with several counters begins several times."""
+    error: str = ""
+    """Error message, one line; empty unless the outcome is `failed`."""
+    plan: tuple[PlannedStep, ...] = ()
+    """All steps of the job in order; empty where they are not known."""
+    said: tuple[str, ...] = ()
+    """Sentences for the user on what was done; empty before the outcome `done`."""
+
+    @property
+    def live(self) -> bool:
+        """Whether the job is starting or running."""
+        return self.outcome in ("starting", "running")
+
+    @property
+    def fraction(self) -> float:
+        """Finished fraction of the running step, in [0, 1]."""
+        return min(1.0, self.done / self.total) if self.total else 0.0
+
+
+def seconds_left(state: JobState, now: float) -> float | None:
+    """Seconds until the running step's counter is complete, by the rate since it began; None where it is too early."""
+    spent, done = now - state.begun_at, state.done - state.begun
+    if not state.live or not 0 < done < state.total - state.begun or spent < _MIN_SPENT:
+        return None
+    return spent * (state.total - state.done) / done
+
+
+def seconds_left_in_job(state: JobState, now: float) -> float | None:
+    """Seconds until the job ends; None unless each part of it was measured.
+
+    The running step counts by its rate, or by its duration in the last run while it has no rate yet; later steps by
+    their durations in the last run.
+    """
+    names = [step.name for step in state.plan]
+    if not state.live or state.step not in names:
+        return None
+    at = names.index(state.step)
+    current, later = state.plan[at], state.plan[at + 1 :]
+    left = seconds_left(state, now)
+    if current.is_measured:
+        # the counter may be one of several of this step
+        expected = current.seconds - (now - state.step_started)
+        left = max(left or 0.0, expected) if expected > 0 else left
+    if left is None or not all(step.is_measured for step in later):
+        return None
+    return left + sum(step.seconds for step in later)
+
+
+def write_state(folder: Path, state: JobState) -> None:
+    """Replace the state file atomically."""
+    with atomic_write(folder / _STATE_FILE) as stream:
+        stream.write((json.dumps(asdict(state)) + "\n").encode())
+
+
+class Jobs:
+    """At most one job at a time per folder, also across processes."""
+
+    def __init__(self, folder: Path) -> None:
+        """Attach to the job that runs in `folder`, if any."""
+        self.folder = folder
+        self._child: subprocess.Popen[bytes] | None = None
+
+    def start(self, command: Sequence[str], *, title: str, shown: Sequence[str]) -> None:
+        """Start a job.
+
+        Args:
+            command: Command line; its process must call `acquire_job_lock`.
+            title: Title for the user.
+            shown: Arguments of the equivalent `splatgraft` command.
+
+        Raises:
+            ValueError: If a job is running already.
+        """
+        try:
+            state = self.state()
+        except ValueError:
+            # replaced by that of the new job; a job at work still holds its lock
+            state = None
+            (self.folder / _STATE_FILE).unlink(missing_ok=True)
+        if state is not None and state.live:
+            raise ValueError(f"{state.title}: expected no other job, found this one running; wait or cancel it")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / _LOG_FILE).open("wb") as log:
+            self._child = subprocess.Popen(
+                list(command), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+            )
+        first = JobState(title, tuple(shown), self._child.pid, "starting", time.time())
+        # the child may have written a newer state already
+        if not (found := self._read()) or found.pid != self._child.pid:
+            write_state(self.folder, first)
+
+    def state(self) -> JobState | None:
+        """The state of the running job, else of the last one; None where there was none.
+
+        Raises:
+            ValueError: If the state file is damaged.
+        """
+        if self._child is not None:
+            self._child.poll()
+        state = self._read()
+        if state is None or not state.live:
+            return state
+        # a starting process has not locked yet; a running one is alive as long as the lock is held
+        is_alive = _is_locked(self.folder / _LOCK_FILE) if state.outcome == "running" else self._is_alive(state.pid)
+        if is_alive:
+            return state
+        state = self._read() or state
+        return replace(state, outcome="killed") if state.live else state
+
+    def cancel(self) -> None:
+        """Interrupt the process group of the running job; earlier results stay complete."""
+        state = self.state()
+        if state is not None and state.live:
+            if hasattr(os, "killpg"):
+                os.killpg(state.pid, signal.SIGINT)
+            else:
+                os.kill(state.pid, signal.SIGTERM)
+
+    def _read(self) -> JobState | None:
+        path = self.folder / _STATE_FILE
+        try:
+            found = json.loads(path.read_text())
+            plan = tuple(PlannedStep(**step) for step in found.pop("plan", ()))
+            texts = {name: tuple(found.pop(name)) for name in ("command", "said")}
+            state = JobState(**found, **texts, plan=plan)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise ValueError(f"{path}: expected the state of a job, found {error}") from error
+        # a process is signalled by this number: 0 and below would be a group, or all processes
+        numbers = (state.started, state.done, state.total, state.step_started, state.begun, state.begun_at)
+        is_good = isinstance(state.pid, int) and state.pid > 1 and state.outcome in get_args(Outcome)
+        if not is_good or not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
+            raise ValueError(f"{path}: expected the state of a job, found values of another type")
+        return state
+
+    def _is_alive(self, pid: int) -> bool:
+        if self._child is not None and self._child.pid == pid:
+            return self._child.poll() is None
+        try:
+            os.kill(pid, 0)
+        except OSError:
+            return False
+        return True
+
+
+def acquire_job_lock(folder: Path) -> filelock.BaseFileLock:
+    """Lock the job folder; the operating system releases the lock when the process ends.
+
+    Raises:
+        ValueError: If another job holds the lock.
+    """
+    lock = filelock.FileLock(folder / _LOCK_FILE)
+    try:
+        lock.acquire(timeout=0)
+    except filelock.Timeout as error:
+        raise ValueError(f"{folder}: expected no other job running here, found one") from error
+    return lock
+
+
+def _is_locked(path: Path) -> bool:
+    try:
+        with filelock.FileLock(path).acquire(timeout=0):
+            return False
+    except filelock.Timeout:
+        return True

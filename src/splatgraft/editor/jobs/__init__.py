@@ -1,1 +1,0 @@
-"""Jobs in child processes, and exports of results."""

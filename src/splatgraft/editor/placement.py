@@ -1,0 +1,296 @@
+"""An object's placement: its handles and its size, and operations such as drop, upright, rescale and duplicate."""
+
+import math
+import warnings
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from splatgraft.composition import ObjectBase, PlaceOptions, RestOptions, object_base, place_object, rest_on_surface
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.core.similarity import Similarity
+from splatgraft.editor.state import check_height_cm
+from splatgraft.formats.metric_scale import MetricScale
+
+Triple = tuple[float, float, float]
+
+_BESIDE = 2.2
+"""Distance of a duplicate over the object's reach to the sides: a fifth of it remains between them."""
+_INSIDE = 0.98
+"""Share of an object's Gaussians within its reach, so that floaters do not count."""
+_DIRECTIONS = 8
+"""Directions in which a place for a duplicate is looked for."""
+_MIN_FLAT = 0.6
+"""Share of the object's base that stands on the surface."""
+_SAME_HEIGHT = 0.15
+"""Largest difference of heights over the object's own, at which two places count as one surface."""
+
+
+@dataclass(frozen=True)
+class Gizmo:
+    """Pose and scale of the transform gizmo, which is shown at the object's pivot."""
+
+    position: Triple
+    """Of the pivot, in the target."""
+    wxyz: tuple[float, float, float, float]
+    """Rotation from the object's to the target's axes."""
+    scale: float
+    """Size in the target over size in the object's capture."""
+
+
+def gizmo_from_similarity(target_from_object: Similarity, pivot: Float[Tensor, "3"]) -> Gizmo:
+    """The gizmo of an object placed by `target_from_object`, at `pivot` of the object's own frame."""
+    w, i, j, k = quaternion_from_rotation(target_from_object.rotation[None])[0].tolist()
+    x, y, z = target_from_object.points(pivot).tolist()
+    return Gizmo((x, y, z), (w, i, j, k), target_from_object.scale)
+
+
+def similarity_from_gizmo(gizmo: Gizmo, pivot: Float[Tensor, "3"]) -> Similarity:
+    """The placement that puts `pivot` where the gizmo is."""
+    rotation = rotation_from_quaternion(torch.tensor([gizmo.wxyz], dtype=torch.float64))[0]
+    translation = torch.tensor(gizmo.position, dtype=torch.float64) - gizmo.scale * rotation @ pivot.double()
+    return Similarity(scale=gizmo.scale, rotation=rotation.float(), translation=translation.float())
+
+
+def degrees_from_quaternion(wxyz: tuple[float, float, float, float]) -> Triple:
+    """Rotation angles about the fixed x, then y, then z axis, in degrees."""
+    w, i, j, k = wxyz
+    with warnings.catch_warnings(action="ignore"):  # gimbal lock: one of many triples is as good as another
+        x, y, z = Rotation.from_quat([i, j, k, w]).as_euler("xyz", degrees=True).tolist()
+    return x, y, z
+
+
+def quaternion_from_degrees(degrees: Triple) -> tuple[float, float, float, float]:
+    """The quaternion wxyz of rotations about the fixed x, then y, then z axis, in degrees."""
+    i, j, k, w = Rotation.from_euler("xyz", degrees, degrees=True).as_quat().tolist()
+    return w, i, j, k
+
+
+@dataclass(frozen=True)
+class ObjectSize:
+    """The size of one placed object, and what is known of the captures' units."""
+
+    height: float
+    """From its base to its top, units of its own capture."""
+    scale: float
+    """Size in the target over size in its own capture."""
+    own: MetricScale | None
+    """Of its own capture; None where it is not known, or the object was added from a file."""
+    place: MetricScale | None
+    """Of the target's capture; None where it is not known."""
+
+    @property
+    def here_cm(self) -> float | None:
+        """Height in the target; None where its scale is not known."""
+        return None if self.place is None else 100 * self.place.metres_per_unit * self.scale * self.height
+
+    @property
+    def true_cm(self) -> float | None:
+        """Height in its own capture; None where that one's scale is not known."""
+        return None if self.own is None else 100 * self.own.metres_per_unit * self.height
+
+    def scale_at(self, here_cm: float) -> float:
+        """The `scale` at which the object is that tall in the target.
+
+        Raises:
+            ValueError: The height is out of range, or the target's scale is not known.
+        """
+        check_height_cm(here_cm)
+        if self.place is None:
+            raise ValueError("target: expected a capture whose scale is known, found none; see `splatgraft scale`")
+        return 0.01 * here_cm / (self.place.metres_per_unit * self.height)
+
+    def own_from(self, true_cm: float) -> MetricScale:
+        """The scale of its own capture, where the object is that tall.
+
+        Raises:
+            ValueError: The height is out of range.
+        """
+        check_height_cm(true_cm)
+        return MetricScale(0.01 * true_cm / self.height, f"the object's height of {true_cm:g} cm")
+
+    def place_from(self, here_cm: float) -> MetricScale:
+        """The scale of the target's capture, where the object is that tall at its present scale.
+
+        Raises:
+            ValueError: The height is out of range.
+        """
+        check_height_cm(here_cm)
+        found = 0.01 * here_cm / (self.scale * self.height)
+        return MetricScale(found, f"a placed object's height of {here_cm:g} cm")
+
+
+@dataclass(frozen=True)
+class PlaceableObject:
+    """An object with its base and the capture that it comes from."""
+
+    gaussians: Gaussians
+    """In the frame of its own capture."""
+    base: ObjectBase
+    """Its base: lowest point, up and size, in the same frame."""
+    cameras: Cameras
+    """Cameras of its capture; those of the target where the object was added from a file."""
+    surroundings: Gaussians | None
+    """Its capture without the object; None where not known."""
+
+
+def placeable_object(gaussians: Gaussians, cameras: Cameras, surroundings: Gaussians | None) -> PlaceableObject:
+    """Estimate an object's base.
+
+    Raises:
+        ValueError: If the object is empty.
+    """
+    base = object_base(gaussians, up=estimate_up(cameras), surroundings=surroundings)
+    return PlaceableObject(gaussians, base, cameras, surroundings)
+
+
+def suggest_placement(
+    target: Gaussians, item: PlaceableObject, cameras: Cameras, options: PlaceOptions = PlaceOptions()
+) -> Similarity:
+    """A visible, level place at a plausible size, found as by `compose` with `options`.
+
+    Raises:
+        ValueError: If there is no such place.
+    """
+    both = (cameras, item.cameras)
+    placed = place_object(target, item.gaussians, cameras=both, surroundings=item.surroundings, options=options)
+    return placed.target_from_object
+
+
+def drop_to_surface(
+    target: Gaussians, item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]
+) -> Similarity:
+    """Move vertically onto the surface and align with it; scale and rotation about the vertical stay.
+
+    Raises:
+        ValueError: If nothing lies below.
+    """
+    base_point = target_from_object.points(item.base.point)
+    # start at half the object's height: a sunk object is lifted, and surfaces above the object are ignored
+    above = base_point + 0.5 * target_from_object.scale * item.base.height * torch.nn.functional.normalize(up, dim=0)
+    straight, support = rest_on_surface(
+        target, item.base, point=above, up=up, options=RestOptions(scale=target_from_object.scale)
+    )
+    twist = _twist_about(target_from_object.rotation @ straight.rotation.T, support.normal)
+    options = RestOptions(scale=target_from_object.scale, yaw_deg=math.degrees(twist))
+    return rest_on_surface(target, item.base, point=above, up=up, options=options)[0]
+
+
+def align_up(item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]) -> Similarity:
+    """Apply the smallest rotation that aligns the object's up with `up`; the base point stays fixed."""
+    up = torch.nn.functional.normalize(up, dim=0)
+    rotation = _shortest_rotation(target_from_object.rotation @ item.base.up, up) @ target_from_object.rotation
+    return _about_base_point(item, target_from_object, rotation=rotation, scale=target_from_object.scale)
+
+
+def rescale(item: PlaceableObject, target_from_object: Similarity, scale: float) -> Similarity:
+    """Set the scale; the base point stays fixed."""
+    return _about_base_point(item, target_from_object, rotation=target_from_object.rotation, scale=scale)
+
+
+def plausible_scale(
+    target: Gaussians, item: PlaceableObject, target_from_object: Similarity, cameras: Cameras
+) -> float:
+    """The scale at which the object fills the default share of the views at its place.
+
+    Raises:
+        ValueError: If nothing lies below.
+    """
+    x, y, z = (
+        target_from_object.points(item.base.point)
+        + 0.25 * target_from_object.scale * item.base.height * estimate_up(cameras)
+    ).tolist()
+    options = PlaceOptions(point=(x, y, z), yaw_deg=0.0)
+    return place_object(
+        target, item.gaussians, cameras=(cameras, item.cameras), surroundings=item.surroundings, options=options
+    ).target_from_object.scale
+
+
+def place_beside(
+    target: Gaussians, item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]
+) -> tuple[Similarity, bool]:
+    """The same object on the surface beside itself, at the same height.
+
+    Args:
+        target: The scene, with the objects that stand in it.
+        item: The object.
+        target_from_object: Its placement.
+        up: Up direction of the target.
+
+    Returns:
+        The placement, and whether a surface at that height was found; else the object stands beside itself in the air.
+    """
+    up = torch.nn.functional.normalize(up, dim=0)
+    axis = torch.eye(3)[int(up.abs().argmin())]
+    across = torch.nn.functional.normalize(axis - (axis @ up) * up, dim=0)
+    along = torch.linalg.cross(up, across)
+    size = target_from_object.scale * item.base.height
+    step = _BESIDE * target_from_object.scale * _reach(item)
+    old = float(target_from_object.points(item.base.point) @ up)
+    options = RestOptions(scale=target_from_object.scale)
+    for turn in range(_DIRECTIONS):
+        angle = 2 * math.pi * turn / _DIRECTIONS
+        shift = step * (math.cos(angle) * across + math.sin(angle) * along)
+        shifted = _shifted(target_from_object, shift)
+        above = shifted.points(item.base.point) + 0.5 * size * up
+        try:
+            support = rest_on_surface(target, item.base, point=above, up=up, options=options)[1]
+        except ValueError:
+            continue  # nothing lies below there
+        drop = float(support.point @ up) - old
+        if abs(drop) <= _SAME_HEIGHT * size and support.flat_fraction >= _MIN_FLAT:
+            # it keeps its rotation: only the height is that of the surface
+            return _shifted(shifted, drop * up), True
+    return _shifted(target_from_object, step * across), False
+
+
+def snapped_angles(degrees: tuple[float, float, float], step: float) -> tuple[float, float, float]:
+    """Angles rounded to multiples of `step` degrees."""
+    x, y, z = (round(angle / step) * step for angle in degrees)
+    return x, y, z
+
+
+def _reach(item: PlaceableObject) -> float:
+    """How far an object reaches to the sides of its foot, in its own units."""
+    offset = item.gaussians.means - item.base.point
+    sideways = (offset - (offset @ item.base.up)[:, None] * item.base.up).norm(dim=1)
+    return max(item.base.radius, float(sideways.quantile(_INSIDE)))
+
+
+def _shifted(target_from_object: Similarity, shift: Float[Tensor, "3"]) -> Similarity:
+    return replace(target_from_object, translation=target_from_object.translation + shift)
+
+
+def _about_base_point(
+    item: PlaceableObject, target_from_object: Similarity, *, rotation: Float[Tensor, "3 3"], scale: float
+) -> Similarity:
+    base_point = target_from_object.points(item.base.point)
+    return Similarity(scale=scale, rotation=rotation, translation=base_point - scale * rotation @ item.base.point)
+
+
+def _twist_about(rotation: Float[Tensor, "3 3"], axis: Float[Tensor, "3"]) -> float:
+    """The twist angle of `rotation` about unit `axis` (swing-twist decomposition), radians."""
+    skew = torch.stack(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    trace = rotation.diagonal().sum()
+    # the quaternion is (1 + trace, skew) up to a factor, which gives the tangent of half the twist angle
+    return 2 * math.atan2(float(skew @ axis), 1 + float(trace))
+
+
+def _shortest_rotation(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    axis = torch.linalg.cross(start, end)
+    sine, cosine = float(axis.norm()), float(start @ end)
+    if sine < 1e-6:
+        if cosine > 0:
+            return torch.eye(3)
+        helper = torch.eye(3)[int(start.abs().argmin())]
+        axis, sine = torch.linalg.cross(start, helper), 0.0
+    vector = math.atan2(sine, cosine) * torch.nn.functional.normalize(axis, dim=0).double()
+    return torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_matrix()).float()

@@ -1,1 +1,0 @@
-"""Preview images of the edited scene, with full or draft relighting."""

@@ -1,0 +1,206 @@
+"""The project that is edited: its files by project.toml, which steps are stale, and the commands that run them."""
+
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from splatgraft.commands.init import Init
+from splatgraft.commands.steps.capture import Capture
+from splatgraft.commands.steps.compose import Compose
+from splatgraft.commands.steps.relight import Relight
+from splatgraft.commands.steps.segment import Segment
+from splatgraft.composition import PlaceOptions
+from splatgraft.editor.placement import Triple
+from splatgraft.exports.export import Layer
+from splatgraft.formats import is_scene
+from splatgraft.project.layout import (
+    CAMERAS_FILE,
+    EDITOR_FOLDER,
+    LIGHT_FILE,
+    PLACEMENT_FILE,
+    SCENE_FILE,
+    SELECTION_FILE,
+    SURROUNDINGS_FILE,
+    Side,
+)
+from splatgraft.project.toml_edit import with_keys
+from splatgraft.relighting import RelightOptions
+from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.console import Console
+from splatgraft.workflow.flow import Flow, read_flow
+from splatgraft.workflow.staleness import reasons
+
+ExportPage = Literal["viewer", "report"]
+"""What an exported .html holds."""
+PROBLEM = "project"
+"""Entry of `Project.reasons` where project.toml is invalid."""
+
+
+@dataclass(frozen=True)
+class RenderedViews:
+    """How images of a scene without photographs are rendered."""
+
+    up: Triple | None = None
+    """Up direction in the scene's frame; None: estimated."""
+    is_within: bool = False
+    """Whether the cameras look outwards from the middle of the scene, else at it from around."""
+
+
+@dataclass(frozen=True)
+class ProjectFiles:
+    """Paths and options of one project; most files need not exist yet."""
+
+    file: Path
+    """project.toml; placement.json, light.json, erased.npy and corrections.npy lie beside it."""
+    root: Path
+    """All results; uploads and exports too."""
+    source_scene: Path
+    """The reconstruction with the object."""
+    target_scene: Path
+    """The reconstruction that receives it."""
+    source_cameras: Path
+    """transforms.json of the posed source."""
+    target_cameras: Path
+    """transforms.json of the posed target, which lies beside its photographs."""
+    object: Path
+    """The object's Gaussians."""
+    surroundings: Path
+    """The source without the object."""
+    selection: Path
+    """Which Gaussians of the source are the object."""
+    placement: Path
+    """The composite's placement.json, which names its objects."""
+    relit: Path
+    """The composite with the light transfer."""
+    light: Path
+    """light.json as estimated, or as given."""
+    result: Path
+    """The consolidated scene."""
+    report: Path
+    """The folder of index.html."""
+    without_photos: tuple[bool, bool]
+    """Whether source and target are scenes without photographs, whose images are rendered from the scene."""
+    rendered_views: tuple[RenderedViews, RenderedViews]
+    """How the images of source and target are rendered, where they are scenes without photographs."""
+    light_mode: Literal["transfer", "gain", "off"]
+    """`light` of [relight]: the physical transfer, a gain of the object alone, or nothing."""
+    relight_options: RelightOptions
+    """`options` of [relight]."""
+    place_options: PlaceOptions
+    """Placement options of [compose], for objects without a placement."""
+
+    @property
+    def transfers_light(self) -> bool:
+        """Whether the physical light transfer is used, so that there is a light to estimate and edit."""
+        return self.light_mode == "transfer"
+
+
+@dataclass(frozen=True)
+class Project:
+    """A project whose project.toml may not exist yet."""
+
+    file: Path
+    """project.toml."""
+    out: Path | None = None
+    """Folder of all results; None: the folder of project.toml."""
+
+    def files(self) -> ProjectFiles | None:
+        """The project's files; None where project.toml does not exist yet.
+
+        Raises:
+            ValueError: If project.toml is invalid.
+        """
+        if not self.file.is_file():
+            return None
+        flow = read_flow(self.file, self.out)
+        layout = flow.layout
+        segment, compose, relight = (flow.steps[name] for name in ("segment", "compose", "relight"))
+        assert isinstance(segment, Segment)
+        assert isinstance(compose, Compose)
+        assert isinstance(relight, Relight)
+        return ProjectFiles(
+            file=self.file,
+            root=layout.root,
+            source_scene=segment.scene,
+            target_scene=compose.target,
+            source_cameras=layout.capture("source") / CAMERAS_FILE,
+            target_cameras=layout.capture("target") / CAMERAS_FILE,
+            object=compose.object,
+            surroundings=layout.object / SURROUNDINGS_FILE,
+            selection=layout.object / SELECTION_FILE,
+            placement=layout.composite / PLACEMENT_FILE,
+            relit=layout.relit / SCENE_FILE,
+            light=layout.relit / LIGHT_FILE,
+            result=layout.result / SCENE_FILE,
+            report=layout.report,
+            without_photos=(_has_no_photos(flow, "source"), _has_no_photos(flow, "target")),
+            rendered_views=(_rendered_views(flow, "source"), _rendered_views(flow, "target")),
+            light_mode=relight.light,
+            relight_options=relight.options,
+            place_options=compose.options,
+        )
+
+    def reasons(self) -> Mapping[str, str | None]:
+        """For each step why it is stale, as in `status`; one entry with the error where project.toml is invalid."""
+        try:
+            return reasons(read_flow(self.file, self.out))
+        except ValueError as error:
+            return {PROBLEM: str(error)}
+
+    def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
+        """Write project.toml.
+
+        Args:
+            captures: Source and target: captures or scene files.
+            scenes: Scenes trained on these captures, where there are any.
+
+        Raises:
+            ValueError: If a capture or a scene is missing, or project.toml exists.
+        """
+        for scene in scenes:
+            if scene is not None and not scene.is_file():
+                raise ValueError(f"{scene}: expected a trained scene, found no such file")
+        Init(folder=self.file.parent, source=captures[0], target=captures[1]).execute(Console())
+        for side, scene in zip(("source", "target"), scenes, strict=True):
+            if scene is not None:
+                self._set_keys(side, {"scene": os.path.relpath(scene, self.file.parent)})
+
+    def set_view(self, side: Side, views: RenderedViews) -> None:
+        """Set how images of a scene without photographs are rendered."""
+        self._set_keys(side, {"up": views.up, "look": "within" if views.is_within else None})
+
+    def _set_keys(self, table: str, keys: Mapping[str, object]) -> None:
+        text = with_keys(self.file.read_text(encoding="utf-8"), table, keys)
+        with atomic_write(self.file) as stream:
+            stream.write(text.encode())
+
+    def run_words(self, to: str) -> tuple[str, ...]:
+        """The command that runs the stale steps up to `to`, after `splatgraft`."""
+        out = () if self.out is None else ("--out", str(self.out))
+        return ("run", str(self.file), "--to", to, *out)
+
+    def export_words(self, to: Path, *, page: ExportPage, layer: Layer) -> tuple[str, ...]:
+        """The command that writes the result, or a part of it, as a file whose suffix names the format."""
+        part = ("--page", page) if page == "report" else () if layer == "all" else ("--layer", layer)
+        return ("export", str(self._root()), "--to", str(to), *part)
+
+    def job_command(self, words: tuple[str, ...], title: str) -> tuple[str, ...]:
+        """The command line of the child process that runs one of these commands as a job."""
+        return (sys.executable, "-m", "splatgraft.editor.job_process", str(self._root() / EDITOR_FOLDER), title, *words)
+
+    def _root(self) -> Path:
+        files = self.files()
+        return self.file.parent if files is None else files.root
+
+
+def _has_no_photos(flow: Flow, side: Side) -> bool:
+    step = flow.steps[f"{side}/capture"]
+    return isinstance(step, Capture) and is_scene(step.capture)
+
+
+def _rendered_views(flow: Flow, side: Side) -> RenderedViews:
+    step = flow.steps[f"{side}/capture"]
+    return RenderedViews(step.look.up, step.look.look == "within") if isinstance(step, Capture) else RenderedViews()

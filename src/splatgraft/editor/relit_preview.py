@@ -1,0 +1,299 @@
+"""The edited scene with transferred light for pictures: the result of the step `relight`, and faster drafts of it.
+
+A draft relights a reduced level of detail and copies the layers to the nearest Gaussians at full detail.
+"""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from splatgraft.core.composite import Composite
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.scene_cache import SceneCache
+from splatgraft.editor.state import EditState
+from splatgraft.relighting import Light, Relit, SourceScene, relight
+from splatgraft.relighting.gain_transfer import relight_by_gain
+from splatgraft.relighting.prepared_scene import REGION
+from splatgraft.runtime.memo import Memo
+
+TARGET_BUDGET, OBJECT_BUDGET = 30_000, 8_000
+"""Numbers of Gaussians; relighting this many after a change of the light takes about a second on one core."""
+
+
+@dataclass(frozen=True)
+class CoarseGaussians:
+    """A subset of a scene's Gaussians, with the nearest member of the subset for each Gaussian of the scene."""
+
+    gaussians: Gaussians
+    """The m Gaussians that cover most."""
+    nearest: Int[Tensor, "n"]
+    """For each of the scene's n Gaussians the index of the nearest of `gaussians`."""
+
+    @cached_property
+    def none_erased(self) -> Bool[Tensor, "m"]:
+        """All False; always the same tensor, so that memos compare it by identity."""
+        return torch.zeros(self.gaussians.count, dtype=torch.bool)
+
+
+def coarsen(gaussians: Gaussians, budget: int) -> CoarseGaussians:
+    """Reduce a scene to at most `budget` Gaussians; the same object where it has no more."""
+    if gaussians.count <= budget:
+        return CoarseGaussians(gaussians, torch.arange(gaussians.count))
+    subset = gaussians.select(largest_coverage_indices(gaussians, budget))
+    nearest = KDTree(subset.means.double().numpy()).query(gaussians.means.double().numpy())[1]
+    return CoarseGaussians(subset, torch.from_numpy(nearest).long())
+
+
+def coarse_composite(composite: Composite, target: CoarseGaussians, objects: Sequence[CoarseGaussians]) -> Composite:
+    """The composite of the coarse target, from which the erased Gaussians are removed, and the coarse objects."""
+    placed = zip(composite.objects, objects, strict=True)
+    return Composite(
+        target=target.gaussians,
+        objects=tuple(replace(one, gaussians=coarse.gaussians) for one, coarse in placed),
+        erased=target.none_erased,
+    )
+
+
+def upsample_light(relit: Relit, composite: Composite, parts: Sequence[CoarseGaussians]) -> Relit:
+    """Copy the layers of a relit coarse composite to all Gaussians of `composite`, from the nearest coarse Gaussian.
+
+    Args:
+        relit: Result on the coarse composite; no Gaussian of it may have been split.
+        composite: The full composite.
+        parts: The coarse target, then the coarse objects.
+    """
+    counts = [part.gaussians.count for part in parts]
+    assert relit.gaussians.count == sum(counts)
+    starts = torch.tensor([0, *counts[:-1]]).cumsum(0).tolist()
+    row = torch.cat([part.nearest + start for part, start in zip(parts, starts, strict=True)])
+    gaussians, is_object = composite.merged()
+    return Relit(
+        gaussians=gaussians,
+        is_object=is_object,
+        origin=torch.arange(gaussians.count),
+        shade=relit.shade[row],
+        shadow=relit.shadow[row],
+        bounce=relit.bounce[row],
+        # valid over the width of a coarse Gaussian only
+        slope=relit.slope.new_zeros(len(row), *relit.slope.shape[1:]),
+        gloss=relit.gloss[row],
+        bands_replaced=relit.bands_replaced[row],
+        objects=tuple(placed.in_target() for placed in composite.objects),
+        light=relit.light,
+        report=relit.report,
+    )
+
+
+def largest_coverage_indices(gaussians: Gaussians, budget: int) -> Int[Tensor, "m"]:
+    """Indices of the at most `budget` Gaussians with the largest opacity times disc area, in ascending order."""
+    if gaussians.count <= budget:
+        return torch.arange(gaussians.count)
+    two_largest = gaussians.log_scales.sort(dim=1).values[:, 1:].sum(1)
+    log_coverage = torch.nn.functional.logsigmoid(gaussians.opacity_logits) + two_largest
+    return log_coverage.topk(budget).indices.sort().values
+
+
+class RelitPreview:
+    """Relit scenes of one project; intermediate results are memoised by their inputs."""
+
+    def __init__(self, scenes: SceneCache) -> None:
+        """Start with empty memos."""
+        self._scenes = scenes
+        self._relight_memo, self._draft_memo = Memo(), Memo()
+        self._region_poses: bytes = b""
+        """Of the objects, when the region in `_relight_memo` was chosen."""
+        self._memo = Memo()
+        self._full_lock, self._draft_lock, self._composite_lock = threading.RLock(), threading.RLock(), threading.Lock()
+
+    def composite(self, state: EditState) -> Composite:
+        """The target with the placed objects; the same object for the same edits.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        inputs = (self._scenes.gaussians(self._scenes.files.target_scene), state.objects, state.erased)
+        # memos recognise a composite by identity: two threads must get the same one
+        with self._composite_lock:
+            return self._memo.get("composite", inputs, lambda: self._scenes.composite(state))
+
+    def has_draft(self, state: EditState) -> bool:
+        """Whether a draft, a refined one or the light itself of this state is memoised."""
+        return (
+            self.is_relit(state) or self.is_refined(state) or self._memo.peek("draft", self._inputs(state)) is not None
+        )
+
+    def is_refined(self, state: EditState) -> bool:
+        """Whether a refined draft of this state is memoised."""
+        return self._memo.peek("refined", self._inputs(state)) is not None
+
+    def is_relit(self, state: EditState) -> bool:
+        """Whether the light of this state is memoised, or project.toml selects no physical light transfer."""
+        return not self._scenes.files.transfers_light or self._memo.peek("relit", self._inputs(state)) is not None
+
+    def relit(self, state: EditState) -> Relit:
+        """The layers of the full light transfer of this state, as the step computes them.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        return self._make_once("relit", state, self._relight)
+
+    def can_refine(self, state: EditState) -> bool:
+        """Whether objects were moved since the light was estimated: then `refined` takes less time than `relit`."""
+        return self._region_poses not in (b"", _poses(self.composite(state)))
+
+    def refined(self, state: EditState) -> Relit:
+        """All layers after a move under the sources of the light that were estimated before it, at full detail.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        return self._make_once("refined", state, self._refine)
+
+    def draft(self, state: EditState) -> Relit:
+        """A draft of the light transfer: shadow edges are coarse, and the first draft leaves out the source's light.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        return self._make_once("draft", state, self._draft)
+
+    def prepare_drafts(self, state: EditState) -> None:
+        """Compute once what drafts after a move share, which the first draft left out: what lights the source scene.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        composite, sources = self.composite(state), self._scenes.source_scenes(state)
+        if not (_is_large(composite) and self._memo.has("relit")):
+            return
+        with self._draft_lock:
+            shared = (composite.target, composite.erased, *sources)
+            self._memo.get("drafts prepared", shared, lambda: self._draft(state))
+
+    def best_available(self, state: EditState) -> Relit:
+        """The full transfer where it is memoised, else a refined draft, else a draft.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        if self.is_relit(state):
+            return self.relit(state)
+        return self.refined(state) if self.is_refined(state) else self.draft(state)
+
+    def scene(self, state: EditState, *, draft: bool = False) -> Gaussians:
+        """The scene that the step `relight` writes, or a draft of it.
+
+        Raises:
+            ValueError: If a file is missing.
+        """
+        composite, light_mode = self.composite(state), self._scenes.files.light_mode
+        if light_mode == "off":
+            return self.pasted(composite)[0]
+        if light_mode == "gain":
+            return self._memo.get("gain adjusted", (composite,), lambda: self._gain_adjusted(composite, state))
+        relit = self.best_available(state) if draft else self.relit(state)
+        return self._memo.get("scene", (relit, state.weights), lambda: relit.bake(state.weights)[0])
+
+    def pasted(self, composite: Composite) -> tuple[Gaussians, Bool[Tensor, "n"]]:
+        """The scene that the step `compose` writes, and which Gaussians belong to objects."""
+        return self._memo.get("pasted", (composite,), composite.bake)
+
+    def light_mode_note(self) -> str:
+        """What the preview `Light transfer` shows where project.toml selects no physical transfer; else empty."""
+        light_mode = self._scenes.files.light_mode
+        if light_mode == "transfer":
+            return ""
+        described = {"gain": "exposure and white balance of the object alone", "off": "nothing: the object as captured"}
+        return f"{described[light_mode]}, as set in project.toml ([relight] light = {light_mode})"
+
+    def _gain_adjusted(self, composite: Composite, state: EditState) -> Gaussians:
+        cameras, sources = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.source_scenes(state)
+        adjusted, _ = relight_by_gain(composite, cameras, sources=sources)
+        return adjusted.bake()[0]
+
+    def _make_once(self, name: str, state: EditState, make: Callable[[EditState], Relit]) -> Relit:
+        inputs = self._inputs(state)
+        # a memoised result must not wait for a computation in another thread, nor a draft for the light itself
+        found = self._memo.peek(name, inputs)
+        if found is None:
+            # of a small scene, both share a memo of parts
+            is_apart = name == "draft" and _is_large(inputs[0])
+            with self._draft_lock if is_apart else self._full_lock:
+                found = self._memo.get(name, inputs, lambda: make(state))
+        return found
+
+    def _inputs(self, state: EditState) -> tuple[Any, ...]:
+        return (self.composite(state), state.light, repr(self._scenes.files.relight_options))
+
+    def _relight(self, state: EditState) -> Relit:
+        if self.can_refine(state):
+            # the step knows of no place before: sources and shadow maps are those of this one
+            self._relight_memo.forget(REGION)
+            self._region_poses = b""
+        relit = self._refine(state)
+        self._memo.forget("refined")  # a second copy of a large scene
+        return relit
+
+    def _refine(self, state: EditState) -> Relit:
+        return self._relight_composite(self.composite(state), self._scenes.source_scenes(state), light=state.light)
+
+    def _draft(self, state: EditState) -> Relit:
+        composite, sources = self.composite(state), self._scenes.source_scenes(state)
+        if not self._memo.has("relit"):
+            # analysing the source scene takes half of the time of the first result
+            sources = [None] * len(sources)
+        if not _is_large(composite):
+            return self._relight_composite(composite, sources, light=state.light, is_draft=True)
+        memo, kept = self._memo, (composite.target, composite.erased)
+        target = memo.get("coarse target", kept, lambda: coarsen(kept[0].select(~kept[1]), TARGET_BUDGET))
+        objects = [
+            memo.get(f"coarse object {i}", (one.gaussians,), lambda one=one: coarsen(one.gaussians, OBJECT_BUDGET))
+            for i, one in enumerate(composite.objects)
+        ]
+        coarse = coarse_composite(composite, target, objects)
+        coarse_sources = [None if source is None else self._coarse_source(source) for source in sources]
+        relit = self._relight_composite(coarse, coarse_sources, light=state.light, is_draft=True)
+        return upsample_light(relit, composite, [target, *objects])
+
+    def _relight_composite(
+        self,
+        composite: Composite,
+        sources: Sequence[SourceScene | None],
+        *,
+        light: Light | None,
+        is_draft: bool = False,
+    ) -> Relit:
+        cameras, options = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.files.relight_options
+        options = replace(options, most_added=0.0, fitted_views=0) if is_draft else options
+        full_target = self._scenes.gaussians(self._scenes.files.target_scene)
+        memo = self._relight_memo if composite.target is full_target else self._draft_memo
+        if memo is self._relight_memo and not self._region_poses:
+            self._region_poses = _poses(composite)
+        return relight(composite, cameras, sources=sources, light=light, options=options, cache=memo)
+
+    def _coarse_source(self, source: SourceScene) -> SourceScene:
+        def make() -> SourceScene:
+            return replace(source, gaussians=coarsen(source.gaussians, TARGET_BUDGET).gaussians)
+
+        return self._memo.get("coarse source", (source,), make)
+
+
+def _is_large(composite: Composite) -> bool:
+    objects = [one.gaussians.count for one in composite.objects]
+    return composite.kept_count > TARGET_BUDGET or max(objects, default=0) > OBJECT_BUDGET
+
+
+def _poses(composite: Composite) -> bytes:
+    """Where the objects are."""
+    moves = [one.target_from_object for one in composite.objects]
+    return b"".join(
+        part.numpy().tobytes() for m in moves for part in (torch.tensor(m.scale), m.rotation, m.translation)
+    )

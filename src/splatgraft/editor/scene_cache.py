@@ -1,0 +1,215 @@
+"""A project's scenes and cameras in memory, read again when a file changes, and composites of the placed objects."""
+
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from splatgraft.composition import compose
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.composite import Composite
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.editor.placement import PlaceableObject, placeable_object
+from splatgraft.editor.project import ProjectFiles
+from splatgraft.editor.scene_sample import SceneSample, read_sample, sample_count
+from splatgraft.editor.state import EditState
+from splatgraft.formats import read_cameras, read_capture, read_gaussians
+from splatgraft.formats.gaussian_flags import read_flags
+from splatgraft.formats.placement import ObjectPlacement
+from splatgraft.relighting import SourceScene
+from splatgraft.runtime.memo import Memo
+
+_LARGE_BYTES = 12_000_000
+"""A file below is read within a tenth of a second."""
+
+
+class SceneCache:
+    """Contents of a project's files; the same object is returned until the file changes."""
+
+    def __init__(self, files: ProjectFiles) -> None:
+        """Start empty."""
+        self.files = files
+        self.on_read: Callable[[], None] = lambda: None
+        """Called in a thread when a scene that `at_hand` asked for is there, or could not be read."""
+        self._contents: dict[tuple[str, Path], tuple[tuple[int, int], Any]] = {}
+        self._derived = Memo()
+        self._lock = threading.RLock()
+        self._file_locks: dict[tuple[str, Path], threading.RLock] = {}
+        self._reading: set[Path] = set()
+        self._failed: set[Path] = set()
+
+    def gaussians(self, path: Path) -> Gaussians:
+        """The scene in a file.
+
+        Raises:
+            ValueError: If the file is missing or invalid.
+        """
+        return self._read("gaussians", path, read_gaussians)
+
+    def at_hand(self, paths: Iterable[Path]) -> bool:
+        """Whether `gaussians` answers at once; scenes for which it would not are read in the background.
+
+        A file that could not be read counts as at hand, so that whoever uses it reports what is wrong with it.
+        """
+        with self._lock:
+            missing = [path for path in set(paths) - self._failed if not self._is_quick(path)]
+            started = [path for path in missing if path not in self._reading]
+            self._reading |= set(started)
+        for path in started:
+            # a thread for each, so that a small object does not wait for a large scene
+            threading.Thread(target=self._read_ahead, args=(path,), name="splatgraft scene", daemon=True).start()
+        return not missing
+
+    def count(self, path: Path) -> int | None:
+        """Number of Gaussians in a file; None where only reading all of it would tell.
+
+        Raises:
+            ValueError: If the file is missing or invalid.
+        """
+        return self.gaussians(path).count if self._is_quick(path) else sample_count(path)
+
+    def reading_note(self, path: Path) -> str:
+        """What the page says while a scene is read."""
+        count = self.count(path)
+        if count is None:
+            return "The scene is being read."
+        return f"{count:,} Gaussians are being read. A sample is shown meanwhile."
+
+    def sample(self, path: Path) -> SceneSample | None:
+        """Some of a scene's Gaussians, without reading all; None where the file's layout does not allow it."""
+        return self._read("sample", path, read_sample)
+
+    def sampled_gaussians(self, path: Path, erased: Bool[Tensor, "n"] | None = None) -> Gaussians:
+        """As `sample`, with constant colours and without the erased Gaussians; the whole scene where there is none."""
+        whole = self.sample(path)
+        if whole is None:
+            return self.gaussians(path)
+
+        def make() -> Gaussians:
+            found = whole if erased is None else whole.without(erased.numpy())
+            parts = (found.means, found.log_scales, found.quaternions, found.opacity_logits, found.band_0[:, None])
+            return Gaussians(*(torch.from_numpy(part.copy()) for part in parts))
+
+        return self.derive(f"sampled {path}", (whole, erased), make)
+
+    def cameras(self, path: Path) -> Cameras:
+        """The cameras in a file.
+
+        Raises:
+            ValueError: If the file is missing or invalid.
+        """
+        return self._read("cameras", path, read_cameras)
+
+    def capture(self, path: Path) -> PosedImages:
+        """The posed images whose cameras are in a file.
+
+        Raises:
+            ValueError: If the file or one that it names is missing or invalid.
+        """
+        return self._read("capture", path, lambda path: read_capture(path.parent))
+
+    def segmented(self) -> Bool[Tensor, "n"] | None:
+        """Flags of the source's Gaussians in the last result of `segment`; None where there is none."""
+        if not self.files.selection.is_file() or not self.files.source_scene.is_file():
+            return None
+        found = self._read("selection", self.files.selection, read_flags)
+        # flags of another reconstruction do not apply
+        return found if len(found) == self.gaussians(self.files.source_scene).count else None
+
+    def object_path(self, item: ObjectPlacement) -> Path:
+        """The file of a placed object."""
+        return item.object_path or self.files.object
+
+    def base_files(self, objects: Sequence[ObjectPlacement]) -> tuple[Path, ...]:
+        """The scenes that `placeable_object` reads for these objects."""
+        paths = tuple(self.object_path(item) for item in objects)
+        return (*paths, self.files.surroundings) if self.files.object in paths else paths
+
+    def placeable_object(self, item: ObjectPlacement) -> PlaceableObject:
+        """A placed object with its base.
+
+        Raises:
+            ValueError: If its file is missing, invalid or empty.
+        """
+        path = self.object_path(item)
+        gaussians, own = self.gaussians(path), path == self.files.object
+        cameras = self.cameras(self.files.source_cameras if own else self.files.target_cameras)
+        surroundings = self.gaussians(self.files.surroundings) if own and self.files.surroundings.is_file() else None
+        inputs = (gaussians, cameras, surroundings)
+        return self.derive(f"placeable_object {path}", inputs, lambda: placeable_object(*inputs))
+
+    def composite(self, state: EditState) -> Composite:
+        """The target with the placed objects.
+
+        Raises:
+            ValueError: If a file is missing or invalid, or the erased flags belong to another target.
+        """
+        target, erased = self.gaussians(self.files.target_scene), state.erased
+        if erased is None:
+            erased = self.derive("none erased", (target,), lambda: torch.zeros(target.count, dtype=torch.bool))
+        return self._composed(target, state.objects or (), erased)
+
+    def sampled_composite(self, state: EditState) -> Composite:
+        """A sample of the target with those placed objects that are in memory or small.
+
+        Raises:
+            ValueError: If a file is missing or invalid.
+        """
+        target = self.sampled_gaussians(self.files.target_scene, state.erased)
+        items = [item for item in state.objects or () if self._is_quick(self.object_path(item))]
+        return self._composed(target, items, torch.zeros(target.count, dtype=torch.bool))
+
+    def complement(self, name: str, flags: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """The inverted flags; the same tensor for the same flags of that name."""
+        return self.derive(f"complement {name}", (flags,), lambda: ~flags)
+
+    def source_scenes(self, state: EditState) -> list[SourceScene | None]:
+        """The source scene of each placed object, as in the step `relight`; None for objects from other files."""
+        own = [self.object_path(item) == self.files.object for item in state.objects or ()]
+        if not any(own) or not self.files.surroundings.is_file():
+            return [None] * len(own)
+        inputs = (self.gaussians(self.files.surroundings), self.cameras(self.files.source_cameras))
+        source = self.derive("source", inputs, lambda: SourceScene(*inputs))
+        return [source if flag else None for flag in own]
+
+    def derive(self, name: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+        """The memoised result of `make`, computed again when one of `inputs` is another object."""
+        with self._lock:
+            return self._derived.get(name, inputs, make)
+
+    def _composed(self, target: Gaussians, items: Sequence[ObjectPlacement], erased: Bool[Tensor, "n"]) -> Composite:
+        objects = [self.gaussians(self.object_path(item)) for item in items]
+        return compose(target, objects, target_from_objects=[item.target_from_object for item in items], erased=erased)
+
+    def _is_quick(self, path: Path) -> bool:
+        """Whether a scene is in memory, or its file is small or missing."""
+        stamp, cached = _stamp(path), self._contents.get(("gaussians", path))
+        return stamp[1] < _LARGE_BYTES or (cached is not None and cached[0] == stamp)
+
+    def _read(self, kind: str, path: Path, read: Callable[[Path], Any]) -> Any:
+        # one lock per file: while a large scene is read, others are still to be had
+        with self._file_locks.setdefault((kind, path), threading.RLock()):
+            stamp, cached = _stamp(path), self._contents.get((kind, path))
+            if cached is None or cached[0] != stamp:
+                cached = (stamp, read(path))
+                self._contents[kind, path] = cached
+            return cached[1]
+
+    def _read_ahead(self, path: Path) -> None:
+        try:
+            self.gaussians(path)
+        except (ValueError, OSError, MemoryError):
+            self._failed.add(path)
+        with self._lock:
+            self._reading.discard(path)
+        self.on_read()
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """Time and size of a file; zeros where there is none."""
+    return (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)

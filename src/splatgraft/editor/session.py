@@ -1,0 +1,416 @@
+"""An open project: its edits with undo history, saved after every change, and its scenes, pictures and job."""
+
+import contextlib
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.similarity import Similarity
+from splatgraft.editor.history import History, ProjectBackup, StateStore
+from splatgraft.editor.jobs import Jobs, JobState
+from splatgraft.editor.pictures import Pictures
+from splatgraft.editor.placement import ObjectSize, PlaceableObject
+from splatgraft.editor.project import PROBLEM, ExportPage, Project, ProjectFiles, RenderedViews
+from splatgraft.editor.relit_preview import RelitPreview
+from splatgraft.editor.scene_cache import SceneCache
+from splatgraft.editor.state import EditState, check_state
+from splatgraft.editor.state_files import as_written, find_state, state_files, write_state
+from splatgraft.exports.export import Layer
+from splatgraft.formats.metric_scale import read_scale, write_scale
+from splatgraft.formats.placement import ObjectPlacement, read_placement
+from splatgraft.project.layout import EDITOR_FOLDER, Side
+from splatgraft.segmentation import Box, add_correction, apply_corrections
+
+
+class Session:
+    """An open project."""
+
+    def __init__(self, project: Project) -> None:
+        """Open the project with the edits and the undo history of the last session.
+
+        Raises:
+            ValueError: If project.toml is missing or invalid. Other files may be: `notice` names them then.
+        """
+        files = project.files()
+        if files is None:
+            raise ValueError(f"{project.file}: expected a project, found none")
+        self.project = project
+        self.files: ProjectFiles = files
+        self.scenes = SceneCache(files)
+        self.relighting = RelitPreview(self.scenes)
+        self.pictures = Pictures(self.scenes, self.relighting)
+        self.jobs = Jobs(files.root / EDITOR_FOLDER)
+        self.notice: str | None = None
+        """What the user should know of the files; None where all is well."""
+        self._store = StateStore(files.root, project_folder=files.file.parent)
+        self._backup = ProjectBackup(files.file)
+        self._backup.keep()
+        found = find_state(files.file)
+        self.state: EditState = found.state
+        """The current edits; `change` replaces them."""
+        self._problems = dict(found.problems)
+        self._opening_is_step = False
+        self.history: History = self._read_history()
+        if self._problems:
+            self.notice = self._problems_text()
+        self._stamps = self._read_stamps()
+        self._composed: tuple[int, tuple[ObjectPlacement, ...]] = (0, ())
+        self._lock = threading.RLock()
+
+    def change(self, state: EditState) -> None:
+        """Save a new state as one undo step.
+
+        Raises:
+            ValueError: If a value is out of its range, the files were changed outside the editor, which loads that
+                change, or cannot be written.
+        """
+        # an unchanged state adds no undo step
+        self._save(state, lambda history, name: history if name == history.present else history.pushed(name))
+
+    def amend(self, state: EditState) -> None:
+        """Save a changed state as a part of the present undo step.
+
+        Raises:
+            ValueError: As `change`.
+        """
+        self._save(state, History.amended)
+
+    def has_steps(self) -> bool:
+        """Whether there is anything to undo or to redo."""
+        return bool(self.history.past or self.history.future or self._problems)
+
+    def undo(self) -> bool:
+        """Go back by one step; False where there is none. A file that could not be read is a step: it is written anew.
+
+        Raises:
+            ValueError: As `change`.
+        """
+        with self._lock:
+            # files may have been made unreadable since the last look
+            with contextlib.suppress(ValueError):
+                self.reload()
+            if self._problems and not self._opening_is_step:
+                self._restore_files()
+                return True
+            return self._step(History.undone)
+
+    def redo(self) -> bool:
+        """Go forward by one step; False where there is none.
+
+        Raises:
+            ValueError: As `change`.
+        """
+        with self._lock:
+            return self._step(History.redone)
+
+    def set_aside(self) -> None:
+        """Move project.toml, all edits and their history aside; results stay. The session must not be used again.
+
+        Raises:
+            ValueError: If a job is running.
+        """
+        job = self.job()
+        if job is not None and job.live:
+            raise ValueError(f"{job.title}: expected no job at work, found this one; wait or cancel it")
+        self._backup.move_aside((*state_files(self.files.file), *self._store.paths()))
+
+    def reload(self) -> bool:
+        """Load changes made outside the editor as one undo step; whether there were any.
+
+        Raises:
+            ValueError: If a file is invalid; once for each change of the files.
+        """
+        with self._lock:
+            stamps = self._read_stamps()
+            if stamps == self._stamps:
+                return False
+            self._stamps, self._opening_is_step = stamps, False
+            try:
+                found, files = find_state(self.files.file), self.project.files()
+            except ValueError as error:
+                self._problems = {PROBLEM: str(error)}
+                raise ValueError(self._problems_text()) from None
+            self._problems = dict(found.problems)
+            if self._problems:
+                raise ValueError(self._problems_text())
+            self._backup.keep()
+            self.state = found.state
+            name = self._store.save(found.state)
+            if name != self.history.present:
+                self._save_history(self.history.pushed(name))
+            self._use_files(files)
+            return True
+
+    def _save(self, state: EditState, next_history: Callable[[History, str], History]) -> None:
+        check_state(state)
+        with self._lock:
+            state = as_written(state, self.state)
+            self._apply(next_history(self.history, self._store.save(state)), state)
+
+    def _step(self, move: Callable[[History], History]) -> bool:
+        """Move in the history to the next state that can be read."""
+        history = self.history
+        while (moved := move(history)) is not history:
+            history = moved
+            try:
+                state = self._store.read(history.present)
+            except ValueError as error:
+                self.notice = f"{error}; that step is left out"
+                continue
+            self._apply(history, state)
+            return True
+        return False
+
+    def _apply(self, history: History, state: EditState) -> None:
+        if history.present == self.history.present and not self._problems:
+            self._save_history(history)
+            return
+        if self.reload():
+            raise ValueError(
+                f"{self.files.file.name}: changed outside the editor; the change was loaded, please repeat your edit"
+            )
+        if PROBLEM in self._problems:
+            raise ValueError(self._problems_text())
+        if self._problems:
+            self._backup.copy_broken(state_files(self.files.file))
+        write_state(self.files.file, None if self._problems else self.state, state)
+        self.state, self._problems, self._stamps = state, {}, self._read_stamps()
+        self._backup.keep()
+        self._save_history(history)
+
+    def _restore_files(self) -> None:
+        """Write the present state over files that could not be read, of which copies are kept."""
+        folder = self._backup.copy_broken(state_files(self.files.file))
+        if PROBLEM in self._problems:
+            self._backup.restore()
+        write_state(self.files.file, None, self.state)
+        self.notice = (
+            f"written again as before: {', '.join(sorted(self._problems))}; the unreadable files are in {folder}"
+        )
+        self._problems, self._stamps = {}, self._read_stamps()
+        self._use_files(self.project.files())
+
+    def _problems_text(self) -> str:
+        found = "; ".join(dict.fromkeys(self._problems.values()))
+        return f"{found}. All else is open; Undo puts back what was there before"
+
+    def _read_history(self) -> History:
+        """The saved history, with one more step where the files were changed while no editor was open."""
+        try:
+            saved = self._store.read_history()
+        except ValueError as error:
+            self.notice, saved = f"{error}; the undo history is empty now", None
+        now = self._store.save(self.state)
+        self._opening_is_step = saved is not None and saved.present != now
+        history = History(now) if saved is None else saved.pushed(now) if self._opening_is_step else saved
+        self._store.save_history(history)
+        return history
+
+    def _save_history(self, history: History) -> None:
+        self.history = history
+        self._store.save_history(history)
+
+    def _use_files(self, files: ProjectFiles | None) -> None:
+        if files is not None and files != self.files:
+            self.files = self.scenes.files = files
+
+    def _read_stamps(self) -> tuple[tuple[int, int] | None, ...]:
+        files = state_files(self.files.file)
+        return tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in files)
+
+    def set_view(self, side: Side, views: RenderedViews) -> None:
+        """Set how images of a scene without photographs are rendered; not an undo step.
+
+        Raises:
+            ValueError: As `change`.
+        """
+        with self._lock:
+            if self.reload():
+                raise ValueError(f"{self.files.file.name}: changed outside the editor; please repeat your edit")
+            self.project.set_view(side, views)
+            self._stamps = self._read_stamps()
+            self._backup.keep()
+            self._use_files(self.project.files())
+
+    # the selection in the source
+
+    def selection(self) -> Bool[Tensor, "n"] | None:
+        """Flags of the source's Gaussians that are the object: segmented, else in the box, with corrections."""
+        if not self.files.source_scene.is_file():
+            return None
+        scene = self.scenes.gaussians(self.files.source_scene)
+        segmented, state = self.scenes.segmented(), self.state
+        inputs = (scene, segmented, state.box, state.corrections)
+        return self.scenes.derive("selected", inputs, lambda: self._selected(scene, segmented))
+
+    def _selected(self, scene: Gaussians, segmented: Bool[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
+        corrections = self.state.corrections
+        if segmented is None:
+            box = self.box()
+            segmented = torch.zeros(scene.count, dtype=torch.bool) if box is None else box.contains(scene.means)
+        # corrections of another reconstruction do not apply
+        fits = corrections is None or len(corrections) == scene.count
+        return apply_corrections(segmented, corrections) if fits else segmented
+
+    def box(self) -> Box | None:
+        """The box around the object, in the source's world."""
+        numbers = self.state.box
+        return None if numbers is None else Box(torch.tensor(numbers[:3]), torch.tensor(numbers[3:]))
+
+    def correct(self, flags: Bool[Tensor, "n"], *, add: bool) -> None:
+        """Add Gaussians to the object or remove them from it.
+
+        Raises:
+            ValueError: As `change`.
+        """
+        corrections = self.state.corrections
+        if corrections is not None and len(corrections) != len(flags):
+            corrections = None  # of another reconstruction
+        self.change(replace(self.state, corrections=add_correction(corrections, flags, add=add)))
+
+    # the objects in the target
+
+    def can_place(self) -> bool:
+        """Whether the files of the object and the target exist."""
+        return self.files.object.is_file() and self.files.target_scene.is_file()
+
+    def objects(self) -> tuple[ObjectPlacement, ...]:
+        """The placed objects: as edited, else as `compose` placed them."""
+        if self.state.objects is not None:
+            return self.state.objects
+        if not self.can_place() or not self.files.placement.is_file():
+            return ()
+        stamp = self.files.placement.stat().st_mtime_ns
+        if self._composed[0] != stamp:
+            own = self.files.object.resolve()
+            # the project's own object is stored without a path
+            items = tuple(
+                replace(item, object_path=None) if item.object_path and item.object_path.resolve() == own else item
+                for item in read_placement(self.files.placement).objects
+            )
+            self._composed = (stamp, items)
+        return self._composed[1]
+
+    def placed_state(self) -> EditState:
+        """The current state with the objects that `compose` placed filled in."""
+        return self.state if self.state.objects is not None else replace(self.state, objects=self.objects())
+
+    def placed_scenes(self) -> tuple[Path, ...]:
+        """The files of the target and of the placed objects."""
+        return (self.files.target_scene, *(self.scenes.object_path(item) for item in self.objects()))
+
+    def placeable_object(self, index: int) -> PlaceableObject:
+        """A placed object with its base.
+
+        Raises:
+            ValueError: If its file is missing or empty.
+        """
+        return self.scenes.placeable_object(self.objects()[index])
+
+    def up(self) -> Float[Tensor, "3"]:
+        """Up direction of the target."""
+        return estimate_up(self.scenes.cameras(self.files.target_cameras))
+
+    def set_placement(self, index: int, target_from_object: Similarity) -> None:
+        """Change the placement of one object.
+
+        Raises:
+            ValueError: As `change`.
+        """
+        item = replace(self.objects()[index], target_from_object=target_from_object)
+        self.change(self.placed_state().with_object(index, item))
+
+    # metric sizes
+
+    def size(self, index: int) -> ObjectSize:
+        """The size of one placed object.
+
+        Raises:
+            ValueError: If its file or a scale.json cannot be read.
+        """
+        item = self.objects()[index]
+        is_own = self.scenes.object_path(item) == self.files.object
+        return ObjectSize(
+            height=self.placeable_object(index).base.height,
+            scale=item.target_from_object.scale,
+            own=read_scale(self.files.source_cameras) if is_own else None,
+            place=read_scale(self.files.target_cameras),
+        )
+
+    def true_scale(self) -> float | None:
+        """The scale at which the source's object is as large as it was; None where a capture's scale is not known.
+
+        Raises:
+            ValueError: If a scale.json cannot be read.
+        """
+        own, place = read_scale(self.files.source_cameras), read_scale(self.files.target_cameras)
+        return None if own is None or place is None else own.metres_per_unit / place.metres_per_unit
+
+    def set_own_scale(self, index: int, true_cm: float) -> Path:
+        """Store the scale of an object's own capture from the object's true height; gives the file.
+
+        Raises:
+            ValueError: The height is out of range, or the object was added from a file.
+        """
+        path = self.scenes.object_path(self.objects()[index])
+        if path != self.files.object:
+            raise ValueError(
+                f"{path}: expected the object of the project's source, found one that was added from a file"
+            )
+        return write_scale(self.files.source_cameras, self.size(index).own_from(true_cm))
+
+    def set_place_scale(self, index: int, here_cm: float) -> Path:
+        """Store the scale of the target's capture from a placed object's height in it; gives the file.
+
+        Raises:
+            ValueError: The height is out of range.
+        """
+        return write_scale(self.files.target_cameras, self.size(index).place_from(here_cm))
+
+    # jobs
+
+    def run(self, to: str, title: str) -> None:
+        """Start a child process that runs the stale steps up to `to`.
+
+        Raises:
+            ValueError: If a job is running.
+        """
+        self._start(self.project.run_words(to), title)
+
+    def export(self, to: Path, *, page: ExportPage, layer: Layer) -> JobState | None:
+        """Start a child process that writes the result as a file whose suffix names the format; gives its job.
+
+        Raises:
+            ValueError: If a job is running.
+        """
+        to.parent.mkdir(parents=True, exist_ok=True)
+        self._start(self.project.export_words(to, page=page, layer=layer), f"Write {to.name}")
+        return self.job()
+
+    def _start(self, words: tuple[str, ...], title: str) -> None:
+        self.jobs.start(self.project.job_command(words, title), title=title, shown=words)
+
+    def job(self) -> JobState | None:
+        """The running job, else the last one; None where there was none."""
+        return self.jobs.state()
+
+    def reasons(self) -> Mapping[str, str | None]:
+        """For each step why it is stale; None where it is up to date."""
+        return self.project.reasons()
+
+    def why_stale(self, step: str) -> str | None:
+        """Why the result of a step is out of date, with the first step that is; None where it is up to date."""
+        found = self.reasons()
+        if step not in found:
+            return found.get(PROBLEM)
+        name, reason = step, found[step]
+        while reason is not None and (before := reason.removeprefix("waits for ")) in found and before != reason:
+            name, reason = before, found[before]
+        return None if reason is None else f"{name}: {reason}"

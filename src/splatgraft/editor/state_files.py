@@ -1,0 +1,206 @@
+"""The edits of a project in its files: project.toml, placement.json, erased.npy, corrections.npy, prompts.json and
+light.json."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from splatgraft.editor.state import BoxNumbers, EditState, check_state
+from splatgraft.formats.corrections import read_corrections, write_corrections
+from splatgraft.formats.placement import Placement, read_placement, write_placement
+from splatgraft.formats.prompts import read_prompts, write_prompts
+from splatgraft.project.layout import ERASED_FILE, LIGHT_FILE, PLACEMENT_FILE
+from splatgraft.project.toml_edit import with_keys
+from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
+from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.settings import MAX_TEXT_BYTES, read_toml
+
+_CORRECTIONS_FILE, _PROMPTS_FILE = "corrections.npy", "prompts.json"
+_FILES = {"objects": PLACEMENT_FILE, "corrections": _CORRECTIONS_FILE, "prompts": _PROMPTS_FILE, "light": LIGHT_FILE}
+"""Usual file of a field of the state; project.toml holds the others."""
+
+
+@dataclass(frozen=True)
+class FoundState:
+    """What project.toml and the files beside it hold."""
+
+    state: EditState
+    """The edits; what could not be read is as in a project without it."""
+    problems: Mapping[str, str]
+    """One line for each field of the state that could not be read."""
+
+
+def read_state(project: Path) -> EditState:
+    """Read the state from project.toml and the files beside it.
+
+    Raises:
+        ValueError: If one of these files is invalid.
+    """
+    found = find_state(project)
+    for problem in found.problems.values():
+        raise ValueError(problem)
+    return found.state
+
+
+def find_state(project: Path) -> FoundState:
+    """Read what can be read of the state.
+
+    Raises:
+        ValueError: If project.toml is no TOML, or one of its tables is none.
+    """
+    content, folder = read_toml(project), project.parent
+    segment, relight, harmonize = (_table(content, name, project) for name in ("segment", "relight", "harmonize"))
+    placement = folder / PLACEMENT_FILE
+    given, corrections, prompts = relight.get("given_light"), segment.get("corrections"), segment.get("prompts")
+    readers: dict[str, Callable[[], dict[str, Any]]] = {
+        "objects": lambda: _placed(placement) if placement.is_file() else {},
+        "corrections": lambda: {} if corrections is None else {"corrections": read_corrections(folder / corrections)},
+        "mask_source": lambda: {"mask_source": segment.get("mask_source")},
+        "box": lambda: {} if "box" not in segment else {"box": _six(segment["box"], project)},
+        "keep": lambda: {"keep": segment.get("keep")},
+        "prompts": lambda: {} if prompts is None else {"prompts": read_prompts(folder / prompts)},
+        "light": lambda: {} if given is None else {"light": _light(folder / given)},
+        "weights": lambda: {"weights": _weights(relight, project)},
+        "harmonizer": lambda: {"harmonizer": harmonize.get("method")},
+    }
+    values: dict[str, Any] = {}
+    problems: dict[str, str] = {}
+    for name, read in readers.items():
+        try:
+            part = read()
+            check_state(EditState(**part))
+        # a file may hold anything: numbers beyond float's range, a path of the wrong type, nesting without end
+        except (ValueError, OSError, TypeError, ArithmeticError, RecursionError, MemoryError) as error:
+            line = " ".join((str(error) or type(error).__name__).split())
+            problems[name] = line if str(folder) in line else f"{folder / _FILES.get(name, project.name)}: {line}"
+            continue
+        values |= part
+    return FoundState(EditState(**values), problems)
+
+
+def write_state(project: Path, before: EditState | None, after: EditState) -> None:
+    """Update the files from state `before` to state `after`; what both agree on stays untouched.
+
+    Files that project.toml refers to are written before it, so that it never refers to a missing file.
+
+    Args:
+        project: project.toml.
+        before: What the files hold; None where that is not known, and then all is written.
+        after: What they shall hold.
+
+    Raises:
+        ValueError: If project.toml cannot be changed line by line.
+    """
+
+    def is_new(name: str) -> bool:
+        return before is None or getattr(after, name) is not getattr(before, name)
+
+    folder, old = project.parent, project.read_text(encoding="utf-8")
+    text = old
+    for table, keys in _changed_keys(before, after).items():
+        text = with_keys(text, table, keys)
+    if after.corrections is not None and is_new("corrections"):
+        write_corrections(folder / _CORRECTIONS_FILE, after.corrections)
+    if after.prompts is not None and is_new("prompts"):
+        write_prompts(folder / _PROMPTS_FILE, after.prompts)
+    if after.light is not None and is_new("light"):
+        with atomic_write(folder / LIGHT_FILE) as stream:
+            stream.write(light_to_json(after.light).encode())
+    if is_new("objects") or is_new("erased"):
+        if after.objects is None:
+            (folder / PLACEMENT_FILE).unlink(missing_ok=True)
+        else:
+            write_placement(folder / PLACEMENT_FILE, Placement(objects=after.objects, erased=after.erased))
+        if after.objects is None or after.erased is None:
+            (folder / ERASED_FILE).unlink(missing_ok=True)
+    if text != old:
+        with atomic_write(project) as stream:
+            stream.write(text.encode())
+
+
+def as_written(state: EditState, before: EditState) -> EditState:
+    """The state as it is read back: light.json rounds to six digits. A light shared with `before` stays identical."""
+    if state.light is None or state.light is before.light:
+        return state
+    return replace(state, light=light_from_json(light_to_json(state.light)))
+
+
+def state_files(project: Path) -> tuple[Path, ...]:
+    """All files that hold the state."""
+    return (project, *(project.parent / name for name in (*_FILES.values(), ERASED_FILE)))
+
+
+def _changed_keys(before: EditState | None, after: EditState) -> dict[str, dict[str, Any]]:
+    """What changes in each table of project.toml; None removes a key."""
+    new, old = _keys(after), {} if before is None else _keys(before)
+    # the file of what was changed may have another name, given by hand
+    renewed = {
+        key
+        for key, field in (("corrections", "corrections"), ("prompts", "prompts"), ("given_light", "light"))
+        if before is not None and getattr(after, field) is not getattr(before, field)
+    }
+    changes: dict[str, dict[str, Any]] = {}
+    for (table, key), value in new.items():
+        if (table, key) not in old or key in renewed or json.dumps(value) != json.dumps(old[table, key]):
+            changes.setdefault(table, {})[key] = value
+    return changes
+
+
+def _keys(state: EditState) -> dict[tuple[str, str], Any]:
+    """All keys of the editor by table and name."""
+    segment = {
+        "mask_source": state.mask_source,
+        "box": state.box,
+        "keep": state.keep,
+        "corrections": None if state.corrections is None else _CORRECTIONS_FILE,
+        "prompts": None if state.prompts is None else _PROMPTS_FILE,
+    }
+    # what is physically right is the default and needs no key
+    usual = asdict(LayerWeights())
+    relight = {key: None if value == usual[key] else value for key, value in asdict(state.weights).items()}
+    relight["given_light"] = None if state.light is None else LIGHT_FILE
+    tables = {"segment": segment, "relight": relight, "harmonize": {"method": state.harmonizer}}
+    return {(table, key): value for table, keys in tables.items() for key, value in keys.items()}
+
+
+def _table(content: Mapping[str, Any], name: str, project: Path) -> Mapping[str, Any]:
+    table = content.get(name, {})
+    if not isinstance(table, dict):
+        raise ValueError(f"{project}: expected [{name}] to be a table, found {table!r:.60}")
+    return table
+
+
+def _placed(path: Path) -> dict[str, Any]:
+    _check_size(path)
+    found = read_placement(path)
+    return {"objects": found.objects, "erased": found.erased}
+
+
+def _light(path: Path) -> Light:
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a light.json, found no such file")
+    _check_size(path)
+    return light_from_json(path.read_text(encoding="utf-8"), name=str(path))
+
+
+def _weights(relight: Mapping[str, Any], project: Path) -> LayerWeights:
+    given = {f.name: relight[f.name] for f in fields(LayerWeights) if f.name in relight}
+    for name, value in given.items():
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise ValueError(f"{project} [relight] {name}: expected a number, found {value!r:.60}")
+    return LayerWeights(**{name: float(value) for name, value in given.items()})
+
+
+def _six(box: Any, project: Path) -> BoxNumbers:
+    if not isinstance(box, list) or len(box) != 6 or not all(isinstance(x, int | float) for x in box):
+        raise ValueError(f"{project} [segment] box: expected six numbers, found {box!r:.60}")
+    a, b, c, d, e, f = (float(x) for x in box)
+    return a, b, c, d, e, f
+
+
+def _check_size(path: Path) -> None:
+    size = path.stat().st_size
+    if size > MAX_TEXT_BYTES:
+        raise ValueError(f"{path}: expected at most {MAX_TEXT_BYTES >> 20} MiB of text, found {size >> 20} MiB")

@@ -1,0 +1,67 @@
+"""A worker thread that processes only the newest request and discards older waiting ones."""
+
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+_JOIN_SECONDS = 1.0
+
+
+class LatestOnlyWorker(Generic[T]):
+    """A thread with at most one waiting request."""
+
+    def __init__(self, work: Callable[[T], None], on_error: Callable[[Exception], None]) -> None:
+        """Start the thread.
+
+        Args:
+            work: Called in the thread with one request at a time.
+            on_error: Called in the thread with each exception that `work` raises.
+        """
+        self._work, self._on_error = work, on_error
+        self._waiting: list[T] = []
+        self._wake = threading.Condition()
+        self._open = True
+        self._thread = threading.Thread(target=self._run, name="splatgraft preview", daemon=True)
+        self._thread.start()
+
+    def submit(self, request: T) -> None:
+        """Process `request` after the current one; it replaces any waiting request."""
+        with self._wake:
+            self._waiting = [request]
+            self._wake.notify()
+
+    @property
+    def superseded(self) -> bool:
+        """Whether a newer request waits; long work may stop then."""
+        return bool(self._waiting)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the worker was closed while it was at work: what it writes to may be gone."""
+        return not self._open
+
+    def wait_idle(self, seconds: float) -> bool:
+        """Wait until a newer request arrives, at most `seconds`; whether none arrived."""
+        with self._wake:
+            return not self._wake.wait_for(lambda: bool(self._waiting) or not self._open, timeout=seconds)
+
+    def close(self) -> None:
+        """Discard the waiting request and stop the thread after the current one, which may outlast this call."""
+        with self._wake:
+            self._open, self._waiting = False, []
+            self._wake.notify()
+        self._thread.join(timeout=_JOIN_SECONDS)
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: bool(self._waiting) or not self._open)
+                if not self._open:
+                    return
+                request = self._waiting.pop()
+            try:
+                self._work(request)
+            except Exception as error:  # one failed request must not end the thread
+                if not self.closed:
+                    self._on_error(error)
