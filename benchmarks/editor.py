@@ -30,8 +30,8 @@ from splatgraft.core.cameras import look_at
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.rotations import quaternion_from_rotation
-from splatgraft.project.toml_edit import with_keys
 from splatgraft.formats import write_gaussians
+from splatgraft.project.toml_edit import with_keys
 
 WIDTH, HEIGHT, REPEATS, HANG_LIMIT = 1280, 720, 5, 600.0
 BALL_BOX = [-0.35, -0.35, 0.02, 0.35, 0.35, 0.75]
@@ -70,6 +70,8 @@ class Client:
             subprotocols=["viser-v1.1.1"],  # pyright: ignore[reportArgumentType]
             max_size=None,
             open_timeout=HANG_LIMIT,
+            # what is not read fills the queue, and then no answer to the end arrives
+            close_timeout=1.0,
         )
         self._gui: dict[str, dict[str, Any]] = {}
         self.scenes: set[str] = set()

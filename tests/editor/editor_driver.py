@@ -19,9 +19,9 @@ import pytest
 from PIL import Image
 from waiting import HANG_LIMIT, act_until, wait_until
 
-from splatgraft.editor.jobs.jobs import Jobs
-from splatgraft.editor.session.edit_state import EditState
-from splatgraft.editor.session.state_files import read_state
+from splatgraft.editor.jobs import Jobs
+from splatgraft.editor.state import EditState
+from splatgraft.editor.state_files import read_state
 
 ARGUMENTS = (
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
@@ -94,6 +94,7 @@ class Editor:
 
     def __init__(self, project: Path, *options: str) -> None:
         """Start the server and wait for its address."""
+        # the next free port is taken where another worker has this one
         words = [sys.executable, "-m", "splatgraft", "edit", str(project), "--port", "18080", *options]
         self.log = project.parent / "server.log"
         with self.log.open("ab") as errors:
@@ -101,16 +102,6 @@ class Editor:
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().strip()
         assert self.url.startswith("http"), self.log.read_text()[-2000:]
-
-    @property
-    def base(self) -> str:
-        """The address without the token."""
-        return self.url.partition("?")[0].rstrip("/")
-
-    @property
-    def token(self) -> str:
-        """The token in the address."""
-        return self.url.partition("?token=")[2]
 
     def kill(self) -> None:
         """Kill the process, as a power cut would."""
@@ -145,10 +136,10 @@ class Window:
         page.wait_for_selector(".sg-header")
 
     @staticmethod
-    def opened(browser: Any, editor: Editor) -> "Window":
+    def opened(browser: Any, address: str) -> "Window":
         """Open a new window on an editor."""
         page = browser.new_page()
-        page.goto(editor.url)
+        page.goto(address)
         return Window(page)
 
     # waiting
@@ -380,7 +371,7 @@ def wait_for_job(project: Path) -> None:
     wait_until(lambda: (state := jobs.state()) is not None and not state.live, what="the end of the job")
     state = jobs.state()
     assert state is not None
-    assert state.outcome == "done", f"{state.error}\n{jobs.log_tail()}"
+    assert state.outcome == "done", f"{state.error}\n{(project.parent / '.editor' / 'job.log').read_text()[-2000:]}"
 
 
 def history_of(project: Path) -> dict[str, Any]:

@@ -6,18 +6,15 @@ from typing import Any, cast
 import cv2
 import numpy as np
 import pytest
-from test_hostile_values import made, page_of, project
-from test_typed_numbers import arrives, is_handled
+from editor_pages import opened_page, sends
 from tiny_project import ball, photograph, plane
-from waiting import wait_until
 
-from splatgraft.editor.session.project_access import RenderedViews
-from splatgraft.editor.session.state_files import read_state
-from splatgraft.project.toml_edit import with_keys
+from splatgraft.editor.page.page import Page
+from splatgraft.editor.project import RenderedViews
+from splatgraft.editor.state_files import read_state
 from splatgraft.folders.input_description import describe_input
 from splatgraft.formats import write_gaussians
-
-__all__ = ["made", "project"]
+from splatgraft.project.toml_edit import with_keys
 
 
 @pytest.fixture(scope="module")
@@ -76,62 +73,49 @@ def test_a_project_is_named_with_the_command_that_opens_it(project: Path) -> Non
 
 
 def test_a_project_is_started_only_of_two_usable_paths(inputs: Path, tmp_path: Path) -> None:
-    page, close = page_of(tmp_path / "new" / "project.toml")
-    try:
-        phase = cast("Any", page._phases["Open"])
+    with opened_page(tmp_path / "new" / "project.toml") as page:
+        phase = cast("Any", page.phases["Open"])
         assert phase._start.disabled
         for second, usable in (("letter.pdf", False), ("ball.ply", True)):
             phase._look((str(inputs / "ball.ply"), str(inputs / second)))
             assert phase._start.disabled != usable
         assert "80 Gaussians" in phase._found_source.content
-    finally:
-        close()
 
 
-def test_there_is_a_way_back_from_a_project_and_back_to_it(project: Path) -> None:
-    page, close = page_of(project)
-    try:
-        session = page.require_session()
-        session.change(session.placed_state())
-        kept = {name: (project.parent / name).read_bytes() for name in ("project.toml", "placement.json")}
-        page.show_phase("Open")
-        phase = cast("Any", page._phases["Open"])
-        phase._ask_back()
-        assert phase._confirm.visible
-        phase._leave_project()
-        assert page.session is None
-        assert page.problem is None
-        # nothing of the old project is left for the next one, but its results
-        assert not (project.parent / "placement.json").is_file()
-        assert (project.parent / "target" / "scene" / "scene.ply").is_file()
-        assert phase._again.visible
-        page.return_to_project()
-        assert {name: (project.parent / name).read_bytes() for name in kept} == kept
-        assert read_state(project).objects is not None
-        assert page.require_session().undo()
-        wait_until(lambda: page.session is not None, what="the project")
-    finally:
-        close()
+def test_there_is_a_way_back_from_a_project_and_back_to_it(page: Page) -> None:
+    context = page.context
+    session, folder = context.require_session(), context.project.file.parent
+    session.change(session.placed_state())
+    kept = {name: (folder / name).read_bytes() for name in ("project.toml", "placement.json")}
+    page.show_phase("Open")
+    phase = cast("Any", page.phases["Open"])
+    phase._ask_back()
+    assert phase._confirm.visible
+    phase._leave_project()
+    assert context.session is None
+    assert context.problem is None
+    # nothing of the old project is left for the next one, but its results
+    assert not (folder / "placement.json").is_file()
+    assert (folder / "target" / "scene" / "scene.ply").is_file()
+    assert phase._again.visible
+    phase._return_to_project()
+    assert {name: (folder / name).read_bytes() for name in kept} == kept
+    assert read_state(context.project.file).objects is not None
+    assert context.require_session().undo()
 
 
 def test_an_opened_project_shows_how_its_scenes_are_viewed(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = with_keys(project.read_text(), "source", {"up": [0.0, -1.0, 0.0], "look": "within"})
     project.write_text(with_keys(text, "target", {"up": [0.0, 0.25, 1.0]}))
-    page, close = page_of(project)
-    try:
+    with opened_page(project) as page:
         page.show_phase("Open")
-        phase = cast("Any", page._phases["Open"])
+        phase, session = cast("Any", page.phases["Open"]), page.context.require_session()
         assert (phase._looks["source"].value, phase._ups["source"].value) == ("from within", "-y")
         assert (phase._looks["target"].value, phase._ups["target"].value) == ("from around", "(0, 0.25, 1)")
         # one of them is changed: the other one stays
-        session = page.require_session()
-        monkeypatch.setattr(page, "run", lambda to, title: None)
-        arrives(phase._looks["target"], "from within")
-        is_handled(phase._looks["target"])
+        monkeypatch.setattr(page.context, "run", lambda to, title: None)
+        sends(phase._looks["target"], "from within")
         assert session.files.rendered_views[1] == RenderedViews((0.0, 0.25, 1.0), is_within=True)
-        arrives(phase._ups["target"], "as found")
-        is_handled(phase._ups["target"])
+        sends(phase._ups["target"], "as found")
         assert session.files.rendered_views[1] == RenderedViews(None, is_within=True)
         assert session.files.rendered_views[0] == RenderedViews((0.0, -1.0, 0.0), is_within=True)
-    finally:
-        close()

@@ -1,11 +1,18 @@
-"""Selection by rectangle, click and brush."""
+"""Selection by rectangle, click and brush, and points that are clicked in photos."""
 
+from pathlib import Path
+
+import numpy as np
+import pytest
 import torch
+from PIL import Image
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.editor.previews.level_of_detail import largest_coverage_indices
-from splatgraft.editor.session.picking import (
+from splatgraft.core.images import read_upright
+from splatgraft.core.prompts import ViewPrompt
+from splatgraft.editor.page.photo_clicks import PhotoView, prompt_of, with_click
+from splatgraft.editor.picking import (
     Ray,
     Rectangle,
     brush_selection,
@@ -14,6 +21,7 @@ from splatgraft.editor.session.picking import (
     in_rectangle,
     interpolate_rays,
 )
+from splatgraft.editor.relit_preview import largest_coverage_indices
 from splatgraft.segmentation import add_correction, apply_corrections
 
 
@@ -82,3 +90,52 @@ def test_level_of_detail_keeps_the_largest_coverage_in_order() -> None:
     both = Gaussians(**{k: torch.cat([getattr(small, k), getattr(large, k)]) for k in large.__dict__})
     assert largest_coverage_indices(both, 2).tolist() == [3, 4]
     assert largest_coverage_indices(both, 5).tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("canvas", [(800, 300), (300, 800), (640, 480)])
+def test_a_click_on_a_drawn_point_is_that_point(canvas: tuple[int, int]) -> None:
+    view = PhotoView((320, 200), canvas)
+    prompt = ViewPrompt(inside=torch.tensor([[250.0, 40.0]]))
+    drawn = view.drawn(np.full((100, 160, 3), 128, np.uint8), prompt).astype(int)
+    assert drawn.shape == (canvas[1], canvas[0], 3)
+    rows, columns = ((drawn[..., 1] > 180) & (drawn[..., 0] < 120)).nonzero()
+    found = view.pixel_at(((columns.mean() + 0.5) / canvas[0], (rows.mean() + 0.5) / canvas[1]))
+    # to a pixel of the canvas
+    assert found == pytest.approx((250, 40), abs=1.5 / view.scale)
+    # the canvas is larger than the photo on one pair of sides, unless it has its shape
+    assert view.pixel_at((0.5, 0.5)) == pytest.approx((160, 100))
+    if canvas == (800, 300):
+        assert view.pixel_at((0.01, 0.5)) is None
+    if canvas == (300, 800):
+        assert view.pixel_at((0.5, 0.99)) is None
+
+
+def test_a_photo_is_shown_upright_with_its_own_size(tmp_path: Path) -> None:
+    pixels = np.zeros((60, 100, 3), np.uint8)
+    pixels[:, :50, 0] = 255
+    tags = Image.Exif()
+    tags[274] = 6  # the camera was turned: a viewer turns the picture by 90 degrees to the right
+    Image.fromarray(pixels).save(tmp_path / "a.png", exif=tags)
+    found, size = read_upright(tmp_path / "a.png", 50)
+    assert size == (60, 100)
+    assert found.shape == (50, 30, 3)
+    # what was left is above now
+    assert found[:20, :, 0].min() > 250
+    assert found[30:, :, 0].max() < 5
+
+
+def test_clicks_add_and_remove_points() -> None:
+    one = with_click(None, "a/b.jpg", (10.04, 20.0), on_object=True, longer_side=1000)
+    two = with_click(one, "a/b.jpg", (500.0, 20.0), on_object=False, longer_side=1000)
+    assert prompt_of(two, "a/b.jpg").inside[0].tolist() == pytest.approx([10.0, 20.0])
+    assert len(prompt_of(two, "a/b.jpg").outside) == 1
+    # near an existing one, of either kind
+    three = with_click(two, "a/b.jpg", (495.0, 25.0), on_object=True, longer_side=1000)
+    assert len(prompt_of(three, "a/b.jpg").outside) == 0
+    assert with_click(one, "a/b.jpg", (11.0, 19.0), on_object=False, longer_side=1000) is None
+    # a file by hand may call the photo by its stem, and has a rectangle
+    by_hand = {"b": ViewPrompt(inside=torch.tensor([[1.0, 2.0]]), box=(0.0, 0.0, 9.0, 9.0))}
+    kept = with_click(by_hand, "a/b.jpg", (2.0, 2.0), on_object=True, longer_side=1000)
+    assert kept is not None
+    assert list(kept) == ["b"]
+    assert kept["b"].box == (0.0, 0.0, 9.0, 9.0)

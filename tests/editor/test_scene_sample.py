@@ -1,7 +1,5 @@
 """A sample of a scene is rows of its file, read without torch."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,7 @@ from shapes import ring
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.spherical_harmonics import C0
-from splatgraft.editor.session.scene_sample import read_first_view, read_sample, sample_count
+from splatgraft.editor.scene_sample import read_first_view, read_sample, sample_count
 from splatgraft.formats import write_cameras, write_gaussians
 
 
@@ -101,8 +99,3 @@ def test_the_first_view_is_through_the_first_camera(tmp_path: Path) -> None:
     for text in ("", "{}", '{"frames": []}', "[1]", '{"frames": [{"transform_matrix": [[1]]}], "w": 1, "h": 1}'):
         (tmp_path / "transforms.json").write_text(text)
         assert read_first_view(tmp_path / "transforms.json") is None
-
-
-def test_what_opens_first_needs_no_torch() -> None:
-    code = "import sys, splatgraft.editor.page.opening, splatgraft.editor.page.server; print('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

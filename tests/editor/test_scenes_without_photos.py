@@ -5,40 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_project import ball, plane
+from editor_pages import scene_project
+from tiny_project import ball
 
 from splatgraft.cli import main
-from splatgraft.editor.project import Project
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.gaussians import concatenate
-from splatgraft.editor.project import RenderedViews
+from splatgraft.editor.project import Project, RenderedViews
 from splatgraft.editor.session import Session
-from splatgraft.project.toml_edit import with_keys
-from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
+from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.formats.placement import read_placement
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.runtime.settings import read_toml
-
-AROUND_THE_BALL = [-0.35, -0.35, 0.03, 0.35, 0.35, 0.65]
-
-
-def scene_project(root: Path, *, suffix: str, **segment: object) -> Path:
-    """Write two scene files and a project of them; returns project.toml."""
-    scenes = [concatenate([plane((0.3, 0.5, 0.3)), ball()]), plane((0.5, 0.45, 0.6))]
-    paths = [root / f"{name}{suffix}" for name in ("source", "target")]
-    for path, scene in zip(paths, scenes, strict=True):
-        write_gaussians(path, scene)
-    project = root / "project" / "project.toml"
-    assert main(["init", str(project.parent), "--source", str(paths[0]), "--target", str(paths[1])]) == 0
-    text = with_keys(project.read_text(), "segment", {"keep": "all", "solidify": 4, **segment})
-    for side in ("source", "target"):
-        text = with_keys(text, side, {"views": 8, "picture_width": 160})
-    text = with_keys(text, "compose", {"point": [0.0, 0.0, 0.5], "scale": 0.8})
-    project.write_text(with_keys(text, "consolidate", {"passes": 1}))
-    return project
 
 
 def test_a_transfer_between_two_scene_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    project = scene_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, threshold=0.5)
+    project = scene_project(tmp_path, mask_source="grabcut", threshold=0.5)
     assert main(["run", str(project), "--to", "consolidate"]) == 0
     said = capsys.readouterr().err
     assert "a scene without photographs: 8 pictures" in said
@@ -56,7 +37,7 @@ def test_a_transfer_between_two_scene_files(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_box_alone_segments_and_the_whole_scene_may_be_the_object(tmp_path: Path) -> None:
-    project = scene_project(tmp_path, suffix=".spz", box=AROUND_THE_BALL, mask_source="box")
+    project = scene_project(tmp_path, suffix=".spz")
     assert main(["run", str(project), "--to", "segment"]) == 0
     assert read_gaussians(project.parent / "object" / "object.ply").count == ball().count
     everything = [-9.0, -9.0, -9.0, 9.0, 9.0, 9.0]
@@ -77,7 +58,7 @@ def test_a_box_alone_segments_and_the_whole_scene_may_be_the_object(tmp_path: Pa
 
 
 def test_up_can_be_set_and_is_no_undo_step(tmp_path: Path) -> None:
-    project = scene_project(tmp_path, suffix=".ply", box=AROUND_THE_BALL, mask_source="box")
+    project = scene_project(tmp_path)
     session = Session(Project(project))
     session.set_view("target", RenderedViews(up=(0.0, 0.0, -1.0)))
     assert not session.reload()
@@ -97,7 +78,7 @@ def test_up_can_be_set_and_is_no_undo_step(tmp_path: Path) -> None:
 
 
 def test_wrong_inputs_are_reported_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    project = scene_project(tmp_path, suffix=".ply")
+    project = scene_project(tmp_path)
     text = project.read_text()
     for wrong, message in (
         (text.replace('scene = "../source.ply"', 'capture = "../source.ply"'), "write scene = instead"),

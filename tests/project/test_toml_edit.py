@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatgraft.project.toml_edit import with_keys
 from splatgraft.project.project_file import TEMPLATE
+from splatgraft.project.toml_edit import with_keys
 
 TEXT = """\
 # a comment

@@ -10,8 +10,8 @@ from typing import Annotated
 import tyro
 
 from splatgraft.editor.access import LOOPBACK
-from splatgraft.project.folder_lock import locked
 from splatgraft.project.layout import PROJECT_FILE
+from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.process import end_process, open_page
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from splatgraft.commands.init import Init
 from splatgraft.commands.steps.segment import Segment
-from splatgraft.project.toml_edit import with_keys
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
 from splatgraft.project.record import read_record
 from splatgraft.project.step import DEFAULT_REMEDIES, Positional, Step
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.process import open_page

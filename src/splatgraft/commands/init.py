@@ -5,11 +5,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatgraft.project.toml_edit import with_keys
 from splatgraft.formats import is_scene
 from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.project_file import TEMPLATE
 from splatgraft.project.step import Positional
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
 from splatgraft.workflow.project_reference import full_project_text

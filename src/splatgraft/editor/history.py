@@ -26,7 +26,7 @@ from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.formats.prompts import prompts_from_json, prompts_to_json
 from splatgraft.project.layout import EDITOR_FOLDER
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 _HISTORY_FILE, _STATES_FOLDER = "history.json", "states"
 _GOOD_FILE, _BROKEN_FOLDER, _ASIDE_FOLDER = "project.toml", "broken", "aside"

@@ -113,8 +113,7 @@ def _parsed(command: type[T], words: Sequence[str]) -> T:
 
 def _plan(project: Path, out: Path | None, to: str) -> tuple[PlannedStep, ...]:
     """The steps to be run with their expected durations; empty where the project is invalid."""
-    from splatgraft.workflow.flow import read_flow
-    from splatgraft.workflow.staleness import reasons
+    from splatgraft.workflow.flow import read_flow, reasons
     from splatgraft.workflow.time_estimate import estimate_step_times
 
     try:

@@ -28,10 +28,9 @@ from splatgraft.project.layout import (
 )
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import RelightOptions
-from splatgraft.runtime.atomic_file import atomic_write
 from splatgraft.runtime.console import Console
-from splatgraft.workflow.flow import Flow, read_flow
-from splatgraft.workflow.staleness import reasons
+from splatgraft.runtime.files import atomic_write
+from splatgraft.workflow.flow import Flow, read_flow, reasons
 
 ExportPage = Literal["viewer", "report"]
 """What an exported .html holds."""

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from splatgraft.editor.state import BoxNumbers, EditState, check_state
-from splatgraft.formats.corrections import read_corrections, write_corrections
+from splatgraft.formats.gaussian_flags import read_corrections, write_flags
 from splatgraft.formats.placement import Placement, read_placement, write_placement
 from splatgraft.formats.prompts import read_prompts, write_prompts
 from splatgraft.project.layout import ERASED_FILE, LIGHT_FILE, PLACEMENT_FILE
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.settings import MAX_TEXT_BYTES, read_toml
 
 _CORRECTIONS_FILE, _PROMPTS_FILE = "corrections.npy", "prompts.json"
@@ -102,7 +102,7 @@ def write_state(project: Path, before: EditState | None, after: EditState) -> No
     for table, keys in _changed_keys(before, after).items():
         text = with_keys(text, table, keys)
     if after.corrections is not None and is_new("corrections"):
-        write_corrections(folder / _CORRECTIONS_FILE, after.corrections)
+        write_flags(folder / _CORRECTIONS_FILE, after.corrections)
     if after.prompts is not None and is_new("prompts"):
         write_prompts(folder / _PROMPTS_FILE, after.prompts)
     if after.light is not None and is_new("light"):

@@ -17,7 +17,7 @@ from splatgraft.editor.page.server import GuardedServer
 from splatgraft.editor.project import Project
 from splatgraft.editor.scene_sample import View, typical_distance
 from splatgraft.editor.session import Session
-from splatgraft.runtime.atomic_file import atomic_write
+from splatgraft.runtime.files import atomic_write
 
 STATUS_ORDER, HISTORY_ORDER, VIEW_ORDER = 1e6, 2e6, 3e6
 """Places in the panel of what stands below the phases."""

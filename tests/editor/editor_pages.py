@@ -1,0 +1,77 @@
+"""A project of two tiny scenes, and the real page on it, with the messages that a browser would send."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tiny_project import ball, plane
+from viser import GuiEvent
+
+from splatgraft.cli import main
+from splatgraft.core.gaussians import concatenate
+from splatgraft.editor.page.opening import Opening
+from splatgraft.editor.page.page import Page
+from splatgraft.editor.page.server import GuardedServer
+from splatgraft.editor.project import Project
+from splatgraft.formats import write_gaussians
+from splatgraft.project.toml_edit import with_keys
+
+AROUND_THE_BALL = [-0.35, -0.35, 0.03, 0.35, 0.35, 0.65]
+TOKEN = "secret"
+
+
+def scene_project(root: Path, *, suffix: str = ".ply", **segment: object) -> Path:
+    """Write two scene files and a project of them; returns project.toml."""
+    scenes = [concatenate([plane((0.3, 0.5, 0.3)), ball()]), plane((0.5, 0.45, 0.6))]
+    paths = [root / f"{name}{suffix}" for name in ("source", "target")]
+    for path, scene in zip(paths, scenes, strict=True):
+        write_gaussians(path, scene)
+    project = root / "project" / "project.toml"
+    assert main(["init", str(project.parent), "--source", str(paths[0]), "--target", str(paths[1])]) == 0
+    box = {"box": AROUND_THE_BALL, "mask_source": "box"}
+    text = with_keys(project.read_text(), "segment", {"keep": "all", "solidify": 4, **box, **segment})
+    for side in ("source", "target"):
+        text = with_keys(text, side, {"views": 8, "picture_width": 160})
+    text = with_keys(text, "compose", {"point": [0.0, 0.0, 0.5], "scale": 0.8})
+    project.write_text(with_keys(text, "consolidate", {"passes": 1}))
+    return project
+
+
+@contextmanager
+def served() -> Iterator[GuardedServer]:
+    """A server without a page, at a free port."""
+    guarded = GuardedServer(TOKEN, host="127.0.0.1", port=0)
+    try:
+        yield guarded
+    finally:
+        guarded.close()
+
+
+@contextmanager
+def opened_page(project: Path, *, opening: bool = False) -> Iterator[Page]:
+    """The page on a project, which need not exist."""
+    with served() as guarded:
+        shown = Opening(guarded.viser, project, project.parent) if opening else None
+        page = Page(guarded, Project(project), budget=1000, opening=shown)
+        try:
+            yield page
+        finally:
+            page.close()
+
+
+def arrives(handle: Any, value: Any) -> None:
+    """What viser does first with a value that a browser sends."""
+    handle._impl.value = value
+
+
+def is_handled(handle: Any) -> None:
+    """What viser does next, in another thread."""
+    for callback in handle._impl.update_cb:
+        callback(GuiEvent(client=None, client_id=0, target=handle))  # pyright: ignore[reportArgumentType]
+
+
+def sends(handle: Any, value: Any) -> None:
+    """A value that a browser sends, handled."""
+    arrives(handle, value)
+    is_handled(handle)

@@ -1,0 +1,132 @@
+"""Who may open the page: requests by Host, Origin and token, and which of the windows edits."""
+
+import http.client
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from editor_pages import TOKEN, served
+from viser import _messages
+
+from splatgraft.cli import main
+from splatgraft.editor.access import allowed_query, check_access, cookie_name
+from splatgraft.project.step import locked
+
+HERE = {"Host": "127.0.0.1:8080"}
+PAGE = HERE | {"Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
+
+
+def test_the_page_s_own_requests_are_accepted_with_the_token() -> None:
+    for headers in (HERE, PAGE, {"Host": "localhost:8080"}, {"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}):
+        assert check_access("secret", headers, "/?token=secret").allowed, headers
+        # programs of other users of the machine can send the same headers
+        assert not check_access("secret", headers, "/").allowed, headers
+        assert not check_access("secret", headers, "/?token=guess").allowed, headers
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        HERE | {"Origin": "http://evil.example"},
+        HERE | {"Origin": "null"},
+        HERE | {"Origin": "http://127.0.0.1:9999"},
+        PAGE | {"Origin": "http://evil.example"},
+        HERE | {"Upgrade": "websocket"},
+        # DNS rebinding: a foreign name that resolves to this machine
+        {"Host": "evil.example:8080"},
+        {"Host": "evil.example:8080", "Origin": "http://evil.example:8080"},
+        {"Host": "evil.example", "X-Forwarded-Host": "127.0.0.1", "X-Forwarded-For": "127.0.0.1"},
+        # repeated headers, as the server joins them
+        {"Host": "127.0.0.1:8080, evil.example"},
+        {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080, http://evil.example"},
+        {},
+    ],
+)
+def test_foreign_requests_are_refused(headers: dict[str, str]) -> None:
+    assert not check_access("secret", headers, "/?token=secret").allowed
+
+
+def test_the_token_is_kept_in_a_cookie_of_the_port() -> None:
+    cookie = check_access("first", HERE, "/?token=first").cookie
+    assert cookie == "splatgraft_token_8080=first; HttpOnly; SameSite=Strict; Path=/"
+    names = [cookie_name(host) for host in ("127.0.0.1:8080", "127.0.0.1:8081", "[::1]:8080", "localhost")]
+    assert names == [f"splatgraft_token_{key}" for key in (8080, 8081, 8080, "default")]
+    both = "; ".join(f"{name}={token}" for name, token in zip(names[:2], ("first", "second"), strict=True))
+    for port, token in ((8080, "first"), (8081, "second")):
+        headers = {"Host": f"127.0.0.1:{port}", "Cookie": both}
+        assert check_access(token, headers, "/assets/x.js").allowed
+        assert not check_access("third", headers, "/").allowed
+        assert not check_access(token, headers | {"Origin": "http://evil.example"}, "/").allowed
+
+
+def test_a_page_s_query_may_hold_the_token_alone() -> None:
+    assert allowed_query("/") is None
+    assert allowed_query("/?token=t") is None
+    assert allowed_query("/?token=t&websocket=ws://evil.example") == "?token=t"
+    assert allowed_query("/?playbackPath=https://evil.example/a.viser") == "?"
+
+
+def test_the_server_refuses_what_is_foreign_and_serves_only_shared_files(tmp_path: Path) -> None:
+    (tmp_path / "a.sog").write_bytes(b"scene")
+    with served() as guarded:
+        guarded.files = lambda name: tmp_path / name if name == "a.sog" else None
+
+        def answer(path: str, **headers: str) -> http.client.HTTPResponse:
+            connection = http.client.HTTPConnection("127.0.0.1", guarded.port, timeout=600)
+            connection.request("GET", path, headers=headers)
+            found = connection.getresponse()
+            found.read()
+            connection.close()
+            return found
+
+        page = answer(f"/?token={TOKEN}")
+        assert page.status == 200
+        assert page.headers["X-Frame-Options"] == "DENY"
+        cookie = (page.headers["Set-Cookie"] or "").partition(";")[0]
+        assert answer("/files/a.sog", Cookie=cookie).status == 200
+        assert answer("/").status == 403
+        assert answer(f"/?token={TOKEN}", Origin="http://evil.example").status == 403
+        assert answer(f"/?token={TOKEN}", Host="evil.example").status == 403
+        assert answer(f"/?token={TOKEN}&websocket=ws://evil.example").headers["Location"] == f"?token={TOKEN}"
+        for path in ("/files/../project.toml", "/files/%2e%2e/project.toml", "/project.toml", "/files/"):
+            assert answer(path, Cookie=cookie).status == 404, path
+
+
+def test_the_oldest_window_edits_and_tunnels_are_blocked() -> None:
+    with served() as guarded:
+        passed: list[object] = []
+
+        async def inner(window: int, message: object) -> None:
+            passed.append(window)
+
+        def send(window: int, message: object) -> None:
+            with pytest.raises(StopIteration):
+                guarded._forward_allowed(inner, window, message).send(None)
+
+        message = _messages.GuiFormSubmitMessage("x")
+        for number in (1, 2):
+            guarded._opened(number)
+        send(1, _messages.ShareUrlRequest())
+        send(2, message)
+        assert passed == []
+        send(1, message)
+        assert passed == [1]
+        guarded._closed(1)
+        send(2, message)
+        assert passed == [1, 2]
+        guarded._closed(2)
+
+
+def test_the_page_is_served_before_torch_is_loaded() -> None:
+    code = (
+        "import sys, splatgraft.commands.edit, splatgraft.editor.page.opening, splatgraft.editor.page.server;"
+        "print('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+def test_a_second_editor_on_a_project_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with locked(tmp_path / "edit"):
+        assert main(["edit", str(tmp_path)]) == 2
+    assert "expected no other run at work here" in capsys.readouterr().err

@@ -1,0 +1,130 @@
+"""Placements: gizmo and angles, drop, upright and rescale, duplicates beside the original."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_project import ball, plane
+
+from splatgraft.composition import object_base
+from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.gaussians import concatenate
+from splatgraft.core.rotations import rotation_from_quaternion
+from splatgraft.core.similarity import Similarity
+from splatgraft.editor.placement import (
+    Gizmo,
+    PlaceableObject,
+    align_up,
+    degrees_from_quaternion,
+    drop_to_surface,
+    gizmo_from_similarity,
+    place_beside,
+    quaternion_from_degrees,
+    rescale,
+    similarity_from_gizmo,
+    snapped_angles,
+)
+from splatgraft.editor.session import Session
+
+ANGLE = st.floats(-179, 179)
+TURNS = st.tuples(ANGLE, st.floats(-89, 89), ANGLE)
+POINT = st.tuples(*[st.floats(-10, 10)] * 3)
+UP = torch.tensor([0.0, 0.0, 1.0])
+FLOOR = Similarity(scale=4.0, rotation=torch.eye(3), translation=torch.tensor([0.0, 0.0, -1.0]))
+
+
+@given(TURNS, POINT, POINT, st.floats(0.01, 100))
+def test_gizmo_to_placement_and_back(turns: tuple, at: tuple, pivot: tuple, scale: float) -> None:
+    foot = torch.tensor(pivot)
+    found = gizmo_from_similarity(similarity_from_gizmo(Gizmo(at, quaternion_from_degrees(turns), scale), foot), foot)
+    assert found.scale == scale
+    # float32: 1e-7 of numbers up to 100 times 18, twice
+    assert torch.allclose(torch.tensor(found.position), torch.tensor(at), atol=1e-3)
+    ours, theirs = (rotation_from_quaternion(torch.tensor([q])) for q in (found.wxyz, quaternion_from_degrees(turns)))
+    # float32 quaternions: 1e-7, a few operations deep
+    assert torch.allclose(ours, theirs, atol=1e-5)
+
+
+@given(TURNS)
+def test_angles_to_quaternion_and_back(turns: tuple) -> None:
+    # double precision all the way; near 90 degrees the arcsine loses half of its digits
+    assert degrees_from_quaternion(quaternion_from_degrees(turns)) == pytest.approx(turns, abs=1e-4)
+
+
+@pytest.mark.parametrize("pitch", [90.0, -90.0])
+def test_gimbal_lock_gives_the_same_rotation(pitch: float) -> None:
+    wxyz = quaternion_from_degrees((30.0, pitch, 10.0))
+    again = quaternion_from_degrees(degrees_from_quaternion(wxyz))
+    assert abs(sum(a * b for a, b in zip(wxyz, again, strict=True))) == pytest.approx(1, abs=1e-6)
+
+
+def test_a_rotation_about_one_axis() -> None:
+    half = math.sqrt(0.5)
+    assert quaternion_from_degrees((0.0, 0.0, 90.0)) == pytest.approx((half, 0, 0, half))
+
+
+def test_operations_keep_what_they_do_not_change(session: Session) -> None:
+    item, up = session.placeable_object(0), torch.tensor([0.0, 0.0, 1.0])
+    target = session.scenes.gaussians(session.files.target_scene)
+    start = session.objects()[0].target_from_object
+    turned = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.7, 0.4], [0.7, 0, 0], [-0.4, 0, 0]]))
+    tilted = Similarity(scale=start.scale, rotation=turned @ start.rotation, translation=start.translation + 0.3 * up)
+    straight = align_up(item, tilted, up=up)
+    # float32 rotations, two deep
+    assert torch.allclose(straight.rotation @ item.base.up, up, atol=1e-5)
+    assert torch.allclose(straight.points(item.base.point), tilted.points(item.base.point), atol=1e-5)
+    fallen = drop_to_surface(target, item, straight, up=up)
+    assert fallen.scale == straight.scale
+    # the plane's Gaussians are a hundredth thick and were trained for sixty steps
+    assert abs(float(fallen.points(item.base.point)[2])) < 0.1
+    assert float(fallen.points(item.base.point)[2]) < float(straight.points(item.base.point)[2])
+    # the turn about the vertical stayed: heads of a vector at right angles to up agree, but for the slope of the plane
+    side = torch.linalg.cross(item.base.up, torch.tensor([1.0, 0, 0]))
+    heads = [m.rotation @ side / side.norm() for m in (straight, fallen)]
+    assert float(heads[0] @ heads[1]) > 0.98
+    again = drop_to_surface(target, item, fallen, up=up)
+    assert torch.allclose(again.translation, fallen.translation, atol=0.02)
+    half = rescale(item, fallen, 0.5 * fallen.scale)
+    assert torch.allclose(half.points(item.base.point), fallen.points(item.base.point), atol=1e-5)
+
+
+def item() -> PlaceableObject:
+    pose = look_at(torch.tensor([[2.0, 0, 1]]), torch.zeros(3), UP)
+    return PlaceableObject(
+        ball(), object_base(ball(), up=UP, surroundings=None), pinhole(pose, 45.0, width=48, height=36), None
+    )
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0), (0.75, 0.0), (-0.75, 0.0), (0.7, 0.7), (-0.7, -0.7)])
+def test_a_duplicate_near_a_table_s_edge_stays_on_the_table(at: tuple[float, float]) -> None:
+    # a table of two units above a floor of eight
+    target = concatenate([plane((0.5, 0.5, 0.5)), FLOOR.gaussians(plane((0.3, 0.3, 0.3)))])
+    one = item()
+    foot = one.base.point
+    placed = Similarity(scale=0.5, rotation=torch.eye(3), translation=torch.tensor([*at, 0.0]) - 0.5 * foot)
+    beside, is_supported = place_beside(target, one, placed, up=UP)
+    assert is_supported
+    stands = beside.points(foot)
+    assert float(stands[:2].abs().max()) < 1.12  # the table's edge, and the width of its last Gaussians
+    # a thickness of the table's Gaussians
+    assert abs(float(stands[2])) < 0.05
+    assert (
+        float((stands - placed.points(foot))[:2].norm()) > 2 * 0.5 * 0.2
+    )  # they do not touch: the ball has a radius of a quarter
+    assert torch.equal(beside.rotation, placed.rotation)
+    assert beside.scale == placed.scale
+
+
+def test_where_nothing_is_beside_it_a_duplicate_is_said_to_be_in_the_air() -> None:
+    one = item()
+    pillar = Similarity(scale=0.1, rotation=torch.eye(3), translation=torch.zeros(3)).gaussians(plane((0.5, 0.5, 0.5)))
+    placed = Similarity(scale=1.0, rotation=torch.eye(3), translation=-one.base.point)
+    beside, is_supported = place_beside(pillar, one, placed, up=UP)
+    assert not is_supported
+    assert float(beside.points(one.base.point)[2]) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_angles_snap_to_multiples() -> None:
+    assert snapped_angles((7.0, -8.0, 97.6), 15.0) == (0.0, -15.0, 105.0)
