@@ -51,7 +51,7 @@ blender: .venv-blender/.installed
 .PHONY: exam
 exam: install blender
 	@test -n "$(NUMBER)" || { echo "make: expected NUMBER=..., a number that no exam has used, found none"; exit 1; }
-	$(BIN)/python benchmarks/exam $(NUMBER)
+	$(BIN)/splatgraft paper exam $(NUMBER) --blender-python .venv-blender/bin/python
 
 # Debian's Chromium with software OpenGL, for the stories of the editor; apt is used by root alone
 browser:

@@ -2,7 +2,7 @@
 
     python benchmarks/fit_light.py SCENES [SCENES ...] --work FOLDER [FOLDER ...] --evidence FOLDER
 
-SCENES are folders of scenes as `python benchmarks/exam` renders them. The objective, in stops: the mean over places of
+SCENES are folders of scenes as `splatgraft paper exam` renders them. The objective, in stops: the mean over places of
 the RMS over 200 normals of log2(estimated / true irradiance), plus half of the same RMS of the ratio of both places.
 Numbers are changed a few at a time by random factors, and a change is kept where the objective falls. With `--folds`,
 the numbers are fitted as often without one part of the scenes, and the objective of the part left out is printed. What
@@ -25,16 +25,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from exam.scene_files import ExamScene
-from exam.training_scenes import estimated_lights, scenes_in
-
 from splatgraft.core.directions import even_directions
 from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem
 from splatgraft.relighting.light.radiance_search import SearchSettings, irradiance_of, search_radiance
+from splatgraft_paper.exam.scenes import ExamScene, estimated_lights, scenes_in
 
 NORMALS = even_directions(200)
 FACTORS = {

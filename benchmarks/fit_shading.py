@@ -1,7 +1,7 @@
 """Fits the numbers of the object's shading over rendered scenes, and checks them across scenes.
 
-`python benchmarks/fit_shading.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `python
-benchmarks/exam` renders them. The objective is the mean gain of the object's PSNR over pasting on the held-out views.
+`python benchmarks/fit_shading.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `splatgraft
+paper exam` renders them. The objective is the mean gain of the object's PSNR over pasting on the held-out views.
 Every combination of a grid is tried; the numbers are chosen with each scene left out in turn, too, and the gain of the
 scene left out is reported. Gloss stays as today's numbers give it. The shares of level and tint have to be chosen on
 scenes that benchmarks/fit_light.py did not see: on its own scenes the light is better than elsewhere.
@@ -15,15 +15,10 @@ from pathlib import Path
 
 import torch
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from exam.evaluate_scene import measure_row
-from exam.rows import make_row
-from exam.scene_files import ExamScene
-from exam.training_scenes import scenes_in
-
 from splatgraft.relighting import relight
 from splatgraft.relighting.shading.irradiance import ShadeSettings, shade_ratio
+from splatgraft_paper.exam.measure import make_row, measure_row
+from splatgraft_paper.exam.scenes import ExamScene, scenes_in
 
 FLOORS = (0.02, 0.08, 0.2)
 LEVEL_SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)

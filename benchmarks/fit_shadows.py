@@ -1,7 +1,7 @@
 """Fits the strength of shadows under an estimated light over rendered scenes, and checks it across scenes.
 
-`python benchmarks/fit_shadows.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `python
-benchmarks/exam` renders them. A light that is averaged over what is possible has less contrast than the true one, so
+`python benchmarks/fit_shadows.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `splatgraft
+paper exam` renders them. A light that is averaged over what is possible has less contrast than the true one, so
 shadows come out too weak. The objective is the share that is removed of pasting's error, the RMSE of the ratio of
 luminance with the object to that without it over all pixels beside the object: a strong shadow in a wrong place costs.
 Every power of a grid is tried; it is chosen with each scene left out in turn, too, and the share of the scene left out
@@ -15,19 +15,14 @@ from pathlib import Path
 
 import torch
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from exam.evaluate_scene import measure_row
-from exam.rows import make_row
-from exam.scene_files import ExamScene
-from exam.training_scenes import scenes_in
-
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.evaluation.measure import luminance_ratio
 from splatgraft.evaluation.regions import find_regions
 from splatgraft.relighting import relight
 from splatgraft.relighting.shadows.scene_ratio import SceneRatio
 from splatgraft.relighting.transfer import SHADOW_POWER
+from splatgraft_paper.exam.measure import make_row, measure_row
+from splatgraft_paper.exam.scenes import ExamScene, scenes_in
 
 POWERS = (1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0)
 

@@ -30,12 +30,12 @@ from splatgraft.harmonization import (
 from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting import SourceScene, relight
+from splatgraft.relighting.irradiance_ratio import relight_by_irradiance_ratio
 from splatgraft.relighting.light.light import light_to_json
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft_paper.benchmark.scene import ComposedScene, perform_if_stale
-from splatgraft_paper.benchmark.transplat import RelightByIrradianceRatio
-from splatgraft_paper.benchmark.true_light_file import read_true_light
+from splatgraft_paper.benchmark.true_light import read_true_light
 from splatgraft_paper.peers.methods import method_options
 
 Prior = Literal["off", "gain", "transplat", "transfer", "true-light"]
@@ -93,8 +93,13 @@ class Method:
 
 
 @dataclass(frozen=True)
-class RelightWithTrueLight:
-    """The physical transfer with the true light instead of an estimate: an upper bound for the light estimate."""
+class RelightForBenchmark:
+    """A light transfer that only the benchmark has.
+
+    With a light: the physical transfer with the true light instead of an estimate, an upper bound for the estimate.
+    Without: TranSplat's, which multiplies the object's colours by irradiance at its new place over that at its old one,
+    both from the scenes, and casts no shadow.
+    """
 
     target: Path
     """The target scene, a .ply."""
@@ -106,31 +111,31 @@ class RelightWithTrueLight:
     """The source without the object."""
     object_cameras: Path
     """The source's."""
-    light: Path
-    """light.json."""
     out: Path
     """Folder for scene.ply."""
+    light: Path | None = None
+    """light.json."""
 
     def inputs(self) -> Inputs:
         """All files that are read."""
+        rest = (self.cameras, self.object_cameras, *((self.light,) if self.light else ()))
         scenes = (self.target, self.surroundings)
-        cameras = (self.cameras, self.object_cameras)
-        return {"scenes": scenes, "placement": placement_files(self.placement), "rest": (*cameras, self.light)}
+        return {"scenes": scenes, "placement": placement_files(self.placement), "rest": rest}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the relit composite."""
         source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
         composite = read_composite(self.target, self.placement)
-        relit = relight(
-            composite,
-            read_cameras(self.cameras),
-            sources=[source],
-            light=read_true_light(self.light),
-        )
-        write_gaussians(folder / SCENE_FILE, relit.bake()[0])
-        if relit.light is not None:
-            (folder / LIGHT_FILE).write_text(light_to_json(relit.light))
-        for sentence in relit.report:
+        if self.light is None:
+            result, report = relight_by_irradiance_ratio(composite, sources=[source])
+        else:
+            light, cameras = read_true_light(self.light), read_cameras(self.cameras)
+            result = relight(composite, cameras, sources=[source], light=light)
+            report = result.report
+            if result.light is not None:
+                (folder / LIGHT_FILE).write_text(light_to_json(result.light))
+        write_gaussians(folder / SCENE_FILE, result.bake()[0])
+        for sentence in report:
             context.console.say(sentence)
 
 
@@ -281,26 +286,14 @@ def run_method(
 def _relit_scene(prior: Prior, scene: ComposedScene, console: Console) -> tuple[Path, float]:
     out = scene.work / "priors" / prior
     placement = scene.composite / PLACEMENT_FILE
-    if prior == "true-light":
-        if scene.light is None or scene.surroundings is None or scene.source_cameras is None:
-            raise ValueError(f"{scene.name}: expected a true light and the object's capture, found none")
-        with_true_light = RelightWithTrueLight(
-            scene.target,
-            placement,
-            scene.cameras,
-            light=scene.light,
-            out=out,
-            surroundings=scene.surroundings,
-            object_cameras=scene.source_cameras,
+    if prior in ("true-light", "transplat"):
+        light = scene.light if prior == "true-light" else None
+        if scene.surroundings is None or scene.source_cameras is None or (prior == "true-light" and light is None):
+            raise ValueError(f"{scene.name}: {prior}: expected the object's capture and a true light, found none")
+        step = RelightForBenchmark(
+            scene.target, placement, scene.cameras, scene.surroundings, scene.source_cameras, out, light
         )
-        return out / SCENE_FILE, perform_if_stale(with_true_light, console)
-    if prior == "transplat":
-        if scene.surroundings is None or scene.source_cameras is None:
-            raise ValueError(
-                f"{scene.name}: expected the object's capture, by which the old light is known, found none"
-            )
-        ratio = RelightByIrradianceRatio(scene.target, placement, scene.surroundings, scene.source_cameras, out)
-        return out / SCENE_FILE, perform_if_stale(ratio, console)
+        return out / SCENE_FILE, perform_if_stale(step, console)
     kind = "gain" if prior == "gain" else "transfer"
     step = Relight(
         scene.target,

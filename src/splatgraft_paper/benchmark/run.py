@@ -1,18 +1,38 @@
-"""One run of the benchmark: folders of its results, and the measurement of all methods on one scene."""
+"""One run of the benchmark: all methods measured on its scenes; tables as JSON, Markdown and a page."""
 
 import json
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
+from html import escape
+from importlib.metadata import version
 from pathlib import Path
 from typing import cast
 
+import torch
+
+from splatgraft.core.images import read_rgb, write_image
+from splatgraft.evaluation.regions import find_regions
+from splatgraft.evaluation.report_page import ViewFiles, html_page, viewer
 from splatgraft.fitting.perceptual_losses import lpips_vgg
+from splatgraft.formats import read_capture
+from splatgraft.project.layout import METRICS_FILE
 from splatgraft.project.step import Device
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
-from splatgraft_paper.benchmark.image_features import inception_features
-from splatgraft_paper.benchmark.measure_method import MeasureMethod
+from splatgraft_paper.benchmark.image_features import (
+    Features,
+    frechet_distance,
+    inception_features,
+    kernel_distance,
+)
+from splatgraft_paper.benchmark.measure import REGIONS, MeasureMethod, only_region, true_view
 from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_method
 from splatgraft_paper.benchmark.scene import GroundTruthScene, compose_scene, perform_if_stale
+from splatgraft_paper.benchmark.table import Benchmark, Row, as_json, markdown, table_section, tables
 
 NOT_RUN_FILE = "not_run.txt"
 SECONDS_FILE = "seconds.json"
@@ -94,3 +114,117 @@ def unmeasurable_metrics(folder: Path | None) -> dict[str, str]:
     except ValueError as error:
         missing["fid and kid"] = str(error)
     return missing
+
+
+def collect_results(run: BenchmarkRun, missing: dict[str, str], failures: list[str]) -> Benchmark:
+    """Read the measured values of all methods on all scenes.
+
+    Args:
+        run: The run.
+        missing: Metrics that were not measured, with the reason.
+        failures: One line per scene that failed as a whole.
+    """
+    rows, not_run, floors = [], [f"not run: {line}" for line in failures], []
+    counts: set[int] = set()
+    for method in run.methods:
+        for scene in run.scenes:
+            out = run.measured(scene, method)
+            reason = run.not_run_file(scene, method)
+            if reason.is_file():
+                not_run.append(f"{method.name} on {scene.name} not run: {reason.read_text()}")
+            elif (out / METRICS_FILE).is_file():
+                record = json.loads((out / METRICS_FILE).read_text())
+                times = json.loads(run.seconds_file(scene, method).read_text())
+                rows.append(Row(scene.name, method.name, record["values"], times))
+                counts.add(len(record["views"]))
+                if (disagreement := record["values"].get("disagreement_truth")) is not None:
+                    floors.append(disagreement)
+    notes = [
+        f"Every 8th view is held out of reconstruction, harmonisation and consolidation; {_span(counts)} per scene.",
+        f"{len(run.scenes)} scenes, quality {run.options.quality}, {os.cpu_count()} cores of {platform.machine()}, "
+        f"torch on {'CUDA' if torch.cuda.is_available() and run.device != 'cpu' else 'the CPU'}.",
+        f"Made by splatgraft {version('splatgraft')}: {shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}",
+    ]
+    if floors:
+        floor = sum(floors) / len(floors)
+        notes.append(f"The truth's own neighbouring views disagree by {floor:.4f} (gloss, render noise).")
+    if "fid and kid" not in missing:
+        notes.append("FID and KID are over the held-out views of all scenes; with so few pictures they are biased.")
+    pooled = {} if "fid and kid" in missing else _distributions(run)
+    return Benchmark(tuple(rows), tuple(not_run), missing, tuple(notes), pooled)
+
+
+def write_benchmark_report(run: BenchmarkRun, found: Benchmark) -> None:
+    """Write benchmark.json, benchmark.md and index.html."""
+    (run.out / "benchmark.json").write_text(json.dumps(as_json(found), indent=1, allow_nan=False))
+    (run.out / "benchmark.md").write_text(markdown(found))
+    views = []
+    by_name = {scene.name: scene for scene in run.scenes}
+    for scene in found.scenes:
+        truth = read_capture(by_name[scene].truth)
+        folders = {m.name: run.measured(by_name[scene], m) / "pictures" for m in run.methods}
+        stems = sorted({path.stem for folder in folders.values() for path in folder.glob("*.png")})
+        for stem in stems:
+            index = [Path(name).stem for name in truth.cameras.names].index(stem)
+            shown = run.out / "truth" / scene / f"{stem}.png"
+            shown.parent.mkdir(parents=True, exist_ok=True)
+            write_image(shown, truth.image(index))
+            files = {name: folder / f"{stem}.png" for name, folder in folders.items()}
+            files = {name: path for name, path in files.items() if path.is_file()} | {"Ground truth": shown}
+            relative = {name: str(path.relative_to(run.out)) for name, path in files.items()}
+            height, width = truth.image(index).shape[:2]
+            views.append(ViewFiles(f"{scene} {stem}", held_out=True, files=relative, width=width, height=height))
+    (run.out / "index.html").write_text(_benchmark_html(found, views))
+
+
+def _distributions(run: BenchmarkRun) -> dict[str, dict[str, float | None]]:
+    features: Features = inception_features(run.weights)
+    out: dict[str, dict[str, float | None]] = {}
+    for method in run.methods:
+        out[method.name] = {}
+        for region in REGIONS:
+            pairs = list(_pictures(run, method, region))
+            if len(pairs) < 2:
+                continue
+            found, wanted = features([p for p, _ in pairs]), features([t for _, t in pairs])
+            out[method.name] |= {
+                f"fid_{region}": frechet_distance(found, wanted),
+                f"kid_{region}": kernel_distance(found, wanted),
+            }
+    return out
+
+
+def _pictures(run: BenchmarkRun, method: Method, region: str) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """A method's pictures of all held-out views, each with the truth, which replaces it outside the region."""
+    for scene in run.scenes:
+        truth, photographs = read_capture(scene.truth), read_capture(scene.target)
+        for index, name in enumerate(truth.cameras.names):
+            path = run.measured(scene, method) / "pictures" / f"{Path(name).stem}.png"
+            if path.is_file():
+                view = true_view(truth, photographs, index)
+                mixed = only_region(read_rgb(path), view, find_regions(view), region)
+                if mixed is not None:
+                    yield mixed, view.image
+
+
+def _span(counts: set[int]) -> str:
+    if not counts:
+        return "no views"
+    low, high = min(counts), max(counts)
+    return f"{low} views" if low == high else f"{low} to {high} views"
+
+
+def _benchmark_html(benchmark: Benchmark, views: Sequence[ViewFiles]) -> str:
+    """Format the page; the files of `views` are relative to it."""
+    notes = [*benchmark.notes, *benchmark.not_run]
+    notes += [f"Not measured: {name}: {reason}" for name, reason in benchmark.not_measured.items()]
+    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    sections = [
+        viewer(views) if views else "",
+        *(table_section(table) for table in tables(benchmark)),
+        f"<section><h2>Limitations</h2><ul>{items}</ul></section>\n",
+    ]
+    scenes = len(benchmark.scenes)
+    count = f"{len(benchmark.methods)} methods on {scenes} scene{'s' if scenes != 1 else ''}"
+    subtitle = f"{count}; means over held-out views, then over scenes, with 95% bootstrap intervals over scenes."
+    return html_page("Benchmark of object transfer", subtitle, "".join(sections), views=views)

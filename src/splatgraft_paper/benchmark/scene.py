@@ -21,7 +21,7 @@ from splatgraft.project.record import read_record, why_stale
 from splatgraft.project.step import Device, Step, job_of, perform
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
-from splatgraft_paper.benchmark.true_light_file import TRUE_LIGHT_FILE
+from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE
 
 HELD_OUT_EVERY = 8
 """Every 8th view, from the first, is held out of reconstruction, harmonisation and consolidation."""

@@ -4,10 +4,11 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 
 import numpy as np
 
-from splatgraft_paper.benchmark.view_metrics import REGIONS
+from splatgraft_paper.benchmark.measure import REGIONS
 
 _RESAMPLES = 10_000
 """Of the bootstrap."""
@@ -221,3 +222,16 @@ def _cell(name: str, found: Summary | None, missing: bool = False) -> str:
     if found.scenes == 1 or found.low == found.high:
         return _plain(name, found.mean)
     return f"{_plain(name, found.mean)} [{_plain(name, found.low)}, {_plain(name, found.high)}]"
+
+
+def table_section(table: Table) -> str:
+    """Format one table with its title."""
+    head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table.head)
+    rows = "".join(
+        f'<tr><th scope="row">{escape(name)}</th>' + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
+        for name, *cells in table.rows
+    )
+    return (
+        f'<section><h2>{escape(table.title)}</h2><div class="scroll"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></div></section>\n"
+    )

@@ -4,14 +4,17 @@ The panorama is not clipped, as a photograph is: the sun of an environment map, 
 times as bright as the rest. Such peaks become sources first; what is left is divided as a photograph's panorama.
 """
 
+import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
+from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg, light_from_json, light_to_json
 from splatgraft.relighting.light.panorama import Panorama, cube_directions
 from splatgraft.relighting.light.panorama_sources import light_from_panorama
 
@@ -19,32 +22,23 @@ _FACE = 64
 """Pixels; width of a face of the cube map."""
 
 
-@dataclass(frozen=True)
-class PeakSettings:
-    """What of a panorama is a peak. Set by hand: suns and lamps of environment maps are 100 to 1000 times the mean."""
-
-    brightest: float = 50.0
-    """Times the mean gray radiance; a pixel above it makes a peak. Windows of rooms stay below."""
-    around: float = 5.0
-    """Times the mean; above it pixels near that pixel belong to the peak."""
-    near_deg: float = 15.0
-    """Degrees from the brightest pixel to what belongs to its peak."""
-    most: int = 6
-    """Peaks."""
+_PEAK_OVER_MEAN, _PEAK_AROUND = 50.0, 5.0
+"""Times the mean gray radiance: a pixel above the first makes a peak, and near it pixels above the second belong to it.
+Set by hand: suns and lamps of environment maps are 100 to 1000 times the mean; windows of rooms stay below."""
+_PEAK_NEAR_DEG = 15.0
+"""Degrees from the brightest pixel to what belongs to its peak."""
+_MAX_PEAKS = 6
 
 
-def light_from_probe(
-    panorama: Float[Tensor, "h w 3"], suns: list[dict], *, settings: PeakSettings = PeakSettings()
-) -> Light:
+def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Light:
     """A light from a rendered panorama and a list of suns.
 
     Args:
         panorama: Equirectangular linear radiance; row 0 is up (+z), the middle column +x, to the right -y.
         suns: Entries of suns.json: direction (unit, towards the sun), irradiance (linear rgb) and angular_radius
             (radians).
-        settings: Which parts of the panorama are sources of their own.
     """
-    panorama, peaks = _without_peaks(panorama, settings)
+    panorama, peaks = _without_peaks(panorama)
     directions, solid_angles = cube_directions(_FACE)
     cube = Panorama(
         radiance=_sampled(panorama, directions),
@@ -67,20 +61,18 @@ def light_from_probe(
     return Light(sources=tuple(ordered), ambient=captured.ambient, coverage=1.0, unseen_up=0.0)
 
 
-def _without_peaks(
-    panorama: Float[Tensor, "h w 3"], settings: PeakSettings
-) -> tuple[Float[Tensor, "h w 3"], list[LightSource]]:
+def _without_peaks(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], list[LightSource]]:
     """The panorama with its peaks replaced by the median of what is near them, and the peaks as sources."""
     directions, solid_angles = panorama_pixels(panorama)
     mean = float((panorama.mean(-1) * solid_angles).sum()) / (4 * math.pi)
     rest, peaks = panorama.clone(), []
-    while len(peaks) < settings.most:
+    while len(peaks) < _MAX_PEAKS:
         gray = rest.mean(-1)
         brightest = int(gray.argmax())
-        if float(gray.flatten()[brightest]) <= settings.brightest * mean:
+        if float(gray.flatten()[brightest]) <= _PEAK_OVER_MEAN * mean:
             break
-        near = directions @ directions.reshape(-1, 3)[brightest] > math.cos(math.radians(settings.near_deg))
-        peak = near & (gray > settings.around * mean)
+        near = directions @ directions.reshape(-1, 3)[brightest] > math.cos(math.radians(_PEAK_NEAR_DEG))
+        peak = near & (gray > _PEAK_AROUND * mean)
         around = rest[near & ~peak] if bool((near & ~peak).any()) else rest[~peak]
         peaks.append(_source(rest[peak], directions[peak], solid_angles[peak]))
         rest[peak] = around.median(0).values
@@ -126,3 +118,40 @@ def _sampled(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, "6 s s 
 def _triple(values: list[float]) -> tuple[float, float, float]:
     x, y, z = values
     return (x, y, z)
+
+
+TRUE_LIGHT_FILE = "true_light.json"
+
+
+def read_probe(panorama: Path, suns: Path) -> Light:
+    """Read the light that was measured at a place: a panorama without the suns (.npy), and a list of suns (.json).
+
+    Raises:
+        ValueError: A file is missing or damaged.
+    """
+    try:
+        radiance = torch.from_numpy(np.load(panorama, allow_pickle=False)).float()
+        return light_from_probe(radiance, json.loads(suns.read_text()))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{panorama}, {suns.name}: expected a measured light, found {error}") from error
+
+
+def write_true_light(scene: Path) -> None:
+    """Write true_light.json from probe.npy and suns.json of a gathered scene.
+
+    Raises:
+        ValueError: One of the two is missing or damaged.
+    """
+    light = read_probe(scene / "probe.npy", scene / "suns.json")
+    (scene / TRUE_LIGHT_FILE).write_text(light_to_json(light))
+
+
+def read_true_light(path: Path) -> Light:
+    """Read true_light.json.
+
+    Raises:
+        ValueError: There is no such file.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: expected the scene's true light, found none")
+    return light_from_json(path.read_text(), name=str(path))

@@ -9,8 +9,13 @@ from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task, run_tasks
 from splatgraft_paper.benchmark.methods import Method
-from splatgraft_paper.benchmark.report import collect_results, write_benchmark_report
-from splatgraft_paper.benchmark.run import BenchmarkRun, measure_scene, unmeasurable_metrics
+from splatgraft_paper.benchmark.run import (
+    BenchmarkRun,
+    collect_results,
+    measure_scene,
+    unmeasurable_metrics,
+    write_benchmark_report,
+)
 from splatgraft_paper.benchmark.scene import GroundTruthScene
 
 

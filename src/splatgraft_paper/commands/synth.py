@@ -14,11 +14,16 @@ from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.project.step import Positional, locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task
-from splatgraft_paper.benchmark.true_light_file import TRUE_LIGHT_FILE, write_true_light
+from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE, write_true_light
 from splatgraft_paper.synthesis import benchmark, pairs
-from splatgraft_paper.synthesis.jobs import copy_shared_takes, render_job
-from splatgraft_paper.synthesis.outdoors import SUPPLIED_MAPS
-from splatgraft_paper.synthesis.rendered_data import RenderWorkers, check_pairs, read_render_size, write_failures
+from splatgraft_paper.synthesis.jobs import (
+    RenderWorkers,
+    copy_shared_takes,
+    read_render_size,
+    render_job,
+    write_failures,
+)
+from splatgraft_paper.synthesis.places import SUPPLIED_MAPS
 from splatgraft_paper.synthesis.spheres import render_spheres
 from splatgraft_paper.training.pairs import RECORD_FILE, RelitSample, write_relit_manifest, write_sample
 from splatgraft_paper.training.recipes import parse_image_size
@@ -76,7 +81,7 @@ class SynthPairs:
                 folders.append(self.out / pairs.job_folder_name(job))
                 tasks.append(Task(folders[-1].name, partial(render_job, job, folders[-1], python)))
             failures += self.workers.run(tasks, console)
-            return check_pairs(self.out, failures, console)
+            return pairs.check_pairs(self.out, failures, console)
 
 
 def _files(folder: Path | None, suffixes: tuple[str, ...], option: str) -> tuple[str, ...]:
@@ -179,7 +184,7 @@ class SynthCheck:
         """Rewrite the manifest of pairs; 1 where something is faulty."""
         scenes = sorted(path.parent for path in self.out.glob("*/scene.json"))
         if not scenes:
-            return check_pairs(self.out, [], console)
+            return pairs.check_pairs(self.out, [], console)
         faults = [wrong for wrong in map(benchmark.find_defect, scenes) if wrong]
         console.say(f"{len(scenes) - len(faults)} of {len(scenes)} scenes are sound")
         write_failures(self.out, faults, console)

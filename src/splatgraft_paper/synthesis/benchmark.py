@@ -25,13 +25,11 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats import read_capture, write_capture
 from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
-from splatgraft_paper.synthesis import furniture, objects
-from splatgraft_paper.synthesis.cameras import capture_cameras
+from splatgraft_paper.synthesis import objects
+from splatgraft_paper.synthesis.furniture import Palette, box, cabinet, placed, plant
 from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take
-from splatgraft_paper.synthesis.outdoors import SUPPLIED_MAPS
-from splatgraft_paper.synthesis.pairs import make_scene
-from splatgraft_paper.synthesis.palette import Palette
-from splatgraft_paper.synthesis.scene import Material, Part, Place, Scene, World
+from splatgraft_paper.synthesis.places import SUPPLIED_MAPS, make_scene
+from splatgraft_paper.synthesis.scene import Material, Part, Place, Scene, World, capture_cameras
 
 _OBJECT_POINTS = 40_000
 """Sampled points on the object, from which its true normals follow."""
@@ -110,16 +108,12 @@ def pedestal_scene(seed: int, place: Place) -> Scene:
     top = max(0.5, 3.2 * place.radius)
     pedestal_material = replace(palette.stone(), roughness=0.7, scale=2.0)
     pedestal = Part("cylinder", (top, top, 0.4), (x, y, z - 0.2), pedestal_material, bevel=0.02)
-    ground = furniture.box((14, 14, 0.1), (x, y, z - 0.45), Material("tiles", (0.3, 0.29, 0.27), (0.2, 0.2, 0.2), 0.7))
+    ground = box((14, 14, 0.1), (x, y, z - 0.45), Material("tiles", (0.3, 0.29, 0.27), (0.2, 0.2, 0.2), 0.7))
     parts = [pedestal, ground]
     for i in range(5):
         angle = 2 * math.pi * (i + rng.random()) / 5
-        made = (
-            furniture.cabinet(rng, palette, 0.8, rng.uniform(0.4, 0.9)) if i % 2 else furniture.plant(rng, palette, 1.0)
-        )
-        parts += furniture.placed(
-            made, (x + 2.6 * math.cos(angle), y + 2.6 * math.sin(angle), z - 0.4), angle - math.pi / 2
-        )
+        made = cabinet(rng, palette, 0.8, rng.uniform(0.4, 0.9)) if i % 2 else plant(rng, palette, 1.0)
+        parts += placed(made, (x + 2.6 * math.cos(angle), y + 2.6 * math.sin(angle), z - 0.4), angle - math.pi / 2)
     world = World("environment", path=rng.choice(SUPPLIED_MAPS[:6]), rotation=rng.uniform(0, 6.283))
     return Scene(
         name=f"stage_{seed}",
@@ -145,8 +139,8 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
     parts = objects.make(which.object_seed, place)
     height = max(part.location[2] + part.size[2] / 2 for part in parts)
     yaw = random.Random(f"yaw-{which.seed}").uniform(0, 6.283)
-    source_parts = objects.standing_at(parts, place.location, yaw)
-    target_parts = objects.standing_at(parts, place.location, yaw + math.radians(which.pose_deg))
+    source_parts = placed(parts, place.location, yaw)
+    target_parts = placed(parts, place.location, yaw + math.radians(which.pose_deg))
     object_passes: tuple[str, ...] = ("color", "mask", "depth")
     middle = (place.location[0], place.location[1], place.location[2] + height / 2)
     provenance = {"scene": which.name, "pose_deg": str(which.pose_deg), "licence": "own render"}

@@ -1,21 +1,20 @@
-"""Render jobs: their description, and rendering them in a Blender process."""
+"""Render jobs, their rendering in Blender processes, and the checks and failure lists of the folders they write."""
 
 import json
 import shutil
 import subprocess
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from splatgraft.runtime.console import Console
 from splatgraft.runtime.process import run_logged
-from splatgraft.runtime.workers import Task
+from splatgraft.runtime.workers import Task, run_tasks
 from splatgraft_paper.synthesis.scene import Camera, Part, Scene, Vector, World
 
-Pass = Literal["color", "depth", "normal", "albedo", "mask", "groups"]
-"""`groups` is the linear light of every lamp alone and of the world, at the exposure of the pictures: NNNN_groups.npy
-(g, h, w, 3), in the order of light_groups.json. Where any take has it, probes have a first axis of groups too."""
+Pass = Literal["color", "depth", "normal", "albedo", "mask"]
 _WORKER = Path(__file__).parent / "blender" / "worker.py"
 
 
@@ -185,6 +184,57 @@ def check_blender(blender_python: Path) -> str:
     return found[-1].removeprefix("version ")
 
 
-def render_tasks(jobs: Sequence[tuple[Job, Path]], blender_python: Path) -> list[Task]:
-    """Make one task per job, for `run_tasks`."""
-    return [Task(out.name, partial(render_job, job, out, blender_python)) for job, out in jobs]
+FAILURES_FILE = "failures.txt"
+_SHOWN_FAILURES = 10
+
+
+@dataclass(frozen=True)
+class RenderWorkers:
+    """The Blender processes that render."""
+
+    blender_python: Path | None = None
+    """A Python 3.11 that has bpy; this one where not given."""
+    processes: int = 2
+    """Blender processes at a time on this machine."""
+    ray: str | None = None
+    """Address of a Ray cluster whose machines all see the folder; `local` for one of this machine's cores."""
+
+    def python(self, console: Console) -> Path:
+        """The interpreter, after a trial import of bpy.
+
+        Raises:
+            ValueError: It has no bpy.
+        """
+        found = self.blender_python or Path(sys.executable)
+        console.say(f"blender: {check_blender(found)} in {found}")
+        return found
+
+    def run(self, tasks: list[Task], console: Console) -> list[str]:
+        """Render, and return one line per task that failed."""
+        with console.bar("render") as progress:
+            return run_tasks(tasks, at_once=self.processes, ray_address=self.ray, progress=progress)
+
+
+def read_render_size(text: str, samples: int) -> RenderSize:
+    """Parse WIDTHxHEIGHT.
+
+    Raises:
+        ValueError: It is not of this form, a side is below 16 pixels, or `samples` is below 1.
+    """
+    parts = text.split("x")
+    if len(parts) != 2 or not all(part.isdigit() and int(part) >= 16 for part in parts) or samples < 1:
+        raise ValueError(
+            f"--size, --samples: expected such as 704x496 and at least one sample, found {text}, {samples}"
+        )
+    return RenderSize(int(parts[0]), int(parts[1]), samples)
+
+
+def write_failures(out: Path, failures: list[str], console: Console) -> None:
+    """Write failures.txt, or remove it where nothing failed, and say the first lines."""
+    path = out / FAILURES_FILE
+    path.unlink(missing_ok=True)
+    if failures:
+        path.write_text("\n".join(failures) + "\n")
+        for failure in failures[:_SHOWN_FAILURES]:
+            console.say(failure)
+        console.say(f"{len(failures)} failures, all in {path}")

@@ -5,8 +5,8 @@ import random
 from dataclasses import replace
 from pathlib import Path
 
-from splatgraft_paper.synthesis.palette import Palette, tone
-from splatgraft_paper.synthesis.scene import Material, Number, Part, Pattern, Place, Shape, Vector, add, rotate_z
+from splatgraft_paper.synthesis.furniture import Palette, tone
+from splatgraft_paper.synthesis.scene import Material, Number, Part, Pattern, Place, Shape, add, rotate_z
 
 
 def _profile(rng: random.Random) -> tuple[tuple[float, float], ...]:
@@ -107,15 +107,3 @@ def from_file(path: Path, place: Place) -> tuple[Part, ...]:
     size = (1.9 * place.radius, 1.9 * place.radius, height)
     any_material = Material("plain", (0.5, 0.5, 0.5))
     return (Part("model", size, (0, 0, height / 2), any_material, path=str(path)),)
-
-
-def standing_at(parts: tuple[Part, ...], location: Vector, yaw: Number) -> tuple[Part, ...]:
-    """Rotate the object about the vertical by `yaw` radians and move it from the origin to `location`."""
-    return tuple(
-        replace(
-            p,
-            location=add(rotate_z(p.location, yaw), location),
-            rotation=(p.rotation[0], p.rotation[1], p.rotation[2] + yaw),
-        )
-        for p in parts
-    )

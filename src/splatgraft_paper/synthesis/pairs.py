@@ -26,31 +26,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import read_rgb, read_straight_rgb
+from splatgraft.runtime.console import Console
 from splatgraft_paper.synthesis import objects
-from splatgraft_paper.synthesis.cameras import camera_arc
-from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take
-from splatgraft_paper.synthesis.outdoors import OUTDOORS, SUPPLIED_MAPS, outdoor
-from splatgraft_paper.synthesis.rooms import INTERIORS, interior
-from splatgraft_paper.synthesis.scene import Scene, World
+from splatgraft_paper.synthesis.furniture import placed
+from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take, write_failures
+from splatgraft_paper.synthesis.places import KINDS, SUPPLIED_MAPS, make_scene
+from splatgraft_paper.synthesis.scene import World, camera_arc
 
 _OBJECT_POINTS, _SCENE_POINTS = 12_000, 100_000
 """Sampled points per object and per scene."""
 _SURFACE_RADIUS = 8.0
 """Metres around the object within which surface points are sampled."""
-KINDS: tuple[str, ...] = (*INTERIORS, *OUTDOORS)
-
-
-def make_scene(kind: str, seed: int) -> Scene:
-    """Make the scene of a kind and a seed.
-
-    Raises:
-        ValueError: the kind is unknown.
-    """
-    if kind in INTERIORS:
-        return interior(seed, kind)
-    if kind in OUTDOORS:
-        return outdoor(seed, kind)
-    raise ValueError(f"scene kind: expected one of {', '.join(KINDS)}, found '{kind}'")
 
 
 @dataclass(frozen=True)
@@ -88,7 +74,7 @@ def plan(options: PairPlan, number: int) -> Job:
         else:
             parts = objects.make(rng.randrange(2**31), place)
         heights.append(max(part.location[2] + part.size[2] / 2 for part in parts))
-        things[f"object{i}"] = objects.standing_at(parts, place.location, rng.uniform(0, 6.283))
+        things[f"object{i}"] = placed(parts, place.location, rng.uniform(0, 6.283))
     middle = (place.location[0], place.location[1], place.location[2] + 0.5 * max(heights))
     takes = [Take("background", scene=True)]
     for name in things:
@@ -133,23 +119,6 @@ class PairSample:
         return self.folder / take / f"{self.camera:04d}{'_' + kind if kind else ''}{suffix}"
 
 
-@dataclass(frozen=True)
-class Pair:
-    """One training pair in memory, sRGB in [0, 1]."""
-
-    composite: Float[Tensor, "h w 3"]
-    """The object in the light of another place, pasted onto the background (paper, Eq. 2)."""
-    target: Float[Tensor, "h w 3"]
-    """The scene rendered with the object."""
-    background: Float[Tensor, "h w 3"]
-    mask: Float[Tensor, "h w"]
-    depth: Float[Tensor, "h w"]
-    """Metres along the optical axis, 0 for the sky."""
-    normal: Float[Tensor, "h w 3"]
-    """Unit, world axes."""
-    albedo: Float[Tensor, "h w 3"]
-
-
 def match_statistics(
     relit: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
@@ -183,32 +152,6 @@ def composite(
     return mask[..., None] * relit + (1 - mask[..., None]) * background
 
 
-def load_pair(sample: PairSample) -> Pair:
-    """Read one pair and compute its composite.
-
-    Raises:
-        ValueError: a file is missing or broken.
-    """
-    target, background = read_rgb(sample.path(sample.object)), read_rgb(sample.path("background"))
-    mask = read_rgb(sample.path(sample.object, "mask"))[..., 0]
-    relit = read_straight_rgb(sample.path(f"{sample.object}_{sample.light}"))
-    depth_path = sample.path(sample.object, "depth")
-    try:
-        depth = torch.from_numpy(np.load(depth_path, allow_pickle=False).astype(np.float32))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{depth_path}: expected a float16 array, found {error}") from error
-    normal = read_rgb(sample.path(sample.object, "normal")) * 2 - 1
-    return Pair(
-        composite=composite(match_statistics(relit, target, mask), background, mask),
-        target=target,
-        background=background,
-        mask=mask,
-        depth=depth,
-        normal=torch.nn.functional.normalize(normal, dim=-1),
-        albedo=read_rgb(sample.path(sample.object, "albedo")),
-    )
-
-
 def samples_in(folder: Path) -> list[PairSample]:
     """List all pairs of a rendered folder by its job.json.
 
@@ -227,30 +170,32 @@ def samples_in(folder: Path) -> list[PairSample]:
 
 def find_defect(sample: PairSample) -> str | None:
     """Describe the first defect of a pair in one line, or None: a missing, broken, empty, black or clipped picture."""
+    target_path, background_path = sample.path(sample.object), sample.path("background")
+    mask_path, relit_path = sample.path(sample.object, "mask"), sample.path(f"{sample.object}_{sample.light}")
+    depth_path = sample.path(sample.object, "depth")
     try:
-        pair = load_pair(sample)
-        relit = read_straight_rgb(sample.path(f"{sample.object}_{sample.light}"))
-    except ValueError as error:
-        return str(error)
-    luma, inside = pair.target.mean(-1), pair.mask > 0.5
+        target, background, mask = read_rgb(target_path), read_rgb(background_path), read_rgb(mask_path)[..., 0]
+        relit = read_straight_rgb(relit_path)
+        for kind in ("normal", "albedo"):
+            read_rgb(sample.path(sample.object, kind))
+        np.load(depth_path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        said = str(error)
+        return said if "expected" in said else f"{depth_path}: expected a float16 array, found {said}"
+    luma, inside = target.mean(-1), mask > 0.5
     covered, clipped = float(inside.float().mean()), float((luma > 0.995).float().mean())
     mean, deviation = float(luma.mean()), float(luma.std())
-    far = torch.nn.functional.max_pool2d(pair.mask[None, None], 31, 1, 15)[0, 0] < 0.01
-    difference = float((pair.target - pair.background)[far].abs().median()) if bool(far.any()) else 0.0
+    far = torch.nn.functional.max_pool2d(mask[None, None], 31, 1, 15)[0, 0] < 0.01
+    difference = float((target - background)[far].abs().median()) if bool(far.any()) else 0.0
     lit = float(relit[inside].mean()) if covered else 0.0
-    target = sample.path(sample.object)
+    lines = f"mean {mean:.3f}, deviation {deviation:.3f}"
     # thresholds set by hand on rendered pairs
     checks = (
-        (0.002 <= covered <= 0.7, sample.path(sample.object, "mask"), "a mask of 0.2% to 70%", f"{covered:.2%}"),
-        (mean > 0.02 and deviation > 0.01, target, "a lit picture", f"mean {mean:.3f}, deviation {deviation:.3f}"),
-        (clipped <= 0.4, target, "at most 40% clipped", f"{clipped:.0%}"),
-        (lit > 0.01, sample.path(f"{sample.object}_{sample.light}"), "a lit object", f"mean {lit:.3f}"),
-        (
-            difference <= 0.08,
-            sample.path("background"),
-            "the target's scene",
-            f"a median difference of {difference:.3f}",
-        ),
+        (0.002 <= covered <= 0.7, mask_path, "a mask of 0.2% to 70%", f"{covered:.2%}"),
+        (mean > 0.02 and deviation > 0.01, target_path, "a lit picture", lines),
+        (clipped <= 0.4, target_path, "at most 40% clipped", f"{clipped:.0%}"),
+        (lit > 0.01, relit_path, "a lit object", f"mean {lit:.3f}"),
+        (difference <= 0.08, background_path, "the target's scene", f"a median difference of {difference:.3f}"),
     )
     return next(
         (f"{path}: expected {expected}, found {found}" for sound, path, expected, found in checks if not sound), None
@@ -304,3 +249,23 @@ def read_manifest(out: Path) -> list[PairSample]:
                 f"{path}, line {number}: expected folder, camera, object and light, found {line[:80]}"
             ) from error
     return samples
+
+
+def check_pairs(out: Path, failures: list[str], console: Console) -> int:
+    """Check all rendered scenes in `out`; write the manifest of their pairs and the list of failures.
+
+    Returns:
+        0 where nothing failed and no pair is faulty, otherwise 1.
+
+    Raises:
+        ValueError: There are neither scenes nor failures.
+    """
+    folders = sorted(path.parent for path in out.glob("*/job.json"))
+    if not folders and not failures:
+        raise ValueError(f"{out}: expected rendered pairs or benchmark scenes, found none")
+    count, faults = write_manifest(out, folders)
+    console.say(f"{count} sound pairs in {len(folders)} scenes; {len(failures)} scenes failed, {len(faults)} faults")
+    write_failures(out, [*failures, *faults], console)
+    if folders:
+        console.result(out / "manifest.jsonl")
+    return 1 if failures or faults else 0

@@ -15,7 +15,7 @@ from torch import Tensor
 from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.evaluation import side_by_side
 from splatgraft.evaluation.report_page import html_page
-from splatgraft_paper.benchmark.page import table_section
+from splatgraft_paper.benchmark.table import table_section
 from splatgraft_paper.tables.data_layout import as_toml
 from splatgraft_paper.tables.paper_numbers import COMGS_IS_GIVEN, SCENES
 from splatgraft_paper.tables.paper_scene import LAYOUT_FILE, Dataset, Kind, PaperScene

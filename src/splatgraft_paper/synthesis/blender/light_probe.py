@@ -3,7 +3,6 @@
 import math
 
 import bpy
-import light_groups
 import numpy as np
 import passes
 import scene_builder
@@ -21,10 +20,8 @@ _SUN_PIXELS = 24
 def measure(scene, world, point, things):
     """Render the radiance (64, 128, 3) around `point` without the suns' discs, and list the suns that reach it.
 
-    In Blender's units. Surfaces are lit by the suns. Where the view layer has light groups, the radiance is that of
-    each (g, 64, 128, 3), and every sun names its group.
-
-    Row 0 looks up, the middle column along +x; columns run to the right as seen from inside (towards -y).
+    In Blender's units. Surfaces are lit by the suns. Row 0 looks up, the middle column along +x; columns run to the
+    right as seen from inside (towards -y).
     """
     cycles, layer = bpy.context.scene.cycles, bpy.context.scene
     lamps = [thing for thing in things if thing.type == "LIGHT"]
@@ -46,8 +43,7 @@ def measure(scene, world, point, things):
         panorama = np.where(disc[..., None], panorama, with_sun)
     for thing in shown:
         thing.visible_camera = False
-    described = zip(scene["lamps"], lamps, strict=False)  # none where the scene is hidden
-    suns = [_lamp_sun(lamp, thing) for lamp, thing in described if lamp["kind"] == "sun"]
+    suns = [_lamp_sun(lamp) for lamp in scene["lamps"] if lamp["kind"] == "sun"]
     if world["kind"] == "sky":
         suns.append(_sky_sun(world, things))
     return panorama, [sun for sun in suns if _reaches(point, sun["direction"])]
@@ -55,8 +51,7 @@ def measure(scene, world, point, things):
 
 def _panorama(camera, world):
     bpy.context.scene.world = scene_builder.make_world(world)
-    kind = "groups" if light_groups.names() else "color"
-    return passes.render(camera, [kind])[kind][..., :3].astype(np.float64)
+    return passes.render(camera, ["color"])["color"][..., :3].astype(np.float64)
 
 
 def _around(towards, angle):
@@ -78,14 +73,13 @@ def _panoramic(point):
     return thing
 
 
-def _lamp_sun(lamp, thing):
+def _lamp_sun(lamp):
     towards = -Vector(lamp["direction"]).normalized()
     irradiance = [lamp["power"] * channel for channel in lamp["color"]]
     return {
         "direction": list(towards),
         "irradiance": irradiance,
         "angular_radius": 0.5 * lamp["size"],
-        "group": thing.name,
     }
 
 
@@ -120,7 +114,6 @@ def _sky_sun(world, things):
         "direction": list(towards),
         "irradiance": irradiance.tolist(),
         "angular_radius": 0.5 * world["sun_size"],
-        "group": light_groups.WORLD,
     }
 
 

@@ -6,7 +6,6 @@ import tempfile
 import zlib
 
 import bpy
-import light_groups
 import numpy as np
 
 
@@ -62,8 +61,22 @@ def configure(width, height, samples, seed):
     layer.use_pass_cryptomatte_object = True
 
 
-def _outputs(folder, names, matte, denoised):
-    """Make a compositor tree that writes the passes as EXR files into `folder`, light groups denoised or not."""
+def render(camera, names, matte=()):
+    """Render one camera; returns arrays by pass: color (linear RGBA), depth, normal, albedo, mask."""
+    scene = bpy.context.scene
+    scene.camera = camera
+    with tempfile.TemporaryDirectory() as folder:
+        _write_passes(folder, names, matte)
+        bpy.ops.render.render(write_still=False)
+        found = {name: _read(folder, name) for name in names}
+    for name in ("depth", "mask"):
+        if name in found:
+            found[name] = found[name][..., 0]
+    return found
+
+
+def _write_passes(folder, names, matte):
+    """Make a compositor tree that writes the passes as EXR files into `folder`."""
     scene = bpy.context.scene
     scene.use_nodes = True
     tree = scene.node_tree
@@ -73,24 +86,9 @@ def _outputs(folder, names, matte, denoised):
     out.base_path = folder
     out.format.file_format, out.format.color_depth, out.format.color_mode = "OPEN_EXR", "32", "RGBA"
     out.file_slots.clear()
-    groups = light_groups.names() if "groups" in names else []
-    for name in [*(name for name in names if name != "groups"), *map(_slot, groups)]:
-        out.file_slots.new(name)
-    for name in groups:
-        light = layers.outputs[f"Combined_{name}"]
-        if not denoised:
-            tree.links.new(light, out.inputs[_slot(name)])
-            continue
-        denoise = tree.nodes.new("CompositorNodeDenoise")
-        denoise.prefilter = "FAST"
-        tree.links.new(light, denoise.inputs["Image"])
-        tree.links.new(layers.outputs["Denoising Normal"], denoise.inputs["Normal"])
-        tree.links.new(layers.outputs["Denoising Albedo"], denoise.inputs["Albedo"])
-        tree.links.new(denoise.outputs["Image"], out.inputs[_slot(name)])
     sockets = {"color": "Image", "depth": "Depth", "normal": "Normal", "albedo": "DiffCol"}
     for name in names:
-        if name == "groups":
-            continue
+        out.file_slots.new(name)
         if name == "mask":
             crypto = tree.nodes.new("CompositorNodeCryptomatteV2")
             crypto.source = "RENDER"
@@ -99,37 +97,6 @@ def _outputs(folder, names, matte, denoised):
             tree.links.new(crypto.outputs["Matte"], out.inputs[name])
         else:
             tree.links.new(layers.outputs[sockets[name]], out.inputs[name])
-
-
-def render(camera, names, matte=()):
-    """Render one camera; returns arrays by pass: color (linear RGBA), depth, normal, albedo, mask, groups.
-
-    `groups` are the linear rgb (g, h, w, 3) of the light groups, in the order of `light_groups.names()`; the colour is
-    their sum.
-    """
-    scene = bpy.context.scene
-    scene.camera = camera
-    by_group, denoised = "groups" in names, scene.cycles.use_denoising
-    bpy.context.view_layer.cycles.denoising_store_passes = by_group
-    # the groups are denoised one by one
-    scene.cycles.use_denoising = denoised and not by_group
-    with tempfile.TemporaryDirectory() as folder:
-        _outputs(folder, names, matte, denoised)
-        bpy.ops.render.render(write_still=False)
-        found = {name: _read(folder, name) for name in names if name != "groups"}
-        if "groups" in names:
-            found["groups"] = np.stack([_read(folder, _slot(name))[..., :3] for name in light_groups.names()])
-            if "color" in found:
-                found["color"][..., :3] = found["groups"].sum(0)
-    scene.cycles.use_denoising = denoised
-    for name in ("depth", "mask"):
-        if name in found:
-            found[name] = found[name][..., 0]
-    return found
-
-
-def _slot(group):
-    return f"group_{group}_"
 
 
 def _read(folder, name):

@@ -8,7 +8,6 @@ from itertools import pairwise
 
 import bmesh
 import bpy
-import light_groups
 import materials  # found in this folder, which the worker puts on the path
 from mathutils import Euler, Matrix, Vector, noise
 
@@ -302,7 +301,7 @@ def environment_path(name):
 def make_world(world):
     """Make a Blender world from the JSON form of `synthesis.scene.World`."""
     made = bpy.data.worlds.new("world")
-    made.use_nodes, made.lightgroup = True, light_groups.WORLD
+    made.use_nodes = True
     nodes, links = made.node_tree.nodes, made.node_tree.links
     background = nodes["Background"]
     background.inputs["Strength"].default_value = world["strength"]

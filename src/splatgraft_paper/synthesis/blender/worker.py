@@ -13,7 +13,6 @@ import time
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
 import bpy
-import light_groups
 import light_probe
 import numpy as np
 import passes
@@ -101,8 +100,6 @@ def _write(folder, name, take, arrays, exposure):
             passes.write_png(path + ".png", color)
         elif kind == "depth":
             passes.write_npy(path + ".npy", np.where(arrays["depth"] > 500, 0, arrays["depth"]).astype(np.float16))
-        elif kind == "groups":
-            passes.write_npy(path + ".npy", (arrays["groups"] * exposure).astype(np.float16))
         elif kind == "normal":
             passes.write_png(path + ".png", arrays["normal"][..., :3] * 0.5 + 0.5)
         elif kind == "albedo":
@@ -123,10 +120,6 @@ def main(path):
     os.makedirs(job["out"], exist_ok=True)
     scene_things, objects, cameras = _populate(job)
     passes.configure(job["width"], job["height"], job["samples"], job.get("seed", 0))
-    if any("groups" in take["passes"] for take in job["takes"]):
-        names = light_groups.assign(scene_things)
-        with open(os.path.join(job["out"], "light_groups.json"), "w") as out:
-            json.dump(names, out)
     poses = [[list(row) for row in camera.matrix_world] for camera in cameras]
     with open(os.path.join(job["out"], "cameras.json.partial"), "w") as out:
         fields = [camera["field_of_view"] for camera in job["cameras"]]

@@ -37,7 +37,7 @@ from splatgraft.relighting.shadows.scene_ratio import (
 )
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
-from splatgraft_paper.benchmark.true_light import light_from_probe
+from splatgraft_paper.benchmark.true_light import read_probe
 from splatgraft_paper.synthesis.benchmark import rendered_cameras
 from splatgraft_paper.synthesis.pairs import samples_in
 
@@ -112,20 +112,6 @@ def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Pro
         progress(number + 1, len(folders), folder.name)
 
 
-def read_light(folder: Path) -> Light:
-    """Read the light that a probe take measured.
-
-    Raises:
-        ValueError: it is missing or broken.
-    """
-    try:
-        panorama = torch.from_numpy(np.load(folder / "0000.npy", allow_pickle=False)).float()
-        suns = json.loads((folder / "suns.json").read_text())
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{folder}: expected 0000.npy and suns.json, found {error}") from error
-    return light_from_probe(panorama, suns)
-
-
 def light_transfer_priors(folder: Path, object_: str, lights: list[str], *, seed: int) -> list[PairPrior]:
     """Compute one prior per light of an object.
 
@@ -143,12 +129,12 @@ def light_transfer_priors(folder: Path, object_: str, lights: list[str], *, seed
     pixels = read_pixels(folder, object_, cameras)
     object_surfels = read_surfels(folder, object_, _GRAY)
     scene_surfels = read_surfels(folder, "scene", _GRAY)
-    light_at_place = read_light(folder / "place_probe")
+    light_at_place = _probe(folder / "place_probe")
     priors = []
     for light in lights:
         rng = random.Random(f"prior-{seed}-{folder.name}-{object_}-{light}")
         target_light = perturb_light(light_at_place, rng)
-        source_light = perturb_light(read_light(folder / f"{object_}_{light}_probe"), rng)
+        source_light = perturb_light(_probe(folder / f"{object_}_{light}_probe"), rng)
         noise = torch.Generator().manual_seed(rng.randrange(2**31))
         transfer = _PairTransfer(pixels, object_surfels, scene_surfels, source_light, target_light)
         on_object, on_scene = transfer.object_log_ratio(noise), transfer.scene_log_ratio()
@@ -296,6 +282,10 @@ def _smooth_noise(shape: torch.Size, generator: torch.Generator) -> Float[Tensor
         math.radians(_NORMAL_NOISE_DEG)
     )
     return torch.nn.functional.interpolate(coarse, size=(h, w), mode="bilinear").permute(0, 2, 3, 1)
+
+
+def _probe(folder: Path) -> Light:
+    return read_probe(folder / "0000.npy", folder / "suns.json")
 
 
 def perturb_light(light: Light, rng: random.Random) -> Light:

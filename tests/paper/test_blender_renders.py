@@ -24,8 +24,11 @@ from splatgraft.formats import read_capture
 from splatgraft.runtime.workers import Task, run_tasks
 from splatgraft_paper.benchmark.true_light import light_from_probe
 from splatgraft_paper.synthesis import benchmark, objects, pairs
+from splatgraft_paper.synthesis.furniture import placed
 from splatgraft_paper.synthesis.jobs import Job, RenderSize, Take, check_blender, render_job
+from splatgraft_paper.synthesis.places import make_scene
 from splatgraft_paper.synthesis.scene import Camera, Lamp, Material, Part, Place, Scene, World
+from splatgraft_paper.training.pairs import open_rendered
 
 PYTHON = Path(os.environ.get("SPLATGRAFT_BLENDER_PYTHON", "no-blender"))
 pytestmark = pytest.mark.skipif(
@@ -72,9 +75,11 @@ def test_an_interpreter_without_bpy_is_refused():
         check_blender(Path("/bin/false"))
 
 
+@pytest.mark.long
 def test_a_rendered_composite_is_equation_2_to_the_bit(pair_folder):
-    for sample in pairs.samples_in(pair_folder):
-        pair = pairs.load_pair(sample)
+    pairs.write_manifest(pair_folder.parent, [pair_folder])
+    for sample, files in zip(pairs.samples_in(pair_folder), open_rendered(pair_folder.parent).pairs, strict=True):
+        pair = files.read()
         relit = read_straight_rgb(sample.path("object0_light0"))
         background = read_rgb(sample.path("background"))
         mask = read_rgb(sample.path("object0", "mask"))[..., :1]
@@ -83,6 +88,7 @@ def test_a_rendered_composite_is_equation_2_to_the_bit(pair_folder):
         assert torch.equal(pair.composite[mask[..., 0] == 0], background[mask[..., 0] == 0])
 
 
+@pytest.mark.long
 def test_rendered_pairs_are_sound_and_show_the_same_scene_with_and_without_the_object(pair_folder):
     samples = pairs.samples_in(pair_folder)
     assert len(samples) == 5
@@ -90,6 +96,7 @@ def test_rendered_pairs_are_sound_and_show_the_same_scene_with_and_without_the_o
 
 
 @pytest.mark.parametrize("damage", ["truncated", "black", "another scene"])
+@pytest.mark.long
 def test_a_spoilt_render_is_caught_and_named(pair_folder, damage):
     sample = pairs.samples_in(pair_folder)[2]
     path = sample.path("background")
@@ -109,6 +116,7 @@ def test_a_spoilt_render_is_caught_and_named(pair_folder, damage):
         path.write_bytes(sound)
 
 
+@pytest.mark.long
 def test_masks_and_depths_lie_where_the_poses_project_known_points(tmp_path):
     centers, radius = ((0.5, 0.2, 0.4), (-0.4, -0.3, 0.25), (0.1, 0.6, 0.9)), 0.12
     cameras = (Camera((2.2, -1.4, 1.3), (0, 0, 0.4), 0.9), Camera((-1.0, -2.5, 0.8), (0.1, 0.1, 0.5), 1.2))
@@ -135,6 +143,7 @@ def test_masks_and_depths_lie_where_the_poses_project_known_points(tmp_path):
             assert abs(depth - front) < 0.01
 
 
+@pytest.mark.long
 def test_a_scene_lit_from_the_left_has_its_shadow_on_the_right(tmp_path):
     # the camera stands at -y and looks along +y, so that +x is right in the picture
     cameras = (Camera((0, -3, 1.6), (0, 0, 0.2), 0.9),)
@@ -155,6 +164,7 @@ def test_a_scene_lit_from_the_left_has_its_shadow_on_the_right(tmp_path):
     assert sides["right"] < -4
 
 
+@pytest.mark.long
 def test_a_killed_job_goes_on_where_it_was_and_ends_the_same(tmp_path):
     job = pairs.plan(pairs.PairPlan(objects=1, lights=1, size=RenderSize(64, 48, 2)), 5)
     whole = rendered(job, tmp_path / "whole")
@@ -180,6 +190,7 @@ def test_a_killed_job_goes_on_where_it_was_and_ends_the_same(tmp_path):
     assert not list(out.rglob("*.partial"))
 
 
+@pytest.mark.long
 def test_a_job_that_blender_cannot_render_says_so_in_a_line(tmp_path):
     thing = Part("model", (1, 1, 1), (0, 0, 0.5), WHITE, path=str(tmp_path / "absent.glb"))
     job = Job(floor_scene(), {"a": (thing,)}, (Camera((0, -3, 1), (0, 0, 0)),), (Take("a", True, "a"),), TINY)
@@ -189,6 +200,7 @@ def test_a_job_that_blender_cannot_render_says_so_in_a_line(tmp_path):
     assert "absent.glb" in failures[0]
 
 
+@pytest.mark.long
 def test_a_benchmark_scene_is_laid_out_sound_with_its_true_light(tmp_path):
     which = benchmark.SCENES[6]
     size = benchmark.BenchmarkSize(replace(TINY, samples=1), 3)
@@ -199,7 +211,7 @@ def test_a_benchmark_scene_is_laid_out_sound_with_its_true_light(tmp_path):
     out = tmp_path / which.name
     benchmark.gather(which, *folders, out)
     assert benchmark.find_defect(out) is None
-    truth, place = read_capture(out / "ground_truth"), pairs.make_scene(which.kind, which.seed).places[0]
+    truth, place = read_capture(out / "ground_truth"), make_scene(which.kind, which.seed).places[0]
     assert truth.cameras.names == read_capture(out / "target").cameras.names
     # sparse points are where surfaces are: the support under the object among them, within noise (0.2% of 3 m)
     points = read_capture(out / "target").points
@@ -222,6 +234,7 @@ def test_a_benchmark_scene_is_laid_out_sound_with_its_true_light(tmp_path):
     assert abs(float(surface[:, 2].min()) - place.location[2]) < 0.03  # a blob is sunk by 4% of its height
 
 
+@pytest.mark.long
 def test_a_turned_object_stands_as_the_placement_says():
     which = next(scene for scene in benchmark.ROTATIONS if scene.pose_deg == 120)
     target, source = benchmark.plan(which, benchmark.BenchmarkSize(TINY, 3))
@@ -233,6 +246,7 @@ def test_a_turned_object_stands_as_the_placement_says():
         assert np.allclose(moved, after.location[:2], atol=1e-9)
 
 
+@pytest.mark.long
 def test_a_sun_behind_a_wall_is_no_light_at_the_place_though_an_object_stands_around_the_probe(tmp_path):
     sun = Lamp("sun", (1.0, 1.0, 1.0), 3.0, direction=(1, 0, -1), size=0.01)
     open_air = floor_scene(lamps=[sun])
@@ -260,6 +274,7 @@ def test_a_sun_lamp_is_listed_and_its_disc_is_not_in_the_panorama(tmp_path):
     assert sky.max() < 1.5 * np.median(sky)
 
 
+@pytest.mark.long
 def test_a_model_of_the_users_fits_its_place_and_stands_on_it(tmp_path):
     # a flat slab, 4 x 2 x 0.5 in the file's units, far from the file's origin; .obj files have y up
     corners = [(x, y, z) for x in (10, 14) for y in (3, 3.5) for z in (-2, 0)]
@@ -267,7 +282,7 @@ def test_a_model_of_the_users_fits_its_place_and_stands_on_it(tmp_path):
     lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {face}" for face in faces]
     (tmp_path / "slab.obj").write_text("\n".join(lines) + "\n")
     scene = floor_scene()
-    slab = objects.standing_at(objects.from_file(tmp_path / "slab.obj", scene.places[0]), (0.0, 0.0, 0.0), 0.0)
+    slab = placed(objects.from_file(tmp_path / "slab.obj", scene.places[0]), (0.0, 0.0, 0.0), 0.0)
     cameras = (Camera((0, -4, 0.02), (0, 0, 0.02), 0.6), Camera((0, -0.001, 5), (0, 0, 0), 0.6))
     takes = (Take("slab", scene=False, object="slab", passes=("color", "mask")),)
     size = RenderSize(width=160, height=112, samples=4)

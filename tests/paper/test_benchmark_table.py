@@ -10,8 +10,8 @@ import torch
 from splatgraft.core.cameras import Cameras
 from splatgraft.evaluation.regions import Truth, find_regions
 from splatgraft_paper.benchmark.image_features import frechet_distance, kernel_distance
+from splatgraft_paper.benchmark.measure import disagreement, measure_view, only_region, warp
 from splatgraft_paper.benchmark.table import Benchmark, Row, as_json, markdown, summaries, summarize, tables
-from splatgraft_paper.benchmark.view_metrics import disagreement, measure_view, only_region, warp
 
 
 def benchmark(scenes=("a", "b", "c"), **options):

@@ -51,11 +51,6 @@ def test_normalised_object_has_the_targets_mean_and_deviation():
     assert torch.allclose(made.std(0), wanted.std(0), rtol=1e-4)
 
 
-def test_loaded_pair_equals_background_outside_the_mask(tmp_path):
-    pair = pairs.load_pair(write_sample(tmp_path / "a"))
-    assert torch.equal(pair.composite[pair.mask == 0], pair.background[pair.mask == 0])
-
-
 def test_sound_samples_make_the_manifest_and_come_back(tmp_path):
     sample = write_sample(tmp_path / "a")
     count, faults = pairs.write_manifest(tmp_path, [tmp_path / "a"])

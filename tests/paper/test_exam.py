@@ -5,12 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from exam.draw import SIZE, draw_scenes
-from exam.evaluate_scene import SceneResult, measure_row
-from exam.measure_light import light_errors, median_angle_deg, nearest_normals, seen_surface
-from exam.rows import make_row
-from exam.scene_files import ExamScene, TrueView
-from exam.summary import summarize_light, summarize_row, summary_markdown
 from shapes import ring, surfels
 
 from splatgraft.core.cameras import Cameras
@@ -22,7 +16,10 @@ from splatgraft.evaluation import Truth
 from splatgraft.relighting import Light, LightSource, SourceScene
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.rendering import render
-from splatgraft_paper.synthesis import benchmark, pairs
+from splatgraft_paper.exam.measure import SceneResult, light_errors, make_row, measure_row, median_angle_deg
+from splatgraft_paper.exam.scenes import SIZE, ExamScene, TrueView, draw_scenes, nearest_normals, seen_surface
+from splatgraft_paper.exam.summary import summarize_light, summarize_row, summary_markdown
+from splatgraft_paper.synthesis import benchmark, places
 
 SUN = LightSource(direction=(0.0, 0.0, 1.0), irradiance=(3.0, 3.0, 3.0))
 LIGHT = Light(sources=(SUN,), ambient=fit_ambient(torch.tensor([0.5, 0.5, 0.5])))
@@ -36,7 +33,7 @@ def test_a_number_is_an_exam():
     assert not {scene.seed for scene in first} & {scene.seed for scene in other}
     assert not {scene.object_seed for scene in first} & {scene.object_seed for scene in other}
     # all kinds, in another order
-    assert sorted(scene.kind for scene in first) == sorted(pairs.KINDS) == sorted(scene.kind for scene in other)
+    assert sorted(scene.kind for scene in first) == sorted(places.KINDS) == sorted(scene.kind for scene in other)
     assert len({scene.name for scene in first}) == 8
 
 
@@ -137,10 +134,10 @@ def test_fitted_colours_make_the_true_shadow_in_views_they_were_not_fitted_to():
         old_light=even,
         normals=None,
     )
-    rows = {row: make_row(row, scene)[0] for row in ("paste", "told-both", "fitted")}
+    rows = {row: make_row(row, scene)[0] for row in ("paste", "true-lights", "fitted")}
     error = {row: measure_row(made, scene.views)["shadow"] for row, made in rows.items()}
     assert error["fitted"] < 0.3 * error["paste"]
-    assert error["told-both"] > 0.7 * error["paste"]
+    assert error["true-lights"] > 0.7 * error["paste"]
 
 
 def result(name, *rows, light=None) -> SceneResult:

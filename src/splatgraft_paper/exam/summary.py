@@ -1,11 +1,9 @@
-"""The figures of an exam over all its scenes, and its report in Markdown."""
+"""The figures of a held-out benchmark over all its scenes, and its report in Markdown."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exam.evaluate_scene import METRICS, SceneResult
-from exam.measure_light import LIGHT_ERRORS
-from exam.rows import ROWS
+from splatgraft_paper.exam.measure import LIGHT_ERRORS, METRICS, ROWS, SceneResult
 
 _METRIC_TITLES = {
     "object": "PSNR of the object, dB",

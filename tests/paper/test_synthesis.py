@@ -5,34 +5,36 @@ import math
 
 import pytest
 
-from splatgraft_paper.synthesis import benchmark, cameras, objects, pairs
+from splatgraft_paper.synthesis import benchmark, objects, pairs, places
+from splatgraft_paper.synthesis.furniture import placed
 from splatgraft_paper.synthesis.jobs import RenderSize, copy_shared_takes
+from splatgraft_paper.synthesis.scene import ARC_LENGTH, camera_arc
 
 
-@pytest.mark.parametrize("kind", pairs.KINDS)
+@pytest.mark.parametrize("kind", places.KINDS)
 def test_same_seed_same_scene_other_seed_other_scene(kind):
-    assert pairs.make_scene(kind, 3) == pairs.make_scene(kind, 3)
-    assert pairs.make_scene(kind, 3).parts != pairs.make_scene(kind, 4).parts
+    assert places.make_scene(kind, 3) == places.make_scene(kind, 3)
+    assert places.make_scene(kind, 3).parts != places.make_scene(kind, 4).parts
 
 
 def test_unknown_kind_is_named():
     with pytest.raises(ValueError, match=r"expected one of living_room.*found 'cellar'"):
-        pairs.make_scene("cellar", 0)
+        places.make_scene("cellar", 0)
 
 
-@pytest.mark.parametrize("kind", pairs.KINDS)
+@pytest.mark.parametrize("kind", places.KINDS)
 def test_cameras_stay_inside_and_out_of_furniture(kind):
     for seed in range(3):
-        scene = pairs.make_scene(kind, seed)
+        scene = places.make_scene(kind, seed)
         low, high = scene.bounds
-        for camera in cameras.camera_arc(scene, scene.places[0], 0.3, seed):
+        for camera in camera_arc(scene, scene.places[0], 0.3, seed):
             assert all(low[i] <= camera.location[i] <= high[i] for i in range(3))
             for a, b in scene.obstacles:
                 assert not all(a[i] < camera.location[i] < b[i] for i in range(3))
 
 
 def test_objects_stand_on_their_place_and_fit_it():
-    place = pairs.make_scene("kitchen", 1).places[0]
+    place = places.make_scene("kitchen", 1).places[0]
     for seed in range(60):
         parts = objects.make(seed, place)
         top = max(p.location[2] + p.size[2] / 2 for p in parts)
@@ -43,10 +45,10 @@ def test_objects_stand_on_their_place_and_fit_it():
         assert body.size[0] / 2 <= place.radius
 
 
-def test_standing_at_turns_about_the_vertical():
-    place = pairs.make_scene("kitchen", 1).places[0]
+def test_placed_things_turn_about_the_vertical():
+    place = places.make_scene("kitchen", 1).places[0]
     parts = objects.make(5, place)
-    moved = objects.standing_at(parts, (1.0, 2.0, 3.0), 0.7)
+    moved = placed(parts, (1.0, 2.0, 3.0), 0.7)
     for before, after in zip(parts, moved, strict=True):
         radius = math.hypot(*before.location[:2])
         assert math.hypot(after.location[0] - 1, after.location[1] - 2) == pytest.approx(radius)
@@ -57,7 +59,7 @@ def test_plan_renders_each_background_once_and_is_plain_data():
     options = pairs.PairPlan(scenes=2, objects=2, lights=3, size=RenderSize(64, 48, 2))
     for job in (pairs.plan(options, number) for number in range(2)):
         assert [take.name for take in job.takes].count("background") == 1
-        assert len(job.cameras) == cameras.ARC_LENGTH
+        assert len(job.cameras) == ARC_LENGTH
         assert len([take for take in job.takes if "_light" in take.name and take.is_pictures]) == 6
         json.loads(job.scene.to_json())
 

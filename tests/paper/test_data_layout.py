@@ -4,8 +4,8 @@ import pytest
 import torch
 from paper_data import put
 
-from splatgraft_paper.benchmark.picture_metrics import KnownView, measure_picture, padded_ssim
 from splatgraft_paper.tables.data_layout import as_toml, find_layout
+from splatgraft_paper.tables.measure_pictures import KnownView, measure_picture, padded_ssim
 from splatgraft_paper.tables.paper_numbers import PAPER_TABLES, SYNTHETIC, published_name
 from splatgraft_paper.tables.picture_folders import held_out_stems, match_views, pictures, role_of
 

@@ -1,0 +1,173 @@
+"""The command `paper exam`: the held-out benchmark of the light transfer, on new synthetic scenes of a number."""
+
+import hashlib
+import json
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+import splatgraft
+import splatgraft_paper.exam
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import atomic_write
+from splatgraft_paper.exam.measure import ROWS, SceneResult, evaluate_scene
+from splatgraft_paper.exam.scenes import SIZE, TRAINING_NUMBER, draw_scenes, read_scene, render_scene
+from splatgraft_paper.exam.summary import summarize_light, summarize_row, summary_markdown
+from splatgraft_paper.synthesis.benchmark import SCENES
+from splatgraft_paper.synthesis.jobs import RenderWorkers
+
+_RENAMED_ROWS = {
+    "told-new": "true-new-light",
+    "told-both": "true-lights",
+    "told-both-and-normals": "true-lights-and-normals",
+}
+"""Names of version 0.1.0 that are understood for one more version."""
+
+
+@dataclass(frozen=True)
+class Exam:
+    """Measure the light transfer on scenes drawn from a number, or on given scenes; a stopped run goes on.
+
+    The scenes follow from the number alone. A number is used once: whoever has looked at its scenes may tune to them.
+    """
+
+    number: Annotated[int | None, tyro.conf.Positional] = None
+    """The scenes' seeds follow from it; 0 is for training, never a proof."""
+    benchmark: bool = False
+    """The nine benchmark scenes in the same size, instead of a number: a regression table."""
+    scenes_from: Path | None = None
+    """Folder of rendered scenes, instead of a number."""
+    scenes: int | None = None
+    """Number of scenes; 12, or all of --benchmark and --scenes-from."""
+    out: Path | None = None
+    """Folder of scenes/, work/ (reconstructions), results/, pictures/ (held-out views one above the other: pasted,
+    transfer, with all that is true, truth), exam.md and exam.json; build/exam/NUMBER where not given."""
+    work: Path | None = None
+    """Folder of the reconstructions, to be shared by runs; OUT/work where not given."""
+    iterations: int = 1000
+    """Of each reconstruction."""
+    budget: int = 20_000
+    """Gaussians of each reconstruction."""
+    rows: tuple[str, ...] = tuple(ROWS)
+    """Rows of the table."""
+    workers: RenderWorkers = field(default_factory=RenderWorkers)
+
+    def execute(self, console: Console) -> int:
+        """Render, measure and report; 1 where a scene could not be made."""
+        given = [self.number is not None, self.benchmark, self.scenes_from is not None]
+        if sum(given) != 1:
+            raise ValueError(f"exam: expected a NUMBER, --benchmark or --scenes-from, found {sum(given)} of them")
+        rows = self._rows(console)
+        name = str(self.number) if given[0] else "benchmark" if given[1] else "given"
+        out = self.out or Path("build") / "exam" / name
+        results, failures = [], []
+        for scene, make_folder in self._scene_folders(out, console):
+            try:
+                results.append(self._result(make_folder(), out, rows, console))
+            except ValueError as error:
+                failures.append(f"{scene}: {error}")
+                console.say(failures[-1])
+        self._write_report(out, rows, results, failures)
+        console.result(out / "exam.md")
+        return 1 if failures else 0
+
+    def _rows(self, console: Console) -> tuple[str, ...]:
+        asked = []
+        for row in self.rows:
+            if row in _RENAMED_ROWS:
+                console.say(f"--rows: {row} is now {_RENAMED_ROWS[row]}; the next version drops the old name")
+            asked.append(_RENAMED_ROWS.get(row, row))
+        if unknown := [row for row in asked if row not in ROWS]:
+            raise ValueError(f"--rows: expected names among {', '.join(ROWS)}; found {unknown[0]}")
+        return tuple(row for row in ROWS if row in asked)
+
+    @property
+    def _options(self) -> ReconstructOptions:
+        return ReconstructOptions(iterations=self.iterations, budget=self.budget)
+
+    def _scene_folders(self, out: Path, console: Console) -> Iterator[tuple[str, partial[Path]]]:
+        """Name of each scene, and the function that renders what is missing of it and gives its folder."""
+        if self.scenes_from is not None:
+            folders = sorted(path.parent for path in self.scenes_from.glob("*/placement.json"))
+            for folder in folders[: self.scenes]:
+                yield folder.name, partial(Path, folder)
+            return
+        python = self.workers.python(console)
+        scenes = SCENES[: self.scenes] if self.number is None else draw_scenes(self.number, self.scenes or 12)
+        for which in scenes:
+            yield which.name, partial(render_scene, which, out, python, jobs=self.workers.processes)
+
+    def _result(self, folder: Path, out: Path, rows: tuple[str, ...], console: Console) -> SceneResult:
+        """The result of one rendered scene, measured where that is not done yet, or the code or an option changed."""
+        text = hashlib.sha256(f"{folder.resolve()} {rows} {self._options}".encode())
+        for package in (splatgraft, splatgraft_paper.exam):
+            for path in sorted(Path(package.__file__ or "").parent.rglob("*.py")):
+                text.update(path.read_bytes())
+        file, key = out / "results" / f"{folder.name}.json", text.hexdigest()
+        if file.is_file() and (record := json.loads(file.read_text()))["key"] == key:
+            return SceneResult.from_json(record["result"])
+        started = time.perf_counter()
+        scene = read_scene(folder, (self.work or out / "work") / folder.name, self._options, console)
+        composed = time.perf_counter()
+        found = evaluate_scene(scene, rows, out / "pictures" / f"{folder.name}.png")
+        console.say(
+            f"{folder.name}: reconstructed in {composed - started:.0f} s, "
+            f"measured in {time.perf_counter() - composed:.0f} s"
+        )
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(file) as stream:
+            stream.write(json.dumps({"key": key, "result": found.as_json()}, indent=1).encode())
+        return found
+
+    def _write_report(self, out: Path, rows: tuple[str, ...], results: list[SceneResult], failures: list[str]) -> None:
+        head = {
+            "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+            "commit": _commit(),
+            "number": self.number,
+            "iterations": self._options.all_iterations,
+            "budget": self._options.max_gaussians,
+            "failures": failures,
+        }
+        size = f"{SIZE.render.width}x{SIZE.render.height}, {SIZE.views} views, {SIZE.render.samples} samples; "
+        conditions = (
+            f"`{head['command']}` at commit {head['commit']}. {size if self.scenes_from is None else ''}"
+            f"{head['iterations']} iterations, at most {head['budget']} Gaussians a capture; every 8th view is held "
+            "out and measured."
+        )
+        text = f"# {self._title()}\n\n{conditions}\n\n{summary_markdown(results)}"
+        text += "".join(f"- not measured: {failure}\n" for failure in failures)
+        light = {title: None if found is None else asdict(found) for title, found in summarize_light(results).items()}
+        record = {
+            **head,
+            "rows": {row: asdict(summarize_row(row, results)) for row in rows},
+            "light": light,
+            "scenes": [one.as_json() for one in results],
+        }
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "exam.json").write_text(json.dumps(record, indent=1, allow_nan=False))
+        (out / "exam.md").write_text(text)
+
+    def _title(self) -> str:
+        if self.scenes_from is not None:
+            return "Scenes that were given: no proof"
+        if self.number is None:
+            return "The benchmark's nine scenes: no proof"
+        if self.number == TRAINING_NUMBER:
+            return f"Number {self.number}, for training: no proof"
+        return f"Held-out benchmark {self.number}"
+
+
+def _commit() -> str:
+    folder = str(Path(splatgraft.__file__).parent)
+    command = ["git", "-C", folder, "describe", "--always", "--dirty", "--exclude=*"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"

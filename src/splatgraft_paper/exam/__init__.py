@@ -1,0 +1,1 @@
+"""The held-out benchmark of the light transfer (`paper exam`)."""

@@ -1,0 +1,234 @@
+"""The rows of the held-out benchmark of the light transfer, measured on the held-out views of a scene.
+
+Pasting, the transfer with everything estimated, with more and more of the ground truth given, and what new colours of
+the Gaussians can reach at all; errors of the light, as irradiance without occlusion, and of normals.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.consolidation import ConsolidateOptions, consolidate
+from splatgraft.core.directions import even_directions
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear, write_image
+from splatgraft.evaluation.regions import find_regions
+from splatgraft.relighting import Light, Relit, SourceScene, relight
+from splatgraft.relighting.gain_transfer import relight_by_gain
+from splatgraft.relighting.irradiance_ratio import relight_by_irradiance_ratio
+from splatgraft_paper.benchmark.measure import measure_view
+from splatgraft_paper.exam.scenes import ExamScene, TrueView
+
+ROWS: Mapping[str, str] = {
+    "paste": "the object as it was captured",
+    "gain": "one gain per channel, from the light around both places",
+    "transplat": "the ratio of irradiances at each normal (TranSplat's diffuse path), both estimated; no shadow",
+    "transfer": "the transfer, everything estimated",
+    "true-new-light": "the transfer with the ground-truth new light",
+    "true-lights": "the transfer with both ground-truth lights",
+    "true-lights-and-normals": "the transfer with both ground-truth lights and the ground-truth normals",
+    "fitted": "no transfer: colours fitted to true pictures of the other views; no recolouring reaches much more",
+}
+
+
+def make_row(row: str, scene: ExamScene) -> tuple[Gaussians, Relit | None]:
+    """The scene that a row gives.
+
+    Returns:
+        The scene to draw, and the transfer in layers where the row is one.
+
+    Raises:
+        ValueError: The row is unknown, or tells what is not known of this scene.
+    """
+    if row == "paste":
+        return scene.composite.bake()[0], None
+    if row == "gain":
+        return relight_by_gain(scene.composite, scene.cameras, sources=[scene.source])[0].bake()[0], None
+    if row == "transplat":
+        return relight_by_irradiance_ratio(scene.composite, sources=[scene.source])[0].bake()[0], None
+    if row == "fitted":
+        return _fitted_to_truth(scene), None
+    source, light = _with_truth(row, scene)
+    relit = relight(scene.composite, scene.cameras, sources=[source], light=light)
+    return relit.bake()[0], relit
+
+
+def _fitted_to_truth(scene: ExamScene) -> Gaussians:
+    """The scene of `true-lights` with colours that make the true object and the true shadow in the views of `cameras`.
+
+    The shadow is the ratio of the true pictures with and without the object, on the target as it was reconstructed, so
+    that errors of the reconstruction count as little as in the other rows.
+    """
+    lit, _ = make_row("true-lights", scene)
+    images = []
+    for view in scene.fitted_views:
+        regions = find_regions(view.truth)
+        with_object, without = (linear_from_srgb(image) for image in (view.truth.image, view.truth.background))
+        shadowed = srgb_from_linear(linear_from_srgb(view.background) * with_object / without.clamp_min(1e-3))
+        image = torch.where(regions.rest[..., None], view.picture(lit), shadowed.clamp(0, 1))
+        images.append(torch.where(regions.object[..., None], view.truth.image, image))
+    return consolidate(lit, scene.cameras, images, ConsolidateOptions(view_error=False))
+
+
+def _with_truth(row: str, scene: ExamScene) -> tuple[SourceScene, Light | None]:
+    with_light = replace(scene.source, light=scene.old_light)
+    if row == "transfer":
+        return scene.source, None
+    if row == "true-new-light":
+        return scene.source, scene.new_light
+    if row == "true-lights":
+        return with_light, scene.new_light
+    if row != "true-lights-and-normals":
+        raise ValueError(f"--rows: expected names among {', '.join(ROWS)}; found {row}")
+    if scene.normals is None:
+        raise ValueError("there is no surface.npy")
+    return replace(with_light, normals=scene.normals), scene.new_light
+
+
+LIGHT_ROW = "transfer"
+"""The row whose estimates of light and normals are measured."""
+METRICS = {"object": "psnr_object", "whole": "psnr_whole", "shadow": "shadow_ratio_rmse"}
+"""Of a row, and the names that `measure_view` gives them: PSNR in dB twice, and the error of the shadow's strength."""
+_PICTURED = ("paste", "transfer", "true-lights-and-normals")
+_OPAQUE = 0.3
+"""Opacity above which the normal of a Gaussian is measured."""
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """What was measured on one scene; a value is None where it is not defined."""
+
+    name: str
+    rows: dict[str, dict[str, float | None]] = field(default_factory=dict)
+    """Per row the values of `METRICS`, means over held-out views."""
+    light: dict[str, dict[str, float] | None] = field(default_factory=dict)
+    """`light_errors` at the new and the old place; None where no light was found."""
+    normals_deg: float | None = None
+    """Median angle between estimated and true normals of the object."""
+    notes: tuple[str, ...] = ()
+    """Why a row or a value is missing; what the transfer reports."""
+
+    @property
+    def ratio_level(self) -> float | None:
+        """Error of the level of the ratio of new to old light, stops."""
+        new, old = self.light.get("new"), self.light.get("old")
+        return None if new is None or old is None else new["level"] - old["level"]
+
+    def as_json(self) -> dict:
+        """Plain data, from which `from_json` makes the same value."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(record: dict) -> "SceneResult":
+        """Read what `as_json` gave."""
+        return SceneResult(**{**record, "notes": tuple(record["notes"])})
+
+
+def evaluate_scene(scene: ExamScene, rows: Sequence[str], picture: Path) -> SceneResult:
+    """Make and measure the rows of a scene.
+
+    Args:
+        scene: The scene.
+        rows: Names of `ROWS`.
+        picture: A .png to write: held-out views one above the other; pasted, the transfer, the one with all ground
+            truth, the truth side by side.
+    """
+    values, columns, notes = {}, [], []
+    light, normals_deg = {}, None
+    for row in rows:
+        try:
+            result, relit = make_row(row, scene)
+        except ValueError as error:
+            notes.append(f"{row}: {error}")
+            continue
+        values[row] = measure_row(result, scene.views)
+        if row in _PICTURED:
+            columns.append([view.picture(result) for view in scene.views])
+        if row == LIGHT_ROW and relit is not None:
+            light, normals_deg = _measure_estimates(scene, relit)
+            notes += relit.report
+    columns.append([view.truth.image for view in scene.views])
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    write_image(picture, torch.cat([torch.cat(column, 0) for column in columns], 1))
+    return SceneResult(scene.name, values, light, normals_deg, tuple(notes))
+
+
+def measure_row(result: Gaussians, views: Sequence[TrueView]) -> dict[str, float | None]:
+    """The values of `METRICS`, means over the views where they are defined."""
+    found = [measure_view(view.picture(result), view.truth, background=view.background) for view in views]
+    out: dict[str, float | None] = {}
+    for short, name in METRICS.items():
+        known = [values[name] for values in found if math.isfinite(values[name])]
+        out[short] = sum(known) / len(known) if known else None
+    return out
+
+
+def _measure_estimates(scene: ExamScene, relit: Relit) -> tuple[dict[str, dict[str, float] | None], float | None]:
+    """Errors of both lights, and of the normals in degrees, of a transfer that estimates everything."""
+    light = {"new": None if relit.light is None else light_errors(relit.light, scene.new_light), "old": None}
+    if not relit.prepared:
+        return light, None
+    found, rotation = relit.prepared[0], scene.composite.objects[0].target_from_object.rotation
+    if found.source_lighting is not None:
+        light["old"] = light_errors(found.source_lighting.light, scene.old_light.rotated(rotation))
+    if scene.normals is None:
+        return light, None
+    opaque_and_seen = (found.gaussians.opacities > _OPAQUE) & found.normals.seen
+    return light, median_angle_deg(found.normals.vectors, scene.normals @ rotation.T, opaque_and_seen)
+
+
+_NORMALS = 200
+"""Even directions over which errors of irradiance are averaged."""
+_FINE_NORMALS = 10_000
+"""Even directions among which the one of most irradiance is looked for; 2 degrees apart."""
+_DARKEST = 1e-6
+"""Linear irradiance; less counts as this."""
+
+LIGHT_ERRORS = ("rms", "level", "tint", "direction_deg")
+
+
+def light_errors(estimated: Light, truth: Light) -> dict[str, float]:
+    """Measure an estimated light against the true one.
+
+    Args:
+        estimated: The estimate.
+        truth: In the same frame.
+
+    Returns:
+        `rms`: of log2 of the ratio of gray irradiance over even normals, stops; `level`: its mean, positive where the
+        estimate is too bright; `tint`: RMS over normals and channels of log2 of the ratio of irradiance over that of
+        gray irradiance, stops; `direction_deg`: angle between the normals of most gray irradiance.
+    """
+    normals = even_directions(_NORMALS)
+    colors = [light.irradiance(normals).clamp_min(_DARKEST) for light in (estimated, truth)]
+    grays = [color.mean(1, keepdim=True) for color in colors]
+    gray = (grays[0] / grays[1]).log2()
+    tint = (colors[0] / colors[1]).log2() - gray
+    brightest = [_brightest(light) for light in (estimated, truth)]
+    return {
+        "rms": _rms(gray),
+        "level": float(gray.mean()),
+        "tint": _rms(tint),
+        "direction_deg": math.degrees(math.acos(max(-1.0, min(1.0, float(brightest[0] @ brightest[1]))))),
+    }
+
+
+def median_angle_deg(one: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"], which: Bool[Tensor, "n"]) -> float | None:
+    """The median angle between unit normals, over those that `which` chooses; None where it chooses none."""
+    if not bool(which.any()):
+        return None
+    return float((one * other).sum(1)[which].clamp(-1, 1).acos().rad2deg().median())
+
+
+def _rms(values: Tensor) -> float:
+    return float((values**2).mean().sqrt())
+
+
+def _brightest(light: Light) -> Float[Tensor, "3"]:
+    normals = even_directions(_FINE_NORMALS)
+    return normals[light.irradiance(normals).mean(1).argmax()]

@@ -1,0 +1,253 @@
+"""Scenes of the held-out benchmark: drawn from a number alone, rendered, reconstructed, and read with their truth."""
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.composite import Composite
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.posed_images import held_out
+from splatgraft.evaluation import Truth
+from splatgraft.folders.composite_folder import read_composite
+from splatgraft.formats import read_cameras, read_capture, read_gaussians
+from splatgraft.project.layout import PLACEMENT_FILE
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.relighting import Light, SourceScene
+from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
+from splatgraft.rendering import render
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.workers import Task, run_tasks
+from splatgraft_paper.benchmark.measure import true_view
+from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY, GroundTruthScene, compose_scene
+from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE, read_probe, write_true_light
+from splatgraft_paper.synthesis.benchmark import BenchmarkScene, BenchmarkSize, draw_scene, find_defect, gather, plan
+from splatgraft_paper.synthesis.jobs import RenderSize, render_job
+from splatgraft_paper.synthesis.places import KINDS
+
+_CELLS = 80
+"""Width of the image in whose cells surface points are compared; the object takes up half of it or less."""
+_BEHIND = 0.05
+"""Of the object's size: how far behind the nearest point a point is still seen."""
+TRAINING_NUMBER = 0
+"""Its scenes are for development; every other number is used for one exam only."""
+SIZE = BenchmarkSize(RenderSize(width=288, height=204, samples=8), views=18)
+_SEEDS = (2**31, 2**32)
+"""Range of the seeds of scenes and objects. The benchmark's scenes have 9000001 and up, its objects 11 and up, the
+development scenes 9100 to 9999; training pairs have 100003 x set + scene, and objects below 2**31."""
+
+
+def draw_scenes(number: int, count: int) -> tuple[BenchmarkScene, ...]:
+    """Draw the scenes of an exam: all kinds in turn, in an order drawn too, each with a seed and an object's seed.
+
+    Seeds whose scene has no room for the cameras are drawn again. The first scenes do not depend on `count`.
+    """
+    rng = random.Random(f"exam-{number}")
+    kinds = rng.sample(KINDS, len(KINDS))
+    order = [kinds[i % len(kinds)] for i in range(count)]
+    return tuple(draw_scene(rng, f"{i:02d}_{kind}", kind, _SEEDS, SIZE) for i, kind in enumerate(order))
+
+
+def render_scene(which: BenchmarkScene, out: Path, blender_python: Path, *, jobs: int) -> Path:
+    """Render what is missing of a scene.
+
+    Args:
+        which: The scene.
+        out: Folder of the exam; receives renders/ and scenes/.
+        blender_python: A Python with bpy.
+        jobs: Blender processes at a time.
+
+    Returns:
+        The scene's folder, as `synth benchmark` lays it out.
+
+    Raises:
+        ValueError: Blender fails, or a picture is black, clipped or without the object.
+    """
+    folder = out / "scenes" / which.name
+    if not (folder / TRUE_LIGHT_FILE).is_file():  # it is written last
+        sides = [out / "renders" / f"{which.name}_{side}" for side in ("target", "source")]
+        planned = zip(plan(which, SIZE), sides, strict=True)
+        tasks = [Task(side.name, partial(render_job, job, side, blender_python)) for job, side in planned]
+        if failures := run_tasks(tasks, at_once=jobs):
+            raise ValueError(failures[0])
+        gather(which, sides[0], sides[1], folder)
+        write_true_light(folder)
+    if defect := find_defect(folder):
+        raise ValueError(defect)
+    return folder
+
+
+@dataclass(frozen=True)
+class TrueView:
+    """One view of the target with what is true of it."""
+
+    camera: Cameras
+    truth: Truth
+    background: Float[Tensor, "h w 3"]
+    """The reconstructed target without the object, sRGB in [0, 1]."""
+
+    def picture(self, scene: Gaussians) -> Float[Tensor, "h w 3"]:
+        """A scene from this view, sRGB in [0, 1]."""
+        return render(scene, self.camera).color[0].clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class ExamScene:
+    """One scene with what is true of it; n Gaussians of the object."""
+
+    name: str
+    composite: Composite
+    cameras: Cameras
+    """The target's, without the held-out ones."""
+    source: SourceScene
+    """The source without the object, and without its true light."""
+    views: tuple[TrueView, ...]
+    """Held out: nothing was fitted to them."""
+    fitted_views: tuple[TrueView, ...]
+    """Those of `cameras`, whose pictures without the object the target was fitted to."""
+    new_light: Light
+    """True, at the object's place in the target, target's frame."""
+    old_light: Light
+    """True, at its place in the source, source's frame."""
+    normals: Float[Tensor, "n 3"] | None
+    """True, of the object's Gaussians, source's frame; None where the object's surface is not known."""
+
+
+def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: Console) -> ExamScene:
+    """Reconstruct and compose a rendered scene where that is not done yet, and read it.
+
+    Args:
+        folder: As `render_scene` leaves it; without surface.npy no normals are known.
+        work: Receives both reconstructions, the object and the composite.
+        options: Of both reconstructions.
+        console: Takes progress.
+
+    Raises:
+        ValueError: A file is missing or damaged.
+    """
+    files = GroundTruthScene.from_folder(folder)
+    composed = compose_scene(files, work, options, device="cpu", console=console)
+    composite = read_composite(composed.target, composed.composite / PLACEMENT_FILE)
+    assert composed.surroundings is not None
+    assert composed.source_cameras is not None
+    source = SourceScene(read_gaussians(composed.surroundings), read_cameras(composed.source_cameras))
+    return ExamScene(
+        name=folder.name,
+        composite=composite,
+        cameras=read_cameras(composed.cameras),
+        source=source,
+        views=_true_views(files, composite.target, are_held_out=True),
+        fitted_views=_true_views(files, composite.target, are_held_out=False),
+        new_light=read_probe(folder / "probe.npy", folder / "suns.json"),
+        old_light=read_probe(folder / "old_light" / "0000.npy", folder / "old_light" / "suns.json"),
+        normals=_read_normals(folder / "surface.npy", composite.objects[0].gaussians, source.cameras),
+    )
+
+
+def _true_views(files: GroundTruthScene, target: Gaussians, *, are_held_out: bool) -> tuple[TrueView, ...]:
+    truth, photographs = read_capture(files.truth), read_capture(files.target)
+    views = []
+    chosen = held_out(len(truth), HELD_OUT_EVERY) == are_held_out
+    for index in torch.nonzero(chosen).flatten().tolist():
+        camera = truth.cameras[index]
+        background = render(target, camera).color[0].clamp(0, 1)
+        views.append(TrueView(camera, true_view(truth, photographs, index), background))
+    return tuple(views)
+
+
+def _read_normals(path: Path, thing: Gaussians, cameras: Cameras) -> Float[Tensor, "n 3"] | None:
+    if not path.is_file():
+        return None
+    surface = torch.from_numpy(np.load(path, allow_pickle=False)).float()
+    return nearest_normals(thing.means, seen_surface(surface, cameras))
+
+
+_RECONSTRUCTION = ReconstructOptions(iterations=1000, budget=20_000)
+"""As an exam's."""
+
+
+@dataclass(frozen=True)
+class TrainingScene:
+    """A rendered scene on disk."""
+
+    name: str
+    """EXAM-SCENE."""
+    files: Path
+    """As `render_scene` leaves them."""
+    work: Path
+    """Its reconstructions, object and composite."""
+
+    def read(self) -> ExamScene:
+        """The scene; it is reconstructed where that is not done yet.
+
+        Raises:
+            ValueError: A file is missing or damaged.
+        """
+        return read_scene(self.files, self.work, _RECONSTRUCTION, Console())
+
+
+def scenes_in(folders: Sequence[Path], works: Sequence[Path]) -> list[TrainingScene]:
+    """All scenes with known light in folders of exams.
+
+    Args:
+        folders: Each holds scenes.
+        works: Their reconstructions, in the same order.
+    """
+    return [
+        TrainingScene(f"{folder.resolve().parent.name}-{path.name}", path, work / path.name)
+        for folder, work in zip(folders, works, strict=True)
+        for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file())
+    ]
+
+
+def estimated_lights(scene: ExamScene) -> dict[str, EstimatedLight | NoLight]:
+    """The estimates at the `new` and the `old` place of a scene, by nothing but its reconstructions."""
+    placed, source = scene.composite.objects[0], scene.source
+    new = fit_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
+    old = fit_light(
+        source.gaussians, bounding_sphere(placed.gaussians), source.cameras, object_gaussians=placed.gaussians
+    )
+    return {"new": new, "old": old}
+
+
+def seen_surface(surface: Float[Tensor, "m 6"], cameras: Cameras) -> Float[Tensor, "s 6"]:
+    """The surface points that some camera sees: not what lies inside of the object or under it.
+
+    A point is seen where it faces the camera and no point in its cell of an image is nearer by more than a share
+    of the object's size.
+
+    Args:
+        surface: Positions and unit normals of m points, ten or more per cell.
+        cameras: That the object was captured with.
+    """
+    points, normals = surface[:, :3], surface[:, 3:]
+    middle, size = points.mean(0), float((points - points.mean(0)).norm(dim=1).max())
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for i in range(len(cameras)):
+        pose = cameras.camera_from_world[i]
+        depth = points @ pose[2, :3] + pose[2, 3]
+        if float(depth.min()) <= 0:
+            continue
+        plane = (points @ pose[:2, :3].T + pose[:2, 3]) / depth[:, None]
+        half = size / float(middle @ pose[2, :3] + pose[2, 3])
+        cells = ((plane - plane.mean(0)) / half * _CELLS / 4 + _CELLS / 2).long().clamp(0, _CELLS - 1)
+        index = cells[:, 1] * _CELLS + cells[:, 0]
+        nearest = torch.full((_CELLS**2,), torch.inf).scatter_reduce(0, index, depth, "amin")
+        facing = ((cameras.centers[i] - points) * normals).sum(1) > 0
+        seen |= facing & (depth < nearest[index] + _BEHIND * size)
+    return surface[seen]
+
+
+def nearest_normals(points: Float[Tensor, "n 3"], surface: Float[Tensor, "m 6"]) -> Float[Tensor, "n 3"]:
+    """The outward normal of the nearest of m surface points (position and unit normal) to each point."""
+    nearest = KDTree(surface[:, :3].numpy()).query(points.numpy())[1]
+    return surface[torch.from_numpy(nearest), 3:].contiguous()
