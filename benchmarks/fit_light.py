@@ -14,7 +14,6 @@ import json
 import math
 import multiprocessing
 import random
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

@@ -9,7 +9,6 @@ scenes that benchmarks/fit_light.py did not see: on its own scenes the light is 
 
 import argparse
 import itertools
-import sys
 from dataclasses import replace
 from pathlib import Path
 

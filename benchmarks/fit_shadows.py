@@ -9,7 +9,6 @@ is reported.
 """
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 

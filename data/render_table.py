@@ -17,10 +17,9 @@ from PIL import Image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats import write_capture
 from splatgraft_paper.synthesis.benchmark import rendered_cameras, sparse_points
-from splatgraft_paper.synthesis.scene import capture_cameras
 from splatgraft_paper.synthesis.jobs import Job, RenderSize, Take, render_job
-from splatgraft_paper.synthesis.pairs import make_scene
-from splatgraft_paper.synthesis.scene import Lamp, Scene
+from splatgraft_paper.synthesis.places import make_scene
+from splatgraft_paper.synthesis.scene import Lamp, Scene, capture_cameras
 
 SEED = 71000
 VIEWS = 28
