@@ -7,7 +7,7 @@ import torch
 from made_captures import SIZE, ring, texture, write_photos
 from PIL import Image
 
-from splatgraft.capture import drawn_pictures, require_coverage, usable_photos
+from splatgraft.capture import require_coverage, usable_photos
 from splatgraft.capture.usable_views import find_odd_photos, median_parallax_deg
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.posed_images import PosedImages
@@ -89,16 +89,6 @@ def test_one_photo_many_times_is_refused_with_what_is_needed(tmp_path):
         Image.fromarray(texture(0)).save(photo)
     with pytest.raises(ValueError, match=r"^here: expected at least 8 different photos .*found 1 of 20; .*copy of it"):
         usable_photos(photos, "here")
-
-
-def test_screenshots_are_told_from_photographs(tmp_path):
-    photos = write_photos(tmp_path / "c", 9)
-    assert drawn_pictures(photos) is None
-    for i, photo in enumerate(photos):
-        page = np.full((SIZE[1], SIZE[0], 3), 245, np.uint8)
-        page[10 * i : 10 * i + 20, 20:60] = (40, 60, 20 * i)
-        Image.fromarray(page).save(photo)
-    assert "expected photographs, found pictures that are even over" in (drawn_pictures(photos) or "")
 
 
 def capture(cameras: Cameras, points: torch.Tensor = NO_POINTS) -> PosedImages:

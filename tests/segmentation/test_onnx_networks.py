@@ -4,8 +4,6 @@ SAM 2's interface (names, order, shapes, dynamic axes) is that of samexporter's 
 1024. The real weights were not run.
 """
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -49,10 +47,10 @@ def save(path, nodes, inputs, outputs, weights=()):
 def red(tmp_path):
     """A network that answers with the normalised red channel, as logits or as it is."""
 
-    def make(channels=3, side=32, head="Identity", batch=1):
+    def make(channels=3, side=32, head="Identity"):
         weight = constant("w", [1, channels, 1, 1], [1.0] + [0.0] * (channels - 1))
         nodes = [node("Conv input_image,w red"), node(f"{head} red output_image")]
-        given, found = (info(f"{end}_image", [batch, n, side, side]) for end, n in (("input", channels), ("output", 1)))
+        given, found = (info(f"{end}_image", [1, n, side, side]) for end, n in (("input", channels), ("output", 1)))
         return save(tmp_path / "red.onnx", nodes, [given], [found], [weight])
 
     return make
@@ -98,22 +96,12 @@ def test_logits_become_a_mask_of_the_pictures_size_and_probabilities_stay(red):
     assert torch.allclose(load_birefnet(red(head="Sigmoid")).mask(halves), expected, atol=1e-5)
 
 
-def test_batches_give_the_masks_of_one_by_one_and_sizes_may_differ(red):
-    g = torch.Generator().manual_seed(0)
-    images = [torch.rand(h, w, 3, generator=g) for h, w in ((20, 30), (16, 16), (40, 9))]
-    network = load_birefnet(red(batch="batch_size"))
-    alone = [network.mask(image) for image in images]
-    together = list(replace(network, at_once=2).masks(iter(images)))
-    assert [mask.shape for mask in together] == [(20, 30), (16, 16), (40, 9)]
-    assert all(torch.allclose(a, b, atol=1e-6) for a, b in zip(alone, together, strict=True))
-
-
 def test_all_cores_work_and_cuda_is_taken_where_onnxruntime_has_it(red, monkeypatch):
-    path = red(batch="batch_size")
+    path = red()
     monkeypatch.setattr(onnx_networks, "_usable_cores", lambda: 3)
     network = load_birefnet(path)
     assert network.session.get_session_options().intra_op_num_threads == 3
-    assert (network.place, network.at_once) == ("3 cores", 1)
+    assert network.place == "3 cores"
     asked, there = [], ["CUDAExecutionProvider", "CPUExecutionProvider"]
 
     class OnCuda:
@@ -131,7 +119,7 @@ def test_all_cores_work_and_cuda_is_taken_where_onnxruntime_has_it(red, monkeypa
     monkeypatch.setattr(onnxruntime, "InferenceSession", OnCuda)
     found = load_birefnet(path)
     assert asked == [there]
-    assert (found.place, found.at_once) == ("CUDA", 4)
+    assert found.place == "CUDA"
 
 
 def test_bad_weights_and_missing_packages_are_named(red, tmp_path, monkeypatch):

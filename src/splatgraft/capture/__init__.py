@@ -6,7 +6,6 @@ from splatgraft.capture.pose_report import PoseReport, read_doubts, write_pose_r
 from splatgraft.capture.structure_from_motion import PoseOptions, pose_photos, predict_pose_seconds
 from splatgraft.capture.usable_views import (
     MIN_VIEWS,
-    drawn_pictures,
     readable_views,
     require_coverage,
     usable_masks,
@@ -22,7 +21,6 @@ __all__ = [
     "PoseOptions",
     "PoseReport",
     "VirtualCameraOptions",
-    "drawn_pictures",
     "extract_frames",
     "place_virtual_cameras",
     "pose_photos",

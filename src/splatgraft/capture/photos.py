@@ -18,17 +18,6 @@ from splatgraft.formats.captures.masks import check_mask
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
 
-_TURNS = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
-"""What makes a stored image upright, by its EXIF orientation."""
-
 
 def working_copies(photos: Sequence[Path], folder: Path, max_size_px: int) -> list[Path]:
     """Upright copies, at most `max_size_px` on the longest side, that keep the EXIF focal length.
@@ -80,12 +69,13 @@ def working_masks(masks: Sequence[Path | None], copies: Sequence[Path], folder: 
             continue
         folder.mkdir(parents=True, exist_ok=True)
         coverage = Image.fromarray((read_mask(mask) * 255).round().to(torch.uint8).numpy())
-        with Image.open(mask) as stored:
-            turned = _TURNS.get(stored.getexif().get(Base.Orientation, 1))
-        coverage = coverage if turned is None else coverage.transpose(turned)
         size = stored_size(copy)
-        if turned is None:
+        with Image.open(mask) as stored:
+            orientation = stored.getexif().get(Base.Orientation, 1)
+        if orientation == 1:
             check_mask(mask, size)
+        coverage.getexif()[Base.Orientation] = orientation
+        coverage = ImageOps.exif_transpose(coverage)
         written[copy.name] = folder / f"{copy.name}.png"
         coverage.resize(size, Image.Resampling.BOX).save(written[copy.name])
     return written

@@ -52,11 +52,6 @@ _THUMBNAIL_PX = 64
 _COPY_LEVELS = 4.0
 """Largest difference between two thumbnails that are of one picture, grey levels of 255: that of a JPEG saved again;
 another viewpoint moves edges by much more."""
-_SAMPLES = 8
-"""Photos that are looked at to tell drawings from photographs, evenly spaced."""
-_EVEN_SHARE = 0.8
-"""Share of neighbours of exactly one colour, above which a picture is no photograph: 0.01 to 0.4 in three photographed
-captures, up to 0.53 in a rendered one, 0.98 in screenshots."""
 
 
 @dataclass(frozen=True)
@@ -284,26 +279,6 @@ def _blurred(photos: Sequence[_Photo]) -> dict[Path, str]:
         for photo in photos
         if photo.log_detail < limit
     }
-
-
-def drawn_pictures(photos: Sequence[Path]) -> str | None:
-    """One sentence where the pictures look like screenshots or drawings, from which no poses follow; else None.
-
-    Args:
-        photos: Readable image files, of which some are decoded.
-    """
-    shares: list[float] = []
-    for index in np.linspace(0, len(photos) - 1, min(_SAMPLES, len(photos))):
-        with opened(photos[int(index)]) as image:
-            pixels = np.array(image.convert("RGB"))
-        shares.append(float((pixels[:, 1:] == pixels[:, :-1]).all(-1).mean()))
-    middle = float(np.median(shares))
-    if middle < _EVEN_SHARE:
-        return None
-    return (
-        f"{photos[0].parent}: expected photographs, found pictures that are even over {middle:.0%} of their area, as "
-        "screenshots and drawings are; poses and surfaces are found from texture"
-    )
 
 
 def require_coverage(capture: PosedImages, name: str) -> None:

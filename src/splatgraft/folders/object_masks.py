@@ -152,9 +152,9 @@ def network_masks(capture: PosedImages, *, weights: Path | None, folder: Path, p
     network = load_birefnet() if weights is None else load_birefnet(weights)
 
     def made() -> Iterator[Tensor]:
-        for done, mask in enumerate(network.masks(capture.image(index) for index in range(len(capture)))):
-            progress(done + 1, len(capture), f"masks from the network on {network.place}")
-            yield mask
+        for index in range(len(capture)):
+            yield network.mask(capture.image(index))
+            progress(index + 1, len(capture), f"masks from the network on {network.place}")
 
     return _written(capture, made(), folder)
 

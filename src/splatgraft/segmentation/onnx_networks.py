@@ -9,7 +9,6 @@ in pixels of the encoder's picture, `point_labels` (0 beside the object, 1 on it
 """
 
 import os
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,8 +28,6 @@ BIREFNET_REPOSITORY = "onnx-community/BiRefNet-ONNX"
 _BIREFNET_FILE = "onnx/model.onnx"
 _BIREFNET_SIDE = 1024
 """Width and height, pixels, at which BiRefNet was trained; taken where the network leaves its side free."""
-_AT_ONCE_ON_CUDA = 4
-"""Images in one pass of BiRefNet; about 3 GB each at 1024 pixels, by its largest activations. An estimate."""
 _SAM2_FEATURES = ("image_embed", "high_res_feats_0", "high_res_feats_1")
 _SAM2_PROMPTS = ("point_coords", "point_labels", "mask_input", "has_mask_input")
 _SAM2_MASK_STRIDE = 4
@@ -48,41 +45,26 @@ class BiRefNet:
     """A loaded network that finds the foreground of images."""
 
     session: Any
-    """An onnxruntime.InferenceSession with one input (n, 3, side, side) and logits or probabilities out."""
+    """An onnxruntime.InferenceSession with one input (1, 3, side, side) and logits or probabilities out."""
     side: int
     """Width and height of the network's input, pixels."""
-    at_once: int = 1
-    """Images that it takes in one pass."""
 
     @property
     def place(self) -> str:
         """Where it computes, for messages."""
-        cores = self.session.get_session_options().intra_op_num_threads
-        return "CUDA" if _runs_on_cuda(self.session) else f"{cores} cores"
+        # it may not compute on CUDA, though asked, where CUDA's libraries are missing
+        on_cuda = self.session.get_providers()[0] == _CUDA
+        return "CUDA" if on_cuda else f"{self.session.get_session_options().intra_op_num_threads} cores"
 
     def mask(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
         """Share of each pixel that is foreground, in [0, 1]."""
-        return next(self.masks([image]))
-
-    def masks(self, images: Iterable[Float[Tensor, "_ _ 3"]]) -> Iterator[Float[Tensor, "_ _"]]:
-        """Share of each pixel that is foreground, in [0, 1], of each image in order; `at_once` images are held."""
-        waiting: list[Tensor] = []
-        for image in images:
-            waiting.append(image)
-            if len(waiting) == self.at_once:
-                yield from self._pass(waiting)
-                waiting = []
-        if waiting:
-            yield from self._pass(waiting)
-
-    def _pass(self, images: list[Tensor]) -> Iterator[Tensor]:
-        squares = torch.stack([_square(image, self.side) for image in images])
+        square = _square(image, self.side)[None].numpy()
         # the last output is the finest where a network gives several
-        made = self.session.run(None, {self.session.get_inputs()[0].name: squares.numpy()})[-1]
+        made = self.session.run(None, {self.session.get_inputs()[0].name: square})[-1]
         made = torch.from_numpy(np.asarray(made, np.float32))
-        for image, found in zip(images, made.reshape(len(images), *made.shape[-2:]), strict=True):
-            shares = found.sigmoid() if float(found.min()) < 0 or float(found.max()) > 1 else found
-            yield resize(shares, image.shape[1], image.shape[0])
+        found = made.reshape(made.shape[-2:])
+        shares = found.sigmoid() if float(found.min()) < 0 or float(found.max()) > 1 else found
+        return resize(shares, image.shape[1], image.shape[0])
 
 
 @dataclass(frozen=True)
@@ -136,9 +118,8 @@ def load_birefnet(weights: Path | str = BIREFNET_REPOSITORY, *, threads: int | N
     shape = session.get_inputs()[0].shape
     if len(shape) != 4 or shape[1] not in (3, "channels", "num_channels"):
         raise ValueError(f"{path}: expected an input of shape (1, 3, side, side), found {shape}")
-    # a free side or batch is written as a name
-    at_once = 1 if isinstance(shape[0], int) or not _runs_on_cuda(session) else _AT_ONCE_ON_CUDA
-    return BiRefNet(session, shape[2] if isinstance(shape[2], int) else _BIREFNET_SIDE, at_once)
+    # a free side is written as a name
+    return BiRefNet(session, shape[2] if isinstance(shape[2], int) else _BIREFNET_SIDE)
 
 
 def load_sam2(encoder: Path, decoder: Path, *, threads: int | None = None) -> Sam2:
@@ -229,8 +210,3 @@ def _require(module: str, method: str) -> None:
 
 def _usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _runs_on_cuda(session: Any) -> bool:
-    """Whether a session computes on CUDA; it may not, though asked, where CUDA's libraries are missing."""
-    return session.get_providers()[0] == _CUDA

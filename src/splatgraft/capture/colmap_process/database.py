@@ -234,37 +234,3 @@ def with_focals(database: Path, target: Path, focals: Focals) -> Path:
                 camera.params = [focals[camera.camera_id], *camera.params[1:]]
                 opened.update_camera(camera)
     return target
-
-
-def with_own_cameras(database: Path, target: Path) -> Path:
-    """A copy of `database` at `target` in which each photo has a camera of its own, with the number of the photo."""
-    with pycolmap.Database.open(database) as shared, pycolmap.Database.open(fresh(target)) as own:
-        for image in shared.read_all_images():
-            camera = shared.read_camera(image.camera_id)
-            camera.camera_id = image.camera_id = image.frame_id = image.image_id
-            rig, frame = pycolmap.Rig(rig_id=image.image_id), pycolmap.Frame(frame_id=image.image_id)
-            rig.add_ref_sensor(camera.sensor_id)
-            frame.rig_id = rig.rig_id
-            frame.add_data_id(image.data_id)
-            own.write_camera(camera, use_camera_id=True)
-            own.write_rig(rig, use_rig_id=True)
-            own.write_frame(frame, use_frame_id=True)
-            own.write_image(image, use_image_id=True)
-            own.write_keypoints(image.image_id, shared.read_keypoints(image.image_id))
-        for pair, geometry in zip(*shared.read_two_view_geometries(), strict=True):
-            own.write_two_view_geometry(*pycolmap.pair_id_to_image_pair(pair), geometry)
-    return target
-
-
-def median_focals(database: Path, models: list[Any]) -> Focals:
-    """Per shared camera of `database`, the median focal length of its photos in the largest of `models`."""
-    if not models:
-        return {}
-    with pycolmap.Database.open(database) as shared:
-        camera_of = {image.image_id: image.camera_id for image in shared.read_all_images()}
-    model = max(models, key=lambda m: m.num_reg_images())
-    found: dict[int, list[float]] = {}
-    for image in model.images.values():
-        if image.has_pose:
-            found.setdefault(camera_of[image.image_id], []).append(float(model.cameras[image.camera_id].params[0]))
-    return {camera: float(np.median(focals)) for camera, focals in found.items()}

@@ -20,8 +20,6 @@ from .database import copy_database, fresh
 from .job import Job, say
 from .scores import ALIKE, Matches, explained_shares, lens_numbers, posed_and_explained, read_matches
 
-_SHARED_PHOTOS = 3
-"""Photos that two models must share: the fewest that fix a similarity transform by the places of cameras."""
 _POOR_SHARE = 0.8
 """A photo with less than this of the median photo's share of matches explained is posed anew."""
 _LENS_OBSERVATIONS = 300
@@ -37,43 +35,13 @@ _ADJUSTED_CHANGE = 0.0005
 
 
 def refined(job: Job, database: Path, models: list[Any]) -> Any:
-    """The best of `models`, of which there is at least one, with what others of them add to it, refined."""
+    """The best of `models`, of which there is at least one, refined."""
     matches, refiner = read_matches(database), _Refiner(job, database)
-    start = joined(models) or max(models, key=lambda model: posed_and_explained(matches, model))
+    start = max(models, key=lambda model: posed_and_explained(matches, model))
     best = _reposed(refiner, matches, refiner.adjusted(refiner.with_all_photos(start)))
     best = _with_own_lenses(job, database, matches, best)
     best.extract_colors_for_all_images(job.photos)
     return best
-
-
-def joined(models: list[Any]) -> Any | None:
-    """The largest of `models` of one database with the photos of the others that fit it; None where none does.
-
-    The transform is the one in which most points of shared photos are seen where both models say
-    (COLMAP's model_aligner). The points are those of the largest model: what was added has to be triangulated.
-    """
-    by_size = sorted(models, key=lambda model: -model.num_reg_images())
-    if len(by_size) < 2:
-        return None
-    whole, added = pycolmap.Reconstruction(by_size[0]), 0
-    for part in by_size[1:]:
-        shared = set(whole.reg_image_ids()) & set(part.reg_image_ids())
-        if len(shared) < _SHARED_PHOTOS:
-            continue
-        whole_from_part = pycolmap.align_reconstructions_via_reprojections(part, whole)
-        if whole_from_part is None:
-            continue
-        moved = pycolmap.Reconstruction(part)
-        moved.transform(whole_from_part)
-        for i in sorted(set(moved.reg_image_ids()) - shared):
-            image = moved.images[i]
-            if not whole.exists_image(i):
-                continue
-            frame = whole.frame(image.frame_id)
-            frame.rig_from_world = moved.frame(image.frame_id).rig_from_world
-            whole.register_frame(image.frame_id)
-            added += 1
-    return whole if added else None
 
 
 def _reposed(refiner: "_Refiner", matches: Matches, model: Any) -> Any:

@@ -7,7 +7,6 @@ from pathlib import Path
 from splatgraft.capture import (
     PoseOptions,
     VirtualCameraOptions,
-    drawn_pictures,
     extract_frames,
     place_virtual_cameras,
     pose_photos,
@@ -165,8 +164,6 @@ class Capture:
         found = find_photos(self.capture)
         kept, odd = usable_photos(found.paths, str(self.capture), keep_odd=self.keep_odd, progress=context.progress)
         self._say_left_out(len(kept), odd, context)
-        if (warning := drawn_pictures(kept)) is not None:
-            context.console.tell(Note(warning, "warning"))
         photos, empty = usable_masks(found.only(kept))
         self._say_left_out(len(kept), empty, context)
         masks = describe_masks(photos.paths, photos.masks)
