@@ -26,10 +26,9 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """
     if function is None:
         return functools.partial(kernel, **options)
-    compiled = numba.njit(cache=True, **options)(function)
-    if not numba.config.DISABLE_JIT:
-        index = compiled._cache._cache_file
-        index._source_stamp = (index._source_stamp, _hash_of_sources(Path(function.__code__.co_filename)))
+    compiled: Any = numba.njit(cache=True, **options)(function)
+    index = compiled._cache._cache_file
+    index._source_stamp = (index._source_stamp, _hash_of_sources(Path(function.__code__.co_filename)))
     return compiled
 
 
