@@ -134,27 +134,21 @@ def _best_place(
 
 
 def _warnings(support: Support, hidden: float, unseen: float) -> tuple[Note, ...]:
+    found = []
+    if unseen > 0.2:
+        text = f"{unseen:.0%} of the target's images show a side of the object that none of its photos shows."
+        remedy = "Turn it (--yaw-deg), place it before a wall, or photograph it from there too."
+        found.append(Note(text, "warning", remedy))
     # the underside is always hidden: a sixth of a cube
-    found = (
-        (
-            unseen > 0.2,
-            f"{unseen:.0%} of the target's images show a side of the object that none of its photos shows, where it is "
-            "unknown.",
-            "Turn it (--yaw-deg), place it before a wall, or photograph it from there too.",
-        ),
-        (
-            hidden > 0.25,
-            f"{hidden:.0%} of the object is hidden from every camera: it may stick in a wall or in furniture.",
-            "",
-        ),
-        (support.flat_fraction < 0.6, f"Only {support.flat_fraction:.0%} of the ground under the object is level.", ""),
-        (
-            support.obstructed_fraction > 0.1,
-            f"{support.obstructed_fraction:.0%} of the ground under the object is taken by something else.",
-            "",
-        ),
-    )
-    return tuple(Note(text, "warning", remedy) for true, text, remedy in found if true)
+    if hidden > 0.25:
+        text = f"{hidden:.0%} of the object is hidden from every camera: it may stick in a wall or in furniture."
+        found.append(Note(text, "warning"))
+    if support.flat_fraction < 0.6:
+        found.append(Note(f"Only {support.flat_fraction:.0%} of the ground under the object is level.", "warning"))
+    if support.obstructed_fraction > 0.1:
+        taken = support.obstructed_fraction
+        found.append(Note(f"{taken:.0%} of the ground under the object is taken by something else.", "warning"))
+    return tuple(found)
 
 
 def facing_yaw_deg(
