@@ -25,10 +25,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.directions import even_directions
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight
+from splatgraft.relighting.light.estimate import EstimatedLight
 from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem
-from splatgraft.relighting.light.radiance_search import SearchSettings, irradiance_of, search_radiance
+from splatgraft.relighting.light.radiance_search import irradiance_of, search_radiance
 from splatgraft_paper.exam.scenes import ExamScene, estimated_lights, scenes_in
 
 NORMALS = even_directions(200)
@@ -84,10 +85,8 @@ def _place(found: EstimatedLight | NoLight, truth: Light) -> TrainingPlace:
 
 def log_irradiance(place: TrainingPlace, numbers: dict[str, float]) -> Float[Tensor, "200"]:
     """Estimated, base 2, gray."""
-    rest = dict(numbers)
-    search = SearchSettings(temperature=rest.pop("temperature"))
-    problem = radiance_problem(place.evidence, settings=RadianceSettings(**rest))
-    radiance = search_radiance(problem, settings=search).radiance(place.evidence, torch.ones(3))
+    problem = radiance_problem(place.evidence, settings=RadianceSettings(**numbers))
+    radiance = search_radiance(problem).radiance(place.evidence, torch.ones(3))
     return irradiance_of(radiance.mean(1), NORMALS).clamp_min(1e-6).log2()
 
 
@@ -182,8 +181,7 @@ def main() -> None:
         pairs[one.name] = torch.load(kept, weights_only=False)
     scenes = Scenes(pairs, options.jobs)
     everything = range(len(pairs))
-    numbers = {**asdict(RadianceSettings()), "temperature": SearchSettings().temperature}
-    numbers = {name: numbers[name] for name in (*FACTORS, *SHIFTS)}
+    numbers = {name: value for name, value in asdict(RadianceSettings()).items() if name in (*FACTORS, *SHIFTS)}
     if options.start is not None:
         numbers |= json.loads(options.start.read_text())
     for fold in range(options.folds):

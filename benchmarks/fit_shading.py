@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from splatgraft.relighting import relight
-from splatgraft.relighting.shading.irradiance import ShadeSettings, shade_ratio
+from splatgraft.relighting.shading import ShadeSettings, shade_ratio
 from splatgraft_paper.exam.measure import make_row, measure_row
 from splatgraft_paper.exam.scenes import ExamScene, scenes_in
 

@@ -18,8 +18,8 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.evaluation.measure import luminance_ratio
 from splatgraft.evaluation.regions import find_regions
 from splatgraft.relighting import relight
+from splatgraft.relighting.cast_shadows import SHADOW_POWER
 from splatgraft.relighting.shadows.scene_ratio import SceneRatio
-from splatgraft.relighting.transfer import SHADOW_POWER
 from splatgraft_paper.exam.measure import make_row, measure_row
 from splatgraft_paper.exam.scenes import ExamScene, scenes_in
 

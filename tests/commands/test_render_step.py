@@ -13,7 +13,7 @@ from splatgraft.formats import write_gaussians
 from splatgraft.formats.gaussian_flags import write_flags
 from splatgraft.project.step import job_of, perform
 from splatgraft.relighting import Light, LightSource, light_to_json
-from splatgraft.relighting.light.confidence import light_confidence
+from splatgraft.relighting.light.light import light_confidence
 from splatgraft.runtime.console import Console
 
 LIGHT = Light((LightSource((0.0, 0.0, 1.0), (2.0, 2.0, 2.0), confidence=0.5),), torch.full((9, 3), 0.1), coverage=0.8)

@@ -22,7 +22,7 @@ from splatgraft.editor.session import Session
 from splatgraft.formats import read_gaussians
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights, Light
-from splatgraft.relighting.layers import unchanged
+from splatgraft.relighting.layers import pasted
 
 
 @pytest.fixture(scope="module")
@@ -144,8 +144,8 @@ def test_each_gaussian_gets_the_light_of_the_nearest_coarse_one() -> None:
     assert coarse.merged()[0].count == 80
     # the same tensor for the same parts, so that memos stay valid
     assert coarse_composite(composite, parts[0], parts[1:]).erased is coarse.erased
-    baked, is_object = coarse.merged()
-    plain = unchanged(baked, is_object, objects=(), report=("a sentence",))
+    baked, _ = coarse.merged()
+    plain = pasted(coarse, "a sentence")
     # light linear in position: its error is proportional to the distance to the nearest coarse Gaussian
     lit = upsample_light(replace(plain, shadow=0.5 + 0.1 * baked.means), composite, parts)
     whole, flags = composite.merged()
@@ -155,7 +155,7 @@ def test_each_gaussian_gets_the_light_of_the_nearest_coarse_one() -> None:
     distance = (whole.means[:, None] - baked.means).norm(dim=2).amin(1)
     assert bool((error <= 0.1 * distance + 1e-6).all())  # float32 of numbers up to four
     assert int((distance == 0).sum()) == 80
-    assert lit.report == ("a sentence",)
+    assert lit.report == plain.report
     assert lit.shaded(LayerWeights()).count == whole.count
 
 

@@ -15,7 +15,7 @@ from splatgraft.cli import main
 from splatgraft.harmonization.compact.features import apply_output
 from splatgraft.harmonization.compact.network import SHIPPED, CompactNetwork, CompactSize, read_weights
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
-from splatgraft.relighting.shading.irradiance import KNOWN_LIGHTS, shade_ratio
+from splatgraft.relighting.shading import KNOWN_LIGHTS, shade_ratio
 from splatgraft_paper.synthesis.pairs import write_manifest
 from splatgraft_paper.training.compact import priors
 from splatgraft_paper.training.compact.loop import CompactOptions, CompactTask, compact_loss, region_errors

@@ -10,7 +10,7 @@ from shapes import UP, ring, surfels
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.relighting.light.estimate import NoLight, estimate_light
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 
 PLACE = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
 
@@ -29,8 +29,8 @@ def room() -> Gaussians:
 @pytest.mark.parametrize("count", [1, 12])
 def test_few_views_and_no_bands_give_a_finite_light(count, degree):
     light = estimate_light(room().with_sh_degree(degree), PLACE, ring(count))
-    assert not isinstance(light, NoLight)
-    found = light.irradiance(even_directions(50))
+    assert isinstance(light, EstimatedLight)
+    found = light.light.irradiance(even_directions(50))
     assert bool(torch.isfinite(found).all())
     # sRGB 0.7 is 0.448; the seen part of the room is that and the floor's 0.133
     assert 0.1 * math.pi < float(found.mean()) < 0.9 * math.pi
@@ -42,8 +42,8 @@ def test_colours_that_are_not_finite_or_huge_leave_the_light_finite(value):
     sh = scene.sh.clone()
     sh[::97] = value
     light = estimate_light(replace(scene, sh=sh), PLACE, ring())
-    assert not isinstance(light, NoLight)
-    found = light.irradiance(even_directions(50))
+    assert isinstance(light, EstimatedLight)
+    found = light.light.irradiance(even_directions(50))
     assert bool(torch.isfinite(found).all())
     assert float(found.max()) < 100
 
@@ -54,5 +54,5 @@ def test_places_that_are_not_finite_or_huge_leave_the_light_finite(value):
     means = scene.means.clone()
     means[::97, 0] = value
     light = estimate_light(replace(scene, means=means), PLACE, ring())
-    assert not isinstance(light, NoLight)
-    assert bool(torch.isfinite(light.irradiance(even_directions(50))).all())
+    assert isinstance(light, EstimatedLight)
+    assert bool(torch.isfinite(light.light.irradiance(even_directions(50))).all())

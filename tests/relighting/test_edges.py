@@ -14,7 +14,7 @@ from splatgraft.core.directions import even_directions
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting import Light, LightSource, RelightOptions, relight
-from splatgraft.relighting.layers import unchanged
+from splatgraft.relighting.layers import pasted
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.rendering import render
 
@@ -131,7 +131,7 @@ def test_a_slope_too_small_to_square_changes_nothing(size):
     """Squares below 1e-38 are 0 in float32: a length of 0 under a slope that is not."""
     points, up = torch.rand(20, 3), torch.tensor([[0.0, 0.0, 1.0]]).repeat(20, 1)
     scene = surfels(points, up, width=0.1, thickness=0.01, srgb=0.5)
-    relit = unchanged(scene, torch.zeros(20, dtype=torch.bool), objects=(), report=())
+    relit = pasted(Composite(scene, (), torch.zeros(20, dtype=torch.bool)), "")
     relit = replace(relit, shadow=torch.full((20, 3), 0.4))
     flat = relit.shaded()
     sloped = replace(relit, slope=torch.full((20, 3), size)).shaded()

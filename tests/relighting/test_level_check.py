@@ -13,8 +13,8 @@ from splatgraft.core.exposure import LuminanceScale
 from splatgraft.core.gaussians import empty
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting import Light, Relit, SourceScene, relight
-from splatgraft.relighting.level_check import describe_level
 from splatgraft.relighting.light.light import fit_ambient
+from splatgraft.relighting.report import describe_level
 
 
 def even(radiance: float) -> Light:
@@ -39,7 +39,7 @@ def test_agreeing_levels_are_told_in_stops_and_lux(relit: Relit):
     assert "the new place is 2.0 stops brighter than the old one" in found[0].text
     assert "light on the object 2.0 stops brighter" in found[0].text
     assert "differ" not in found[0].text
-    assert not found[0].is_doubtful
+    assert not found[0].in_doubt
     # even radiance L gives pi L of illuminance on a convex body; the ball's own Gaussians take some of it
     words = found[0].text.replace(",", "").split()
     there, old = (float(words[i - 1].lstrip("(")) for i, word in enumerate(words) if word in ("lux", "at"))
@@ -51,7 +51,7 @@ def test_a_large_difference_and_a_darker_place_are_said(relit: Relit):
     (line,) = describe_level(relit, target=LuminanceScale(800.0, 10.0), source=LuminanceScale(100.0, 40.0))
     assert "the new place is 2.0 stops darker than the old one" in line.text
     assert "They differ by 4.0 stops" in line.text
-    assert line.is_doubtful
+    assert line.in_doubt
     assert "sun" not in line.text
 
 

@@ -15,9 +15,9 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.splitting import split_along
-from splatgraft.relighting.light.estimate import estimate_light
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.light import Light, fit_ambient
-from splatgraft.relighting.shading.normals import estimate_normals
+from splatgraft.relighting.normals import estimate_normals
 from splatgraft.rendering import render
 
 
@@ -55,8 +55,8 @@ def sunlit_scene(sun, strength):
 def estimated(scene, cameras=None) -> Light:
     place = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
     found = estimate_light(scene, place, views() if cameras is None else cameras)
-    assert isinstance(found, Light)
-    return found
+    assert isinstance(found, EstimatedLight)
+    return found.light
 
 
 def main_direction(light):
@@ -129,8 +129,8 @@ def test_the_estimate_does_not_depend_on_the_world_axes():
     poses[:, :3] = turn @ poses[:, :3]
     place = BoundingSphere(turn @ torch.tensor([0.0, 0.0, 0.3]), 0.3)
     found = estimate_light(turned_scene, place, replace(cameras, world_from_camera=poses))
-    assert isinstance(found, Light)
-    assert math.degrees(math.acos(min(1.0, float(torch.tensor(found.sources[0].direction) @ (turn @ sun))))) < 11
+    assert isinstance(found, EstimatedLight)
+    assert math.degrees(math.acos(min(1.0, float(torch.tensor(found.light.sources[0].direction) @ (turn @ sun))))) < 11
 
 
 def test_a_harmonic_fit_of_half_the_sphere_recovers_an_even_light():

@@ -8,8 +8,9 @@ import torch
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.relighting.gain import local_gain, mean_light
 from splatgraft.relighting.light.panorama import Panorama, cube_directions
-from splatgraft.relighting.shading.gain import apply_gain, local_gain, mean_light
+from splatgraft.relighting.shading import apply_gain
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 

@@ -18,11 +18,9 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import basis, colors, dc_from_rgb
 from splatgraft.relighting import SourceScene, relight
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
-from splatgraft.relighting.shading.gloss import gloss_bands
-from splatgraft.relighting.shading.materials import estimate_materials
-from splatgraft.relighting.shading.object_views import object_views
-from splatgraft.relighting.shading.reflected_light import ReflectedLight, reflected_light
-from splatgraft.relighting.shadows.light_sampling import sample_light
+from splatgraft.relighting.light.samples import sample_light
+from splatgraft.relighting.materials import ReflectedLight, estimate_materials, gloss_bands, reflected_light
+from splatgraft.relighting.object_views import object_views
 
 COUNT = 1500
 AROUND = even_directions(COUNT)
@@ -137,4 +135,4 @@ def test_the_report_names_a_mirror(reflectance):
     composite = Composite(far, (placed,), torch.zeros(far.count, dtype=torch.bool))
     source = SourceScene(empty(), cameras, light=light, normals=AROUND)
     report = relight(composite, cameras, sources=(source,), light=lamp(1, 0, 1)).report
-    assert any("is a mirror, whose reflections are only blurred" in line for line in report) == (reflectance > 0)
+    assert any("is a mirror, whose reflections are only blurred" in note.text for note in report) == (reflectance > 0)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from splatgraft.relighting.shading.nearest_neighbours import nearest_neighbours
+from splatgraft.relighting.nearest_neighbours import nearest_neighbours
 
 
 @pytest.mark.parametrize("n", [1, 2, 9, 700])

@@ -9,9 +9,8 @@ from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.spherical_harmonics import dc_from_rgb
-from splatgraft.relighting.shading.depth_normals import fuse_normals
-from splatgraft.relighting.shading.normals import estimate_normals
-from splatgraft.relighting.shading.object_views import object_views
+from splatgraft.relighting.normals import estimate_normals
+from splatgraft.relighting.object_views import fuse_normals, object_views
 
 ORIGIN = BoundingSphere(torch.zeros(3), 0.5)
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from splatgraft.core.bounds import BoundingSphere
+from splatgraft.relighting.light.evidence import ShadingEvidence
+from splatgraft.relighting.light.panorama import DIRECTIONS, Surroundings, nearest_directions
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
-from splatgraft.relighting.light.shading_evidence import ShadingEvidence
-from splatgraft.relighting.light.surroundings import DIRECTIONS, Surroundings, nearest_directions
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 COUNT = len(DIRECTIONS)

@@ -14,7 +14,7 @@ from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting import Light, LightSource, RelightOptions, relight
 from splatgraft.relighting.light.light import fit_ambient
-from splatgraft.relighting.shadows.light_sampling import sample_light
+from splatgraft.relighting.light.samples import sample_light
 from splatgraft.relighting.shadows.scene_ratio import object_shadow_maps, scene_ratio
 from splatgraft.rendering import render
 

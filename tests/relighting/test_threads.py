@@ -8,7 +8,7 @@ PROGRAM = """
 import threading
 import torch
 from splatgraft.core.directions import even_directions, frames_along
-from splatgraft.relighting.shading.normals import estimate_normals
+from splatgraft.relighting.normals import estimate_normals
 from splatgraft.relighting.shadows.shadow_maps import Window, occluders_of, splat_depth_maps, visibility
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.gaussians import Gaussians

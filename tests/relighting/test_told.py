@@ -13,7 +13,6 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.relighting import Light, LightSource, SourceScene, relight
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.prepared_object import prepare_object
-from splatgraft.runtime.memo import Memo
 
 COUNT = 2000
 QUARTER = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -34,7 +33,7 @@ def cameras():
 
 def prepared(source: SourceScene, rotation=QUARTER):
     placed = PlacedObject(ball(), Similarity(1.0, rotation, torch.tensor([0.0, 0.0, 1.0])))
-    return prepare_object(placed, source, cameras(), light=LIGHT, index=0, cache=Memo())
+    return prepare_object(placed, source, cameras(), source_light=source.light, light=LIGHT, number=1)
 
 
 def test_a_told_light_is_turned_with_the_object_and_needs_no_scene():
@@ -53,7 +52,7 @@ def test_an_object_told_to_have_stood_in_the_same_light_keeps_its_colours():
     shade = relit.shade[relit.is_object]
     # both irradiances come from the same samples; float32
     assert torch.allclose(shade, torch.ones_like(shade), atol=1e-4)
-    assert any("as given" in sentence for sentence in relit.report[1:])
+    assert any("as given" in note.text for note in relit.report[1:])
 
 
 def test_between_two_told_lights_the_level_changes_in_full():

@@ -6,8 +6,8 @@ import torch
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.shadows.view_culling import gaussians_in_view
-from splatgraft.relighting.shadows.view_fit import ViewFitSettings, _FittedView, _solved
+from splatgraft.relighting.shadows import view_fit
+from splatgraft.relighting.shadows.view_fit import _FittedView, _solved, gaussians_in_view
 from splatgraft.rendering import view_operator
 
 
@@ -46,7 +46,7 @@ def test_a_view_has_the_gaussians_whose_centres_project_to_its_surroundings():
 
 
 def test_the_solver_equals_sirt_with_dense_matrices():
-    scene, cameras, settings = cloud(120, seed=1), around(3), ViewFitSettings()
+    scene, cameras = cloud(120, seed=1), around(3)
     generator = torch.Generator().manual_seed(2)
     receivers, values = 80, 0.5 + 0.5 * torch.rand(80, generator=generator)
     views, matrices = [], []
@@ -56,27 +56,27 @@ def test_the_solver_equals_sirt_with_dense_matrices():
         first = int((which < receivers).sum())
         target = operator.alpha * (0.3 + 0.7 * torch.rand(operator.alpha.shape, generator=generator))
         directions = torch.nn.functional.normalize(scene.means[which[:first]] - camera.centers[0], dim=1)
-        wide = drawn[:first] > settings.narrowest_px
+        wide = drawn[:first] > view_fit._NARROWEST_PX
         views.append(_FittedView(which[:first], len(which), operator, target, directions, wide))
         dense = torch.zeros(target.numel(), 120)
         dense[:, which] = operator.blend(torch.eye(len(which))).reshape(-1, len(which))
         matrices.append(dense.double())
-    found = _solved(values, views, settings)
+    found = _solved(values, views)
 
-    least = settings.darkest ** (1 / settings.gamma)
+    least = view_fit._DARKEST ** (1 / view_fit._GAMMA)
     value, slope = torch.cat([values, torch.ones(40)]).double(), torch.zeros(120, 3).double()
     weight = sum(dense.sum(0) for dense in matrices)
-    step = torch.where(weight > settings.least_weight, 1 / weight, 0)
+    step = torch.where(weight > view_fit._MIN_WEIGHT, 1 / weight, 0)
     step[receivers:] = 0
     rays = [torch.nn.functional.normalize(scene.means - c.centers[0], dim=1).double() for c in cameras]
-    for _ in range(settings.rounds):
+    for _ in range(view_fit._ROUNDS):
         change, turn = torch.zeros(120).double(), torch.zeros(120, 3).double()
         for dense, view, towards in zip(matrices, views, rays, strict=True):
             back = dense.T @ (view.target.flatten() - dense @ (value + (slope * towards).sum(1)))
             change, turn = change + back, turn + back[:, None] * towards
         value = torch.where(step > 0, (value + step * change).clamp(least, 1), value)
         slope = slope + step[:, None] * turn
-        most = torch.minimum(settings.most_slope * value, 1 - value)[:, None]
+        most = torch.minimum(view_fit._MAX_SLOPE * value, 1 - value)[:, None]
         slope = slope * (most / slope.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1)
     assert torch.equal(found[2], step[:receivers] > 0)
     # five rounds of float32 sums over some 100 pixels of size 1, divided by their weight

@@ -14,14 +14,23 @@ from jaxtyping import Bool, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from splatgraft.core.composite import Composite
+from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
-from splatgraft.relighting import Light, Relit, SourceScene, relight
-from splatgraft.relighting.gain_transfer import relight_by_gain
-from splatgraft.relighting.prepared_scene import REGION
+from splatgraft.relighting import Light, RelightOptions, Relit, SourceScene
+from splatgraft.relighting.cast_shadows import cast_shadows
+from splatgraft.relighting.gain import relight_by_gain
+from splatgraft.relighting.layers import assemble_layers, pasted
+from splatgraft.relighting.light.panorama import NoLight
+from splatgraft.relighting.prepared_object import PreparedObject, SourceLight, find_source_light, prepare_object
+from splatgraft.relighting.scene_light import SceneLight, find_scene_light
 from splatgraft.runtime.memo import Memo
+
+_KEPT_SOURCE_LIGHTS = 8
+"""Objects and source scenes whose old light is kept."""
 
 TARGET_BUDGET, OBJECT_BUDGET = 30_000, 8_000
 """Numbers of Gaussians; relighting this many after a change of the light takes about a second on one core."""
@@ -100,15 +109,102 @@ def largest_coverage_indices(gaussians: Gaussians, budget: int) -> Int[Tensor, "
     return log_coverage.topk(budget).indices.sort().values
 
 
+class _TransferValues:
+    """The values of the last transfer, of which the next one takes what still holds."""
+
+    def __init__(self) -> None:
+        self._memo = Memo()
+        self._source_lights: list[tuple[Gaussians, SourceScene, SourceLight]] = []
+
+    def is_moved(self, composite: Composite, cameras: Cameras, light: Light | None, reach: float) -> bool:
+        """Whether objects were moved since the light of the scene was found."""
+        kept = self._memo.peek(_kind(light), (composite.target, composite.erased, cameras, light, reach))
+        return kept is not None and kept[0] != _poses(composite)
+
+    def relight(
+        self,
+        composite: Composite,
+        cameras: Cameras,
+        *,
+        sources: Sequence[SourceScene | None],
+        light: Light | None,
+        options: RelightOptions,
+        exact: bool,
+    ) -> Relit:
+        """The transfer as `relight` makes it; after a short move not `exact`: under the sources found before it."""
+        pairs = enumerate(zip(composite.objects, sources, strict=True), 1)
+        placed = [(number, one, source) for number, (one, source) in pairs if one.gaussians.count]
+        if not placed:
+            return pasted(composite, "No object is placed: nothing to light.")
+        scene = self._scene_light(composite, cameras, light, options.reach, exact=exact)
+        if isinstance(scene, NoLight):
+            return pasted(composite, f"{scene.reason} The object is pasted as it is.")
+        objects = [self._object(number, one, source, scene, exact=exact) for number, one, source in placed]
+        merged, is_object = composite.merged()
+        views, budget = cameras.spread(options.fitted_views), options.budget(merged.count)
+        shadows = cast_shadows(scene, objects, merged.select(~is_object), views=views, budget=budget)
+        return assemble_layers(merged, scene, objects, shadows)
+
+    def _scene_light(
+        self, composite: Composite, cameras: Cameras, light: Light | None, reach: float, *, exact: bool
+    ) -> SceneLight | NoLight:
+        kind, inputs = _kind(light), (composite.target, composite.erased, cameras, light, reach)
+        poses, kept = _poses(composite), self._memo.peek(_kind(light), inputs)
+        if kept is not None and kept[0] == poses:
+            return kept[1]
+        spheres = [bounding_sphere(one.in_target()) for one in composite.objects if one.gaussians.count]
+        if kept is not None and not exact:
+            latest = self._memo.peek(f"{kind}, moved", (kept[1],)) or kept[1]
+            moved = latest.moved(spheres)
+            if isinstance(moved, SceneLight):
+                self._memo.put(f"{kind}, moved", (kept[1],), moved)
+            if moved is not None:
+                return moved
+        target = composite.target.select(~composite.erased)
+        found = find_scene_light(target, cameras, spheres, light=light, reach=reach)
+        if isinstance(found, SceneLight):
+            self._memo.put(kind, inputs, (poses, found))
+        return found
+
+    def _object(
+        self, number: int, placed: PlacedObject, source: SourceScene | None, scene: SceneLight, *, exact: bool
+    ) -> PreparedObject:
+        name, inputs = f"object {number}", (placed.gaussians, source, scene.cameras)
+        kept: PreparedObject | None = self._memo.peek(name, inputs)
+        place = placed.target_from_object.translation
+        if kept is not None and not (exact and not torch.equal(kept.target_from_object.translation, place)):
+            moved = kept.moved(placed, scene.light)
+            if moved is not None:
+                return moved
+        prepared = prepare_object(
+            placed,
+            source,
+            scene.cameras,
+            source_light=self._source_light(placed.gaussians, source),
+            light=scene.light,
+            number=number,
+        )
+        self._memo.put(name, inputs, prepared)
+        return prepared
+
+    def _source_light(self, gaussians: Gaussians, source: SourceScene | None) -> SourceLight:
+        if source is None:
+            return None
+        for of_object, of_source, light in self._source_lights:
+            if of_object is gaussians and of_source is source:
+                return light
+        light = find_source_light(gaussians, source)
+        self._source_lights = [*self._source_lights[1 - _KEPT_SOURCE_LIGHTS :], (gaussians, source, light)]
+        return light
+
+
 class RelitPreview:
     """Relit scenes of one project; intermediate results are memoised by their inputs."""
 
     def __init__(self, scenes: SceneCache) -> None:
         """Start with empty memos."""
         self._scenes = scenes
-        self._relight_memo, self._draft_memo = Memo(), Memo()
-        self._region_poses: bytes = b""
-        """Of the objects, when the region in `_relight_memo` was chosen."""
+        self._full_values, self._draft_values = _TransferValues(), _TransferValues()
         self._memo = Memo()
         self._full_lock, self._draft_lock, self._composite_lock = threading.RLock(), threading.RLock(), threading.Lock()
 
@@ -147,7 +243,9 @@ class RelitPreview:
 
     def can_refine(self, state: EditState) -> bool:
         """Whether objects were moved since the light was estimated: then `refined` takes less time than `relit`."""
-        return self._region_poses not in (b"", _poses(self.composite(state)))
+        return self._full_values.is_moved(
+            self.composite(state), self._cameras(), state.light, self._scenes.files.relight_options.reach
+        )
 
     def refined(self, state: EditState) -> Relit:
         """All layers after a move under the sources of the light that were estimated before it, at full detail.
@@ -215,8 +313,7 @@ class RelitPreview:
         return f"{described[light_mode]}, as set in project.toml ([relight] light = {light_mode})"
 
     def _gain_adjusted(self, composite: Composite, state: EditState) -> Gaussians:
-        cameras, sources = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.source_scenes(state)
-        adjusted, _ = relight_by_gain(composite, cameras, sources=sources)
+        adjusted, _ = relight_by_gain(composite, self._cameras(), sources=self._scenes.source_scenes(state))
         return adjusted.bake()[0]
 
     def _make_once(self, name: str, state: EditState, make: Callable[[EditState], Relit]) -> Relit:
@@ -234,16 +331,14 @@ class RelitPreview:
         return (self.composite(state), state.light, repr(self._scenes.files.relight_options))
 
     def _relight(self, state: EditState) -> Relit:
-        if self.can_refine(state):
-            # the step knows of no place before: sources and shadow maps are those of this one
-            self._relight_memo.forget(REGION)
-            self._region_poses = b""
-        relit = self._refine(state)
+        # the step knows of no place before: sources and shadow maps are those of this one
+        relit = self._transfer(self.composite(state), self._scenes.source_scenes(state), light=state.light)
         self._memo.forget("refined")  # a second copy of a large scene
         return relit
 
     def _refine(self, state: EditState) -> Relit:
-        return self._relight_composite(self.composite(state), self._scenes.source_scenes(state), light=state.light)
+        composite, sources = self.composite(state), self._scenes.source_scenes(state)
+        return self._transfer(composite, sources, light=state.light, exact=False)
 
     def _draft(self, state: EditState) -> Relit:
         composite, sources = self.composite(state), self._scenes.source_scenes(state)
@@ -251,7 +346,7 @@ class RelitPreview:
             # analysing the source scene takes half of the time of the first result
             sources = [None] * len(sources)
         if not _is_large(composite):
-            return self._relight_composite(composite, sources, light=state.light, is_draft=True)
+            return self._draft_transfer(composite, sources, light=state.light)
         memo, kept = self._memo, (composite.target, composite.erased)
         target = memo.get("coarse target", kept, lambda: coarsen(kept[0].select(~kept[1]), TARGET_BUDGET))
         objects = [
@@ -260,24 +355,26 @@ class RelitPreview:
         ]
         coarse = coarse_composite(composite, target, objects)
         coarse_sources = [None if source is None else self._coarse_source(source) for source in sources]
-        relit = self._relight_composite(coarse, coarse_sources, light=state.light, is_draft=True)
+        relit = self._draft_transfer(coarse, coarse_sources, light=state.light)
         return upsample_light(relit, composite, [target, *objects])
 
-    def _relight_composite(
-        self,
-        composite: Composite,
-        sources: Sequence[SourceScene | None],
-        *,
-        light: Light | None,
-        is_draft: bool = False,
+    def _transfer(
+        self, composite: Composite, sources: Sequence[SourceScene | None], *, light: Light | None, exact: bool = True
     ) -> Relit:
-        cameras, options = self._scenes.cameras(self._scenes.files.target_cameras), self._scenes.files.relight_options
-        options = replace(options, most_added=0.0, fitted_views=0) if is_draft else options
-        full_target = self._scenes.gaussians(self._scenes.files.target_scene)
-        memo = self._relight_memo if composite.target is full_target else self._draft_memo
-        if memo is self._relight_memo and not self._region_poses:
-            self._region_poses = _poses(composite)
-        return relight(composite, cameras, sources=sources, light=light, options=options, cache=memo)
+        options = self._scenes.files.relight_options
+        values, cameras = self._full_values, self._cameras()
+        return values.relight(composite, cameras, sources=sources, light=light, options=options, exact=exact)
+
+    def _draft_transfer(
+        self, composite: Composite, sources: Sequence[SourceScene | None], *, light: Light | None
+    ) -> Relit:
+        options = replace(self._scenes.files.relight_options, most_added=0.0, fitted_views=0)
+        is_full = composite.target is self._scenes.gaussians(self._scenes.files.target_scene)
+        values, cameras = self._full_values if is_full else self._draft_values, self._cameras()
+        return values.relight(composite, cameras, sources=sources, light=light, options=options, exact=False)
+
+    def _cameras(self) -> Cameras:
+        return self._scenes.cameras(self._scenes.files.target_cameras)
 
     def _coarse_source(self, source: SourceScene) -> SourceScene:
         def make() -> SourceScene:
@@ -297,3 +394,8 @@ def _poses(composite: Composite) -> bytes:
     return b"".join(
         part.numpy().tobytes() for m in moves for part in (torch.tensor(m.scale), m.rotation, m.translation)
     )
+
+
+def _kind(light: Light | None) -> str:
+    """Name of the scene's light among kept values: an estimate is kept while another light is given."""
+    return "estimated light" if light is None else "given light"

@@ -3,7 +3,6 @@
 from splatgraft.relighting.layers import LayerWeights, Relit
 from splatgraft.relighting.light.light import Light, LightSource, light_from_json, light_to_json
 from splatgraft.relighting.prepared_object import SourceScene
-from splatgraft.relighting.shadow_removal import remove_object_shadow
 from splatgraft.relighting.transfer import RelightOptions, relight
 
 __all__ = [
@@ -16,5 +15,4 @@ __all__ = [
     "light_from_json",
     "light_to_json",
     "relight",
-    "remove_object_shadow",
 ]

@@ -1,5 +1,6 @@
 """The result of a light transfer: a composite with shading, shadow, bounce and gloss as layers to weight and bake."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -7,19 +8,34 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.composite import Composite
+from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
 from splatgraft.core.splitting import split_wide_around
-from splatgraft.relighting.light.confidence import light_confidence
+from splatgraft.relighting.cast_shadows import Shadows
 from splatgraft.relighting.light.estimate import EstimatedLight
-from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.light import Light, light_confidence
+from splatgraft.relighting.materials import gloss_bands, reflected_light
 from splatgraft.relighting.prepared_object import PreparedObject
-from splatgraft.relighting.shading.gain import apply_gain
+from splatgraft.relighting.scene_light import SceneLight
+from splatgraft.relighting.shading import (
+    KNOWN_LIGHTS,
+    ShadeSettings,
+    apply_gain,
+    irradiance,
+    light_scale,
+    shade_ratio,
+    unknown_origin_ratio,
+)
+from splatgraft.runtime.note import Note
 
-_MOST_VIEW_CHANGE = 0.9
-"""Most share of the light in a shadow that a view direction takes away; set by hand."""
-_LEAST_SLOPE = 1e-6
+_MAX_VIEW_CHANGE = 0.9
+"""Share of the light in a shadow that a view direction takes away; set by hand."""
+_MIN_SLOPE = 1e-6
 """Of a ratio over view directions; below it nothing is seen, and divisions would overflow."""
+_MIN_CERTAIN = 0.5
+"""Share of the light that was captured and whose direction is certain, below which most of it is a guess."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +82,10 @@ class Relit:
     """The placed objects, target's frame."""
     light: Light | None
     """At the objects' place; None where there was no transfer."""
-    report: tuple[str, ...]
-    """Sentences: the lights that were found and their uncertainty, and what was not done and why."""
+    report: tuple[Note, ...]
+    """The lights that were found and their uncertainty, and what was not done and why."""
     estimate: EstimatedLight | None = None
-    """What `light` rests on; None where it was told or there was no transfer."""
+    """What `light` rests on; None where it was given or there was no transfer."""
     received: tuple[Float[Tensor, "n 3"], ...] = ()
     """Linear rgb irradiance on the Gaussians of each object at the new place."""
     prepared: tuple[PreparedObject, ...] = ()
@@ -138,18 +154,111 @@ def _srgb_slope(
     By the secant between both ends, limited so that neither is black nor brighter than without a shadow.
     """
     # the squares of slopes below 1e-20 are 0 in float32
-    length = slope.norm(dim=1, keepdim=True).clamp_min(_LEAST_SLOPE)
-    most = torch.minimum(_MOST_VIEW_CHANGE * ratio, (1 - ratio).clamp_min(0))
-    change = torch.minimum(length, most).clamp_min(_LEAST_SLOPE)
+    length = slope.norm(dim=1, keepdim=True).clamp_min(_MIN_SLOPE)
+    most = torch.minimum(_MAX_VIEW_CHANGE * ratio, (1 - ratio).clamp_min(0))
+    change = torch.minimum(length, most).clamp_min(_MIN_SLOPE)
     linear = linear_from_srgb(srgb.clamp(0, 1))
     high, low = (srgb_from_linear(linear * (ratio + sign * change)) for sign in (1, -1))
     return (slope / length)[:, :, None] * (0.5 * (high - low))[:, None]
 
 
-def unchanged(
-    gaussians: Gaussians, is_object: Bool[Tensor, "m"], *, objects: tuple[Gaussians, ...], report: tuple[str, ...]
-) -> Relit:
-    """The copy-paste result, with the sentences that say why."""
+@dataclass(frozen=True)
+class _Shading:
+    """How an object of n Gaussians is lit."""
+
+    received: Float[Tensor, "n 3"]
+    """Linear rgb irradiance at the new place."""
+    shade: Float[Tensor, "n 3"]
+    """Factor on linear rgb by its own shading."""
+    gloss: Float[Tensor, "n 16 3"] | None
+    """Coefficients of what it reflects at its new place; None where it is matt."""
+
+
+def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[PreparedObject], shadows: Shadows) -> Relit:
+    """Shade the objects, and put all layers in the order of the merged composite; pieces where their whole was.
+
+    Args:
+        merged: The composite, as `Composite.merged` gives it.
+        scene: The light at the objects' place.
+        objects: All that have Gaussians.
+        shadows: Of that light.
+    """
+    shadings = [_shading(one, scene, shares) for one, shares in zip(objects, shadows.scene_visibility, strict=True)]
+    receivers, on_scene = shadows.receivers, shadows.on_scene
+    rest = torch.ones(scene.scene.count, dtype=torch.bool)
+    rest[receivers.origin] = False
+    rest_index = rest.nonzero()[:, 0]
+    object_rows = torch.arange(scene.scene.count, merged.count)
+    gaussians = concatenate([merged.select(rest_index), receivers.gaussians, merged.select(object_rows)])
+    count = gaussians.count - len(object_rows)
+    ones, zeros = torch.ones(len(rest_index), 3), torch.zeros(len(rest_index), 3)
+    replaced = [torch.full((one.gaussians.count,), one.source_lighting is not None) for one in objects]
+    origin = torch.cat([rest_index, receivers.origin, object_rows])
+    order = origin.argsort(stable=True)
+    return Relit(
+        gaussians=gaussians.select(order),
+        is_object=order >= count,
+        origin=origin[order],
+        shade=torch.cat([torch.ones(count, 3), *[one.shade for one in shadings]])[order],
+        shadow=torch.cat([ones, on_scene.shadow, *[ratio.shadow for ratio in shadows.on_objects]])[order],
+        bounce=torch.cat([zeros, on_scene.bounce, *[ratio.bounce for ratio in shadows.on_objects]])[order],
+        slope=torch.cat([zeros, on_scene.slope, *[ratio.slope for ratio in shadows.on_objects]])[order],
+        gloss=_gloss_layer(gaussians, shadings)[order],
+        bands_replaced=torch.cat([torch.zeros(count, dtype=torch.bool), *replaced])[order],
+        objects=tuple(one.gaussians for one in objects),
+        light=scene.light,
+        report=(_light_note(scene), *(note for one in objects for note in one.notes)),
+        estimate=scene.estimate,
+        received=tuple(one.received for one in shadings),
+        prepared=tuple(objects),
+    )
+
+
+def _light_note(scene: SceneLight) -> Note:
+    """What the light at the new place is, and whether most of it is a guess."""
+    text = scene.light.describe(estimate_up(scene.cameras)) + ("." if scene.estimate is not None else ", as given.")
+    certain = light_confidence(scene.light)
+    if certain >= _MIN_CERTAIN:
+        return Note(text)
+    remedy = (
+        f"Most of this light is a guess ({certain:.0%} of it was captured with a certain direction): photograph what "
+        "surrounds the place, or give the light (--given-light)."
+    )
+    return Note(text, "warning", remedy)
+
+
+def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Tensor, "n k"]) -> _Shading:
+    """The object's shading by the scene's light, ambient light included."""
+    normals, opacities = one.normals.vectors, one.gaussians.opacities
+    # the ambient light was captured at the place itself, where blockers are part of the panorama; so in the source
+    shares = torch.where(torch.as_tensor(scene.samples.is_source), scene_visibility, torch.ones(()))
+    shares = one.self_visibility * shares
+    received = irradiance(scene.samples, normals, sample_visibility=shares)
+    source = one.source_lighting
+    if source is None:
+        return _Shading(received, unknown_origin_ratio(received, opacities), None)
+    settings = KNOWN_LIGHTS if scene.estimate is None and source.estimate is None else ShadeSettings()
+    shade = shade_ratio(received, source.irradiance, opacities, settings=settings)
+    if not bool(source.materials.glossy.any()):
+        return _Shading(received, shade, None)
+    scale = light_scale(received, source.irradiance, opacities, settings=settings)
+    reflected = reflected_light(scene.light, scene.samples, shares).scaled(scale)
+    return _Shading(received, shade, gloss_bands(one.gaussians, normals, source.materials, reflected, shade=shade))
+
+
+def _gloss_layer(gaussians: Gaussians, shadings: Sequence[_Shading]) -> Float[Tensor, "m k 3"]:
+    """The gloss layer of all m Gaussians, the objects' last; of degree 3 where something is glossy."""
+    if all(one.gloss is None for one in shadings):
+        return torch.zeros_like(gaussians.sh)
+    count = spherical_harmonics.coefficient_count(spherical_harmonics.MAX_DEGREE)
+    on_objects = [torch.zeros(len(one.shade), count, 3) if one.gloss is None else one.gloss for one in shadings]
+    on_scene = torch.zeros(gaussians.count - sum(map(len, on_objects)), count, 3)
+    return torch.cat([on_scene, *on_objects])
+
+
+def pasted(composite: Composite, reason: str) -> Relit:
+    """The copy-paste result, with the reason why there is no transfer."""
+    gaussians, is_object = composite.merged()
     ones = torch.ones(gaussians.count, 3)
     return Relit(
         gaussians=gaussians,
@@ -161,7 +270,7 @@ def unchanged(
         slope=torch.zeros_like(ones),
         gloss=torch.zeros_like(gaussians.sh),
         bands_replaced=torch.zeros(gaussians.count, dtype=torch.bool),
-        objects=objects,
+        objects=tuple(placed.in_target() for placed in composite.objects if placed.gaussians.count),
         light=None,
-        report=report,
+        report=(Note(reason, "warning"),),
     )

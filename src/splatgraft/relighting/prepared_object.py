@@ -1,7 +1,7 @@
-"""A placed object prepared for lighting: normals, shadow maps, self-visibility, and the light it was captured in.
+"""A placed object prepared for the light at its new place: normals, shadow maps, self-visibility, and its old light.
 
-All of it moves with the object and is cached; it is computed again after a rotation, a change of scale, or with other
-light sources.
+All of it moves with the object (`PreparedObject.moved`); it is made again after a rotation, a change of scale, or with
+other light sources.
 """
 
 from dataclasses import dataclass, replace
@@ -16,20 +16,22 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
-from splatgraft.relighting.light.light import Light
-from splatgraft.relighting.shading.depth_normals import fuse_normals
-from splatgraft.relighting.shading.irradiance import irradiance
-from splatgraft.relighting.shading.materials import Materials, estimate_materials
-from splatgraft.relighting.shading.normals import Normals, estimate_normals
-from splatgraft.relighting.shading.object_views import ObjectView, object_views
-from splatgraft.relighting.shading.reflected_light import reflected_light
-from splatgraft.relighting.shadows.light_sampling import LightSamples, ambient_pairs, sample_light, source_pairs
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
+from splatgraft.relighting.light.light import Light, LightSource
+from splatgraft.relighting.light.panorama import NoLight
+from splatgraft.relighting.light.samples import ambient_pairs, sample_light, source_pairs
+from splatgraft.relighting.materials import Materials, estimate_materials, reflected_light
+from splatgraft.relighting.normals import Normals, estimate_normals
+from splatgraft.relighting.object_views import ObjectView, fuse_normals, object_views
+from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows.scene_ratio import ObjectShadowMaps, object_shadow_maps, self_visibility
-from splatgraft.runtime.memo import Memo
+from splatgraft.runtime.note import Note
 
-_LEAST_TOLD = 0.03
+_MIN_GLOSS = 0.03
 """Share of the object; less gloss is not reported."""
+
+SourceLight = Light | EstimatedLight | NoLight | None
+"""The light that an object was captured in: given, estimated, none, or None without a source scene."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +59,15 @@ class SourceLighting:
     materials: Materials
     """What of the object's colours is matt and what is gloss, in units of that light."""
     estimate: EstimatedLight | None
-    """What the light rests on, source's frame; None where it was told."""
+    """What the light rests on, source's frame; None where it was given."""
 
 
 @dataclass(frozen=True)
 class PreparedObject:
     """One placed object of n Gaussians, target's frame."""
 
+    number: int
+    """Of the object among all placed ones, from 1."""
     gaussians: Gaussians
     """Target's frame."""
     target_from_object: Similarity
@@ -72,18 +76,64 @@ class PreparedObject:
     """Of the Gaussians."""
     normals: Normals
     """Of the Gaussians."""
+    light_sources: tuple[LightSource, ...]
+    """Of the light at the new place, for which the maps are."""
     maps: ObjectShadowMaps
     """For the samples of the light at the new place."""
     self_visibility: Float[Tensor, "n k"]
     """Share of every sample of the new light that the object lets through to its own Gaussians, in [0, 1]."""
     source_lighting: SourceLighting | None
     """None where it is not known."""
-    notes: str | None
-    """A sentence on the light it was captured in, or on why that is not known; None without a source scene."""
+    notes: tuple[Note, ...]
+    """The light it was captured in, or why that is not known."""
+
+    def moved(self, placed: PlacedObject, light: Light) -> "PreparedObject | None":
+        """The object translated to where `placed` has it, under other ambient light.
+
+        Returns:
+            None where it was rotated or scaled, too, or the light has other sources.
+        """
+        old, new = self.target_from_object, placed.target_from_object
+        if light.sources != self.light_sources or new.scale != old.scale or not torch.equal(new.rotation, old.rotation):
+            return None
+        center = self.sphere.center + (new.translation - old.translation).to(self.sphere.center)
+        window = replace(self.maps.ambient_maps.window, center=center)
+        samples = sample_light(light)
+        parts = [part for part in (source_pairs(samples)[0], ambient_pairs(samples)[0]) if len(part)]
+        occlusions = tuple(
+            (part, replace(occlusion, center=center), bias)
+            for part, (_, occlusion, bias) in zip(parts, self.maps.occlusions, strict=True)
+        )
+        return replace(
+            self,
+            gaussians=placed.in_target(),
+            target_from_object=new,
+            sphere=BoundingSphere(center, self.sphere.radius),
+            maps=ObjectShadowMaps(replace(self.maps.ambient_maps, window=window), occlusions),
+        )
+
+
+def find_source_light(object_gaussians: Gaussians, source: SourceScene | None) -> SourceLight:
+    """The light that an object was captured in, in the frame of its source scene: as given there, or estimated.
+
+    The object's shading and its shadow in its capture are evidence, too.
+    """
+    if source is None:
+        return None
+    if source.light is not None:
+        return source.light
+    place = bounding_sphere(object_gaussians)
+    return estimate_light(source.gaussians, place, source.cameras, object_gaussians=object_gaussians)
 
 
 def prepare_object(
-    placed: PlacedObject, source: SourceScene | None, cameras: Cameras, *, light: Light, index: int, cache: Memo
+    placed: PlacedObject,
+    source: SourceScene | None,
+    cameras: Cameras,
+    *,
+    source_light: SourceLight,
+    light: Light,
+    number: int,
 ) -> PreparedObject:
     """Prepare one object for the light at its new place.
 
@@ -91,55 +141,50 @@ def prepare_object(
         placed: Object and placement.
         source: The scene it was taken from; None where not known.
         cameras: Of the target's capture.
+        source_light: What `find_source_light` gives.
         light: At the new place.
-        index: Of the object among all placed ones; part of the cache's keys.
-        cache: Reused where only the object's position changed.
+        number: Of the object among all placed ones, from 1.
 
     Raises:
-        ValueError: The source tells normals, and not one for each of the object's Gaussians.
+        ValueError: The source gives normals, and not one for each of the object's Gaussians.
     """
-    samples = sample_light(light)
-    name, key = f"prepared object {index}", (placed.gaussians, source, cameras, light.sources)
-    cached: PreparedObject | None = cache.peek(name, key)
-    if cached is not None and _same_pose(cached.target_from_object, placed.target_from_object):
-        return _moved(cached, placed, samples)
     gaussians = placed.in_target()
     sphere = bounding_sphere(gaussians)
     # the object is seen best from where it was captured
     seen_from = cameras if source is None else placed.target_from_object.cameras(source.cameras)
     views = object_views(gaussians, sphere, seen_from)
     normals = _normals(placed, source, gaussians, seen_from, views)
+    samples = sample_light(light)
     maps = object_shadow_maps(gaussians, sphere, samples)
-    source_lighting, notes = None, None
-    if source is not None:
-        found = source.light or _source_light(placed, source, index, cache)
-        if isinstance(found, NoLight):
-            notes = found.reason
-        else:
-            estimate = found if isinstance(found, EstimatedLight) else None
-            source_light = found.light if isinstance(found, EstimatedLight) else found
-            notes = source_light.describe(estimate_up(source.cameras))
-            notes += "." if estimate is not None else ", as given."
-            source_light = source_light.rotated(placed.target_from_object.rotation)
-            source_samples = sample_light(source_light)
-            shares = self_visibility(maps, gaussians, normals.vectors, source_samples)
-            received = irradiance(source_samples, normals.vectors, sample_visibility=shares)
-            reflected = reflected_light(source_light, source_samples, shares)
-            materials = estimate_materials(gaussians, normals.vectors, views, reflected)
-            notes += _gloss_note(materials, gaussians)
-            source_lighting = SourceLighting(source_light, received, materials, estimate)
-    prepared = PreparedObject(
+    lighting, notes = None, []
+    if source is not None and isinstance(source_light, NoLight):
+        notes.append(Note(f"Where object {number} comes from: {source_light.reason}"))
+    elif source is not None and source_light is not None:
+        estimate = source_light if isinstance(source_light, EstimatedLight) else None
+        old = source_light.light if isinstance(source_light, EstimatedLight) else source_light
+        described = old.describe(estimate_up(source.cameras)) + ("." if estimate is not None else ", as given.")
+        old = old.rotated(placed.target_from_object.rotation)
+        old_samples = sample_light(old)
+        shares = self_visibility(maps, gaussians, normals.vectors, old_samples)
+        received = irradiance(old_samples, normals.vectors, sample_visibility=shares)
+        materials = estimate_materials(gaussians, normals.vectors, views, reflected_light(old, old_samples, shares))
+        lighting = SourceLighting(old, received, materials, estimate)
+        notes.append(Note(f"Where object {number} comes from: {described}{_gloss_note(materials, gaussians)}"))
+    if lighting is None:
+        unknown = f"The light that object {number} had is not known: it keeps its mean brightness."
+        notes.append(Note(unknown, "warning"))
+    return PreparedObject(
+        number=number,
         gaussians=gaussians,
         target_from_object=placed.target_from_object,
         sphere=sphere,
         normals=normals,
+        light_sources=light.sources,
         maps=maps,
         self_visibility=self_visibility(maps, gaussians, normals.vectors, samples),
-        source_lighting=source_lighting,
-        notes=notes,
+        source_lighting=lighting,
+        notes=tuple(notes),
     )
-    cache.put(name, key, prepared)
-    return prepared
 
 
 def _gloss_note(materials: Materials, gaussians: Gaussians) -> str:
@@ -147,8 +192,8 @@ def _gloss_note(materials: Materials, gaussians: Gaussians) -> str:
     size = gaussians.opacities * gaussians.scales.sort(1).values[:, 1:].prod(1)
     share = float((size * materials.share).sum() / size.sum())
     mirrors = float((size * materials.mirrors).sum() / size.sum())
-    note = f" {100 * share:.0f}% of what the object showed was gloss." if share > _LEAST_TOLD else ""
-    if mirrors > _LEAST_TOLD:
+    note = f" {100 * share:.0f}% of what the object showed was gloss." if share > _MIN_GLOSS else ""
+    if mirrors > _MIN_GLOSS:
         note += f" {100 * mirrors:.0f}% of it is a mirror, whose reflections are only blurred."
     return note
 
@@ -160,7 +205,7 @@ def _normals(
     cameras: Cameras,
     views: tuple[ObjectView, ...],
 ) -> Normals:
-    """The object's normals in the target's frame: those that the source tells, or an estimate."""
+    """The object's normals in the target's frame: those that the source gives, or an estimate."""
     if source is None or source.normals is None:
         neighbours = estimate_normals(in_target, cameras)
         return fuse_normals(in_target, views, neighbours, radius=bounding_sphere(in_target).radius)
@@ -169,42 +214,3 @@ def _normals(
     turned = source.normals @ placed.target_from_object.rotation.to(source.normals).T
     known = torch.ones(in_target.count)
     return Normals(vectors=turned, confidence=known, seen=known > 0)
-
-
-def _same_pose(one: Similarity, other: Similarity) -> bool:
-    return one.scale == other.scale and torch.equal(one.rotation, other.rotation)
-
-
-def _moved(prepared: PreparedObject, placed: PlacedObject, samples: LightSamples) -> PreparedObject:
-    """The object translated to where `placed` has it, under samples of other irradiance from the same directions."""
-    shift = placed.target_from_object.translation - prepared.target_from_object.translation
-    center = prepared.sphere.center + shift.to(prepared.sphere.center)
-    window = replace(prepared.maps.ambient_maps.window, center=center)
-    parts = [p for p in (source_pairs(samples)[0], ambient_pairs(samples)[0]) if len(p)]
-    occlusions = tuple(
-        (part, replace(occlusion, center=center), bias)
-        for part, (_, occlusion, bias) in zip(parts, prepared.maps.occlusions, strict=True)
-    )
-    return replace(
-        prepared,
-        gaussians=placed.in_target(),
-        target_from_object=placed.target_from_object,
-        sphere=BoundingSphere(center, prepared.sphere.radius),
-        maps=ObjectShadowMaps(replace(prepared.maps.ambient_maps, window=window), occlusions),
-    )
-
-
-def _source_light(placed: PlacedObject, source: SourceScene, index: int, cache: Memo) -> EstimatedLight | NoLight:
-    """The light that object `index` was captured in, estimated once for all copies of one object."""
-    gaussians = placed.gaussians
-    for earlier in range(index):
-        cached = cache.peek(f"source light {earlier}", (gaussians, source))
-        if cached is not None:
-            return cached
-
-    def estimate() -> EstimatedLight | NoLight:
-        # the object's shadow in its capture is evidence too
-        place = bounding_sphere(gaussians)
-        return fit_light(source.gaussians, place, source.cameras, object_gaussians=gaussians)
-
-    return cache.get(f"source light {index}", (gaussians, source), estimate)

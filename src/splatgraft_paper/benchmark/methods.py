@@ -30,11 +30,11 @@ from splatgraft.harmonization import (
 from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting import SourceScene, relight
-from splatgraft.relighting.irradiance_ratio import relight_by_irradiance_ratio
 from splatgraft.relighting.light.light import light_to_json
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft_paper.benchmark.scene import ComposedScene, perform_if_stale
+from splatgraft_paper.benchmark.transplat import relight_by_irradiance_ratio
 from splatgraft_paper.benchmark.true_light import read_true_light
 from splatgraft_paper.peers.methods import method_options
 
@@ -127,16 +127,15 @@ class RelightForBenchmark:
         source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
         composite = read_composite(self.target, self.placement)
         if self.light is None:
-            result, report = relight_by_irradiance_ratio(composite, sources=[source])
+            result, notes = relight_by_irradiance_ratio(composite, sources=[source])
         else:
             light, cameras = read_true_light(self.light), read_cameras(self.cameras)
             result = relight(composite, cameras, sources=[source], light=light)
-            report = result.report
+            notes = result.report
             if result.light is not None:
                 (folder / LIGHT_FILE).write_text(light_to_json(result.light))
         write_gaussians(folder / SCENE_FILE, result.bake()[0])
-        for sentence in report:
-            context.console.say(sentence)
+        context.console.tell(*notes)
 
 
 @dataclass(frozen=True)

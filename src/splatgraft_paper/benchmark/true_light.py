@@ -1,22 +1,46 @@
 """The true light at a place of a synthetic scene: a rendered panorama and the suns that it leaves out.
 
 The panorama is not clipped, as a photograph is: the sun of an environment map, or a studio's lamp, is some hundred
-times as bright as the rest. Such peaks become sources first; what is left is divided as a photograph's panorama.
+times as bright as the rest. Such peaks become sources first; what is left is divided as a photograph's panorama. Bright
+patches of that become sources, too, the rest ambient light of degree 2.
 """
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy import ndimage
 from torch import Tensor
 
+from splatgraft.core.directions import fit_sh
+from splatgraft.core.images import srgb_from_linear
 from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg, light_from_json, light_to_json
 from splatgraft.relighting.light.panorama import Panorama, cube_directions
-from splatgraft.relighting.light.panorama_sources import light_from_panorama
+
+TRUE_LIGHT_FILE = "true_light.json"
+
+# which patches of a panorama without peaks are sources; set by hand
+_CLIPPED = 0.97
+"""sRGB of the brightest channel of a patch."""
+_BRIGHTEST_MEAN = 0.85
+"""sRGB that the mean of the three channels exceeds, besides: saturated colours are no light."""
+_SMALLEST = 2e-4
+"""Steradians; a smaller patch is a highlight."""
+_LARGEST = 0.6
+"""Steradians; a larger patch is sky and stays ambient."""
+_MAX_PATCHES = 4
+_JOINED_PX = 2.0
+"""Pixels between patches that are joined."""
+_MAX_JOINED = 32
+"""Patches that are joined at all, the largest ones."""
+_WIDEST = math.radians(15)
+"""Radians, half the extent; longer patches are cut in half."""
+_CUTS = 2
+"""Cuts of a patch, one after another."""
 
 _FACE = 64
 """Pixels; width of a face of the cube map."""
@@ -46,7 +70,9 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
         directions=directions,
         solid_angles=solid_angles,
     )
-    captured = light_from_panorama(cube, torch.tensor([0.0, 0.0, 1.0]))
+    patches, of_patches = _bright_patches(cube)
+    weights = (cube.solid_angles * ~of_patches).flatten()
+    ambient = fit_sh(directions.reshape(-1, 3), cube.radiance.reshape(-1, 3), weights)
     sources = [
         LightSource(
             direction=_triple(sun["direction"]),
@@ -56,9 +82,17 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
         )
         for sun in suns
     ]
-    patches = [replace(source, uncertainty_deg=0.0) for source in captured.sources]
-    ordered = sorted([*sources, *peaks, *patches], key=lambda source: -source.luminance)
-    return Light(sources=tuple(ordered), ambient=captured.ambient, coverage=1.0, unseen_up=0.0)
+    bright = [
+        LightSource(
+            direction=_triple(patch.direction.tolist()),
+            irradiance=_triple((patch.radiance * patch.solid_angle).tolist()),
+            angular_radius_deg=angular_radius_deg(patch.solid_angle),
+            name="bright patch",
+        )
+        for patch in patches
+    ]
+    ordered = sorted([*sources, *peaks, *bright], key=lambda source: -source.luminance)
+    return Light(sources=tuple(ordered), ambient=ambient)
 
 
 def _without_peaks(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], list[LightSource]]:
@@ -115,12 +149,84 @@ def _sampled(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, "6 s s 
     return values[0].permute(1, 2, 0).reshape(directions.shape).contiguous()
 
 
+@dataclass(frozen=True)
+class _Patch:
+    """A bright, connected part of a panorama."""
+
+    direction: Float[Tensor, "3"]
+    """Unit, towards its middle."""
+    radiance: Float[Tensor, "3"]
+    """Mean linear rgb."""
+    solid_angle: float
+    """Steradians."""
+
+
+def _bright_patches(panorama: Panorama) -> tuple[list[_Patch], Bool[Tensor, "6 s s"]]:
+    """Connected parts of a panorama as bright as a camera records, brightest first, and the pixels they cover.
+
+    Parts that an edge between faces separates are joined. Parts wider than 30 degrees are cut in half along their
+    longest extent, twice at most (median cut, Debevec 2005).
+    """
+    srgb = srgb_from_linear(panorama.radiance)
+    bright = (srgb.max(-1).values >= _CLIPPED) & (srgb.mean(-1) > _BRIGHTEST_MEAN)
+    labels = np.zeros(bright.shape, np.int32)
+    count = 0
+    for face in range(6):
+        found, n = ndimage.label(bright[face].numpy(), structure=np.ones((3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
+        labels[face] = np.where(found > 0, found + count, 0)
+        count += n
+    covered = torch.zeros_like(bright)
+    patches = []
+    for group in _joined([torch.from_numpy(labels == i) for i in range(1, count + 1)], panorama):
+        if _SMALLEST <= float(panorama.solid_angles[group].sum()) <= _LARGEST:
+            covered |= group
+            patches += _cut(panorama, group)
+    patches.sort(key=lambda p: -float(p.radiance.sum()) * p.solid_angle)
+    return patches[:_MAX_PATCHES], covered
+
+
+def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Bool[Tensor, "6 s s"]]:
+    """The groups, of which those with pixels nearer than two pixels' angle are joined."""
+    # a face spans 2 units of tan(angle)
+    touching = 2 * _JOINED_PX / panorama.alpha.shape[1]
+    out: list[Bool[Tensor, "6 s s"]] = []
+    for group in sorted(groups, key=lambda g: -int(g.sum()))[:_MAX_JOINED]:
+        for i, other in enumerate(out):
+            cosine = panorama.directions[group][::3] @ panorama.directions[other][::3].T
+            if float(cosine.max()) > math.cos(touching):
+                out[i] = other | group
+                break
+        else:
+            out.append(group)
+    return out
+
+
+def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], *, depth: int = 0) -> list[_Patch]:
+    """The group as one patch, or as several where it is long."""
+    directions, angles = panorama.directions[group], panorama.solid_angles[group]
+    radiance = panorama.radiance[group]
+    weight = angles * radiance.mean(-1)
+    weight = weight / weight.sum()
+    center = torch.nn.functional.normalize((weight[:, None] * directions).sum(0), dim=0)
+    spread = directions - center
+    values, vectors = torch.linalg.eigh(spread.T @ (weight[:, None] * spread))
+    # a uniform strip of half-width w has variance w^2 / 3
+    if depth < _CUTS and float(values[-1].clamp_min(0).sqrt()) * math.sqrt(3) > _WIDEST:
+        side = spread @ vectors[:, -1] > 0
+        halves = []
+        for half in (side, ~side):
+            part = torch.zeros_like(group)
+            part[group] = half
+            if bool(part.any()):
+                halves += _cut(panorama, part, depth=depth + 1)
+        return halves
+    mean = (angles[:, None] * radiance).sum(0) / angles.sum()
+    return [_Patch(direction=center, radiance=mean, solid_angle=float(angles.sum()))]
+
+
 def _triple(values: list[float]) -> tuple[float, float, float]:
     x, y, z = values
     return (x, y, z)
-
-
-TRUE_LIGHT_FILE = "true_light.json"
 
 
 def read_probe(panorama: Path, suns: Path) -> Light:

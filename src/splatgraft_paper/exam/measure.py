@@ -19,9 +19,9 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear, write_image
 from splatgraft.evaluation.regions import find_regions
 from splatgraft.relighting import Light, Relit, SourceScene, relight
-from splatgraft.relighting.gain_transfer import relight_by_gain
-from splatgraft.relighting.irradiance_ratio import relight_by_irradiance_ratio
+from splatgraft.relighting.gain import relight_by_gain
 from splatgraft_paper.benchmark.measure import measure_view
+from splatgraft_paper.benchmark.transplat import relight_by_irradiance_ratio
 from splatgraft_paper.exam.scenes import ExamScene, TrueView
 
 ROWS: Mapping[str, str] = {
@@ -151,7 +151,7 @@ def evaluate_scene(scene: ExamScene, rows: Sequence[str], picture: Path) -> Scen
             columns.append([view.picture(result) for view in scene.views])
         if row == LIGHT_ROW and relit is not None:
             light, normals_deg = _measure_estimates(scene, relit)
-            notes += relit.report
+            notes += [note.text for note in relit.report]
     columns.append([view.truth.image for view in scene.views])
     picture.parent.mkdir(parents=True, exist_ok=True)
     write_image(picture, torch.cat([torch.cat(column, 0) for column in columns], 1))

@@ -23,7 +23,8 @@ from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.project.layout import PLACEMENT_FILE
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.relighting import Light, SourceScene
-from splatgraft.relighting.light.estimate import EstimatedLight, NoLight, fit_light
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
+from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task, run_tasks
@@ -212,8 +213,8 @@ def scenes_in(folders: Sequence[Path], works: Sequence[Path]) -> list[TrainingSc
 def estimated_lights(scene: ExamScene) -> dict[str, EstimatedLight | NoLight]:
     """The estimates at the `new` and the `old` place of a scene, by nothing but its reconstructions."""
     placed, source = scene.composite.objects[0], scene.source
-    new = fit_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
-    old = fit_light(
+    new = estimate_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
+    old = estimate_light(
         source.gaussians, bounding_sphere(placed.gaussians), source.cameras, object_gaussians=placed.gaussians
     )
     return {"new": new, "old": old}

@@ -1,7 +1,7 @@
 """The command `relight`: light the objects of a composite by the target scene, and add their shadows to it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,16 +17,13 @@ from splatgraft.formats.gaussian_flags import write_flags
 from splatgraft.formats.placement import read_placement
 from splatgraft.project.layout import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_PICTURE, LIGHT_TEXT_FILE, SCENE_FILE
 from splatgraft.project.step import Context, Inputs
-from splatgraft.relighting.gain_transfer import PASTED, relight_by_gain
+from splatgraft.relighting.gain import relight_by_gain
 from splatgraft.relighting.layers import LayerWeights, Relit
-from splatgraft.relighting.level_check import LevelLine, describe_level
-from splatgraft.relighting.light.confidence import light_confidence
 from splatgraft.relighting.light.light import Light, light_from_json, light_to_json
-from splatgraft.relighting.light.light_picture import draw_light
-from splatgraft.relighting.transfer import RelightOptions, SourceScene, relight, unknown_light
-
-LEAST_CERTAIN = 0.5
-"""Share of the light that was captured and whose direction is certain, below which most of it is a guess."""
+from splatgraft.relighting.prepared_object import SourceScene
+from splatgraft.relighting.report import describe_level, draw_light
+from splatgraft.relighting.transfer import RelightOptions, relight
+from splatgraft.runtime.note import Note
 
 
 @dataclass(frozen=True)
@@ -70,36 +67,28 @@ class Relight:
         """Relight, write the scene and the light, and print the report."""
         composite = read_composite(self.target, self.placement)
         found: Light | None = None
-        doubts: tuple[str, ...] = ()
         if self.light == "off":
             gaussians, is_object = composite.bake()
-            sentences = ("The light transfer was off: the object is pasted as it was captured.",)
+            notes = (Note("The light transfer was off: the object is pasted as it was captured."),)
         elif self.light == "gain":
-            adjusted, sentences = relight_by_gain(composite, read_cameras(self.cameras), sources=self._sources())
-            doubts = tuple(sentence for sentence in sentences if sentence.endswith(PASTED))
+            adjusted, notes = relight_by_gain(composite, read_cameras(self.cameras), sources=self._sources())
             gaussians, is_object = adjusted.bake()
         else:
             cameras, sources = read_cameras(self.cameras), self._sources()
             relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
             found = relit.light
             gaussians, is_object = relit.bake(self.weights)
-            levels = self._level(relit)
-            sentences = (*relit.report, *(line.text for line in levels))
-            doubts = (*_doubts(relit, composite), *(line.text for line in levels if line.is_doubtful))
+            notes = (*relit.report, *self._level(relit))
             _draw_lights(folder, relit, composite, sources)
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_flags(folder / IS_OBJECT_FILE, is_object)
-        (folder / LIGHT_TEXT_FILE).write_text("\n".join(sentences) + "\n")
+        (folder / LIGHT_TEXT_FILE).write_text("".join(f"{note.text}\n" for note in notes))
         if found is not None:
             (folder / LIGHT_FILE).write_text(light_to_json(found))
         picture = folder / LIGHT_PICTURE
-        for sentence in sentences:
-            if sentence not in doubts:
-                context.console.say(sentence)
-        for doubt in doubts:
-            context.console.warn(doubt, picture=picture if picture.is_file() else None)
+        context.console.tell(*(replace(note, picture=picture if picture.is_file() else None) for note in notes))
 
-    def _level(self, relit: Relit) -> tuple[LevelLine, ...]:
+    def _level(self, relit: Relit) -> tuple[Note, ...]:
         """What the exposure metadata of both captures says of the level; their photos are no inputs, as only this
         depends on them."""
         if self.object_cameras is None:
@@ -107,7 +96,7 @@ class Relight:
         try:
             target, source = read_luminance_scale(self.cameras), read_luminance_scale(self.object_cameras)
         except ValueError as error:  # the transfer itself needs no photo
-            return (LevelLine(f"The photos' exposure was not compared with the light: {error}.", is_doubtful=True),)
+            return (Note(f"The photos' exposure was not compared with the light: {error}.", "warning"),)
         return () if target is None or source is None else describe_level(relit, target=target, source=source)
 
     def _given(self) -> Light | None:
@@ -131,35 +120,17 @@ class Relight:
         return [source if path is not None and path.resolve() == taken.resolve() else None for path in paths]
 
 
-def _doubts(relit: Relit, composite: Composite) -> tuple[str, ...]:
-    """What of the report tells that the light is not known, and a sentence where most of it is a guess."""
-    if relit.light is None:
-        return relit.report
-    lit = [number for number, one in enumerate(composite.objects, 1) if one.gaussians.count]
-    pairs = zip(lit, relit.prepared, strict=True)
-    doubts = [unknown_light(number) for number, one in pairs if one.source_lighting is None]
-    certain = light_confidence(relit.light)
-    if certain < LEAST_CERTAIN:
-        doubts.append(
-            f"Most of the light at the new place is a guess: {certain:.0%} of it was captured with a certain direction."
-        )
-    return tuple(doubts)
-
-
 def _draw_lights(folder: Path, relit: Relit, composite: Composite, sources: Sequence[SourceScene | None]) -> None:
     """Write pictures of the estimated lights: at the new place, and at the old place of each object."""
     if relit.estimate is not None and relit.objects:
         center = torch.stack([bounding_sphere(one).center for one in relit.objects]).mean(0)
         write_image(folder / LIGHT_PICTURE, draw_light(relit.estimate, composite.target, center))
-    if not relit.prepared:
-        return  # there was no transfer
-    lit = [(i, p, s) for i, (p, s) in enumerate(zip(composite.objects, sources, strict=True), 1) if p.gaussians.count]
-    for one, (i, placed, source) in zip(relit.prepared, lit, strict=True):
-        lighting = one.source_lighting
+    for one in relit.prepared:
+        source, lighting = sources[one.number - 1], one.source_lighting
         if source is not None and lighting is not None and lighting.estimate is not None:
-            center = bounding_sphere(placed.gaussians).center
+            center = bounding_sphere(composite.objects[one.number - 1].gaussians).center
             picture = draw_light(lighting.estimate, source.gaussians, center)
-            write_image(folder / f"source_light_{i}.png", picture)
+            write_image(folder / f"source_light_{one.number}.png", picture)
 
 
 COMMAND = Relight

@@ -17,8 +17,7 @@ from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.harmonization import render_views
 from splatgraft.project.layout import LIGHT_TEXT_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
-from splatgraft.relighting.light.confidence import light_confidence
-from splatgraft.relighting.light.light import light_from_json
+from splatgraft.relighting.light.light import light_confidence, light_from_json
 from splatgraft.rendering import RenderOptions, render
 
 

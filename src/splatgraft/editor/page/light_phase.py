@@ -100,8 +100,8 @@ class LightPhase:
 
     def _show_estimate(self) -> None:
         session = self._context.require_session()
-        for sentence in session.relighting.relit(session.placed_state()).report[:1]:
-            self._context.say(sentence)
+        for found in session.relighting.relit(session.placed_state()).report[:1]:
+            self._context.say(found.text)
 
     def _set_weights(self) -> None:
         session = self._context.require_session()

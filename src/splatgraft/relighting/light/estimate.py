@@ -1,92 +1,77 @@
-"""The light at a place of a scene, from its panorama there and from shadows and highlights on the surfaces around."""
+"""The light at a place of a scene, from its panorama there and from shadows and highlights on the surfaces around.
+
+Peaks of the radiance that explains them become sources, the rest ambient light of degree 2. A source that is seen from
+the place stands where the view towards it ends: nothing that the scene shows there blocks it, such as a window's pane.
+"""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
-from splatgraft.core.cameras import Cameras
+from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.directions import fit_sh
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.relighting.light.highlight_evidence import HighlightSettings, find_highlights
-from splatgraft.relighting.light.light import Light
-from splatgraft.relighting.light.light_from_radiance import RadianceSourceSettings, ambient_of, split_peaks
-from splatgraft.relighting.light.panorama import Panorama, cube_cameras, render_panorama
-from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem, seen_sky
-from splatgraft.relighting.light.radiance_search import RadianceEstimate, SearchSettings, search_radiance
-from splatgraft.relighting.light.shading_evidence import (
-    ShadingEvidenceSettings,
-    find_shading_evidence,
+from splatgraft.core.images import LUMINANCE
+from splatgraft.relighting.light.evidence import find_highlights, find_shading_evidence
+from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
+from splatgraft.relighting.light.panorama import (
+    DIRECTIONS,
+    SOLID_ANGLE,
+    NoLight,
+    panorama_at,
+    place_surroundings,
+    surroundings_at,
 )
-from splatgraft.relighting.light.source_distance import with_source_distances
-from splatgraft.relighting.light.surroundings import DIRECTIONS, surroundings_at
-from splatgraft.relighting.shading.normals import estimate_normals
+from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem, seen_sky
+from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
+from splatgraft.relighting.normals import estimate_normals
 from splatgraft.rendering import render
 
-_SURFACE_ALPHA = 0.5
-"""A pixel of a depth image above this alpha shows a surface."""
+# the evidence; set by hand
 _HUGE = 1e6
-"""World units, and units of colour; such Gaussians are a format's or an optimiser's fault."""
+"""World units, and units of colour; larger Gaussians are a format's or an optimiser's fault."""
 _OVERHEAD = 0.5
 """Cosine to the up direction of what counts as ceiling, 60 degrees."""
+_MIN_RADII, _MAX_RADII = 3.0, 8.0
+"""Object radii: limits of the radius of the region of evidence; between them it is the cameras' median distance."""
+_SCENE_WITHIN = 1.4
+"""Radii of the region within which Gaussians may cast shadows."""
+_HIGHLIGHTS_WITHIN = 0.5
+"""Radii of the region within which highlights count."""
+_FAR = 0.9
+"""Radii of the region from which on light counts as coming from outside of it."""
 
+# what is a source; none of these numbers is sensitive
+_OVER_MEDIAN = 4.0
+"""Luminance of a peak over the median of all directions."""
+_MIN_SHARE = 0.02
+"""Of all light, from one direction of a peak."""
+_MAX_SOURCES = 4
+_NEIGHBOUR_COSINE = math.cos(math.radians(14))
+"""Of the angle to the brightest direction below which a direction belongs to its source: it is a neighbour."""
+_SUN = 0.03
+"""Steradians; a smaller clipped patch is called sun, a larger one window."""
+_UNSEEN_RADIUS_DEG = 1.0
+"""Angular radius of a source that no camera saw, beside the uncertainty of its direction."""
+_HALF_BIN_DEG = 4.0
+"""Error of a direction that is known to one of `DIRECTIONS` alone."""
+_CLIPPED_ERROR_DEG = 2.0
+"""Error of the middle of a clipped patch."""
 
-@dataclass(frozen=True)
-class NoLight:
-    """The light at a place could not be estimated."""
-
-    reason: str
-    """A sentence for a report."""
-
-
-@dataclass(frozen=True)
-class PlaceSettings:
-    """The panorama at a place, and when there is none; all set by hand."""
-
-    size: int = 64
-    """Pixels; width of a face of the cube map."""
-    nearest: float = 0.5
-    """Object radii within which Gaussians are left out of the panorama."""
-    test_size: int = 24
-    """Pixels; width of a face of the depth cube map that tests whether the place is inside something."""
-    blocked_within: float = 0.4
-    """Object radii; a nearer surface blocks the view."""
-    most_blocked: float = 0.6
-    """Share of views; with more blocked the place is inside something."""
-    least_coverage: float = 0.1
-    """Share of the surroundings that must be captured, in [0, 1]."""
-    darkest: float = 2e-3
-    """Mean linear radiance; a darker place has no light."""
-
-
-@dataclass(frozen=True)
-class LightEstimateSettings:
-    """All settings of `estimate_light`."""
-
-    place: PlaceSettings = field(default_factory=PlaceSettings)
-    """Of the panorama that tests the place."""
-    radiance: RadianceSettings = field(default_factory=RadianceSettings)
-    """The density of the light: the numbers that are fitted."""
-    search: SearchSettings = field(default_factory=SearchSettings)
-    """Of its maxima."""
-    shading: ShadingEvidenceSettings = field(default_factory=ShadingEvidenceSettings)
-    """Of the surfaces around."""
-    highlights: HighlightSettings = field(default_factory=HighlightSettings)
-    """Of highlights on them."""
-    peaks: RadianceSourceSettings = field(default_factory=RadianceSourceSettings)
-    """Of sources."""
-    radius: tuple[float, float] = (3.0, 8.0)
-    """Object radii: limits of the radius of the surroundings that are evidence; between them it is the cameras' median
-    distance."""
-    scene_within: float = 1.4
-    """Radii of the surroundings within which Gaussians may cast shadows."""
-    highlights_within: float = 0.5
-    """Radii of the surroundings within which highlights count."""
-    far: float = 0.9
-    """Radii of the surroundings from which on light counts as coming from outside of them."""
+# the view towards a source; set by hand
+_SURFACE_ALPHA = 0.5
+"""A pixel of a depth image above this alpha shows a surface."""
+_SOURCE_IMAGE = (32.0, 16)
+"""Focal length and width, pixels, of the depth image."""
+_SOURCE_QUANTILE = 0.25
+"""Of the depths in that image: the distance to the source."""
+_BLOCKERS_WITHIN = 0.7
+"""Share of that distance within which occluders block the source."""
 
 
 @dataclass(frozen=True)
@@ -100,55 +85,27 @@ class EstimatedLight:
     """What the estimate rests on."""
     tint: Float[Tensor, "3"]
     """Linear rgb of mean 1, of what was seen above the horizon; what no camera saw is taken to have it too."""
-    region: BoundingSphere
-    """Around the place: what is in it is near."""
     place: BoundingSphere
     """Where the sources were estimated."""
 
-    def at(
-        self,
-        scene: Gaussians,
-        cameras: Cameras,
-        place: BoundingSphere,
-        *,
-        settings: PlaceSettings = PlaceSettings(),
-    ) -> "EstimatedLight | NoLight":
+    def at(self, scene: Gaussians, cameras: Cameras, place: BoundingSphere) -> "EstimatedLight | NoLight":
         """At a place in the same region: the same sources, and ambient light with what is near there."""
         if place.radius == self.place.radius and torch.equal(place.center, self.place.center):
             return self
         scene = _usable(scene)
-        panorama = panorama_at(scene, place, settings=settings)
+        panorama = panorama_at(scene, place)
         if isinstance(panorama, NoLight):
             return panorama
-        around = surroundings_at(scene, cameras, place.center, nearest=settings.nearest * place.radius)
-        evidence = replace(self.evidence, around=around)
-        _, rest = split_peaks(self.hidden.radiance(evidence, self.tint), evidence, within=math.inf)
-        light = replace(self.light, ambient=ambient_of(rest), **_seen_shares(evidence))
+        evidence = replace(self.evidence, around=place_surroundings(scene, cameras, place))
+        _, rest = _split_peaks(self.hidden.radiance(evidence, self.tint), evidence, within=math.inf)
+        light = replace(self.light, ambient=_ambient_of(rest), **_seen_shares(evidence))
         return replace(self, evidence=evidence, light=light)
 
 
 def estimate_light(
-    scene: Gaussians,
-    place: BoundingSphere,
-    cameras: Cameras,
-    *,
-    object_gaussians: Gaussians | None = None,
-    settings: LightEstimateSettings = LightEstimateSettings(),
-) -> Light | NoLight:
-    """Estimate the light in the middle of `place`; arguments as of `fit_light`."""
-    found = fit_light(scene, place, cameras, object_gaussians=object_gaussians, settings=settings)
-    return found if isinstance(found, NoLight) else found.light
-
-
-def fit_light(
-    scene: Gaussians,
-    place: BoundingSphere,
-    cameras: Cameras,
-    *,
-    object_gaussians: Gaussians | None = None,
-    settings: LightEstimateSettings = LightEstimateSettings(),
+    scene: Gaussians, place: BoundingSphere, cameras: Cameras, *, object_gaussians: Gaussians | None = None
 ) -> EstimatedLight | NoLight:
-    """Estimate the light in the middle of `place`, with what it rests on.
+    """Estimate the light in the middle of `place`.
 
     Args:
         scene: All Gaussians, without the object.
@@ -156,40 +113,36 @@ def fit_light(
         cameras: Of the scene's capture.
         object_gaussians: The object itself, if it stands there: its shading and its shadow are evidence, but it is not
             part of the surroundings.
-        settings: Of all parts.
     """
     scene = _usable(scene)
-    panorama = panorama_at(scene, place, settings=settings.place)
+    panorama = panorama_at(scene, place)
     if isinstance(panorama, NoLight):
         return panorama
     up = estimate_up(cameras)
     distance = float((cameras.centers - place.center).norm(dim=1).median())
-    least, most = settings.radius
-    region = BoundingSphere(place.center, max(least * place.radius, min(distance, most * place.radius)))
+    region = BoundingSphere(place.center, max(_MIN_RADII * place.radius, min(distance, _MAX_RADII * place.radius)))
     whole = scene
     if object_gaussians is not None:
         degree = max(scene.sh_degree, object_gaussians.sh_degree)
         whole = concatenate([scene.with_sh_degree(degree), object_gaussians.with_sh_degree(degree)])
-    part = whole.select((whole.means - region.center).norm(dim=1) < settings.scene_within * region.radius)
+    part = whole.select((whole.means - region.center).norm(dim=1) < _SCENE_WITHIN * region.radius)
     normals = estimate_normals(part, cameras)
-    surfaces = find_shading_evidence(part, normals, region=region, settings=settings.shading)
-    near = BoundingSphere(region.center, settings.highlights_within * region.radius)
-    highlights = find_highlights(part, normals, cameras, region=near, settings=settings.highlights)
+    surfaces = find_shading_evidence(part, normals, region=region)
+    near = BoundingSphere(region.center, _HIGHLIGHTS_WITHIN * region.radius)
     evidence = LightEvidence(
         surfaces=surfaces,
-        highlights=None if highlights is None else highlights.evidence(),
-        far=surroundings_at(scene, cameras, place.center, nearest=settings.far * region.radius),
-        around=surroundings_at(scene, cameras, place.center, nearest=settings.place.nearest * place.radius),
+        highlights=find_highlights(part, normals, cameras, region=near),
+        far=surroundings_at(scene, cameras, place.center, nearest=_FAR * region.radius),
+        around=place_surroundings(scene, cameras, place),
         up=up,
     )
-    hidden = search_radiance(radiance_problem(evidence, settings=settings.radiance), settings=settings.search)
+    hidden = search_radiance(radiance_problem(evidence))
     mean = (surfaces.weights[:, None] * surfaces.colors).sum(0)
     sky = seen_sky(evidence.far, up, mean.clamp_min(1e-3))
     tint = sky / sky.mean().clamp_min(1e-6)
-    radiance = hidden.radiance(evidence, tint)
-    sources, rest = split_peaks(radiance, evidence, within=region.radius, settings=settings.peaks)
-    light = with_source_distances(Light(sources, ambient_of(rest), **_seen_shares(evidence)), scene, place)
-    return EstimatedLight(light, hidden, evidence, tint, region, place)
+    sources, rest = _split_peaks(hidden.radiance(evidence, tint), evidence, within=region.radius)
+    light = with_source_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
+    return EstimatedLight(light, hidden, evidence, tint, place)
 
 
 def _usable(scene: Gaussians) -> Gaussians:
@@ -206,26 +159,83 @@ def _seen_shares(evidence: LightEvidence) -> dict[str, float]:
     return {"coverage": float(seen.mean()), "unseen_up": float(1 - seen[overhead].mean())}
 
 
-def panorama_at(
-    scene: Gaussians, place: BoundingSphere, *, settings: PlaceSettings = PlaceSettings()
-) -> Panorama | NoLight:
-    """The panorama from the middle of `place`.
+def _split_peaks(
+    radiance: Float[Tensor, "k 3"], evidence: LightEvidence, *, within: float
+) -> tuple[tuple[LightSource, ...], Float[Tensor, "k 3"]]:
+    """The brightest of all `DIRECTIONS` as sources, brightest first, and the radiance without them.
+
+    Occluders farther away than `within` do not block sources that no camera saw.
+    """
+    luminance = radiance @ LUMINANCE
+    is_peak = luminance > _OVER_MEDIAN * luminance.median()
+    is_peak &= luminance > _MIN_SHARE * luminance.sum()
+    near = _NEIGHBOUR_COSINE < DIRECTIONS @ DIRECTIONS.T
+    left, rest, sources = is_peak.clone(), radiance.clone(), []
+    while bool(left.any()) and len(sources) < _MAX_SOURCES:
+        i = int((luminance * left).argmax())
+        group, ring = near[i] & left, near[i] & ~is_peak
+        left &= ~near[i]
+        background = radiance[ring].mean(0) if bool(ring.any()) else radiance.median(0).values
+        sources.append(_source(group, (radiance[group] - background).clamp_min(0), evidence, within=within))
+        rest[group] = torch.minimum(rest[group], background)
+    return tuple(sorted(sources, key=lambda source: -source.luminance)), rest
+
+
+def _ambient_of(rest: Float[Tensor, "k 3"]) -> Float[Tensor, "9 3"]:
+    """Harmonics of degree 2 of radiance from all `DIRECTIONS`."""
+    return fit_sh(DIRECTIONS, rest, torch.ones(len(DIRECTIONS)))
+
+
+def _source(
+    group: Bool[Tensor, "k"], extra: Float[Tensor, "p 3"], evidence: LightEvidence, *, within: float
+) -> LightSource:
+    """The source of the directions in `group`, whose radiance over the background is `extra`."""
+    weight = extra @ LUMINANCE
+    shares = evidence.visible_sources[group]
+    visible = float(shares.sum())
+    towards = evidence.around.clipped_direction[group] if visible > 0 else DIRECTIONS[group]
+    direction = torch.nn.functional.normalize((weight[:, None] * towards).sum(0), dim=0)
+    x, y, z = direction.tolist()
+    r, g, b = (extra.sum(0) * SOLID_ANGLE).tolist()
+    if visible > 0:
+        size = max(visible, 0.1) * SOLID_ANGLE
+        name = "sun" if size < _SUN else "window"
+        # a small patch may show the sun through a window; a large one stands where the panorama shows it
+        distance = _mean_distance(evidence.far.distance[group], weight * shares) if name == "window" else math.inf
+        radius = angular_radius_deg(size)
+        return LightSource((x, y, z), (r, g, b), radius, _CLIPPED_ERROR_DEG, name=name, distance=distance)
+    away = torch.rad2deg(torch.acos((towards @ direction).clamp(-1, 1)))
+    spread = float((weight * away**2).sum() / weight.sum().clamp_min(1e-9)) ** 0.5
+    error = math.hypot(spread, _HALF_BIN_DEG)
+    return LightSource((x, y, z), (r, g, b), _UNSEEN_RADIUS_DEG, error, 1.0, "sun", blockers_within=within)
+
+
+def _mean_distance(distances: Float[Tensor, "p"], weight: Float[Tensor, "p"]) -> float:
+    """Their weighted harmonic mean."""
+    nearness = float((weight / distances).sum() / weight.sum().clamp_min(1e-9))
+    return 1 / nearness if nearness > 0 else math.inf
+
+
+def with_source_distances(light: Light, scene: Gaussians, place: BoundingSphere) -> Light:
+    """`light` with `blockers_within` of each source, where it was infinite, from the depth towards it.
 
     Args:
+        light: At `place`; its sources are seen from there.
         scene: All Gaussians, without the object.
         place: The object's bounding sphere.
-        settings: Resolution, and when there is no panorama.
     """
-    if scene.count == 0:
-        return NoLight("The scene is empty.")
-    rendered = render(scene, cube_cameras(place.center, settings.test_size), outputs=frozenset({"depth"}))
-    blocked = (rendered.alpha > _SURFACE_ALPHA) & (rendered.depth < settings.blocked_within * place.radius)
-    if float(blocked.float().mean()) > settings.most_blocked:
-        return NoLight("The object is inside a wall or another thing: there is no light to be found there.")
-    panorama = render_panorama(scene, place.center, size=settings.size, nearest=settings.nearest * place.radius)
-    if panorama.coverage < settings.least_coverage:
-        return NoLight(f"Only {100 * panorama.coverage:.0f}% of the object's surroundings were captured.")
-    mean = float((panorama.radiance.mean(-1) * panorama.alpha * panorama.solid_angles).sum()) / (4 * math.pi)
-    if mean < settings.darkest:
-        return NoLight("There is no light at the object's place.")
-    return panorama
+    sources = []
+    focal, width = _SOURCE_IMAGE
+    for source in light.sources:
+        if math.isfinite(source.blockers_within):
+            sources.append(source)
+            continue
+        direction = torch.tensor(source.direction)
+        # not core.directions.perpendicular: another roll of the camera would change results
+        up = torch.tensor([0.0, 0.0, 1.0]) if abs(source.direction[2]) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
+        pose = look_at(place.center[None], place.center + direction, up)
+        rendered = render(scene, pinhole(pose, focal, width=width, height=width), outputs=frozenset({"depth"}))
+        visible = (rendered.alpha > _SURFACE_ALPHA) & (rendered.depth > place.radius)
+        distance = float(rendered.depth[visible].quantile(_SOURCE_QUANTILE)) if bool(visible.any()) else math.inf
+        sources.append(replace(source, blockers_within=_BLOCKERS_WITHIN * distance))
+    return replace(light, sources=tuple(sources))

@@ -1,4 +1,6 @@
-"""The value `Light`: the light at a place as a few sources and smooth ambient light; its text form light.json."""
+"""The value `Light`: the light at a place as a few sources and smooth ambient light; its confidence, and its text form
+light.json.
+"""
 
 import json
 import math
@@ -16,11 +18,11 @@ _AMBIENT_COUNT = 9
 _UNCERTAINTY_BLUR = 0.5
 """Share of a direction's uncertainty that blurs shadows; measured: least error in rendered scenes. All of it makes
 shadows of a right direction too pale."""
-_LEAST_AMBIENT = 1e-3
+_MIN_AMBIENT = 1e-3
 """Share of the largest ambient coefficient below which ambient irradiance does not fall: expansions may be negative."""
 
-_LEAST_DISTANCE = 1e-4
-"""World units; least distance of a source in a light.json, whose numbers have four decimals."""
+_MIN_DISTANCE = 1e-4
+"""World units; minimum distance of a source in a light.json, whose numbers have four decimals."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Light:
         """Linear rgb irradiance on unshadowed planes with unit `normals` (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
         bands = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5).to(normals)
         total = spherical_harmonics.basis(normals, _AMBIENT_DEGREE) @ (bands[:, None] * self.ambient.to(normals))
-        total = total.clamp_min(_LEAST_AMBIENT * float(self.ambient[0].abs().max()) + 1e-6)
+        total = total.clamp_min(_MIN_AMBIENT * float(self.ambient[0].abs().max()) + 1e-6)
         for source in self.sources:
             cosine = (normals @ torch.tensor(source.direction).to(normals)).clamp_min(0)
             total = total + cosine[:, None] * torch.tensor(source.irradiance).to(normals)
@@ -214,7 +216,7 @@ def _source(entry: object, where: str) -> LightSource:
         confidence=_scalar(entry, "confidence", 1.0, (0.0, 1.0), where),
         name=name,
         blockers_within=_scalar(entry, "blockers_within", math.inf, (0.0, math.inf), where),
-        distance=_scalar(entry, "distance", math.inf, (_LEAST_DISTANCE, math.inf), where),
+        distance=_scalar(entry, "distance", math.inf, (_MIN_DISTANCE, math.inf), where),
     )
 
 
@@ -236,3 +238,23 @@ def _numbers(values: object, count: int, where: str, bounds: tuple[float, float]
         if not good or not bounds[0] <= value <= bounds[1]:
             raise ValueError(f"{where}: expected {expected}, found {value!r:.60}")
     return [float(v) for v in values]
+
+
+_C0 = 0.28209479
+"""Of the harmonics' first band; rounded, and kept so: `core.spherical_harmonics.C0` would change written priors."""
+_UNCERTAIN_DEG = 20.0
+"""Degrees of direction uncertainty at which a source counts exp(-1); set by hand."""
+
+
+def light_confidence(light: Light) -> float:
+    """Share of the light, in [0, 1], that was captured and whose direction is certain.
+
+    A source counts by exp(-(uncertainty / 20 degrees)^2) times its confidence, ambient light fully; the sum is scaled
+    by the coverage of the surroundings.
+    """
+    ambient = math.pi * float(light.ambient[0].mean()) * _C0
+    total, certain = ambient, ambient
+    for source in light.sources:
+        total += source.luminance
+        certain += source.luminance * source.confidence * math.exp(-((source.uncertainty_deg / _UNCERTAIN_DEG) ** 2))
+    return light.coverage * certain / total if total > 0 else 0.0

@@ -18,12 +18,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatgraft.relighting.light.highlight_evidence import HighlightEvidence
-from splatgraft.relighting.light.shading_evidence import ShadingEvidence
-from splatgraft.relighting.light.surroundings import DIRECTIONS, Surroundings
+from splatgraft.relighting.light.evidence import HighlightEvidence, ShadingEvidence
+from splatgraft.relighting.light.panorama import DIRECTIONS, Surroundings
 
-_MOST_ALBEDO = math.log(0.9)
-_ABOVE_MOST = 100.0
+_MAX_ALBEDO = math.log(0.9)
+_ABOVE_MAX = 100.0
 """Precision of the prior that keeps albedo below 0.9."""
 _LARGEST_STEP = 1.5
 """Of any logarithm in one step."""
@@ -38,6 +37,8 @@ _TOUCHING = math.cos(math.radians(15))
 _LOWEST = math.sin(math.radians(-8))
 """Least sine of the height of what may be a source: a window beside a table reaches below the horizon, reflections lie
 lower."""
+_MAX_PATCHES = 5
+"""Clipped patches that may be sources; the search tries all their combinations."""
 _SMALLEST = 0.05
 """Directions that such a patch covers at least."""
 
@@ -81,6 +82,8 @@ class RadianceSettings:
     """Standard deviation of its logarithm."""
     within_patch_sd: float = 0.272
     """Standard deviation of log radiance within a patch."""
+    temperature: float = 4.6
+    """By which differences of the log density are divided before its local maxima are averaged."""
 
 
 @dataclass(frozen=True)
@@ -215,14 +218,11 @@ class RadianceProblem:
         return ClippedPrior(mean, torch.linalg.inv(covariance))
 
 
-def radiance_problem(
-    found: LightEvidence, *, most_patches: int = 5, settings: RadianceSettings = RadianceSettings()
-) -> RadianceProblem:
+def radiance_problem(found: LightEvidence, *, settings: RadianceSettings = RadianceSettings()) -> RadianceProblem:
     """Set up the density at one place.
 
     Args:
         found: What is known.
-        most_patches: Clipped patches that may be sources; the search tries all their combinations.
         settings: The numbers.
     """
     evidence, far, around, up = found.surfaces, found.far, found.around, found.up
@@ -257,7 +257,7 @@ def radiance_problem(
         material_weights=material_weights,
         sky=math.log(max(float(seen_sky(far, up, mean_color.expand(3)).mean()), _DARKEST)) + s.sky_bias,
         connected=label[:, None] == label[None],
-        patches=_patches(far, clipped, label, up)[:most_patches],
+        patches=_patches(far, clipped, label, up)[:_MAX_PATCHES],
     )
 
 
@@ -319,7 +319,7 @@ def cost(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"]) -
     unseen, clipped = radiances[: len(p.unseen)], radiances[len(p.unseen) :]
     total = float(p.shading_cost(p.residual(radiances, albedo)))
     total += 0.5 * float((p.material_weights * ((albedo - math.log(s.albedo)) / s.albedo_sd) ** 2).sum())
-    total += 0.5 * _ABOVE_MOST * float(((albedo - _MOST_ALBEDO).clamp_min(0) ** 2).sum())
+    total += 0.5 * _ABOVE_MAX * float(((albedo - _MAX_ALBEDO).clamp_min(0) ** 2).sum())
     total += 0.5 * ((float(level) - p.sky) / s.sky_sd) ** 2 + float(unseen_cost(s, unseen - level).sum())
     away = clipped - prior.mean
     return total + 0.5 * float(away @ prior.precision @ away)
@@ -372,10 +372,10 @@ def _step(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], 
     gradient[light] = -(slope.T @ (weights * residual))
     gradient[material] = -_by_material(p, weights * residual)
     diagonal = hessian.diagonal()
-    above = (albedo > _MOST_ALBEDO) * _ABOVE_MOST
+    above = (albedo > _MAX_ALBEDO) * _ABOVE_MAX
     diagonal[material] += _by_material(p, weights) + p.material_weights * s.albedo_sd**-2 + above + 1e-6
     gradient[material] += p.material_weights * (albedo - math.log(s.albedo)) * s.albedo_sd**-2
-    gradient[material] += above * (albedo - _MOST_ALBEDO)
+    gradient[material] += above * (albedo - _MAX_ALBEDO)
     away = radiances[:u] - level
     tied = (s.unseen_nu + 1) / (s.unseen_nu * s.unseen_sd**2 + away**2)
     diagonal[1 : 1 + u] += tied

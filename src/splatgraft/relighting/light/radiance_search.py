@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.relighting.light.panorama import DIRECTIONS
 from splatgraft.relighting.light.radiance_model import (
     ClippedPrior,
     LightEvidence,
@@ -22,36 +23,29 @@ from splatgraft.relighting.light.radiance_model import (
     start,
     unseen_cost,
 )
-from splatgraft.relighting.light.surroundings import DIRECTIONS
 
 _RELEVELED = 0.7
 """Share of the mean residual that albedos take up before a state is polished."""
 _WHITE = 0.3
 """Radiance beyond white that a clipped lamp starts from, at least."""
-_LEAST_SHARE = 0.1
+_MIN_SHARE = 0.1
 """Share of a direction that must be unknown for a lamp in it."""
 
-
-@dataclass(frozen=True)
-class SearchSettings:
-    """How many local maxima are looked for, and how they are averaged."""
-
-    combinations: int = 3
-    """Combinations of clipped patches that are polished."""
-    lamps: int = 5
-    """Single directions that are tried as lamps."""
-    more_lamps: int = 2
-    """Directions that are tried as one more lamp beside the best maximum."""
-    strengths: tuple[float, ...] = (4.0, 12.0, 40.0, 120.0)
-    """Radiance of a lamp over what is there without it."""
-    apart: float = math.radians(18)
-    """Radians between directions that are tried."""
-    temperature: float = 4.6
-    """By which differences of the log density are divided before maxima are averaged; fitted with the density."""
-    same: float = 0.04
-    """Root mean square of log irradiance between maxima, below which they are one."""
-    spread: float = math.radians(35)
-    """Radians around a lamp over which its direction is uncertain at most."""
+# how many local maxima are looked for, and how they are averaged
+_COMBINATIONS = 3
+"""Combinations of clipped patches that are polished."""
+_LAMPS = 5
+"""Single directions that are tried as lamps."""
+_MORE_LAMPS = 2
+"""Directions that are tried as one more lamp beside the best maximum."""
+_STRENGTHS = (4.0, 12.0, 40.0, 120.0)
+"""Radiance of a lamp over what is there without it."""
+_APART = math.radians(18)
+"""Radians between directions that are tried."""
+_SAME = 0.04
+"""Root mean square of log irradiance between maxima, below which they are one."""
+_SPREAD = math.radians(35)
+"""Radians around a lamp over which its direction is uncertain at most."""
 
 
 @dataclass(frozen=True)
@@ -91,29 +85,28 @@ class RadianceEstimate:
         return around.radiance + unseen + (evidence.visible_sources * self.clipped)[:, None]
 
 
-def search_radiance(problem: RadianceProblem, *, settings: SearchSettings = SearchSettings()) -> RadianceEstimate:
+def search_radiance(problem: RadianceProblem) -> RadianceEstimate:
     """Find and average the local maxima of the density of `problem`.
 
     Args:
         problem: The density.
-        settings: Extent of the search.
     """
     nothing = problem.with_prior((False,) * len(problem.patches))
     dark = polish(problem, nothing, start(problem, nothing), steps=2)
-    combined = _combinations(problem, dark)[: settings.combinations]
+    combined = _combinations(problem, dark)[:_COMBINATIONS]
     found = [_polished(problem, one) for one in combined]
     best = combined[0]
     # not polished to the end: a state that has learned to do without a lamp hides it
     early = polish(problem, problem.with_prior(best.sources), best.state, steps=2)
-    found += _with_lamps(problem, replace(best, state=early), settings.lamps, settings)
+    found += _with_lamps(problem, replace(best, state=early), _LAMPS)
     found.sort(key=lambda maximum: maximum.cost)
-    found += _with_lamps(problem, found[0], settings.more_lamps, settings)
-    maxima = _distinct(problem, sorted(found, key=lambda maximum: maximum.cost), settings)
-    weights = torch.tensor([(maxima[0].cost - m.cost) / settings.temperature for m in maxima]).double().exp()
+    found += _with_lamps(problem, found[0], _MORE_LAMPS)
+    maxima = _distinct(problem, sorted(found, key=lambda maximum: maximum.cost))
+    weights = torch.tensor([(maxima[0].cost - m.cost) / problem.settings.temperature for m in maxima]).double().exp()
     weights /= weights.sum()
     hidden = torch.zeros(2, len(DIRECTIONS), dtype=torch.float64)
     for weight, maximum in zip(weights, maxima, strict=True):
-        hidden += weight * _hidden_radiance(problem, maximum, settings)
+        hidden += weight * _hidden_radiance(problem, maximum)
     _, at_best, albedo = problem.split(maxima[0].state)
     return RadianceEstimate(
         unseen=hidden[0].float(),
@@ -183,16 +176,16 @@ def _lamp_costs(
         if p.highlights is not None:
             explained = p.highlights.explained_with_more(light, index, p.shares_at_object * (lamp - now))
             value += s.highlights * torch.log1p(-explained).double()
-        value[p.shares < _LEAST_SHARE] = math.inf
+        value[p.shares < _MIN_SHARE] = math.inf
         columns.append(torch.stack([value, lamp.log(), shift.double()]))
     found = torch.stack(columns, 2)
     return _LampCosts(found[0], found[1], found[2])
 
 
-def _with_lamps(problem: RadianceProblem, base: Maximum, count: int, settings: SearchSettings) -> list[Maximum]:
+def _with_lamps(problem: RadianceProblem, base: Maximum, count: int) -> list[Maximum]:
     """The polished states with one more lamp, at the `count` best directions."""
     prior = problem.with_prior(base.sources)
-    costs = _lamp_costs(problem, prior, base.state, settings.strengths)
+    costs = _lamp_costs(problem, prior, base.state, _STRENGTHS)
     left, strength = costs.cost.min(1)
     towards = DIRECTIONS[torch.cat([problem.unseen, problem.clipped])]
     found = []
@@ -200,7 +193,7 @@ def _with_lamps(problem: RadianceProblem, base: Maximum, count: int, settings: S
         i = int(left.argmin())
         if not math.isfinite(float(left[i])):
             break
-        left = torch.where(towards @ towards[i] > math.cos(settings.apart), math.inf, left)
+        left = torch.where(towards @ towards[i] > math.cos(_APART), math.inf, left)
         state = base.state.clone()
         state[1 + i] = costs.radiance[i, strength[i]]
         state[1 + len(towards) :] += costs.shift[i, strength[i]]
@@ -208,13 +201,13 @@ def _with_lamps(problem: RadianceProblem, base: Maximum, count: int, settings: S
     return found
 
 
-def _distinct(problem: RadianceProblem, maxima: list[Maximum], settings: SearchSettings) -> list[Maximum]:
+def _distinct(problem: RadianceProblem, maxima: list[Maximum]) -> list[Maximum]:
     """The maxima of which no better one gives the same irradiance."""
     kept: list[Maximum] = []
     seen: list[Tensor] = []
     for maximum in maxima:
         log_irradiance = irradiance_of(problem.radiance_at_object(maximum.state)).clamp_min(1e-6).log()
-        if all(float((log_irradiance - other).pow(2).mean().sqrt()) > settings.same for other in seen):
+        if all(float((log_irradiance - other).pow(2).mean().sqrt()) > _SAME for other in seen):
             kept.append(maximum)
             seen.append(log_irradiance)
     return kept
@@ -226,21 +219,21 @@ def irradiance_of(radiance: Float[Tensor, "k ..."], normals: Float[Tensor, "n 3"
     return cosine @ radiance * (4 * math.pi / len(DIRECTIONS))
 
 
-def _hidden_radiance(problem: RadianceProblem, maximum: Maximum, settings: SearchSettings) -> Float[Tensor, "2 k"]:
+def _hidden_radiance(problem: RadianceProblem, maximum: Maximum) -> Float[Tensor, "2 k"]:
     """Radiance of unseen and clipped parts; unseen lamps are spread over directions that explain the scene as well."""
     level, radiances, _ = problem.split(maximum.state)
     count = len(problem.unseen)
     out = torch.zeros(2, len(DIRECTIONS), dtype=torch.float64)
     out[0, problem.unseen], out[1, problem.clipped] = radiances[:count].exp(), radiances[count:].exp()
-    towards, shares = DIRECTIONS[problem.unseen], problem.shares[:count].clamp_min(_LEAST_SHARE)
+    towards, shares = DIRECTIONS[problem.unseen], problem.shares[:count].clamp_min(_MIN_SHARE)
     prior = problem.with_prior(maximum.sources)
-    for i in (radiances[:count] - level > math.log(settings.strengths[0])).nonzero()[:, 0].tolist():
+    for i in (radiances[:count] - level > math.log(_STRENGTHS[0])).nonzero()[:, 0].tolist():
         without = maximum.state.clone()
         without[1 + i] = level
         strengths = tuple((float(radiances[i] - level) + torch.linspace(-1, 1, 5)).exp().tolist())
         value = _lamp_costs(problem, prior, without, strengths).cost[:count].min(1).values
-        value = torch.where(towards @ towards[i] > math.cos(settings.spread), value, math.inf)
-        likely = (-(value - value.min()) / settings.temperature).exp()
+        value = torch.where(towards @ towards[i] > math.cos(_SPREAD), value, math.inf)
+        likely = (-(value - value.min()) / problem.settings.temperature).exp()
         energy = shares[i] * (radiances[i].exp() - level.exp())
         out[0, problem.unseen[i]] = level.exp()
         out[0] = out[0].index_add(0, problem.unseen, energy * likely / likely.sum() / shares)

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from numba import prange
 from torch import Tensor
 
-from splatgraft.relighting.shadows.light_sampling import LightSamples
+from splatgraft.relighting.light.samples import LightSamples
 from splatgraft.relighting.shadows.shadow_maps import FAR, DepthMaps
 from splatgraft.runtime.kernels import kernel, serialized
 
@@ -35,7 +35,7 @@ _WIDEST_CONE = np.float32(1.2)
 """Radians; wider cones are filtered as this one."""
 _GOLDEN_ANGLE = 2.399963
 """Radians; rounded, and kept so: `core.directions.GOLDEN_ANGLE` would change results in the last bits."""
-_LEAST_ALPHA = 1e-4
+_MIN_ALPHA = 1e-4
 """Alpha below which a texel blocks nothing."""
 
 
@@ -193,7 +193,7 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
                 level_size, level_start, over = size, 0, np.float32(1) / texel
                 for t in range(search + taps):
                     if t == search:
-                        if found < _LEAST_ALPHA:
+                        if found < _MIN_ALPHA:
                             break
                         behind = max(np.float32(0), distance / found)
                         width = spread * zoom * behind / (np.float32(1) + near * (depth - behind))
@@ -221,7 +221,7 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
                             if cu < 0 or cv < 0 or cu >= level_size or cv >= level_size:
                                 continue
                             p = texels[k, level_start + cv * level_size + cu]
-                            if p[0] < _LEAST_ALPHA or p[1] > (depth - bias) * p[0]:
+                            if p[0] < _MIN_ALPHA or p[1] > (depth - bias) * p[0]:
                                 continue
                             share = (fu if du == 1 else 1 - fu) * (fv if dv == 1 else 1 - fv)
                             if t < search:

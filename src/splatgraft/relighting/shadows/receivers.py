@@ -2,11 +2,12 @@
 
 A Gaussian has one colour, so one that is wider than a shadow's edge cannot show it: it is split along the axis over
 which the ratio varies most, again and again while the budget lasts. A slope in the first band corrects where an edge
-appears.
+appears. A plain surface is a layer of Gaussians whose centres lie above and below it: the layer's middle is the
+surface, and visibility is tested at its top, as the upper Gaussians would shadow the lower ones (shadow acne).
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,10 +15,10 @@ from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.splitting import PIECE_WIDTH, PIECES, split_along
+from splatgraft.relighting.nearest_neighbours import nearest_neighbours
 from splatgraft.relighting.shadows.scene_ratio import (
     ObjectShadowMaps,
     SceneRatio,
-    SceneRatioSettings,
     light_sums,
     ratio_from_sums,
 )
@@ -29,31 +30,25 @@ _STEPS = (-RIM, -RIM / 2, 0.0, RIM / 2, RIM)
 _LINES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.7, 0.7], [0.7, -0.7]])
 """Directions of lines, along the widest and the second widest axis."""
 
-
-@dataclass(frozen=True)
-class ReceiverSettings:
-    """Which receivers are split, and how far an edge is corrected."""
-
-    rounds: int = 12
-    """Most splits of one Gaussian and its pieces, one after another; set by hand."""
-    broad: float = 0.1
-    """Object radii (standard deviation): ambient light is averaged over wider Gaussians alone; set by hand."""
-    finest: float = 0.02
-    """Object radii (standard deviation): no piece gets narrower; set by hand."""
-    variation: float = 0.003
-    """Share of light times alpha below which a Gaussian is not split, small as many overlap; set by hand."""
-    faintest: float = 0.05
-    """Opacity below which a Gaussian is not split and gets no slope; set by hand."""
-    shows_behind: float = 1.2
-    """Standard deviations. Splats are blended in the order of their centres, so what is visible of one among others
-    lies behind its centre, seen from the camera; without this an edge appears too far from all cameras. Measured on
-    planes: 1.0 for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
-    narrowest: float = 0.25
-    """Of the finest width that is split: narrower Gaussians get no slope; set by hand."""
-    edge: float = 0.02
-    """Share of light by which rim and centre differ at an edge; a rim shows a twentieth of it; set by hand."""
-    ratio: SceneRatioSettings = field(default_factory=SceneRatioSettings)
-    """Limits of the ratio at a point."""
+# which receivers are split, and how far an edge is corrected
+_MAX_SPLITS = 12
+"""Most splits of one Gaussian and its pieces, one after another; set by hand."""
+_BROAD = 0.1
+"""Object radii (standard deviation): ambient light is averaged over wider Gaussians alone; set by hand."""
+_FINEST = 0.02
+"""Object radii (standard deviation): no piece gets narrower; set by hand."""
+_VARIATION = 0.003
+"""Share of light times alpha below which a Gaussian is not split, small as many overlap; set by hand."""
+_FAINTEST = 0.05
+"""Opacity below which a Gaussian is not split and gets no slope; set by hand."""
+_SHOWS_BEHIND = 1.2
+"""Standard deviations. Splats are blended in the order of their centres, so what is visible of one among others
+lies behind its centre, seen from the camera; without this an edge appears too far from all cameras. Measured on
+planes: 1.0 for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
+_NARROWEST = 0.25
+"""Of the finest width that is split: narrower Gaussians get no slope; set by hand."""
+_EDGE = 0.02
+"""Share of light by which rim and centre differ at an edge; a rim shows a twentieth of it; set by hand."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +82,6 @@ def shade_receivers(
     maps: ObjectShadowMaps,
     *,
     budget: int,
-    settings: ReceiverSettings = ReceiverSettings(),
 ) -> tuple[Receivers, Int[Tensor, "j"], SceneRatio, Float[Tensor, "3 j 3"]]:
     """Split receivers at shadow edges and average the ratio over each.
 
@@ -95,7 +89,6 @@ def shade_receivers(
         receivers: All that the object may reach.
         maps: The object's.
         budget: Most Gaussians that are added by splitting.
-        settings: Which are split.
 
     Returns:
         j receivers, some of them pieces; the position in `receivers` that each was or is a piece of; their ratios; and
@@ -104,15 +97,13 @@ def shade_receivers(
     done: list[tuple[Receivers, Tensor, SceneRatio, Tensor]] = []
     pending, which = receivers, torch.arange(len(receivers.origin))
     ambient = _sums(pending, maps, sources=False)
-    for round_ in range(settings.rounds + 1):
-        ratio, variation = _averaged_ratio(pending, maps, ambient, settings)
+    for round_ in range(_MAX_SPLITS + 1):
+        ratio, variation = _averaged_ratio(pending, maps, ambient)
         axis = variation.argmax(1)
         wanted = variation.max(1).values
-        wanted = torch.where(
-            (wanted > settings.variation) & (pending.gaussians.opacities > settings.faintest), wanted, 0
-        )
+        wanted = torch.where((wanted > _VARIATION) & (pending.gaussians.opacities > _FAINTEST), wanted, 0)
         room = budget // (PIECES - 1)
-        if round_ == settings.rounds or room == 0 or not bool((wanted > 0).any()):
+        if round_ == _MAX_SPLITS or room == 0 or not bool((wanted > 0).any()):
             done.append((pending, which, ratio, ambient))
             break
         order = wanted.argsort(descending=True)[: min(room, int((wanted > 0).sum()))]
@@ -125,7 +116,7 @@ def shade_receivers(
         pending = replace(parents.select(parent), gaussians=pieces)
         which, ambient = which[order][parent], ambient[:, order][:, parent]
         # ambient light differs between pieces only where the whole was broad
-        anew = _broad(parents.gaussians, maps, settings)[parent].nonzero()[:, 0]
+        anew = _broad(parents.gaussians, maps)[parent].nonzero()[:, 0]
         ambient[:, anew] = _sums(pending.select(anew), maps, sources=False)
         budget -= (PIECES - 1) * len(order)
     joined = Receivers(
@@ -144,13 +135,13 @@ def shade_receivers(
     return joined, torch.cat([w for _, w, _, _ in done]), ratios, torch.cat([a for *_, a in done], 1)
 
 
-def _broad(gaussians: Gaussians, maps: ObjectShadowMaps, settings: ReceiverSettings) -> Bool[Tensor, "m"]:
+def _broad(gaussians: Gaussians, maps: ObjectShadowMaps) -> Bool[Tensor, "m"]:
     """Whether ambient light may vary over a Gaussian: its edges are no finer than a part of the object."""
-    return gaussians.scales.max(1).values > settings.broad * maps.ambient_maps.window.radius
+    return gaussians.scales.max(1).values > _BROAD * maps.ambient_maps.window.radius
 
 
 def _averaged_ratio(
-    receivers: Receivers, maps: ObjectShadowMaps, ambient: Float[Tensor, "3 m 3"], settings: ReceiverSettings
+    receivers: Receivers, maps: ObjectShadowMaps, ambient: Float[Tensor, "3 m 3"]
 ) -> tuple[SceneRatio, Float[Tensor, "m 3"]]:
     """Ratio averaged over each Gaussian, and how much it varies along each own axis (0 along narrow ones).
 
@@ -158,17 +149,16 @@ def _averaged_ratio(
     """
     g = receivers.gaussians
     by_sources = _sums(receivers, maps, sources=True)
-    ratio, variation = ratio_from_sums(by_sources + ambient, settings=settings.ratio), torch.zeros(g.count, 3)
-    smallest = settings.finest * maps.ambient_maps.window.radius / math.sqrt(PIECE_WIDTH)
-    broad = _broad(g, maps, settings)
+    ratio, variation = ratio_from_sums(by_sources + ambient), torch.zeros(g.count, 3)
+    smallest = _FINEST * maps.ambient_maps.window.radius / math.sqrt(PIECE_WIDTH)
+    broad = _broad(g, maps)
     fine = ((g.scales.max(1).values > smallest) & ~broad).nonzero()[:, 0]
     lit = bool(by_sources.any())
-    fine = _at_an_edge(receivers, maps, fine, (by_sources, ambient), settings=settings) if lit else fine[:0]
-    averages = _Averages(ratio, variation, settings)
-    averages.fill_in(receivers, maps, fine, ambient=ambient[:, fine])
-    averages.fill_in(receivers, maps, broad.nonzero()[:, 0], ambient=None)
-    penumbra = _in_penumbra(g, by_sources, ratio, smallest, settings=settings)
-    averages.fill_in_slope(receivers, maps, penumbra, ambient=ambient)
+    fine = _at_an_edge(receivers, maps, fine, (by_sources, ambient)) if lit else fine[:0]
+    _fill_in(ratio, variation, receivers, maps, which=fine, ambient=ambient[:, fine])
+    _fill_in(ratio, variation, receivers, maps, which=broad.nonzero()[:, 0], ambient=None)
+    penumbra = _in_penumbra(g, by_sources, ratio, smallest)
+    _fill_in_slope(ratio, receivers, maps, penumbra, ambient=ambient)
     variation[g.scales < smallest] = 0
     return ratio, variation
 
@@ -187,8 +177,6 @@ def _at_an_edge(
     maps: ObjectShadowMaps,
     which: Int[Tensor, "f"],
     center_sums: tuple[Float[Tensor, "3 m 3"], Float[Tensor, "3 m 3"]],
-    *,
-    settings: ReceiverSettings,
 ) -> Int[Tensor, "g"]:
     """Those of `which` whose rims receive another share of the light than their centres."""
     if not len(which):
@@ -199,74 +187,68 @@ def _at_an_edge(
     at_rims = _sums(part, maps, sources=True, points=rims).reshape(3, len(which), -1, 3) + ambient
     at_center = by_sources[:, which, None] + ambient
     changes = (at_rims[1] / at_rims[0].clamp_min(1e-9) - at_center[1] / at_center[0].clamp_min(1e-9)).abs()
-    return which[changes.amax((1, 2)) > settings.edge]
+    return which[changes.amax((1, 2)) > _EDGE]
 
 
-@dataclass(frozen=True)
-class _Averages:
-    """Ratio and variation of m receivers, filled in for some of them after others."""
+def _fill_in(
+    ratio: SceneRatio,
+    variation: Float[Tensor, "m 3"],
+    receivers: Receivers,
+    maps: ObjectShadowMaps,
+    *,
+    which: Int[Tensor, "f"],
+    ambient: Float[Tensor, "3 f 3"] | None,
+) -> None:
+    """Average over the Gaussians `which` from points along both wide axes, and along the diagonals between them.
 
-    ratio: SceneRatio
-    variation: Float[Tensor, "m 3"]
-    settings: ReceiverSettings
+    `ambient`, if given, is constant over each: they are narrow, and not sampled along the diagonals.
+    """
+    if not len(which):
+        return
+    part, lines, line = receivers.select(which), 2 if ambient is not None else 4, torch.tensor(_STEPS)
+    beside = line[line != 0]
+    points = _points(part.gaussians, (_LINES[:lines, :, None] * beside).transpose(0, 1).flatten(1))
+    sums = _sums(part, maps, sources=True, points=points)
+    if ambient is None:
+        sums = sums + _sums(part, maps, sources=False, points=points)
+    else:
+        sums = sums + ambient.repeat_interleave(lines * len(beside), 1)
+    there = ratio_from_sums(sums)
+    shadow = _with_center(there.shadow.reshape(len(which), lines, len(beside), 3), ratio.shadow[which])
+    bounce = _with_center(there.bounce.reshape(len(which), lines, len(beside), 3), ratio.bounce[which])
+    # mostly the centre of a Gaussian is visible: weights exp(-x^2), narrower than its alpha exp(-x^2 / 2)
+    weight = torch.exp(-(line**2))[:, None]
+    weight = weight / weight.sum()
+    ratio.shadow[which] = _ellipse_mean((shadow * weight).sum(2), ratio.shadow[which]).clamp(0, 1)
+    ratio.bounce[which] = _ellipse_mean((bounce * weight).sum(2), ratio.bounce[which]).clamp_min(0)
+    alpha = part.gaussians.opacities[:, None, None] * torch.exp(-0.5 * line**2)
+    moves = ((shadow - shadow.mean(2, keepdim=True)).abs().amax(3) * alpha).amax(2)
+    if lines > 2:
+        # half of what varies along a diagonal is along either axis
+        moves = torch.maximum(moves[:, :2], 0.5 * moves[:, 2:].amax(1, keepdim=True))
+    along = (((shadow + bounce).mean(3) * weight[:, 0] * line).sum(2) / (weight[:, 0] * line**2).sum())[:, :2]
+    ratio.slope[which] = _SHOWS_BEHIND * _in_world(part.gaussians, along)
+    variation[which[:, None], part.gaussians.scales.argsort(1, descending=True)[:, :2]] = moves
 
-    def fill_in(
-        self,
-        receivers: Receivers,
-        maps: ObjectShadowMaps,
-        which: Int[Tensor, "f"],
-        *,
-        ambient: Float[Tensor, "3 f 3"] | None,
-    ) -> None:
-        """Average over the Gaussians `which` from points along both wide axes, and along the diagonals between them.
 
-        `ambient`, if given, is constant over each: they are narrow, and not sampled along the diagonals.
-        """
-        if not len(which):
-            return
-        part, lines, line = receivers.select(which), 2 if ambient is not None else 4, torch.tensor(_STEPS)
-        beside = line[line != 0]
-        points = _points(part.gaussians, (_LINES[:lines, :, None] * beside).transpose(0, 1).flatten(1))
-        sums = _sums(part, maps, sources=True, points=points)
-        if ambient is None:
-            sums = sums + _sums(part, maps, sources=False, points=points)
-        else:
-            sums = sums + ambient.repeat_interleave(lines * len(beside), 1)
-        there, ratio = ratio_from_sums(sums, settings=self.settings.ratio), self.ratio
-        shadow = _with_center(there.shadow.reshape(len(which), lines, len(beside), 3), ratio.shadow[which])
-        bounce = _with_center(there.bounce.reshape(len(which), lines, len(beside), 3), ratio.bounce[which])
-        # mostly the centre of a Gaussian is visible: weights exp(-x^2), narrower than its alpha exp(-x^2 / 2)
-        weight = torch.exp(-(line**2))[:, None]
-        weight = weight / weight.sum()
-        ratio.shadow[which] = _ellipse_mean((shadow * weight).sum(2), ratio.shadow[which]).clamp(0, 1)
-        ratio.bounce[which] = _ellipse_mean((bounce * weight).sum(2), ratio.bounce[which]).clamp_min(0)
-        alpha = part.gaussians.opacities[:, None, None] * torch.exp(-0.5 * line**2)
-        moves = ((shadow - shadow.mean(2, keepdim=True)).abs().amax(3) * alpha).amax(2)
-        if lines > 2:
-            # half of what varies along a diagonal is along either axis
-            moves = torch.maximum(moves[:, :2], 0.5 * moves[:, 2:].amax(1, keepdim=True))
-        along = (((shadow + bounce).mean(3) * weight[:, 0] * line).sum(2) / (weight[:, 0] * line**2).sum())[:, :2]
-        ratio.slope[which] = self.settings.shows_behind * _in_world(part.gaussians, along)
-        self.variation[which[:, None], part.gaussians.scales.argsort(1, descending=True)[:, :2]] = moves
-
-    def fill_in_slope(
-        self,
-        receivers: Receivers,
-        maps: ObjectShadowMaps,
-        which: Int[Tensor, "p"],
-        *,
-        ambient: Float[Tensor, "3 m 3"],
-    ) -> None:
-        """The slope of the Gaussians `which` from points beside their centres; ambient light is constant over each."""
-        if not len(which):
-            return
-        part, ratio = receivers.select(which), self.ratio
-        beside = _points(part.gaussians, torch.eye(2))
-        sums = _sums(part, maps, sources=True, points=beside) + ambient[:, which].repeat_interleave(2, 1)
-        there = ratio_from_sums(sums, settings=self.settings.ratio)
-        here = (ratio.shadow[which] + ratio.bounce[which]).mean(1, keepdim=True)
-        along = (there.shadow + there.bounce).mean(1).reshape(-1, 2) - here
-        ratio.slope[which] = self.settings.shows_behind * _in_world(part.gaussians, along)
+def _fill_in_slope(
+    ratio: SceneRatio,
+    receivers: Receivers,
+    maps: ObjectShadowMaps,
+    which: Int[Tensor, "p"],
+    *,
+    ambient: Float[Tensor, "3 m 3"],
+) -> None:
+    """The slope of the Gaussians `which` from points beside their centres; ambient light is constant over each."""
+    if not len(which):
+        return
+    part = receivers.select(which)
+    beside = _points(part.gaussians, torch.eye(2))
+    sums = _sums(part, maps, sources=True, points=beside) + ambient[:, which].repeat_interleave(2, 1)
+    there = ratio_from_sums(sums)
+    here = (ratio.shadow[which] + ratio.bounce[which]).mean(1, keepdim=True)
+    along = (there.shadow + there.bounce).mean(1).reshape(-1, 2) - here
+    ratio.slope[which] = _SHOWS_BEHIND * _in_world(part.gaussians, along)
 
 
 def _with_center(beside: Float[Tensor, "f l s 3"], center: Float[Tensor, "f 3"]) -> Float[Tensor, "f l t 3"]:
@@ -281,15 +263,13 @@ def _in_penumbra(
     by_sources: Float[Tensor, "3 m 3"],
     ratio: SceneRatio,
     smallest: float,
-    *,
-    settings: ReceiverSettings,
 ) -> Int[Tensor, "p"]:
     """Receivers in a penumbra that were too narrow to be averaged, yet are wide enough that their slope is visible."""
     without, with_object, _ = by_sources.mean(-1)
-    partly = (with_object > settings.edge * without) & (with_object < (1 - settings.edge) * without)
+    partly = (with_object > _EDGE * without) & (with_object < (1 - _EDGE) * without)
     widest = gaussians.scales.max(1).values
     unknown = (ratio.slope == 0).all(1)
-    visible = (widest > settings.narrowest * smallest) & (gaussians.opacities > settings.faintest)
+    visible = (widest > _NARROWEST * smallest) & (gaussians.opacities > _FAINTEST)
     return (partly & unknown & visible).nonzero()[:, 0]
 
 
@@ -313,3 +293,47 @@ def _widest(gaussians: Gaussians) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "
     """The two largest scales, and their axes as columns, world frame."""
     widths, axes = gaussians.scales.sort(1, descending=True)
     return widths[:, :2], torch.gather(gaussians.rotations, 2, axes[:, None, :2].expand(-1, 3, -1))
+
+
+# the layer around a receiver
+_LAYER_NEIGHBOURS = 16
+"""Gaussians that form the layer around one, as for its normal."""
+_LEVEL_NEIGHBOURS = 48
+"""Gaussians over whose heights the middle is taken."""
+_LAYER_DEVIATIONS = 3.0
+"""Standard deviations of the layer's height between its middle and its top."""
+
+
+def above_layer(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """For each Gaussian the point on its normal's line at the top of the layer of its neighbours.
+
+    The height's variance is that of the neighbours' centres and their own mean variance along the normal.
+
+    Args:
+        gaussians: n Gaussians.
+        normals: Unit, of their surfaces.
+    """
+    middle, deviation = _layer(gaussians, normals, _LAYER_NEIGHBOURS)
+    return gaussians.means + (middle + _LAYER_DEVIATIONS * deviation)[:, None] * normals
+
+
+def layer_middle(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """For each Gaussian the point on its normal's line in the middle of the layer of its neighbours.
+
+    Args:
+        gaussians: n Gaussians.
+        normals: Unit, of their surfaces.
+    """
+    return gaussians.means + _layer(gaussians, normals, _LEVEL_NEIGHBOURS)[0][:, None] * normals
+
+
+def _layer(
+    gaussians: Gaussians, normals: Float[Tensor, "n 3"], count: int
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Mean and standard deviation of the layer's height over each Gaussian's centre."""
+    if not gaussians.count:
+        return torch.zeros(0), torch.zeros(0)
+    near = nearest_neighbours(gaussians.means, count=count).long()
+    heights = ((gaussians.means[near] - gaussians.means[:, None]) * normals[:, None]).sum(-1)
+    own = ((torch.einsum("nij,ni->nj", gaussians.rotations, normals) * gaussians.scales) ** 2).sum(1)
+    return heights.mean(1), (heights.var(1, correction=0) + own[near].mean(1)).sqrt()

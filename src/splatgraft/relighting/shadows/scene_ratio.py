@@ -13,9 +13,9 @@ from torch import Tensor
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.directions import frames_along
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.shading.irradiance import irradiance
-from splatgraft.relighting.shading.normals import raised
-from splatgraft.relighting.shadows.light_sampling import LightSamples, ambient_pairs, source_pairs
+from splatgraft.relighting.light.samples import LightSamples, ambient_pairs, source_pairs
+from splatgraft.relighting.normals import raised
+from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows.occlusion import Occlusion, occluded_irradiance, occlusion_from_maps
 from splatgraft.relighting.shadows.shadow_maps import (
     DepthMaps,
@@ -26,46 +26,38 @@ from splatgraft.relighting.shadows.shadow_maps import (
     visibility,
 )
 
+# shadow maps of objects and scenes; set by hand
+_SOURCE_SIZE = 512
+"""Pixels, a multiple of 16: width of a map of a source sample; set by hand."""
+AMBIENT_SIZE = 256
+"""Pixels, a multiple of 16: width of a map of an ambient sample; set by hand."""
+_OBJECT_BIAS = (2.0, 1.0)
+"""Pixels, for sources and for ambient light: nearer occluders are the receiver's own surface; set by hand."""
+_SELF_BIAS = (2.5, 2.0)
+"""The same for an object's shadow on itself."""
+_SCENE_BIAS = (2.5, 1.5)
+"""The same for the scene's shadow on itself and on objects."""
+_SELF_AMBIENT = 1 / 3
+"""Share of an ambient sample that still arrives where the object itself blocks it; set by hand."""
+_SCENE_AMBIENT = 0.5
+"""Share of an ambient sample that still arrives where the scene blocks it; set by hand."""
+_BLOCKERS_AROUND = 1.5
+"""Radii of the region within which the scene's Gaussians block light; set by hand."""
+_MAX_ALBEDO = 0.8
+"""Most albedo of an object: its unlit side is no brighter than the light on it allows, whatever light it was
+captured in; fresh snow and white paint have about this."""
+_NEAREST_SOURCE = 1.5
+"""Object radii; a nearer source counts as this far from the object's middle; set by hand."""
 
-@dataclass(frozen=True)
-class ShadowMapSettings:
-    """Resolution and bias of the shadow maps of objects and scenes."""
-
-    source_size: int = 512
-    """Pixels, a multiple of 16: width of a map of a source sample; set by hand."""
-    ambient_size: int = 256
-    """Pixels, a multiple of 16: width of a map of an ambient sample; set by hand."""
-    object_bias: tuple[float, float] = (2.0, 1.0)
-    """Pixels, for sources and for ambient light: nearer occluders are the receiver's own surface; set by hand."""
-    self_bias: tuple[float, float] = (2.5, 2.0)
-    """The same for an object's shadow on itself."""
-    scene_bias: tuple[float, float] = (2.5, 1.5)
-    """The same for the scene's shadow on itself and on objects."""
-    self_ambient: float = 1 / 3
-    """Share of an ambient sample that still arrives where the object itself blocks it; set by hand."""
-    scene_ambient: float = 0.5
-    """Share of an ambient sample that still arrives where the scene blocks it; set by hand."""
-    blockers_around: float = 1.5
-    """Radii of the region within which the scene's Gaussians block light; set by hand."""
-    whitest: float = 0.8
-    """Most albedo of an object: its unlit side is no brighter than the light on it allows, whatever light it was
-    captured in; fresh snow and white paint have about this."""
-    nearest_source: float = 1.5
-    """Object radii; a nearer source counts as this far from the object's middle; set by hand."""
-
-
-@dataclass(frozen=True)
-class SceneRatioSettings:
-    """Limits of shadow and bounce."""
-
-    least_change: float = 0.004
-    """Share of light; smaller changes become 0, full from three times this on. Half an 8-bit step of a mid grey."""
-    darkest: float = 0.04
-    """Share of light that every shadow leaves: light that no sample follows; set by hand."""
-    near_reach: float = 3.5
-    """Object radii within which ambient shadow and bounce are computed; set by hand."""
-    widest_cone: float = 1.2
-    """Radians; wider cones of a source reach as far aside as this one; set by hand."""
+# limits of shadow and bounce; set by hand
+_MIN_CHANGE = 0.004
+"""Share of light; smaller changes become 0, full from three times this on. Half an 8-bit step of a mid grey."""
+DARKEST = 0.04
+"""Share of light that every shadow leaves: light that no sample follows; set by hand."""
+_NEAR_REACH = 3.5
+"""Object radii within which ambient shadow and bounce are computed; set by hand."""
+_WIDEST_CONE = 1.2
+"""Radians; wider cones of a source reach as far aside as this one; set by hand."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +74,6 @@ def object_shadow_maps(
     gaussians: Gaussians,
     sphere: BoundingSphere,
     samples: LightSamples,
-    *,
-    settings: ShadowMapSettings = ShadowMapSettings(),
 ) -> ObjectShadowMaps:
     """Depth maps of an object, in the target's frame, for every light sample, with its colours for the bounce.
 
@@ -91,29 +81,28 @@ def object_shadow_maps(
         gaussians: The object.
         sphere: Its bounding sphere, which the maps cover.
         samples: Of the light at its place.
-        settings: Resolution and bias.
     """
     occluders = occluders_of(gaussians)
     sources, front, back = source_pairs(samples)
     ambient, ambient_front, ambient_back = ambient_pairs(samples)
-    source_bias, ambient_bias = settings.object_bias
+    source_bias, ambient_bias = _OBJECT_BIAS
     occlusions = []
 
     def unlit(part: LightSamples) -> Float[Tensor, "k 3"]:
         facing = irradiance(samples, -part.directions, sample_visibility=torch.ones(len(part), len(samples)))
-        return settings.whitest * facing / math.pi
+        return _MAX_ALBEDO * facing / math.pi
 
     if len(sources):
         both = torch.cat([sources.directions, -sources.directions])
-        nearness = 1 / sources.distances.clamp_min(settings.nearest_source * sphere.radius)
+        nearness = 1 / sources.distances.clamp_min(_NEAREST_SOURCE * sphere.radius)
         # from a near light the sphere's rim is seen farther out than its radius
         rim = sphere.radius / math.sqrt(1 - (float(nearness.max()) * sphere.radius) ** 2)
         window = Window(sphere.center, rim, frames_along(both), torch.cat([nearness, -nearness]))
-        maps = splat_depth_maps(occluders, window, size=settings.source_size, with_color=True)
+        maps = splat_depth_maps(occluders, window, size=_SOURCE_SIZE, with_color=True)
         occlusion = occlusion_from_maps(maps, front, back, brightest=unlit(sources))
         occlusions.append((sources, occlusion, source_bias * maps.texel))
     window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(ambient.directions))
-    maps = splat_depth_maps(occluders, window, size=settings.ambient_size, with_color=True)
+    maps = splat_depth_maps(occluders, window, size=AMBIENT_SIZE, with_color=True)
     occlusion = occlusion_from_maps(maps, ambient_front, ambient_back, brightest=unlit(ambient))
     occlusions.append((ambient, occlusion, ambient_bias * maps.texel))
     return ObjectShadowMaps(maps, tuple(occlusions))
@@ -124,8 +113,6 @@ def self_visibility(
     gaussians: Gaussians,
     normals: Float[Tensor, "m 3"],
     samples: LightSamples,
-    *,
-    settings: ShadowMapSettings = ShadowMapSettings(),
 ) -> Float[Tensor, "m k"]:
     """Visibility of every light sample from an object's own Gaussians, past the object itself.
 
@@ -134,20 +121,19 @@ def self_visibility(
         gaussians: The m Gaussians that receive light.
         normals: Unit, of their surfaces.
         samples: k samples, of the light that the maps were made for or of another one: maps of sources are made anew.
-        settings: Resolution, bias, and the share of ambient light that is reflected between the object's own parts.
 
     Returns:
         Share of each sample that arrives, in [0, 1].
     """
-    window, (source_bias, ambient_bias) = maps.ambient_maps.window, settings.self_bias
+    window, (source_bias, ambient_bias) = maps.ambient_maps.window, _SELF_BIAS
     points = raised(gaussians, normals)
     ambient = visibility(maps.ambient_maps, points, normals, bias=ambient_bias * maps.ambient_maps.texel)
-    ambient = settings.self_ambient + (1 - settings.self_ambient) * ambient
+    ambient = _SELF_AMBIENT + (1 - _SELF_AMBIENT) * ambient
     sources, _, _ = source_pairs(samples)
     if not len(sources):
         return ambient
     lit = Window(center=window.center, radius=window.radius, frames=frames_along(sources.directions))
-    fronts = splat_depth_maps(occluders_of(gaussians), lit, size=settings.ambient_size, with_color=False)
+    fronts = splat_depth_maps(occluders_of(gaussians), lit, size=AMBIENT_SIZE, with_color=False)
     return torch.cat([visibility(fronts, points, normals, bias=source_bias * fronts.texel), ambient], 1)
 
 
@@ -167,14 +153,12 @@ def scene_shadow_maps(
     scene: Gaussians,
     region: BoundingSphere,
     samples: LightSamples,
-    *,
-    settings: ShadowMapSettings = ShadowMapSettings(),
 ) -> SceneShadowMaps:
     """Depth maps of `scene` for every light sample. Only Gaussians in or near `region` block light."""
     maps: list[DepthMaps | None] = []
-    reach = settings.blockers_around * region.radius + 3 * scene.scales.max(1).values
+    reach = _BLOCKERS_AROUND * region.radius + 3 * scene.scales.max(1).values
     blockers = scene.select((scene.means - region.center).norm(dim=1) < reach)
-    sizes = (settings.source_size, settings.ambient_size)
+    sizes = (_SOURCE_SIZE, AMBIENT_SIZE)
     for part, size in zip((source_pairs(samples)[0], ambient_pairs(samples)[0]), sizes, strict=True):
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
         nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
@@ -191,8 +175,6 @@ def scene_visibility(
     maps: SceneShadowMaps,
     points: Float[Tensor, "m 3"],
     normals: Float[Tensor, "m 3"],
-    *,
-    settings: ShadowMapSettings = ShadowMapSettings(),
 ) -> Float[Tensor, "m k"]:
     """Visibility of every light sample from `points` past the scene, so that existing shadows are not darkened twice.
 
@@ -200,14 +182,13 @@ def scene_visibility(
         maps: The scene's, for k samples.
         points: World units.
         normals: Unit, of the surface at each point.
-        settings: Bias, and the share of an ambient sample that a blocker reflects or emits itself.
 
     Returns:
         Share of each sample that arrives, in [0, 1].
     """
-    source_bias, ambient_bias = settings.scene_bias
+    source_bias, ambient_bias = _SCENE_BIAS
     ambient = visibility(maps.ambient_maps, points, normals, bias=ambient_bias * maps.ambient_maps.texel)
-    ambient = settings.scene_ambient + (1 - settings.scene_ambient) * ambient
+    ambient = _SCENE_AMBIENT + (1 - _SCENE_AMBIENT) * ambient
     if maps.source_maps is None:
         return ambient
     of_sources = visibility(maps.source_maps, points, normals, bias=source_bias * maps.source_maps.texel)
@@ -237,7 +218,6 @@ def scene_ratio(
     normals: Float[Tensor, "m 3"],
     *,
     sample_visibility: Float[Tensor, "m k"],
-    settings: SceneRatioSettings = SceneRatioSettings(),
 ) -> SceneRatio:
     """Shadow and bounce of an object on a surface.
 
@@ -246,13 +226,12 @@ def scene_ratio(
         points: World units.
         normals: Unit, of the surface at each point.
         sample_visibility: Share of each light sample that the scene lets through, in [0, 1].
-        settings: Limits.
 
     Returns:
         The ratios at `points`, with a slope of 0.
     """
     sums = (light_sums(maps, points, normals, sample_visibility=sample_visibility, sources=f) for f in (True, False))
-    return ratio_from_sums(sum(sums, torch.zeros(3, len(points), 3)), settings=settings)
+    return ratio_from_sums(sum(sums, torch.zeros(3, len(points), 3)))
 
 
 def light_sums(
@@ -274,14 +253,14 @@ def light_sums(
     return total
 
 
-def ratio_from_sums(sums: Float[Tensor, "3 m 3"], *, settings: SceneRatioSettings = SceneRatioSettings()) -> SceneRatio:
+def ratio_from_sums(sums: Float[Tensor, "3 m 3"]) -> SceneRatio:
     """Ratios from such sums of all light, limited and with small changes set to 0; the slope is 0."""
     without, with_object, bounce = sums
     total = without.clamp_min(1e-9)
     # an unlit point cannot get darker
-    ratio = torch.where(without > 1e-8, with_object / total, 1).clamp(settings.darkest, 1)
-    lost = _soft_threshold(1 - ratio, settings.least_change)
-    gained = _soft_threshold(torch.where(without > 1e-8, bounce / total, 0).clamp(0, 1), settings.least_change)
+    ratio = torch.where(without > 1e-8, with_object / total, 1).clamp(DARKEST, 1)
+    lost = _soft_threshold(1 - ratio, _MIN_CHANGE)
+    gained = _soft_threshold(torch.where(without > 1e-8, bounce / total, 0).clamp(0, 1), _MIN_CHANGE)
     return SceneRatio(shadow=1 - lost, bounce=gained, slope=torch.zeros_like(lost))
 
 
@@ -298,7 +277,6 @@ def reachable(
     *,
     farthest: float,
     rims: Float[Tensor, "m"] | float = 0.0,
-    settings: SceneRatioSettings = SceneRatioSettings(),
 ) -> Bool[Tensor, "m"]:
     """Points whose light an object may change: those near it, and those in the shadow cone of a source.
 
@@ -308,17 +286,16 @@ def reachable(
         samples: Of the light.
         farthest: World units from the object; no point beyond is reached.
         rims: World units; extent of what lies around each point.
-        settings: How near ambient shadows reach.
     """
     away = points - sphere.center
     distance = away.norm(dim=1)
-    near = distance - rims < settings.near_reach * sphere.radius
+    near = distance - rims < _NEAR_REACH * sphere.radius
     parts = zip(samples.directions, samples.softness, samples.is_source, samples.distances, strict=True)
     for direction, softness, source, light_distance in parts:
         if source:
             along = -(away @ direction)
             aside = (distance**2 - along**2).clamp_min(0).sqrt()
-            spread = torch.tan(softness.clamp_max(settings.widest_cone)) * (along + sphere.radius).clamp_min(0)
+            spread = torch.tan(softness.clamp_max(_WIDEST_CONE)) * (along + sphere.radius).clamp_min(0)
             # the shadow of a near light widens with the distance
             wider = 1 + along.clamp_min(0) / (light_distance - sphere.radius).clamp_min(0.5 * sphere.radius)
             near |= (along + rims > -sphere.radius) & (aside - rims < wider * (sphere.radius + spread))

@@ -33,7 +33,7 @@ _SPENT = np.float32(0.02)
 """Transmittance below which a tile of pixels is finished."""
 _HALF = np.float32(0.5)
 """Transmittance at which a texel's first depth is taken."""
-_MOST_ALPHA = np.float32(0.99)
+_MAX_ALPHA = np.float32(0.99)
 """Of one splat in one pixel, as in 3DGS."""
 _DILATION = np.float32(0.15)
 """Pixels squared, added to the variance of a splat's footprint against aliasing."""
@@ -270,7 +270,7 @@ def _blend(splat, at, dv, du, maps):
     bell = bell * bell
     bell = bell * bell
     before = load(transmittance, at)
-    weight = before * where_below(q, cut, smaller(bell * opacity, _MOST_ALPHA))
+    weight = before * where_below(q, cut, smaller(bell * opacity, _MAX_ALPHA))
     after = before - weight
     pixel_depth = du * su + (depth + sv * dv)
     store(near, at, load(near, at) + where_at_least(before, _HALF, where_below(after, _HALF, pixel_depth)))

@@ -8,11 +8,13 @@ side, and blurred. Rendering is linear in the Gaussians' values: simultaneous it
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
+from numba import prange
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -20,40 +22,36 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.shadows.receivers import Receivers
 from splatgraft.relighting.shadows.scene_ratio import SceneRatio
-from splatgraft.relighting.shadows.view_culling import gaussians_in_view
 from splatgraft.rendering import ViewOperator, view_operator
+from splatgraft.runtime.kernels import kernel, serialized
 
 RatioAt = Callable[[Float[Tensor, "p 3"], Float[Tensor, "p 3"], Int[Tensor, "p"]], Float[Tensor, "p"]]
 """Grey ratio of light at points with unit normals, each on the surface of the receiver whose index is given."""
 
-
-@dataclass(frozen=True)
-class ViewFitSettings:
-    """The views and the solver, set by hand."""
-
-    rounds: int = 5
-    """Iterations of the solver."""
-    longest_px: int = 512
-    """Longest side of a view, cut to the shadow; wider ones are reduced."""
-    narrowest_px: float = 0.5
-    """Widest standard deviation in pixels below which a Gaussian keeps what it has: a reduced view draws it wider than
-    it is, and so in the wrong place. Measured on planes: at 0.3 the fit makes shadows worse, at 0.6 better."""
-    margin: float = 0.25
-    """Share of its size that a view reaches beyond the shadow on each side."""
-    changed: float = 0.05
-    """Change of light from which a receiver or a pixel counts as shadowed; fainter changes are smooth."""
-    beside_px: int = 4
-    """Pixels around a shadowed pixel that are fitted too."""
-    receiving: float = 0.5
-    """Share of a pixel that receivers must make up."""
-    gamma: float = 2.2
-    """Exponent of sRGB, in which Gaussians are blended, as a power law."""
-    darkest: float = 0.04
-    """Least ratio of light that is fitted, as `SceneRatioSettings.darkest`."""
-    most_slope: float = 0.9
-    """Most share of a value that a view direction takes away."""
-    least_weight: float = 0.05
-    """Pixels; receivers with less weight in all views together keep what they have."""
+# the views and the solver; set by hand
+_ROUNDS = 5
+"""Iterations of the solver."""
+_LONGEST_PX = 512
+"""Longest side of a view, cut to the shadow; wider ones are reduced."""
+_NARROWEST_PX = 0.5
+"""Widest standard deviation in pixels below which a Gaussian keeps what it has: a reduced view draws it wider than
+it is, and so in the wrong place. Measured on planes: at 0.3 the fit makes shadows worse, at 0.6 better."""
+_MARGIN = 0.25
+"""Share of its size that a view reaches beyond the shadow on each side."""
+_CHANGED = 0.05
+"""Change of light from which a receiver or a pixel counts as shadowed; fainter changes are smooth."""
+_BESIDE_PX = 4
+"""Pixels around a shadowed pixel that are fitted too."""
+_RECEIVING = 0.5
+"""Share of a pixel that receivers must make up."""
+_GAMMA = 2.2
+"""Exponent of sRGB, in which Gaussians are blended, as a power law."""
+_DARKEST = 0.04
+"""Ratio of light below which nothing is fitted, as `scene_ratio.DARKEST`."""
+_MAX_SLOPE = 0.9
+"""Most share of a value that a view direction takes away."""
+_MIN_WEIGHT = 0.05
+"""Pixels; receivers with less weight in all views together keep what they have."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +126,6 @@ def fit_to_views(
     cameras: Cameras,
     *,
     ratio_at: RatioAt,
-    settings: ViewFitSettings = ViewFitSettings(),
 ) -> SceneRatio:
     """Fit the ratios of receivers to what some views show of them.
 
@@ -138,27 +135,26 @@ def fit_to_views(
         others: The rest of the scene, which hides receivers.
         cameras: The views; none to change nothing.
         ratio_at: The ratio anywhere on the receivers' surfaces.
-        settings: Of the views and the solver.
     """
     grey = (ratio.shadow + ratio.bounce).mean(1)
-    shadowed = (1 - grey).abs() > settings.changed
+    shadowed = (1 - grey).abs() > _CHANGED
     if not bool(shadowed.any()) or not len(cameras):
         return ratio
     gaussians = concatenate([receivers.gaussians, others.with_sh_degree(receivers.gaussians.sh_degree)])
-    values = grey.clamp_min(settings.darkest) ** (1 / settings.gamma)
+    values = grey.clamp_min(_DARKEST) ** (1 / _GAMMA)
     scene = _Scene(gaussians, gaussians.log_scales.max(1).values.exp(), values)
     surfaces = _Surfaces.of(receivers)
     views = []
     for camera in cameras:
-        cut = _cut_to(camera, receivers.gaussians.means[shadowed], settings)
+        cut = _cut_to(camera, receivers.gaussians.means[shadowed])
         if cut is not None:
-            found = _view(scene, cut, surfaces, ratio_at=ratio_at, settings=settings)
+            found = _view(scene, cut, surfaces, ratio_at=ratio_at)
             views += [found] if found is not None else []
-    value, slope, known = _solved(values, views, settings)
-    wanted, before = value**settings.gamma, ratio.shadow.mean(1).clamp_min(1e-6)
+    value, slope, known = _solved(values, views)
+    wanted, before = value**_GAMMA, ratio.shadow.mean(1).clamp_min(1e-6)
     factor = ((wanted - ratio.bounce.mean(1)) / before).clamp_min(0)
-    shadow = (ratio.shadow * factor[:, None]).clamp(settings.darkest, 1)
-    slope = settings.gamma * (value ** (settings.gamma - 1))[:, None] * slope
+    shadow = (ratio.shadow * factor[:, None]).clamp(_DARKEST, 1)
+    slope = _GAMMA * (value ** (_GAMMA - 1))[:, None] * slope
     return SceneRatio(
         shadow=torch.where(known[:, None], shadow, ratio.shadow),
         bounce=ratio.bounce,
@@ -167,7 +163,7 @@ def fit_to_views(
 
 
 def _solved(
-    values: Float[Tensor, "r"], views: Sequence[_FittedView], settings: ViewFitSettings
+    values: Float[Tensor, "r"], views: Sequence[_FittedView]
 ) -> tuple[Float[Tensor, "r"], Float[Tensor, "r 3"], Bool[Tensor, "r"]]:
     """Values and slopes of the receivers, and which of these were fitted."""
     slope, weight = torch.zeros(len(values), 3), torch.zeros(len(values))
@@ -176,9 +172,9 @@ def _solved(
         seen = view.weights.blend_transpose(torch.ones_like(view.target)[..., None])[: len(view.which), 0]
         weight[view.which] += seen
         wide[view.which] |= view.wide
-    step = torch.where(wide & (weight > settings.least_weight), 1 / weight.clamp_min(settings.least_weight), 0)
-    least = settings.darkest ** (1 / settings.gamma)
-    for _ in range(settings.rounds):
+    step = torch.where(wide & (weight > _MIN_WEIGHT), 1 / weight.clamp_min(_MIN_WEIGHT), 0)
+    least = _DARKEST ** (1 / _GAMMA)
+    for _ in range(_ROUNDS):
         change, turn = torch.zeros_like(values), torch.zeros_like(slope)
         for view in views:
             seen = torch.ones(view.count)
@@ -188,12 +184,12 @@ def _solved(
             turn[view.which] += back[:, None] * view.directions
         values = (values + step * change).clamp(least, 1)
         slope = slope + step[:, None] * turn
-        most = torch.minimum(settings.most_slope * values, 1 - values)[:, None]
+        most = torch.minimum(_MAX_SLOPE * values, 1 - values)[:, None]
         slope = slope * (most / slope.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1)
     return values, slope, step > 0
 
 
-def _cut_to(camera: Cameras, points: Float[Tensor, "s 3"], settings: ViewFitSettings) -> Cameras | None:
+def _cut_to(camera: Cameras, points: Float[Tensor, "s 3"]) -> Cameras | None:
     """The camera cut to what it shows of `points`, and reduced; None where it shows nothing of them."""
     pixels, depth = _projected(camera, points)
     size = camera.sizes[0].float()
@@ -201,10 +197,10 @@ def _cut_to(camera: Cameras, points: Float[Tensor, "s 3"], settings: ViewFitSett
     if not bool(seen.any()):
         return None
     low, high = pixels[seen].amin(0), pixels[seen].amax(0)
-    margin = settings.margin * (high - low) + settings.beside_px
+    margin = _MARGIN * (high - low) + _BESIDE_PX
     low, high = (low - margin).clamp_min(0).floor(), torch.minimum(high + margin, size).ceil()
     window = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-    return camera.cropped([window]).resized(min(1.0, settings.longest_px / float((high - low).max())))
+    return camera.cropped([window]).resized(min(1.0, _LONGEST_PX / float((high - low).max())))
 
 
 def _projected(camera: Cameras, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n"]]:
@@ -221,7 +217,6 @@ def _view(
     surfaces: _Surfaces,
     *,
     ratio_at: RatioAt,
-    settings: ViewFitSettings,
 ) -> _FittedView | None:
     """What one camera shows: per pixel, the ratio where its ray meets the receivers' surface."""
     which, drawn_px = gaussians_in_view(scene.gaussians.means, scene.widths, camera)
@@ -233,9 +228,9 @@ def _view(
     features[first, 1:4], features[first, 4] = surfaces.points[receivers], 1
     blended = weights.blend(features)
     value, mass = blended[..., 0], blended[..., 4]
-    changed = (value / weights.alpha.clamp_min(1e-6) - 1).abs() > settings.changed
-    beside = F.max_pool2d(changed[None].float(), 2 * settings.beside_px + 1, 1, settings.beside_px)[0].bool()
-    fitted = beside & (mass > settings.receiving)
+    changed = (value / weights.alpha.clamp_min(1e-6) - 1).abs() > _CHANGED
+    beside = F.max_pool2d(changed[None].float(), 2 * _BESIDE_PX + 1, 1, _BESIDE_PX)[0].bool()
+    fitted = beside & (mass > _RECEIVING)
     if not bool(fitted.any()):
         return None
     origin = camera.centers[0]
@@ -244,10 +239,10 @@ def _view(
     fitted[fitted.clone()] = valid
     points, nearest = points[valid], nearest[valid]
     target = value.clone()
-    ratio = ratio_at(points, surfaces.normals[nearest], nearest).clamp(settings.darkest, 1) ** (1 / settings.gamma)
+    ratio = ratio_at(points, surfaces.normals[nearest], nearest).clamp(_DARKEST, 1) ** (1 / _GAMMA)
     target[fitted] = weights.alpha[fitted] * ratio
     directions = F.normalize(gaussians.means[first] - origin, dim=1)
-    return _FittedView(receivers, len(which), weights, target, directions, drawn_px[first] > settings.narrowest_px)
+    return _FittedView(receivers, len(which), weights, target, directions, drawn_px[first] > _NARROWEST_PX)
 
 
 def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
@@ -255,3 +250,48 @@ def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
     v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     rays = torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(camera.intrinsics[0]).T
     return F.normalize(rays @ camera.world_from_camera[0, :3, :3].T, dim=-1)
+
+
+_REACH = np.float32(3)
+"""Standard deviations by which a Gaussian's centre may lie outside the picture."""
+_NEAREST = np.float32(1e-6)
+"""World units; a depth below is taken for this one."""
+
+
+def gaussians_in_view(
+    means: Float[Tensor, "n 3"], widths: Float[Tensor, "n"], camera: Cameras
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
+    """Positions of the Gaussians that the camera may show, ascending, and their standard deviations in pixels.
+
+    Args:
+        means: World units.
+        widths: Largest standard deviations, world units.
+        camera: One.
+    """
+    drawn = np.empty(len(means), np.float32)
+    pose, intrinsics = (
+        np.ascontiguousarray(x[0].numpy(), np.float32) for x in (camera.camera_from_world, camera.intrinsics)
+    )
+    size = camera.sizes[0].float().numpy()
+    _drawn_widths(means.contiguous().numpy(), widths.contiguous().numpy(), pose, intrinsics, size, drawn)
+    which = torch.from_numpy(np.nonzero(drawn >= 0)[0])
+    return which, torch.from_numpy(drawn)[which]
+
+
+@serialized
+@kernel(parallel=True)
+@no_type_check
+def _drawn_widths(means, widths, pose, intrinsics, size, drawn):
+    """Fill `drawn` with standard deviations in pixels; -1 for what lies outside the picture."""
+    for i in prange(means.shape[0]):
+        x, y, z = means[i, 0], means[i, 1], means[i, 2]
+        a = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
+        b = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
+        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        over = np.float32(1) / max(intrinsics[2, 0] * a + intrinsics[2, 1] * b + intrinsics[2, 2] * depth, _NEAREST)
+        u = (intrinsics[0, 0] * a + intrinsics[0, 1] * b + intrinsics[0, 2] * depth) * over
+        v = (intrinsics[1, 0] * a + intrinsics[1, 1] * b + intrinsics[1, 2] * depth) * over
+        width = widths[i] * intrinsics[0, 0] / max(depth, _NEAREST)
+        beside = _REACH * width
+        inside = depth > 0 and u > -beside and v > -beside and u < size[0] + beside and v < size[1] + beside
+        drawn[i] = width if inside else np.float32(-1)

@@ -23,10 +23,9 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import read_mask, read_rgb
 from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.spherical_harmonics import C0
-from splatgraft.relighting.light.confidence import light_confidence
-from splatgraft.relighting.light.light import Light, LightSource
-from splatgraft.relighting.shading.irradiance import irradiance, shade_ratio
-from splatgraft.relighting.shadows.light_sampling import sample_light
+from splatgraft.relighting.light.light import Light, LightSource, light_confidence
+from splatgraft.relighting.light.samples import sample_light
+from splatgraft.relighting.shading import irradiance, shade_ratio
 from splatgraft.relighting.shadows.scene_ratio import (
     object_shadow_maps,
     reachable,

@@ -1,4 +1,8 @@
-"""Exact k nearest neighbours within a set of points, by a tree of bounding boxes over points in Morton order."""
+"""Exact k nearest neighbours within a set of points, by a tree of bounding boxes over points in Morton order.
+
+Not scipy's tree: for 16 neighbours of 100,000 points on two cores it takes 0.6 to 1.2 CPU seconds, this 0.2 to 0.3, and
+among equal distances it chooses others, which changes pictures in their last bits.
+"""
 
 from typing import no_type_check
 

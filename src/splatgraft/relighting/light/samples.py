@@ -13,17 +13,13 @@ from torch import Tensor
 from splatgraft.core.directions import even_pairs, vogel_offsets
 from splatgraft.relighting.light.light import Light, LightSource
 
-
-@dataclass(frozen=True)
-class LightSamplingSettings:
-    """How finely a light is sampled."""
-
-    ambient_samples: int = 32
-    """Directions over the sphere, an even number; set by hand."""
-    source_samples: int = 9
-    """Most samples of all sources together; set by hand."""
-    single_softness: float = math.radians(8.0)
-    """Radians; a source up to this softness is one sample. Measured: one filtered map is then within 0.02 of rays."""
+# how finely a light is sampled
+_AMBIENT_SAMPLES = 32
+"""Directions over the sphere, an even number; set by hand."""
+_SOURCE_SAMPLES = 9
+"""Most samples of all sources together; set by hand."""
+_SINGLE_SOFTNESS = math.radians(8.0)
+"""Radians; a source up to this softness is one sample. Measured: one filtered map is then within 0.02 of rays."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +44,14 @@ class LightSamples:
         return len(self.is_source)
 
 
-def sample_light(light: Light, *, settings: LightSamplingSettings = LightSamplingSettings()) -> LightSamples:
+def sample_light(light: Light) -> LightSamples:
     """All samples of `light`: those of its sources first, brightest source first, then the ambient ones.
 
     A source of confidence c gives c of its irradiance to its own samples and the rest to the ambient ones, so a source
     that may not exist casts a weaker shadow.
     """
     directions, irradiance, softness, within, distances = [], [], [], [], []
-    for source, count in zip(light.sources, _sample_counts(light, settings), strict=False):
+    for source, count in zip(light.sources, _sample_counts(light), strict=False):
         rgb = torch.tensor(source.irradiance) * source.confidence / count
         for direction in _cone_directions(source, count):
             directions.append(direction)
@@ -64,7 +60,7 @@ def sample_light(light: Light, *, settings: LightSamplingSettings = LightSamplin
             distances.append(source.distance)
             softness.append(source.softness / math.sqrt(count) if count > 1 else source.softness)
     unsure = sum((torch.tensor(s.irradiance) * (1 - s.confidence) for s in light.sources), torch.zeros(3))
-    n = settings.ambient_samples
+    n = _AMBIENT_SAMPLES
     ambient = even_pairs(n)
     radiance = light.ambient_radiance(ambient) + unsure / (4 * math.pi)
     return LightSamples(
@@ -79,15 +75,15 @@ def sample_light(light: Light, *, settings: LightSamplingSettings = LightSamplin
     )
 
 
-def main_source_samples(light: Light, *, settings: LightSamplingSettings = LightSamplingSettings()) -> int:
+def main_source_samples(light: Light) -> int:
     """How many of the first samples of `light` belong to its first source."""
-    return _sample_counts(light, settings)[0] if light.sources else 0
+    return _sample_counts(light)[0] if light.sources else 0
 
 
-def _sample_counts(light: Light, settings: LightSamplingSettings) -> list[int]:
+def _sample_counts(light: Light) -> list[int]:
     """Samples per source, brightest first: a wide one takes all that are free, or half where later ones are wide."""
-    wide = [source.softness > settings.single_softness for source in light.sources[: settings.source_samples]]
-    free = settings.source_samples - len(wide)
+    wide = [source.softness > _SINGLE_SOFTNESS for source in light.sources[:_SOURCE_SAMPLES]]
+    free = _SOURCE_SAMPLES - len(wide)
     counts = []
     for i, is_wide in enumerate(wide):
         taken = (free + 1) // 2 if any(wide[i + 1 :]) else free

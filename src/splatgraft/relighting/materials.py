@@ -1,9 +1,12 @@
-"""Gloss of an object's materials, from how its colours change with the view under a known light.
+"""Gloss of an object's materials: fitted to its views under the old light, and shown under the new one.
 
 Per cluster of like colour and place one lobe is fitted by least squares: the part of the seen colours that changes
-with the view is a reflectance times the light in mirrored directions. What a Gaussian shows beside it is matt.
+with the view is a reflectance times the light in mirrored directions. What a Gaussian shows beside it is matt. Lobes
+are von Mises-Fisher densities (reflection as convolution, Ramamoorthi and Hanrahan 2001): each light sample is
+convolved with one by adding variances, the ambient harmonics by the lobe's own coefficients.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,38 +14,101 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
+from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.k_means import k_means
-from splatgraft.relighting.shading.object_views import ObjectView
-from splatgraft.relighting.shading.reflected_light import ReflectedLight
+from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.samples import LightSamples
+from splatgraft.relighting.object_views import ObjectView
+from splatgraft.relighting.shading import apply_gain
+
+
+@dataclass(frozen=True)
+class ReflectedLight:
+    """A light as n surface points reflect it."""
+
+    directions: Float[Tensor, "k 3"]
+    """Unit, towards the samples of its sources."""
+    irradiance: Float[Tensor, "k 3"]
+    """Linear rgb of each sample."""
+    softness: Float[Tensor, "k"]
+    """Radius of each sample's cone, radians."""
+    visibility: Float[Tensor, "n k"]
+    """Share of each sample that reaches each point, in [0, 1]."""
+    ambient: Float[Tensor, "9 3"]
+    """Radiance of everything else, harmonics of degree 2."""
+
+    def select(self, rows: slice | Int[Tensor, "m"]) -> "ReflectedLight":
+        """The light at some of the points."""
+        return replace(self, visibility=self.visibility[rows])
+
+    def scaled(self, factor: Float[Tensor, "3"]) -> "ReflectedLight":
+        """The light with every channel multiplied by a factor."""
+        return replace(self, irradiance=self.irradiance * factor, ambient=self.ambient * factor)
+
+    def radiance(self, directions: Float[Tensor, "n v 3"], concentration: float) -> Float[Tensor, "n v 3"]:
+        """Linear rgb radiance at n points, averaged over lobes around v unit directions each.
+
+        Args:
+            directions: Unit, away from the surface.
+            concentration: Of the lobes; one over the square of their width in radians.
+        """
+        first = 1 / math.tanh(concentration) - 1 / concentration
+        bands = torch.tensor([1.0] + [first] * 3 + [1 - 3 * first / concentration] * 5)
+        total = (spherical_harmonics.basis(directions, 2) @ (bands[:, None] * self.ambient)).clamp_min(0)
+        for i in range(len(self.directions)):
+            # per axis the variance of a cone of radius r is r^2 / 4, that of a lobe is 1 / concentration
+            k = 1 / (1 / concentration + 0.25 * float(self.softness[i]) ** 2)
+            peak = k / (2 * math.pi * (1 - math.exp(-2 * k)))
+            lobe = peak * torch.exp(k * (directions @ self.directions[i] - 1)) * self.visibility[:, i : i + 1]
+            total = total + lobe[..., None] * self.irradiance[i]
+        return total
+
+
+def reflected_light(light: Light, samples: LightSamples, visibility: Float[Tensor, "n k"]) -> ReflectedLight:
+    """The light as n points reflect it.
+
+    Args:
+        light: The light.
+        samples: Of that light, k.
+        visibility: Share of each sample that reaches each point, in [0, 1].
+    """
+    which = torch.as_tensor(samples.is_source)
+    unsure = sum((torch.tensor(s.irradiance) * (1 - s.confidence) for s in light.sources), torch.zeros(3))
+    ambient = light.ambient.clone()
+    ambient[0] += unsure / (4 * math.pi * spherical_harmonics.C0)
+    return ReflectedLight(
+        directions=samples.directions[which],
+        irradiance=samples.irradiance[which],
+        softness=samples.softness[which],
+        visibility=visibility[:, which],
+        ambient=ambient,
+    )
+
 
 _CHUNK = 8192
 """Gaussians at a time; bounds memory."""
-_MOST_FITTED = 8192
+_MAX_FITTED = 8192
 """Gaussians that lobes are fitted to, spread over the object; more add time and change nothing."""
 _ROUNDS = 15
 """Of k-means."""
 
-
-@dataclass(frozen=True)
-class MaterialSettings:
-    """The model's few numbers. On twelve rendered scenes (true light told) the result is flat around all of them."""
-
-    clusters: int = 6
-    """Clusters of colour and place; 2 to 16 give the same PSNR within 0.02 dB."""
-    concentrations: tuple[float, ...] = (1.5, 3.0, 6.0, 12.0, 25.0)
-    """Of the lobes that are tried, from a satin to a polished surface; finer ones no bands of degree 3 can hold."""
-    evidence: float = 0.05
-    """Explained share of the change with the view at which a lobe is believed by half: shares of pure noise."""
-    lowest_cosine: float = 0.1
-    """Between normal and view; flatter views are left out."""
-    least_matt: float = 0.2
-    """Share of a Gaussian's colour that stays, whatever the lobe explains."""
-    facing: float = 0.04
-    """Reflectance at normal incidence relative to grazing, of a dielectric (Schlick 1994)."""
-    mirror: float = 0.3
-    """Reflectance from which the sharpest lobe is called a mirror."""
+# the model's few numbers; on twelve rendered scenes of given true light the result is flat around all of them
+_CLUSTERS = 6
+"""Clusters of colour and place; 2 to 16 give the same PSNR within 0.02 dB."""
+_CONCENTRATIONS = (1.5, 3.0, 6.0, 12.0, 25.0)
+"""Of the lobes that are tried, from a satin to a polished surface; finer ones no bands of degree 3 can hold."""
+_EVIDENCE = 0.05
+"""Explained share of the change with the view at which a lobe is believed by half: shares of pure noise."""
+_LOWEST_COSINE = 0.1
+"""Between normal and view; flatter views are left out."""
+_MIN_MATT = 0.2
+"""Share of a Gaussian's colour that stays, whatever the lobe explains."""
+_FACING = 0.04
+"""Reflectance at normal incidence relative to grazing, of a dielectric (Schlick 1994)."""
+_MIRROR = 0.3
+"""Reflectance from which the sharpest lobe is called a mirror."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +125,6 @@ class Materials:
     """Linear rgb under the old light, without the lobe."""
     share: Float[Tensor, "n"]
     """Of the light seen under the old light, what the lobe gave, in [0, 1]."""
-    settings: MaterialSettings
-    """That it was fitted with."""
 
     @property
     def glossy(self) -> Bool[Tensor, "n"]:
@@ -70,8 +134,8 @@ class Materials:
     @property
     def mirrors(self) -> Bool[Tensor, "n"]:
         """Which Gaussians are mirrors, whose reflections bands can only blur."""
-        sharpest = self.concentration >= max(self.settings.concentrations)
-        return sharpest & ~self.dielectric & (self.reflectance.mean(1) > self.settings.mirror)
+        sharpest = self.concentration >= max(_CONCENTRATIONS)
+        return sharpest & ~self.dielectric & (self.reflectance.mean(1) > _MIRROR)
 
 
 def estimate_materials(
@@ -79,8 +143,6 @@ def estimate_materials(
     normals: Float[Tensor, "n 3"],
     views: tuple[ObjectView, ...],
     light: ReflectedLight,
-    *,
-    settings: MaterialSettings = MaterialSettings(),
 ) -> Materials:
     """Fit the lobes of an object's materials.
 
@@ -89,7 +151,6 @@ def estimate_materials(
         normals: Unit, outward.
         views: Of the object alone, from its capture's cameras.
         light: That it was captured in.
-        settings: The model's numbers.
 
     Returns:
         Lobes in the light's units, all 0 where the Gaussians have no bands or no camera sees them.
@@ -102,13 +163,12 @@ def estimate_materials(
         dielectric=torch.zeros(n, dtype=torch.bool),
         matt=base,
         share=torch.zeros(n),
-        settings=settings,
     )
     if gaussians.sh_degree == 0 or not views:
         return matt
-    record = _Record.of(gaussians, normals, views, settings)
-    cluster = _clusters(record.mean, gaussians.means, settings.clusters)
-    reflectance, concentration, dielectric = _fitted(record, cluster, light, settings)
+    record = _Record.of(gaussians, normals, views)
+    cluster = _clusters(record.mean, gaussians.means, _CLUSTERS)
+    reflectance, concentration, dielectric = _fitted(record, cluster, light)
     lobes = replace(
         matt,
         reflectance=reflectance[cluster],
@@ -120,10 +180,10 @@ def estimate_materials(
         rows = slice(start, start + _CHUNK)
         part = lobe_radiance(lobes, rows, light, record.mirrored(rows), record.cosine[rows])
         old[rows] = (record.weight[rows, :, None] * part).sum(1)
-    left = torch.maximum(base - old, settings.least_matt * base)
+    left = torch.maximum(base - old, _MIN_MATT * base)
     return replace(
         lobes,
-        reflectance=lobes.reflectance * _taken(base, old, settings),
+        reflectance=lobes.reflectance * _taken(base, old),
         matt=left,
         share=1 - left.sum(1) / base.sum(1).clamp_min(1e-6),
     )
@@ -154,7 +214,7 @@ def lobe_radiance(
             part = here.select(which).radiance(mirrored[which], value)
             factor = torch.where(
                 materials.dielectric[rows][which][:, None],
-                _schlick(cosine[which], materials.settings.facing),
+                _schlick(cosine[which], _FACING),
                 torch.ones(()),
             )
             out[which] = part * factor[..., None] * reflectance[which][:, None]
@@ -165,9 +225,9 @@ def _schlick(cosine: Float[Tensor, "m v"], facing: float) -> Float[Tensor, "m v"
     return facing + (1 - facing) * (1 - cosine.clamp(0, 1)) ** 5
 
 
-def _taken(base: Float[Tensor, "n 3"], old: Float[Tensor, "n 3"], settings: MaterialSettings) -> Float[Tensor, "n 3"]:
+def _taken(base: Float[Tensor, "n 3"], old: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Share of the lobe that is taken out of the colours, so that no more is put in."""
-    most = (1 - settings.least_matt) * base
+    most = (1 - _MIN_MATT) * base
     return torch.where(old > 1e-6, most / old.clamp_min(1e-6), torch.zeros(())).clamp(0, 1)
 
 
@@ -199,9 +259,7 @@ class _Record:
         return values - (self.weight[rows][..., None] * values).sum(1, keepdim=True)
 
     @staticmethod
-    def of(
-        gaussians: Gaussians, normals: Float[Tensor, "n 3"], views: tuple[ObjectView, ...], settings: MaterialSettings
-    ) -> "_Record":
+    def of(gaussians: Gaussians, normals: Float[Tensor, "n 3"], views: tuple[ObjectView, ...]) -> "_Record":
         colors, pixels = [], []
         for view in views:
             alpha = view.operator.alpha[..., None]
@@ -213,7 +271,7 @@ class _Record:
             pixels.append(sums[:, 3])
         directions = torch.stack([view.directions for view in views], 1)
         cosine = -(directions * normals[:, None]).sum(-1)
-        seen = torch.stack(pixels, 1) * (cosine > settings.lowest_cosine)
+        seen = torch.stack(pixels, 1) * (cosine > _LOWEST_COSINE)
         total = seen.sum(1)
         return _Record(
             colors=torch.stack(colors, 1),
@@ -241,17 +299,17 @@ def _clusters(mean: Float[Tensor, "n 3"], points: Float[Tensor, "n 3"], count: i
 
 
 def _fitted(
-    record: _Record, cluster: Int[Tensor, "n"], light: ReflectedLight, settings: MaterialSettings
+    record: _Record, cluster: Int[Tensor, "n"], light: ReflectedLight
 ) -> tuple[Float[Tensor, "c 3"], Float[Tensor, "c"], Bool[Tensor, "c"]]:
     """Per cluster the reflectance, concentration and kind of the lobe that explains most."""
-    shapes = [(value, kind) for value in settings.concentrations for kind in (False, True)]
+    shapes = [(value, kind) for value in _CONCENTRATIONS for kind in (False, True)]
     count = int(cluster.max()) + 1
     own, cross, square = (torch.zeros(len(shapes), count, 3) for _ in range(3))
-    fitted = torch.arange(0, len(cluster), -(-len(cluster) // _MOST_FITTED))
+    fitted = torch.arange(0, len(cluster), -(-len(cluster) // _MAX_FITTED))
     for rows in fitted.split(_CHUNK // 4):
         weight = (record.pixels[rows, None] * record.weight[rows])[..., None]
         seen, mirrored, here = record.centred(record.colors[rows], rows), record.mirrored(rows), light.select(rows)
-        fresnel = _schlick(record.cosine[rows], settings.facing)[..., None]
+        fresnel = _schlick(record.cosine[rows], _FACING)[..., None]
         for i, (value, kind) in enumerate(shapes):
             if not kind:
                 radiance = here.radiance(mirrored, value)
@@ -263,7 +321,55 @@ def _fitted(
     best = explained.argmax(0)
     each = torch.arange(count)
     share = explained[best, each]
-    believed = share / (share + settings.evidence)
+    believed = share / (share + _EVIDENCE)
     values = torch.tensor([value for value, _ in shapes])
     kinds = torch.tensor([kind for _, kind in shapes])
     return believed[:, None] * reflectance[best, each], values[best], kinds[best]
+
+
+_GLOSS_CHUNK = 4096
+"""Gaussians at a time; bounds memory."""
+_VIEWS = 64
+"""Directions over the sphere; twice as many as are needed to integrate products of degree 3 without error."""
+_BRIGHTEST = 1.5
+"""Linear; brighter reflections are clipped, which keeps bands from ringing over the whole object."""
+
+
+def gloss_bands(
+    gaussians: Gaussians,
+    normals: Float[Tensor, "n 3"],
+    materials: Materials,
+    light: ReflectedLight,
+    *,
+    shade: Float[Tensor, "n 3"],
+) -> Float[Tensor, "n 16 3"]:
+    """Coefficients that are added after shading and after the old bands are taken out; 0 where nothing is glossy.
+
+    Args:
+        gaussians: The object.
+        normals: Unit, outward.
+        materials: Of the object.
+        light: At the new place, in the units of the old one.
+        shade: Factor on linear rgb of what is matt.
+    """
+    degree = spherical_harmonics.MAX_DEGREE
+    views = even_directions(_VIEWS)
+    project = spherical_harmonics.basis(views, degree) * (4 * math.pi / _VIEWS)
+    out = torch.zeros(gaussians.count, project.shape[1], 3)
+    for start in range(0, gaussians.count, _GLOSS_CHUNK):
+        rows = slice(start, start + _GLOSS_CHUNK)
+        glossy = materials.glossy[rows]
+        if not bool(glossy.any()):
+            continue
+        facing = normals[rows][:, None]
+        towards = -(views * facing).sum(-1)
+        # both a direction and its image in the tangent plane are mirrored to the same side
+        cosine = towards.abs()
+        in_front = views + (towards - cosine)[..., None] * facing
+        lobe = lobe_radiance(materials, rows, light, in_front + 2 * cosine[..., None] * facing, cosine)
+        linear = (materials.matt[rows] * shade[rows])[:, None] + lobe
+        srgb = srgb_from_linear(linear.clamp(0, _BRIGHTEST))
+        bands = torch.einsum("vk,nvc->nkc", project, srgb - 0.5)
+        bands[:, 0] -= apply_gain(gaussians.select(torch.arange(gaussians.count)[rows]), shade[rows]).sh[:, 0]
+        out[rows] = bands * glossy[:, None, None]
+    return out

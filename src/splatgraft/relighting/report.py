@@ -1,4 +1,8 @@
-"""A picture of an estimated light: the panorama with its sources, and where the estimate explains the surfaces."""
+"""What a transfer shows beside its result: pictures of the estimated lights, and a check of their level.
+
+The check compares the estimated change of illuminance with that of the photos' luminance: exposure metadata gives both
+captures absolute units. The ratio that is applied to the object is in each capture's own units, whatever it says.
+"""
 
 import math
 
@@ -9,13 +13,23 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.directions import tangents
+from splatgraft.core.exposure import LuminanceScale
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import srgb_from_linear
+from splatgraft.core.images import LUMINANCE, srgb_from_linear
+from splatgraft.relighting.layers import Relit
 from splatgraft.relighting.light.estimate import EstimatedLight
 from splatgraft.relighting.light.light import LightSource
-from splatgraft.relighting.light.panorama import cube_pixels, render_panorama
-from splatgraft.relighting.light.surroundings import nearest_directions
+from splatgraft.relighting.light.panorama import cube_pixels, nearest_directions, render_panorama
+from splatgraft.runtime.note import Note
 
+# when a level is doubtful; set by hand
+_MAX_DIFFERENCE = 1.5
+"""Stops. The mean reflectance of what a capture shows is mostly from 0.1 to 0.5: of two, at most about 2.3 stops apart,
+and seldom more than this."""
+_MAX_LUX = 200_000.0
+"""Sun and clear sky give up to 130,000; the rest is the error of cameras' speeds."""
+
+# pictures
 _HEIGHT = 256
 """Pixels of the panorama, which is twice as wide."""
 _FACE = 128
@@ -25,6 +39,63 @@ _UNSEEN = torch.tensor([0.35, 0.35, 0.38])
 _STOPS = 2.0
 """Residual, in stops, of full colour: red where a surface is brighter than explained, blue where it is darker."""
 _RED, _WHITE, _BLUE = torch.tensor([[0.8, 0.1, 0.1], [0.92, 0.92, 0.92], [0.1, 0.25, 0.8]])
+
+
+def describe_level(relit: Relit, *, target: LuminanceScale, source: LuminanceScale) -> tuple[Note, ...]:
+    """Compare how much brighter the new place is by the photos and by the light on each object, before any share.
+
+    Args:
+        relit: A transfer.
+        target: Of the target's photos.
+        source: Of the photos that all objects of known source light come from.
+
+    Returns:
+        A note per object of known source light, a warning where the two do not agree or where there is more light than
+        under the sun; none where a photo shows no light.
+    """
+    if min(target.mean, source.mean) <= 0:
+        return ()
+    notes = []
+    for prepared, received in zip(relit.prepared, relit.received, strict=True):
+        if prepared.source_lighting is None:
+            continue
+        weights = prepared.gaussians.opacities
+        new = target.white * _mean_luminance(received, weights)
+        old = source.white * _mean_luminance(prepared.source_lighting.irradiance, weights)
+        if min(new, old) > 0:
+            notes.append(_level_note(prepared.number, math.log2(target.mean / source.mean), new=new, old=old))
+    return tuple(notes)
+
+
+def _level_note(number: int, by_photos: float, *, new: float, old: float) -> Note:
+    by_light = math.log2(new / old)
+    plain = (
+        f"Object {number}: by the exposure of the photos the new place is {_brighter(by_photos)} than the old one, by "
+        f"the light on the object {_brighter(by_light)} ({_rounded(new)} lux there, {_rounded(old)} at the old place)."
+    )
+    doubts = ""
+    if abs(by_light - by_photos) > _MAX_DIFFERENCE:
+        doubts += (
+            f" They differ by {abs(by_light - by_photos):.1f} stops: one of the lights may be wrong, or what the "
+            f"photos of the two places show differs as much in reflectance."
+        )
+    if max(new, old) > _MAX_LUX:
+        doubts += " That is more than sun and sky give: the estimated light is too strong, or the metadata is wrong."
+    return Note(plain + doubts, "warning" if doubts else "said")
+
+
+def _mean_luminance(irradiance: Float[Tensor, "n 3"], weights: Float[Tensor, "n"]) -> float:
+    mean = (weights[:, None] * irradiance).sum(0) / weights.sum().clamp_min(1e-9)
+    return float(mean @ LUMINANCE)
+
+
+def _brighter(stops: float) -> str:
+    return f"{abs(stops):.1f} stops {'brighter' if stops >= 0 else 'darker'}"
+
+
+def _rounded(lux: float) -> str:
+    """Two digits: no camera is calibrated better."""
+    return f"{float(f'{lux:.2g}'):,.6g}"
 
 
 def draw_light(found: EstimatedLight, scene: Gaussians, center: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:

@@ -8,7 +8,7 @@ which cancel in their ratio. Written from the published description; its code is
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -18,42 +18,33 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.estimate import NoLight, panorama_at
-from splatgraft.relighting.light.panorama import Panorama
-from splatgraft.relighting.shading.gain import apply_gain
-from splatgraft.relighting.shading.normals import estimate_normals
-from splatgraft.relighting.transfer import SourceScene
+from splatgraft.relighting import SourceScene
+from splatgraft.relighting.light.panorama import NoLight, Panorama, panorama_at
+from splatgraft.relighting.normals import estimate_normals
+from splatgraft.relighting.shading import apply_gain
+from splatgraft.runtime.note import Note
 
 _DEGREE = 2
 """Of the expansions: the clamped cosine has no band 3, and little above (Ramamoorthi and Hanrahan 2001)."""
-
-
-@dataclass(frozen=True)
-class IrradianceRatioOptions:
-    """Limits of the ratio, set by hand; the publication's are not stated."""
-
-    floor: float = 0.05
-    """Share of the mean irradiance below which neither irradiance counts: expansions may be near 0 or negative."""
-    largest: float = 10.0
-    """Most factor by which a channel is multiplied or divided."""
+# limits of the ratio, set by hand; the publication's are not stated
+_FLOOR = 0.05
+"""Share of the mean irradiance below which neither irradiance counts: expansions may be near 0 or negative."""
+_MAX_RATIO = 10.0
+"""Factor by which a channel is multiplied or divided."""
 
 
 def relight_by_irradiance_ratio(
-    composite: Composite,
-    *,
-    sources: Sequence[SourceScene | None],
-    options: IrradianceRatioOptions = IrradianceRatioOptions(),
-) -> tuple[Composite, tuple[str, ...]]:
+    composite: Composite, *, sources: Sequence[SourceScene | None]
+) -> tuple[Composite, tuple[Note, ...]]:
     """Multiply the linear colours of every object by irradiance at its new place over that at its old one.
 
     Args:
         composite: Target scene and placed objects.
         sources: Per object the scene that it was taken from; None where that is not known.
-        options: Limits of a ratio.
 
     Returns:
-        The composite and a sentence on each object. An object stays as it was captured where its source is not known
-        or there is no light at one of its places, and the sentence gives the reason.
+        The composite and a note on each object. An object stays as it was captured where its source is not known or
+        there is no light at one of its places, and a warning gives the reason.
 
     Raises:
         ValueError: There is not one source (or None) per object.
@@ -61,13 +52,16 @@ def relight_by_irradiance_ratio(
     if len(sources) != len(composite.objects):
         raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")
     scene = composite.target.select(~composite.erased)
-    recolored, report = [], []
+    recolored, notes = [], []
     for number, (placed, source) in enumerate(zip(composite.objects, sources, strict=True), start=1):
-        found = "the scene it comes from is not known." if source is None else _relit(placed, source, scene, options)
-        recolored.append(placed.gaussians if isinstance(found, str) else found)
-        said = f"{found} It is pasted as it is." if isinstance(found, str) else "lit by the ratio of irradiances."
-        report.append(f"Object {number}: {said}")
-    return composite.with_object_colors(tuple(recolored)), tuple(report)
+        found = "the scene it comes from is not known." if source is None else _relit(placed, source, scene)
+        if isinstance(found, str):
+            recolored.append(placed.gaussians)
+            notes.append(Note(f"Object {number}: {found} It is pasted as it is.", "warning"))
+        else:
+            recolored.append(found)
+            notes.append(Note(f"Object {number}: lit by the ratio of irradiances."))
+    return composite.with_object_colors(tuple(recolored)), tuple(notes)
 
 
 def project(panorama: Panorama, degree: int = _DEGREE) -> Float[Tensor, "k 3"]:
@@ -90,23 +84,18 @@ def irradiance_of(coefficients: Float[Tensor, "k 3"], normals: Float[Tensor, "n 
     return spherical_harmonics.basis(normals, _DEGREE) @ (bands[:, None] * coefficients)
 
 
-def irradiance_ratio(
-    target: Float[Tensor, "n 3"], source: Float[Tensor, "n 3"], options: IrradianceRatioOptions
-) -> Float[Tensor, "n 3"]:
+def irradiance_ratio(target: Float[Tensor, "n 3"], source: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Factor on linear colours, floored and limited.
 
     Args:
         target: Irradiance at the new place.
         source: Irradiance at the old place.
-        options: Limits.
     """
-    floored = [x.clamp_min(options.floor * float(x.mean().clamp_min(1e-8))) for x in (target, source)]
-    return (floored[0] / floored[1]).clamp(1 / options.largest, options.largest)
+    floored = [x.clamp_min(_FLOOR * float(x.mean().clamp_min(1e-8))) for x in (target, source)]
+    return (floored[0] / floored[1]).clamp(1 / _MAX_RATIO, _MAX_RATIO)
 
 
-def _relit(
-    placed: PlacedObject, source: SourceScene, scene: Gaussians, options: IrradianceRatioOptions
-) -> Gaussians | str:
+def _relit(placed: PlacedObject, source: SourceScene, scene: Gaussians) -> Gaussians | str:
     """The object with its new colours, or the reason why it has none."""
     if placed.gaussians.count == 0:
         return "it is empty."
@@ -122,5 +111,5 @@ def _relit(
     if normals is None:
         normals = estimate_normals(placed.gaussians, source.cameras).vectors
     turned = normals @ placed.target_from_object.rotation.to(normals).T
-    ratio = irradiance_ratio(irradiance_of(new, turned), irradiance_of(old, normals), options)
+    ratio = irradiance_ratio(irradiance_of(new, turned), irradiance_of(old, normals))
     return replace(placed.gaussians, sh=apply_gain(placed.gaussians, ratio).sh)

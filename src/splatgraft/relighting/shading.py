@@ -1,17 +1,20 @@
-"""Irradiance of Gaussians under light samples, and the ratio of two lights' irradiance as a factor on linear colours.
+"""Irradiance of Gaussians under light samples, ratios of two lights' irradiance, and their application to colours.
 
 The ratio's variation over the object is applied in full; of its mean only a stated share is (ratio images, Debevec
 1998).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.relighting.shadows.light_sampling import LightSamples
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.relighting.light.samples import LightSamples
 
 
 @dataclass(frozen=True)
@@ -136,3 +139,29 @@ def _limited(
     """The ratio with its variation around the mean limited."""
     mean, span = _mean(log_ratio, opacities), math.log(settings.span)
     return (mean + (log_ratio - mean).clamp(-span, span)).exp()
+
+
+def apply_gain(gaussians: Gaussians, gain: Float[Tensor, "3"] | Float[Tensor, "n 3"]) -> Gaussians:
+    """Gaussians whose linear colour is multiplied by `gain`; bands above 0 to first order around the mean colour.
+
+    DC' = sRGB(gain * linear(DC)); higher bands are multiplied by the derivative of that curve at DC. A Gaussian whose
+    gain is exactly 1 keeps every bit.
+    """
+    color = spherical_harmonics.rgb_from_dc(gaussians.sh[:, 0])
+    lit, slope = _through_linear(color, gain.to(color).expand_as(color))
+    same = (gain == 1).to(color.device).expand_as(color)
+    dc = torch.where(same, gaussians.sh[:, 0], spherical_harmonics.dc_from_rgb(lit))
+    higher = gaussians.sh[:, 1:] * torch.where(same, torch.ones_like(slope), slope)[:, None]
+    return replace(gaussians, sh=torch.cat([dc[:, None], higher], 1))
+
+
+def _through_linear(
+    srgb: Float[Tensor, "n 3"], gain: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """sRGB colours after a gain on linear light, and the derivative by the sRGB colour before."""
+    # the caller may be optimising the gain: this derivative is by the colour alone
+    with torch.enable_grad():
+        point = srgb.detach().requires_grad_()
+        lit = srgb_from_linear(linear_from_srgb(point) * gain.detach())
+        (slope,) = torch.autograd.grad(lit.sum(), point)
+    return srgb_from_linear(linear_from_srgb(srgb) * gain), slope

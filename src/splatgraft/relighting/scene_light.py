@@ -1,0 +1,217 @@
+"""The light at the objects' place in a scene, and the Gaussians there that may receive their shadows.
+
+All of it holds while the objects move by less than half of the shadow maps' radius (`SceneLight.moved`).
+
+Where the scene's main light is visibly blocked by what was never captured, the scene's own brightness shows it:
+sunlight through a window lights a patch of a table; the depth maps lack the window's frame, but the table's colours
+show the patch. Brightness is compared within groups of one material, then smoothed over neighbours.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.bounds import BoundingSphere
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.spherical_harmonics import rgb_from_dc
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light, with_source_distances
+from splatgraft.relighting.light.evidence import group_materials
+from splatgraft.relighting.light.light import Light
+from splatgraft.relighting.light.panorama import NoLight
+from splatgraft.relighting.light.samples import LightSamples, main_source_samples, sample_light
+from splatgraft.relighting.nearest_neighbours import nearest_neighbours
+from splatgraft.relighting.normals import Normals, estimate_normals
+from splatgraft.relighting.shading import irradiance
+from splatgraft.relighting.shadows.receivers import RIM, Receivers, above_layer, layer_middle
+from splatgraft.relighting.shadows.scene_ratio import (
+    AMBIENT_SIZE,
+    SceneShadowMaps,
+    reachable,
+    scene_shadow_maps,
+    scene_visibility,
+)
+from splatgraft.relighting.shadows.shadow_maps import thinned
+
+# the region of the shadow maps; set by hand
+_MARGIN = 1.2
+"""Radius of a new region over what the objects need."""
+_KEPT_RADII = (0.8, 2.0)
+"""Minimum and maximum radius of a region that is kept, over what the objects need."""
+_KEPT_SHIFT = 0.5
+"""Radii of a region by which the objects' place may be off its centre."""
+
+# when brightness shows whether the main light arrives; set by hand
+_SMOOTHED = 24
+"""Gaussians over which the median is taken."""
+_CONTRAST = 0.5
+"""Irradiance of the light over that of the rest; with less, brightness shows nothing."""
+_FAINTEST = 0.1
+"""Opacity below which a Gaussian is left out."""
+_MIN_GAUSSIANS = 500
+"""With fewer nothing is estimated."""
+_DARKEST = 0.01
+"""sRGB; darker channels count as this."""
+_LIT_QUANTILE = 0.75
+"""Of apparent albedo in a group of one material: a Gaussian of this brightness is taken to be fully lit."""
+_RAMP_START, _RAMP_WIDTH = 0.2, 0.4
+"""Of the ramp from 0 to 1 over the measured visibility: little light counts as none."""
+
+
+@dataclass(frozen=True)
+class SceneLight:
+    """The light of a scene at the place of objects, and the m receivers of their shadows."""
+
+    scene: Gaussians
+    """All Gaussians that are not erased."""
+    cameras: Cameras
+    """Of the scene's capture."""
+    light: Light
+    """At the objects' place."""
+    estimate: EstimatedLight | None
+    """What `light` rests on; None where it was given."""
+    samples: LightSamples
+    """k samples of `light`."""
+    maps: SceneShadowMaps
+    """The scene's own shadow maps for the samples."""
+    receivers: Receivers
+    """The Gaussians that the objects may reach, from where they were and after a move by up to their radius."""
+    receivers_of: tuple[BoundingSphere, ...]
+    """The objects' bounding spheres when the receivers were chosen."""
+    reach: float
+    """Object radii to which shadows are computed."""
+
+    def moved(self, spheres: Sequence[BoundingSphere]) -> "SceneLight | NoLight | None":
+        """Its sources and shadow maps with the objects at other places, and the ambient light there.
+
+        Args:
+            spheres: Of the objects.
+
+        Returns:
+            None where the objects are too far from the maps' middle, or need larger or much smaller maps.
+        """
+        place, region = _place(spheres), self.maps.region
+        least, most = (factor * place.radius * self.reach for factor in _KEPT_RADII)
+        shift = float((region.center - place.center).norm())
+        if not least <= region.radius <= most or shift >= _KEPT_SHIFT * region.radius:
+            return None
+        estimate, light = None, self.light
+        if self.estimate is not None:
+            estimate = self.estimate.at(self.scene, self.cameras, place)
+            if isinstance(estimate, NoLight):
+                return estimate
+            light = estimate.light
+        there = replace(self, light=light, estimate=estimate, samples=sample_light(light))
+        if len(spheres) == len(self.receivers_of) and all(
+            float((new.center - old.center).norm()) <= new.radius
+            for new, old in zip(spheres, self.receivers_of, strict=True)
+        ):
+            return there
+        receivers = _receivers(self.scene, self.cameras, spheres, light, self.maps)
+        return replace(there, receivers=receivers, receivers_of=tuple(spheres))
+
+
+def find_scene_light(
+    scene: Gaussians, cameras: Cameras, spheres: Sequence[BoundingSphere], *, light: Light | None, reach: float
+) -> SceneLight | NoLight:
+    """Find the light of a scene at the place of objects.
+
+    Args:
+        scene: All Gaussians that are not erased.
+        cameras: Of its capture.
+        spheres: Of the objects, at least one.
+        light: At the objects' place, its sources seen from there; None to estimate it.
+        reach: Object radii to which shadows are computed.
+    """
+    place = _place(spheres)
+    estimate = None
+    if light is None:
+        found = estimate_light(scene, place, cameras)
+        if isinstance(found, NoLight):
+            return found
+        estimate, light = found, found.light
+    else:
+        light = with_source_distances(light, scene, place)
+    samples = sample_light(light)
+    maps = scene_shadow_maps(scene, BoundingSphere(place.center, _MARGIN * (place.radius * reach)), samples)
+    receivers = _receivers(scene, cameras, spheres, light, maps)
+    return SceneLight(scene, cameras, light, estimate, samples, maps, receivers, tuple(spheres), reach)
+
+
+def _place(spheres: Sequence[BoundingSphere]) -> BoundingSphere:
+    """The middle of objects, and the radius of the largest."""
+    center = torch.stack([sphere.center for sphere in spheres]).mean(0)
+    return BoundingSphere(center, max(sphere.radius for sphere in spheres))
+
+
+def _receivers(
+    scene: Gaussians, cameras: Cameras, spheres: Sequence[BoundingSphere], light: Light, maps: SceneShadowMaps
+) -> Receivers:
+    """Gaussians that the objects may reach from where they are, and after a move by up to their radius."""
+    region, samples = maps.region, sample_light(light)
+    reached = torch.zeros(scene.count, dtype=torch.bool)
+    rims = RIM * scene.scales.max(1).values
+    for sphere in spheres:
+        reached |= reachable(scene.means, sphere, samples, farthest=region.radius, rims=rims + sphere.radius)
+    indices = (reached & ((scene.means - region.center).norm(dim=1) < region.radius)).nonzero()[:, 0]
+    gaussians = scene.select(indices)
+    # for the test of what cameras see, occluders need not be finer than a shadow map's pixel
+    occluders = thinned(scene, width=2 * region.radius / AMBIENT_SIZE)
+    normals = estimate_normals(gaussians, cameras, among=occluders)
+    shares = scene_visibility(maps, above_layer(gaussians, normals.vectors), normals.vectors)
+    return Receivers(
+        gaussians=gaussians,
+        normals=normals.vectors,
+        sample_visibility=_with_observed_light(gaussians, normals, light, shares),
+        surface=layer_middle(gaussians, normals.vectors),
+        origin=indices,
+    )
+
+
+def _with_observed_light(
+    gaussians: Gaussians, normals: Normals, light: Light, sample_visibility: Float[Tensor, "m k"]
+) -> Float[Tensor, "m k"]:
+    """`sample_visibility` with the main source's reduced where the scene's colours show that it does not arrive."""
+    if not light.sources:
+        return sample_visibility
+    samples, count = sample_light(light), main_source_samples(light)
+    is_main = torch.arange(len(samples)) < count
+    main = replace(samples, irradiance=samples.irradiance * is_main[:, None])
+    by_main = irradiance(main, normals.vectors, sample_visibility=sample_visibility).mean(1)
+    by_all = irradiance(samples, normals.vectors, sample_visibility=sample_visibility).mean(1)
+    share = _observed_visibility(gaussians, normals, rest=by_all - by_main, main=by_main)
+    return torch.cat([sample_visibility[:, :count] * share[:, None], sample_visibility[:, count:]], 1)
+
+
+def _observed_visibility(
+    gaussians: Gaussians, normals: Normals, *, rest: Float[Tensor, "m"], main: Float[Tensor, "m"]
+) -> Float[Tensor, "m"]:
+    """Share of the main light that is visible in the colours of m Gaussians, in [0, 1]; 1 where unknown.
+
+    `main` is its gray irradiance by geometry, `rest` that of all other light.
+    """
+    share = torch.ones(gaussians.count)
+    brightness = linear_from_srgb(rgb_from_dc(gaussians.sh[:, 0]).clamp(_DARKEST, 1))
+    usable = (main > _CONTRAST * rest) & normals.seen & (gaussians.opacities > _FAINTEST)
+    index = usable.nonzero()[:, 0]
+    if len(index) < _MIN_GAUSSIANS:
+        return share
+    groups = group_materials(brightness[index], normals.vectors[index])
+    value = brightness[index].mean(1)
+    full, without = (rest + main)[index], rest[index]
+    albedo = value / full
+    # a group without any lit Gaussian gets visibility 1 this way: no evidence
+    lit_albedo = torch.zeros(int(groups.max()) + 1)
+    for group in range(len(lit_albedo)):
+        inside = groups == group
+        if bool(inside.any()):
+            lit_albedo[group] = albedo[inside].quantile(_LIT_QUANTILE)
+    measured = ((value / lit_albedo[groups].clamp_min(1e-6) - without) / (full - without)).clamp(0, 1)
+    neighbours = nearest_neighbours(gaussians.means[index], count=_SMOOTHED)
+    smooth = measured[neighbours.long()].median(1).values
+    share[index] = ((smooth - _RAMP_START) / _RAMP_WIDTH).clamp(0, 1)
+    return share

@@ -1,1 +1,0 @@
-"""Shading of Gaussians: normals, irradiance, reflections, and ratios between two lights."""
