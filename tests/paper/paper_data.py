@@ -1,11 +1,11 @@
-"""A folder laid out as the card of the authors' data set says, with pictures of the shipped benchmark scene."""
+"""A folder laid out as `paper tables` reads it, with pictures of the shipped benchmark scene."""
 
 import shutil
 from pathlib import Path
 
 from splatgraft.core.images import read_mask, read_rgb, write_image
 
-TERRACE = Path(__file__).parents[1] / "data" / "benchmark" / "terrace"
+TERRACE = Path(__file__).parents[2] / "data" / "benchmark" / "terrace"
 STEMS = tuple(f"{index:04d}" for index in range(17))
 """So many views that 3 are held out."""
 PLAIN = "bathtub_57e_in_blend_57eadb"
@@ -23,35 +23,26 @@ def parts_of_view(stem):
 
 
 def write_data(root):
-    """Scenes of all three kinds, with the authors' pictures in different orders of folders."""
-    synthetic, results = root / "data_3d/synthetic/insertions", root / "results_3d/synthetic"
+    """Scenes of all three kinds, with the authors' pictures."""
+    synthetic, results = root / "data_3d/synthetic/insertions", root / "results_3d"
+    rotation = root / "data_rotation/bathroom"
     for stem in STEMS:
         truth, background, mask, composite = parts_of_view(stem)
         half = 0.5 * (truth + composite)
-        for scene, (truth_name, mask_name, background_name) in {
-            PLAIN: ("gt", "object_masks", "bg"),
-            OTHER: ("ground_truth/images", "ground_truth/masks", "background/images"),
-        }.items():
-            for name, image in (
-                (truth_name, truth),
-                (mask_name, mask),
-                (background_name, background),
-                ("images", composite),
-            ):
+        for scene in (PLAIN, OTHER):
+            for name, image in (("gt", truth), ("masks", mask), ("background", background), ("composite", composite)):
                 put(synthetic / scene / name / f"{stem}.png", image)
-            put(results / "ours" / scene / f"{stem}.png", half)
-            put(results / "gs_ir" / scene / "renders" / f"{stem}.png", composite)
+            put(results / "synthetic" / "ours" / scene / f"{stem}.png", half)
+            put(results / "synthetic" / "gs_ir" / scene / f"{stem}.png", composite)
         for name, image in (("composite", composite), ("masks", mask)):
             put(root / "data_3d/real/insertions" / REAL / name / f"{stem}.png", image)
-        put(root / "results_3d/real" / REAL / "ours" / f"{stem}.png", half)
-        for pose in ("rot_0", "rot_120", "rot_240"):
-            put(root / "data_rotation/bathroom" / pose / "gt" / f"{stem}.png", truth)
-            put(root / "data_rotation/bathroom" / pose / "composite" / f"{stem}.png", composite)
+        put(results / "real" / "ours" / REAL / f"{stem}.png", half)
+        for pose in ("rot_000", "rot_120", "rot_240"):
+            put(rotation / pose / "gt" / f"{stem}.png", truth)
+            put(rotation / pose / "composite" / f"{stem}.png", composite)
     for number, stem in enumerate(STEMS[::8]):
-        for pose in ("rot_0", "rot_120", "rot_240"):
-            out = root / "results_rotation/bathroom" / pose / "test" / "ours_30000"
-            put(out / "renders" / f"{number:05d}.png", parts_of_view(stem)[0] * 0.9)
-            put(out / "gt" / f"{number:05d}.png", parts_of_view(stem)[0])
+        for pose in ("rot_000", "rot_120", "rot_240"):
+            put(root / "results_rotation/ours/bathroom" / pose / f"{number:05d}.png", parts_of_view(stem)[0] * 0.9)
     shutil.copytree(TERRACE / "target", root / "data_3d/synthetic/scenes/backgrounds/blend_57eadb")
     shutil.copytree(TERRACE / "source", root / "data_3d/synthetic/scenes/objects/bathtub_57e")
     return root

@@ -1,81 +1,52 @@
-"""What names of folders say: roles, views, methods and poses, in the orders in which data sets put them."""
+"""What is found in the authors' data set, the paper's numbers, and metrics by what is known of a view."""
 
+import huggingface_hub
 import pytest
 import torch
 from paper_data import put
 
-from splatgraft_paper.tables.data_layout import as_toml, find_layout
+from splatgraft_paper.tables.layout import download, find_scenes, held_out_stems, match_views, pictures
 from splatgraft_paper.tables.measure_pictures import KnownView, measure_picture, padded_ssim
 from splatgraft_paper.tables.paper_numbers import PAPER_TABLES, SYNTHETIC, published_name
-from splatgraft_paper.tables.picture_folders import held_out_stems, match_views, pictures, role_of
 
 GREY = torch.full((12, 16, 3), 0.5)
-
-
-@pytest.mark.parametrize(
-    ("name", "role"),
-    [
-        ("gt", "truth"),
-        ("ground_truth", "truth"),
-        ("gt_images", "truth"),
-        ("object_masks", "masks"),
-        ("gt_mask", "masks"),
-        ("composite", "composite"),
-        ("copy_paste", "composite"),
-        ("composite_gt", "truth"),
-        ("BG", "background"),
-        ("images", None),
-        ("augmented", None),
-    ],
-)
-def test_a_folders_name_says_what_it_shows(name, role):
-    assert role_of(name) == role
 
 
 def test_views_are_in_the_order_of_their_numbers_and_every_8th_is_held_out(tmp_path):
     for index in (0, 1, 2, 10, 9):
         put(tmp_path / f"frame_{index}.png", GREY)
     assert list(pictures(tmp_path)) == ["frame_0", "frame_1", "frame_2", "frame_9", "frame_10"]
-    assert held_out_stems([str(i) for i in range(17)], 8) == ["0", "8", "16"]
+    assert held_out_stems([str(i) for i in range(17)]) == ["0", "8", "16"]
 
 
 def test_pictures_are_matched_by_name_then_by_number_and_never_by_chance(tmp_path):
     views = [f"r_{i}" for i in range(16)]
     by_name = {"r_3": tmp_path / "r_3.png", "r_8": tmp_path / "r_8.png"}
-    assert list(match_views(views, by_name, 8)[0]) == ["r_3", "r_8"]
+    assert list(match_views(views, by_name)[0]) == ["r_3", "r_8"]
     all_of_them = {f"{i:05d}": tmp_path / f"{i:05d}.png" for i in range(16)}
-    assert match_views(views, all_of_them, 8)[0]["r_15"] == tmp_path / "00015.png"
+    assert match_views(views, all_of_them)[0]["r_15"] == tmp_path / "00015.png"
     held_out = {f"{i:05d}": tmp_path / f"{i:05d}.png" for i in range(2)}
-    assert match_views(views, held_out, 8)[0] == {"r_0": tmp_path / "00000.png", "r_8": tmp_path / "00001.png"}
-    assert match_views(views, {"00000": tmp_path / "a.png"}, 8)[0] == {}
-    assert match_views(views, {"a": tmp_path / "a.png", "b": tmp_path / "b.png"}, 8)[0] == {}
+    assert match_views(views, held_out)[0] == {"r_0": tmp_path / "00000.png", "r_8": tmp_path / "00001.png"}
+    assert match_views(views, {"00000": tmp_path / "a.png"})[0] == {}
+    assert match_views(views, {"a": tmp_path / "a.png", "b": tmp_path / "b.png"})[0] == {}
 
 
-def test_a_folder_whose_name_says_nothing_is_not_used_and_said(tmp_path):
-    scene = tmp_path / "data_3d/synthetic/insertions/sink_in_blend_92e6c7"
-    put(scene / "images" / "0.png", GREY)
-    (found,) = find_layout(tmp_path).scenes
-    assert not found.folders
-    assert any("its name does not say what it shows; name it in layout.toml" in line for line in found.taken)
-    assert any("only numbers that need no truth" in line for line in found.taken)
-
-
-def test_rotations_in_one_folder_or_in_many_are_poses_in_order(tmp_path):
-    for name in ("hall_rot120", "hall_rot0", "yard/90", "yard/0"):
-        put(tmp_path / "data_rotation" / name / "gt" / "0.png", GREY)
-    found = {scene.name: scene.pose for scene in find_layout(tmp_path).scenes}
-    assert found == {"hall_rot0": "P0", "hall_rot120": "P1", "yard_0": "P0", "yard_90": "P1"}
-
-
-def test_what_was_found_is_read_back_the_same_as_a_layout_toml(tmp_path):
-    for role in ("gt", "masks", "composite"):
-        put(tmp_path / "data_3d/real/insertions/truck_in_garden" / role / "0.png", GREY)
-    put(tmp_path / "results_3d/real/3dgs_dr/truck_in_garden/0.png", GREY)
-    first = find_layout(tmp_path)
-    (tmp_path / "layout.toml").write_text(as_toml(first))
-    again = find_layout(tmp_path)
-    assert again.scenes[0].folders == first.scenes[0].folders
-    assert list(again.scenes[0].results) == ["3DGS-DR"]
+def test_scenes_their_captures_and_the_authors_pictures_are_found_by_the_layout(tmp_path):
+    for role in ("gt", "masks"):
+        put(tmp_path / "data_3d/synthetic/insertions/truck_in_garden" / role / "0.png", GREY)
+    put(tmp_path / "data_3d/synthetic/scenes/objects/truck/images/0.png", GREY)
+    put(tmp_path / "results_3d/synthetic/3dgs_dr/truck_in_garden/0.png", GREY)
+    for pose in ("90", "00"):
+        put(tmp_path / "data_rotation/yard" / pose / "gt" / "0.png", GREY)
+        put(tmp_path / "results_rotation/ours/yard" / pose / "0.png", GREY)
+    plain, first, second = find_scenes(tmp_path)
+    assert set(plain.folders) == {"truth", "masks"}
+    assert set(plain.files) == {"source_capture"}
+    assert list(plain.results) == ["3DGS-DR"]
+    assert [(scene.name, scene.pose) for scene in (first, second)] == [("yard_00", "P0"), ("yard_90", "P1")]
+    assert first.results["Ours"] == tmp_path / "results_rotation/ours/yard/00"
+    with pytest.raises(ValueError, match="expected data_3d or data_rotation in it, found neither"):
+        find_scenes(tmp_path / "data_3d")
 
 
 def test_names_of_methods_are_those_of_the_paper():
@@ -131,3 +102,20 @@ def test_padded_ssim_counts_border_pixels_beside_zeros():
     )
     # float32 against float64: 1e-6 of values up to 1, divided by the constant 0.03^2 at worst
     assert float(padded_ssim(a, b)) == pytest.approx(float(wanted[5:-5, 5:-5].mean()), abs=1e-4)
+
+
+def test_scenes_and_results_are_fetched_wherever_the_card_puts_them(tmp_path, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda repo, **how: asked.update(repo=repo, **how))
+    download(tmp_path)
+    assert (asked["repo"], asked["repo_type"]) == ("nviolante/dot3d", "dataset")
+    wanted = ["dot3d_data/results_3d/real/ours/truck_in_garden/0000.png", "results_rotation/ours/bathroom/00/0.png"]
+    found = huggingface_hub.utils.filter_repo_objects([*wanted, "other/0.png"], allow_patterns=asked["allow_patterns"])
+    assert list(found) == wanted
+
+    def unreachable(*_, **__):
+        raise OSError("no route\nto host")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", unreachable)
+    with pytest.raises(ValueError, match=r"datasets/nviolante/dot3d: expected to fetch it, found no route to host$"):
+        download(tmp_path)

@@ -112,7 +112,7 @@ def test_a_method_that_means_nothing_is_refused(text):
 
 
 def test_a_folder_without_scenes_is_one_line(tmp_path, capsys):
-    assert main(["evaluate", "benchmark", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert main(["paper", "benchmark", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "expected scenes with ground_truth/, found none" in capsys.readouterr().err
 
 

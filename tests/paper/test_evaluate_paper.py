@@ -1,14 +1,12 @@
-"""`evaluate paper` on a folder laid out as the card says: measured numbers, published ones, reasons, and our rows."""
+"""`paper tables` on a folder of the published data set: measured numbers, published ones, reasons, and our rows."""
 
 import json
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from paper_data import OTHER, PLAIN, REAL, STEMS, parts_of_view, put, write_data
+from paper_data import PLAIN, REAL, STEMS, parts_of_view, put, write_data
 from random_lpips import write_random_lpips
 from shapes import ring, surfels
 
@@ -93,41 +91,6 @@ def test_a_scene_without_truth_has_the_numbers_that_need_none(measured):
     assert 0 < values["detail_kept"] < 1.2
 
 
-def test_what_was_taken_for_what_can_be_corrected(measured, tmp_path):
-    found = tomllib.loads((measured.out / "layout.toml").read_text())
-    assert found["scenes"][OTHER]["masks"] == f"data_3d/synthetic/insertions/{OTHER}/ground_truth/masks"
-    assert found["scenes"][PLAIN]["composite"] == f"data_3d/synthetic/insertions/{PLAIN}/images"
-    assert found["scenes"][PLAIN]["source_capture"] == "data_3d/synthetic/scenes/objects/bathtub_57e"
-    assert found["scenes"][REAL]["results"]["Ours"] == f"results_3d/real/{REAL}/ours"
-    given = tmp_path / "layout.toml"
-    given.write_text(
-        f'[scenes."{PLAIN}"]\ntruth = "data_3d/synthetic/insertions/{PLAIN}/images"\ncomposite = ""\n'
-        f'[scenes."{PLAIN}".results]\nOurs = "results_3d/synthetic/gs_ir/{PLAIN}/renders"\n'
-    )
-    again = replace(measured, layout=given, out=tmp_path / "out", only=(PLAIN,))
-    assert again.execute(Console()) == 0
-    rows, _ = by_scene_and_method(again)
-    # GS-IR's pictures are the composite, which is now called the truth
-    assert rows[PLAIN, "Ours"]["values"]["ssim_whole"] == pytest.approx(1)
-    assert (PLAIN, "Composite") not in rows
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('[scenes.nowhere]\ntruth = "x"\n', "expected a scene among"),
-        (f'[scenes."{PLAIN}"]\ntruht = "x"\n', "expected keys among"),
-        (f'[scenes."{PLAIN}"]\ntruth = "missing"\n', "expected truth at .*missing, found no such file or folder"),
-        ("held_out = 4\n", "expected the keys held_out_every and scenes, found held_out"),
-    ],
-)
-def test_a_layout_that_fits_nothing_is_one_line(measured, tmp_path, text, message):
-    given = tmp_path / "layout.toml"
-    given.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        replace(measured, layout=given, out=tmp_path / "out").execute(Console())
-
-
 def test_pictures_of_another_size_or_of_other_views_are_said_and_leave_their_cells_empty(measured, tmp_path):
     root = tmp_path / "data"
     for stem in STEMS:
@@ -144,8 +107,8 @@ def test_pictures_of_another_size_or_of_other_views_are_said_and_leave_their_cel
 
 
 def test_a_folder_of_another_data_set_is_one_line(tmp_path, capsys):
-    assert main(["evaluate", "paper", "--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
-    assert "expected data_3d/synthetic/insertions or" in capsys.readouterr().err
+    assert main(["paper", "tables", "--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert "expected data_3d or data_rotation in it" in capsys.readouterr().err
 
 
 def test_a_second_run_measures_nothing_again(measured):
@@ -166,8 +129,8 @@ def write_placed_scene(root):
     scene = root / "data_3d/synthetic/insertions" / PLAIN
     cameras = ring(10, size=(64, 48), focal=50.0)
     for name, gaussians in (("object.ply", ball), ("background.ply", plane)):
-        (scene / "gaussians").mkdir(parents=True, exist_ok=True)
-        write_gaussians(scene / "gaussians" / name, gaussians)
+        scene.mkdir(parents=True, exist_ok=True)
+        write_gaussians(scene / name, gaussians)
     write_cameras(scene / "transforms.json", cameras)
     both = concatenate([plane, ball])
     for index, name in enumerate(cameras.names):
@@ -176,21 +139,11 @@ def write_placed_scene(root):
     return root
 
 
-def add_property(path, name, value):
-    """A float property after the others of a .ply."""
-    head, rows = path.read_bytes().split(b"end_header\n", 1)
-    count = int(next(line.split()[-1] for line in head.splitlines() if line.startswith(b"element vertex")))
-    table = np.frombuffer(rows, "<f4").reshape(count, -1)
-    table = np.concatenate([table, np.full((count, 1), value, "<f4")], 1)
-    path.write_bytes(head + f"property float {name}\nend_header\n".encode() + table.tobytes())
-
-
-def test_our_methods_run_on_a_composite_that_is_already_placed(tmp_path, capsys):
+def test_our_methods_run_on_a_composite_that_is_already_placed(tmp_path):
     weights = tmp_path / "weights"
     weights.mkdir()
     write_random_lpips(weights)
     root = write_placed_scene(tmp_path / "data")
-    add_property(root / "data_3d/synthetic/insertions" / PLAIN / "gaussians/object.ply", "refl", 2.0)
     methods = ("copy-paste", "off+reinhard/paper", "off+flux/paper")
     command = EvaluatePaper(
         root,
@@ -208,6 +161,5 @@ def test_our_methods_run_on_a_composite_that_is_already_placed(tmp_path, capsys)
     assert rows[PLAIN, "off+reinhard/paper"]["seconds"]["consolidate"] > 0
     reasons = {row["method"]: row["reason"] for row in found["missing"]}
     assert "harmonizer flux: expected --weights" in reasons["off+flux/paper"]
-    assert "object.ply: 3DGS-DR: colours are its base colour" in capsys.readouterr().err
     seen = json.loads((command.out / "scenes" / PLAIN / "target/capture/transforms.json").read_text())["frames"]
     assert len(seen) == 8

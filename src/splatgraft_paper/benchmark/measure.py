@@ -23,7 +23,7 @@ from splatgraft.project.layout import METRICS_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.rendering import render
 from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY
-from splatgraft_paper.tables.picture_folders import match_views, pictures
+from splatgraft_paper.tables.layout import match_views, pictures
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class MeasureMethod:
         assert self.pictures is not None
         found: dict[int, Tensor] = {}
         stems = [Path(name).stem for name in truth.cameras.names]
-        matched, _ = match_views(stems, pictures(self.pictures), HELD_OUT_EVERY)
+        matched, _ = match_views(stems, pictures(self.pictures))
         for index, stem in enumerate(stems):
             path = matched.get(stem, self.pictures / f"{stem}.png")
             if stem in matched:

@@ -42,8 +42,6 @@ class GroundTruthScene:
     """placement.json with the object's true pose."""
     light: Path | None = None
     """light.json with the true light, where it is known."""
-    held_out_every: int | None = HELD_OUT_EVERY
-    """Views of the target's capture that no method sees; None where the measured views are others."""
 
     @staticmethod
     def from_folder(folder: Path) -> "GroundTruthScene":
@@ -134,8 +132,8 @@ def compose_scene(
     seconds: dict[str, float] = {}
     for side, path in (("source", ground_truth.source), ("target", ground_truth.target)):
         capture = read_capture(path)
-        if side == "target" and ground_truth.held_out_every is not None:
-            capture = capture.select(~held_out(len(capture), ground_truth.held_out_every))
+        if side == "target":
+            capture = capture.select(~held_out(len(capture), HELD_OUT_EVERY))
         folder = work / side / "capture"
         folder.mkdir(parents=True, exist_ok=True)
         write_capture(folder, capture)

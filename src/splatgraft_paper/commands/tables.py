@@ -1,6 +1,6 @@
-"""The command `paper tables`: tables on the authors' data set or on SynCom, published numbers beside measured."""
+"""The command `paper tables`: the paper's tables on the authors' data set, published numbers beside measured."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
@@ -9,10 +9,8 @@ from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft_paper.benchmark.methods import Method, MethodSettings
 from splatgraft_paper.benchmark.run import unmeasurable_metrics
-from splatgraft_paper.tables.data_layout import find_layout
+from splatgraft_paper.tables.layout import PaperScene, download, find_scenes
 from splatgraft_paper.tables.our_pictures import OurRun
-from splatgraft_paper.tables.paper_scene import DataLayout, Dataset
-from splatgraft_paper.tables.published_datasets import PUBLISHED, download
 from splatgraft_paper.tables.report import write_paper_report
 from splatgraft_paper.tables.run import PaperRun, perform_paper_run
 
@@ -25,11 +23,9 @@ class EvaluatePaper:
     """Measure the authors' published pictures, run ours on their scenes, and write the paper's tables."""
 
     data: Path
-    """Folder of the published data set (the one that holds data_3d/ or dot3d_data/; of SynCom composition/)."""
+    """Folder of the published data set (the one that holds data_3d/ or dot3d_data/)."""
     out: Path = Path("paper")
-    """Folder for index.html, paper.md, paper.json, figures/, layout.toml and all results."""
-    dataset: Dataset = "dot3d"
-    """Whose data set it is: the authors' (dot3d), or that of ComGS (syncom)."""
+    """Folder for index.html, paper.md, paper.json, figures/ and all results."""
     measure_only: bool = False
     """Measure the pictures that are there, and run nothing: needs no GPU and no weights."""
     methods: tuple[str, ...] = (
@@ -38,8 +34,6 @@ class EvaluatePaper:
     """Methods of ours to run, as `evaluate benchmark` names them; off+flux/paper is the paper's own."""
     only: tuple[str, ...] = ()
     """Names of scenes; all where none is given."""
-    layout: Path | None = None
-    """A layout.toml that corrects what was taken for what; DATA/layout.toml where there is one."""
     all_views: bool = False
     """Measure all views, not only the held-out ones."""
     download: bool = False
@@ -55,8 +49,8 @@ class EvaluatePaper:
     def execute(self, console: Console) -> int:
         """Measure and run what is missing and write the tables; 1 where a method that was asked for could not run."""
         if self.download:
-            download(PUBLISHED[self.dataset], self.data)
-        layout = self._chosen(find_layout(self.data, self.layout, dataset=self.dataset))
+            download(self.data)
+        scenes = self._chosen(find_scenes(self.data))
         missing_metrics = unmeasurable_metrics(self.weights)
         for name, reason in missing_metrics.items():
             console.say(f"{name}: not measured: {reason}")
@@ -65,8 +59,8 @@ class EvaluatePaper:
             self.weights, self.harmonizer_weights, cast(Device, self.options.device), self.iterations_of_consolidation
         )
         run = PaperRun(
-            OurRun(self.out, self.options, settings, layout.held_out_every),
-            layout,
+            OurRun(self.out, self.options, settings),
+            scenes,
             methods,
             measure_only=self.measure_only,
             all_views=self.all_views,
@@ -78,8 +72,8 @@ class EvaluatePaper:
         failed = not self.measure_only and any(method in found.ours for _, method in found.missing)
         return 1 if failed else 0
 
-    def _chosen(self, layout: DataLayout) -> DataLayout:
-        names = [scene.name for scene in layout.scenes]
+    def _chosen(self, scenes: tuple[PaperScene, ...]) -> tuple[PaperScene, ...]:
+        names = [scene.name for scene in scenes]
         if unknown := [name for name in self.only if name not in names]:
             raise ValueError(f"--only: expected names among {', '.join(names)}; found {unknown[0]}")
-        return replace(layout, scenes=tuple(s for s in layout.scenes if not self.only or s.name in self.only))
+        return tuple(scene for scene in scenes if not self.only or scene.name in self.only)

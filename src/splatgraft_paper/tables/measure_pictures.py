@@ -21,7 +21,7 @@ from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.project.layout import METRICS_FILE
 from splatgraft.project.step import Context, Inputs
 from splatgraft_paper.benchmark.measure import measure_view
-from splatgraft_paper.tables.picture_folders import held_out_stems, match_views, pictures
+from splatgraft_paper.tables.layout import held_out_stems, match_views, pictures
 
 Size = tuple[int, int]
 
@@ -150,8 +150,6 @@ class MeasurePictures:
     """Folder of LPIPS's weights."""
     lpips: bool = False
     """Whether LPIPS is measured."""
-    held_out_every: int = 8
-    """Every n-th view from the first is measured."""
     all_views: bool = False
     """Measure all views, not only the held-out ones."""
 
@@ -185,8 +183,8 @@ class MeasurePictures:
         reference = self.truth or self.composite
         found = pictures(self.pictures)
         wanted = list(found if reference is None else pictures(reference))
-        matched, how = match_views(wanted, found, self.held_out_every)
-        held_out = held_out_stems(wanted, self.held_out_every)
+        matched, how = match_views(wanted, found)
+        held_out = held_out_stems(wanted)
         stems = [stem for stem in (wanted if self.all_views else held_out) if stem in matched]
         if not stems:
             raise ValueError(f"{self.pictures}: expected pictures of the views in {reference}, found {how}")
@@ -194,17 +192,15 @@ class MeasurePictures:
         for role in ("truth", "masks", "background", "composite"):
             folder: Path | None = getattr(self, role)
             if folder is not None:
-                files[role], _ = match_views(wanted, pictures(folder), self.held_out_every)
+                files[role], _ = match_views(wanted, pictures(folder))
                 if lost := [stem for stem in stems if stem not in files[role]]:
                     raise ValueError(f"{folder}: expected a picture of view {lost[0]} for the {role}, found none")
         return ChosenViews(files, stems, how, len(wanted), len(held_out))
 
     def _protocol(self, chosen: "ChosenViews", sizes: set[Size]) -> dict[str, object]:
         """What a reader needs to know to compare the numbers."""
-        every = self.held_out_every
-        views = "all" if self.all_views or every == 1 else f"held out: every {every}th from the first"
         return {
-            "views": views,
+            "views": "all" if self.all_views else "held out: every 8th from the first",
             "view_count": len(chosen.matched),
             "views_of_the_scene": chosen.of_scene,
             "held_out_views_of_the_scene": chosen.held_out,

@@ -23,9 +23,7 @@ from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
 from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_method
 from splatgraft_paper.benchmark.scene import ComposedScene, GroundTruthScene, compose_scene, perform_if_stale
-from splatgraft_paper.tables.paper_scene import LAYOUT_FILE, PaperScene
-from splatgraft_paper.tables.picture_folders import held_out_stems
-from splatgraft_paper.tables.syncom_scene import convert_syncom
+from splatgraft_paper.tables.layout import PaperScene, held_out_stems
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,6 @@ class OurRun:
     options: ReconstructOptions
     """Of captures that are reconstructed."""
     methods: MethodSettings = field(default_factory=MethodSettings)
-    held_out_every: int = 8
 
     @property
     def device(self) -> Device:
@@ -84,16 +81,11 @@ def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Consol
         ValueError: The scene lacks what is needed, or the method cannot run here, with the reason.
     """
     work = run.out / "scenes" / scene.name
-    if scene.kind == "syncom":
-        converted = convert_syncom(scene, work / "given")
-        cameras_from = converted.cameras
-        composed = compose_scene(converted.truth, work, run.options, device=run.device, console=console)
-    else:
-        cameras_from = _cameras_path(scene)
-        composed = _composed(scene, work, run, console)
+    cameras_from = _cameras_path(scene)
+    composed = _composed(scene, work, run, console)
     result, seconds = run_method(method, composed, run.methods, console)
     names = [Path(name).stem for name in read_cameras(cameras_from).names]
-    stems = tuple(held_out_stems(names, run.held_out_every))
+    stems = tuple(held_out_stems(names))
     out = work / "pictures" / method.folder_name
     perform_if_stale(RenderPictures(result, cameras_from, out, stems=stems, device=run.device), console)
     return out, {**composed.seconds, **seconds}
@@ -102,8 +94,7 @@ def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Consol
 def _cameras_path(scene: PaperScene) -> Path:
     path = scene.files.get("cameras") or scene.files.get("target_capture")
     if path is None:
-        raise ValueError(f"{scene.name}: expected cameras (transforms.json or a COLMAP model), found none; "
-                         f"name them in {LAYOUT_FILE}")  # fmt: skip
+        raise ValueError(f"{scene.name}: expected transforms.json, found none")
     return path
 
 
@@ -116,8 +107,8 @@ def _composed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> C
         truth = GroundTruthScene(scene.name, *captures, scene.folders["truth"], files["placement"])
         return compose_scene(truth, work, run.options, device=run.device, console=console)
     raise ValueError(
-        f"{scene.name}: expected the trained scene and the placed object (target_scene, object_scene), or both "
-        f"captures and a placement.json, found {', '.join(sorted(files)) or 'neither'}; name them in {LAYOUT_FILE}"
+        f"{scene.name}: expected background.ply and object.ply, or both captures, gt/ and placement.json; found "
+        f"{', '.join(path.name for path in files.values()) or 'neither'}"
     )
 
 
@@ -129,7 +120,7 @@ def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> Com
     placement = work / "given_placement" / PLACEMENT_FILE
     for path in (composed.cameras, composed.target, object_file, placement):
         path.parent.mkdir(parents=True, exist_ok=True)
-    write_cameras(composed.cameras, _without(cameras, run.held_out_every))
+    write_cameras(composed.cameras, _without_held_out(cameras))
     for key, path in (("target_scene", composed.target), ("object_scene", object_file)):
         given = read_scene(scene.files[key])
         for note in given.notes:
@@ -140,7 +131,7 @@ def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> Com
     return composed
 
 
-def _without(cameras: Cameras, every: int) -> Cameras:
+def _without_held_out(cameras: Cameras) -> Cameras:
     """The cameras whose views are not held out."""
-    held = set(held_out_stems([Path(name).stem for name in cameras.names], every))
+    held = set(held_out_stems([Path(name).stem for name in cameras.names]))
     return cameras[torch.tensor([Path(name).stem not in held for name in cameras.names])]

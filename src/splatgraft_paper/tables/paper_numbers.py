@@ -1,4 +1,4 @@
-"""The numbers of the paper's tables, transcribed from its source, and ComGS': what ours are put beside."""
+"""The numbers of the paper's tables, transcribed from its source: what ours are put beside."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -80,20 +80,6 @@ UPDATES = PublishedTable(
         "w/Geometric": (68.0, 21.55, 0.820, 0.230, 60.47, 0.0477),
     },
 )
-SYNCOM = PublishedTable(
-    "syncom",
-    "SynCom: an object composed into a scene (the data set of ComGS, Gao et al. 2026)",
-    ("psnr",),
-    {"ComGS, lowest": (24.46,), "ComGS, highest": (24.60,)},
-)
-"""ComGS' published range over its ways to cast shadows; which number is which was not at hand."""
-COMGS_IS_GIVEN = (
-    "ComGS is given more than captures: the ratio of the true to the estimated albedo, per channel, as the median over "
-    "the object's test views (metrics.py of its repository writes albedo_ratio.pth, composition.py multiplies by it), "
-    "and for each composition a seed, whether it is indoors, how far shadows reach (scripts/composition/syncom.py). "
-    "Our methods are given the placement, as ComGS is, and none of these: the numbers are of two protocols."
-)
-"""What a reader must know before comparing with `SYNCOM`."""
 PAPER_TABLES = (SYNTHETIC, ROTATION, DATA_ABLATION, UPDATES)
 """All tables of the paper, in its order."""
 
@@ -101,10 +87,8 @@ SCENES = {
     "synthetic": 9,
     "real": 7,
     "rotation": 9,
-    "syncom": 16,
 }
-"""Scenes of each kind in the published data sets; a rotation counts as a scene, and each of SynCom's four objects in
-each of its four scenes."""
+"""Scenes of each kind in the published data set; a rotation counts as a scene."""
 
 
 def published_name(method: str) -> str:
@@ -122,8 +106,6 @@ _NAMES = {
     **dict.fromkeys(("gshader", "gaussianshader", "gsshader"), "GShader"),
     "gsir": "GS-IR",
     **dict.fromkeys(("3dgsdr", "gsdr"), "3DGS-DR"),
-    "comgs": "ComGS",
-    **dict.fromkeys(("comgstrace", "compositiontrace"), "ComGS, traced"),
     **dict.fromkeys(("composite", "composites", "naive", "copypaste"), "Composite"),
     **dict.fromkeys(("linear", "wlinear", "ourslinear", "iterativelinear"), "w/Linear"),
     **dict.fromkeys(("geometric", "wgeometric", "oursgeometric", "iterativegeometric"), "w/Geometric"),

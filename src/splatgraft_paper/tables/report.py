@@ -16,11 +16,9 @@ from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.evaluation import side_by_side
 from splatgraft.evaluation.report_page import html_page
 from splatgraft_paper.benchmark.table import table_section
-from splatgraft_paper.tables.data_layout import as_toml
-from splatgraft_paper.tables.paper_numbers import COMGS_IS_GIVEN, SCENES
-from splatgraft_paper.tables.paper_scene import LAYOUT_FILE, Dataset, Kind, PaperScene
-from splatgraft_paper.tables.picture_folders import held_out_stems, match_views, pictures
-from splatgraft_paper.tables.results import METRIC_VERSIONS, PaperResults
+from splatgraft_paper.tables.layout import Kind, PaperScene, held_out_stems, match_views, pictures
+from splatgraft_paper.tables.paper_numbers import SCENES
+from splatgraft_paper.tables.run import METRIC_VERSIONS, PaperResults
 from splatgraft_paper.tables.tables import ExplainedTable, paper_tables
 
 _ROW_HEIGHT = 200
@@ -29,21 +27,12 @@ _FIGURES: dict[Kind, tuple[str, ...]] = {
     "synthetic": ("composite", "GS-IR", "GShader", "3DGS-DR", "Ours", "truth"),
     "real": ("background", "composite", "GS-IR", "GShader", "3DGS-DR", "Ours"),
     "rotation": ("composite", "Ours", "truth"),
-    "syncom": ("composite", "ComGS", "ComGS, traced", "truth"),
 }
 """Columns of the paper's figures of 3D results; our methods come before the last."""
-_VIEWS: dict[Dataset, str] = {
-    "dot3d": "the paper says so of the rotation experiment, not of the others",
-    "syncom": "of the compositions, whose cameras are those of no capture; ComGS' public code does not have the script "
-    "that measures them, so which views its numbers are over is a guess",
-}
-_BY: dict[Dataset, str] = {"dot3d": "the authors", "syncom": "pictures beside the data set"}
-_TITLES: dict[Dataset, str] = {"dot3d": "The paper's tables", "syncom": "SynCom"}
 
 
 def write_paper_report(out: Path, results: PaperResults) -> Path:
-    """Write index.html, paper.md, paper.json, layout.toml and figures/; returns the page."""
-    (out / LAYOUT_FILE).write_text(as_toml(results.layout))
+    """Write index.html, paper.md, paper.json and figures/; returns the page."""
     tables, notes = paper_tables(results), protocol_notes(results)
     figures = _figures(out, results)
     shown = [f"![{path.stem}]({path.relative_to(out).as_posix()})" for path in figures]
@@ -60,26 +49,21 @@ def write_paper_report(out: Path, results: PaperResults) -> Path:
     body = "".join(_section(table) for table in tables) + images + protocol
     subtitle = "Published numbers beside those measured here; numbers in brackets name the reason of an empty cell."
     page = out / "index.html"
-    page.write_text(html_page(_TITLES[results.layout.dataset], subtitle, body, views=()))
+    page.write_text(html_page("The paper's tables", subtitle, body, views=()))
     return page
 
 
 def protocol_notes(results: PaperResults) -> list[str]:
     """What a reader needs to know to compare the numbers, one sentence each."""
-    layout = results.layout
     measured = results.measured
-    of_syncom = layout.dataset == "syncom"
-    kinds = {
-        kind: sum(scene.kind == kind for scene in layout.scenes) for kind in SCENES if (kind == "syncom") == of_syncom
-    }
+    kinds = {kind: sum(scene.kind == kind for scene in results.scenes) for kind in SCENES}
     found = ", ".join(f"{count} of {SCENES[kind]} {kind}" for kind, count in kinds.items())
     resolutions = sorted({str(size) for item in measured for size in item.protocol.get("resolution", ())})  # pyright: ignore
     views = sorted({str(item.protocol["views"]) for item in measured})
     masked = sum(bool(item.protocol.get("masks")) for item in measured)
     notes = [
         f"Scenes of the published data set found: {found}.",
-        *([COMGS_IS_GIVEN] if of_syncom else []),
-        f"Views: {'; '.join(views) or 'none'} ({_VIEWS[layout.dataset]}).",
+        f"Views: {'; '.join(views) or 'none'} (the paper says so of the rotation experiment, not of the others).",
         f"Resolution: {', '.join(resolutions) or 'none'}, as the pictures are; nothing is resampled or cropped. Values "
         "are read as 8-bit sRGB in [0, 1] and not clamped further; renders of ours are clamped to [0, 1].",
         f"Masks: {masked} of {len(measured)} measurements have masks; metrics of regions need them.",
@@ -87,7 +71,6 @@ def protocol_notes(results: PaperResults) -> list[str]:
         *(f"{name.upper()}: {text}." for name, text in METRIC_VERSIONS.items()),
         *(f"Not measured: {name}: {reason}" for name, reason in results.not_measured.items()),
         *(f"{scene}, {method}: {reason}" for (scene, method), reason in results.missing.items()),
-        f"What was taken for what is in {LAYOUT_FILE}; a corrected copy in the data's folder overrides it.",
         f"Made by splatgraft {version('splatgraft')}: {shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}",
     ]
     return list(dict.fromkeys(notes))
@@ -101,7 +84,7 @@ def _as_json(results: PaperResults, notes: Sequence[str]) -> dict[str, object]:
                 "kind": item.scene.kind,
                 "pose": item.scene.pose,
                 "method": item.method,
-                "by": "this software" if item.method in results.ours else _BY[results.layout.dataset],
+                "by": "this software" if item.method in results.ours else "the authors",
                 "values": dict(item.values),
                 "protocol": dict(item.protocol),
                 "seconds": dict(item.seconds),
@@ -113,7 +96,6 @@ def _as_json(results: PaperResults, notes: Sequence[str]) -> dict[str, object]:
         "not_measured": dict(results.not_measured),
         "metrics": METRIC_VERSIONS,
         "notes": list(notes),
-        "taken": {scene.name: list(scene.taken) for scene in results.layout.scenes},
     }
 
 
@@ -128,7 +110,7 @@ def _figures(out: Path, results: PaperResults) -> list[Path]:
     for kind, columns in _FIGURES.items():
         ours = [name for name in results.ours if any(results.of(kind, name))]
         wanted = (*columns[:-1], *ours, columns[-1])
-        scenes = [scene for scene in results.layout.scenes if scene.kind == kind]
+        scenes = [scene for scene in results.scenes if scene.kind == kind]
         rows = [row for scene in scenes if (row := _figure_row(out, scene, wanted, results)) is not None]
         if rows:
             width = max(row.shape[1] for row in rows)
@@ -143,7 +125,6 @@ def _figure_row(
     out: Path, scene: PaperScene, columns: Sequence[str], results: PaperResults
 ) -> Float[Tensor, "h w 3"] | None:
     """The middle held-out view of a scene by each column that has a picture of it."""
-    every = results.layout.held_out_every
     folders = {name: scene.folders.get(name) or scene.results.get(name) for name in columns}
     for name in results.ours:
         folder = out / "scenes" / scene.name / "pictures" / name.replace("/", "-")
@@ -155,12 +136,12 @@ def _figure_row(
     if reference is None:
         return None
     stems = list(pictures(reference))
-    held = held_out_stems(stems, every)
+    held = held_out_stems(stems)
     view = held[len(held) // 2]
     labels, shown = [], []
     for name in columns:
         folder = folders.get(name)
-        matched = match_views(stems, pictures(folder), every)[0] if folder is not None else {}
+        matched = match_views(stems, pictures(folder))[0] if folder is not None else {}
         if view in matched:
             image = read_rgb(matched[view])
             labels.append(f"{scene.name}: {name}" if not labels else name)

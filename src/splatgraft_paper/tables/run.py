@@ -1,17 +1,131 @@
 """One run on the authors' data set: their pictures are measured, our methods run, and what is missing is explained."""
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
+from splatgraft.core.flip import VERSION as FLIP_VERSION
+from splatgraft.core.images import read_rgb
+from splatgraft.fitting.perceptual_losses import HEADS_FILE, VGG_FILE
+from splatgraft.project.layout import METRICS_FILE
 from splatgraft.runtime.console import Console
-from splatgraft_paper.benchmark.image_features import inception_features
+from splatgraft_paper.benchmark.image_features import (
+    INCEPTION_FILE,
+    Features,
+    frechet_distance,
+    inception_features,
+    kernel_distance,
+)
 from splatgraft_paper.benchmark.methods import Method
 from splatgraft_paper.benchmark.scene import perform_if_stale
+from splatgraft_paper.tables.layout import Kind, PaperScene
 from splatgraft_paper.tables.measure_pictures import MeasurePictures
 from splatgraft_paper.tables.our_pictures import OurRun, our_pictures
-from splatgraft_paper.tables.paper_scene import DataLayout, Kind, PaperScene
-from splatgraft_paper.tables.results import Measured, PaperResults, pooled_distances, read_measured
+
+METRIC_VERSIONS = {
+    "psnr": "whole images, peak 1, mean over views, then over scenes",
+    "ssim": "Wang 2004, 11x11 Gaussian window, zeros beyond the border, as 3DGS's metrics.py (ssim_whole in the JSON: "
+    "valid pixels only)",
+    "flip": FLIP_VERSION,
+    "lpips": f"Zhang 2018, version 0.1, VGG-16 ({VGG_FILE}, {HEADS_FILE}), pictures scaled to [-1, 1] as published "
+    "(3DGS's metrics.py gives the network [0, 1]; which of the two the paper used is not said)",
+    "fid": f"Heusel 2017, pooled over the measured views of all scenes, {INCEPTION_FILE}",
+    "kid": f"Binkowski 2018, likewise, subsets of 50, {INCEPTION_FILE}",
+}
+"""What each metric was computed with; the paper does not say how it computed its own."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One method on one scene."""
+
+    scene: PaperScene
+    method: str
+    values: Mapping[str, float | None]
+    """Metric to its mean over the measured views."""
+    protocol: Mapping[str, object]
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Seconds by step, of methods that were run here."""
+
+
+@dataclass(frozen=True)
+class PaperResults:
+    """Everything that a run found."""
+
+    scenes: tuple[PaperScene, ...]
+    measured: tuple[Measured, ...]
+    missing: Mapping[tuple[str, str], str]
+    """(scene, method) to the reason why there is no measurement."""
+    not_measured: Mapping[str, str]
+    """Metrics without weights ("lpips", "fid and kid") to the reason."""
+    ours: tuple[str, ...] = ()
+    """Names of the methods of this software, in order."""
+    pooled: Mapping[tuple[Kind, str, str], Mapping[str, float]] = field(default_factory=dict)
+    """(kind, pose or "", method) to FID and KID."""
+
+    def methods(self, kind: Kind) -> list[str]:
+        """Methods with pictures of scenes of a kind: the authors' first, then ours."""
+        found = [m for scene in self.scenes if scene.kind == kind for m in scene.results]
+        return list(dict.fromkeys([*found, *self.ours]))
+
+    def of(self, kind: Kind, method: str, pose: str = "") -> list[Measured]:
+        """The measurements of a method on the scenes of a kind, at one pose where one is given."""
+        chosen = [item for item in self.measured if item.scene.kind == kind and item.method == method]
+        return [item for item in chosen if pose in ("", item.scene.pose)]
+
+    def reason(self, kind: Kind, method: str, metric: str) -> str:
+        """Why a cell is empty."""
+        if metric in self.not_measured:
+            return f"{metric}: {self.not_measured[metric]}"
+        scenes = [scene for scene in self.scenes if scene.kind == kind]
+        if not scenes:
+            return f"the folder has no {kind} scenes"
+        reasons = [text for scene in scenes if (text := self.missing.get((scene.name, method)))]
+        if reasons:
+            return reasons[0]
+        if not any(method in scene.results for scene in scenes) and method not in self.ours:
+            return f"the folder has no pictures of {method}"
+        return "no scene has the truth that this needs"
+
+
+def read_measured(scene: PaperScene, method: str, folder: Path, seconds: Mapping[str, float] | None = None) -> Measured:
+    """Read what `MeasurePictures` wrote."""
+    record = json.loads((folder / METRICS_FILE).read_text())
+    return Measured(scene, method, record["values"], record["protocol"], seconds or {})
+
+
+def pooled_distances(
+    steps: Mapping[tuple[Kind, str, str], list[MeasurePictures]], features: Features
+) -> dict[tuple[Kind, str, str], dict[str, float]]:
+    """FID and KID of a method's pictures of all its scenes against the truth's.
+
+    Args:
+        steps: (kind, pose, method) to the measurements whose pictures are taken together.
+        features: Of the published FID.
+    """
+    out: dict[tuple[Kind, str, str], dict[str, float]] = {}
+    for key, group in steps.items():
+        found, wanted = (_features(group, role, features) for role in ("pictures", "truth"))
+        if len(found) >= 2:
+            out[key] = {"fid": frechet_distance(found, wanted), "kid": kernel_distance(found, wanted)}
+    return out
+
+
+def _features(group: list[MeasurePictures], role: str, features: Features) -> Float[np.ndarray, "n d"]:
+    rows = [features([read_rgb(path)])[0] for path in _paths(group, role)]
+    return np.stack(rows) if rows else np.zeros((0, 1))
+
+
+def _paths(group: list[MeasurePictures], role: str) -> Iterator[Path]:
+    for step in group:
+        chosen = step.views()
+        if "truth" in chosen.files:
+            yield from (chosen.files[role][stem] for stem in chosen.matched)
+
 
 COMPOSITE = "Composite"
 """The row of the pictures before any harmonisation."""
@@ -23,7 +137,7 @@ class PaperRun:
 
     ours: OurRun
     """How our methods are run, and where all results go."""
-    layout: DataLayout
+    scenes: tuple[PaperScene, ...]
     methods: tuple[Method, ...]
     measure_only: bool = False
     """Measure the pictures that are there, and run nothing."""
@@ -51,9 +165,7 @@ def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: C
         console: Takes progress and messages.
     """
     found = _Found("lpips" not in not_measured, console)
-    for scene in run.layout.scenes:
-        for sentence in scene.taken:
-            console.say(f"{scene.name}: {sentence}")
+    for scene in run.scenes:
         composite = scene.folders.get("composite")
         theirs = {**({} if composite is None else {COMPOSITE: composite}), **scene.results}
         for method, folder in theirs.items():
@@ -70,7 +182,7 @@ def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: C
     if "fid and kid" not in not_measured:
         pooled = pooled_distances(found.pools, inception_features(run.ours.methods.weights))
     names = tuple(method.name for method in run.methods)
-    return PaperResults(run.layout, tuple(found.measured), found.missing, not_measured, names, pooled)
+    return PaperResults(run.scenes, tuple(found.measured), found.missing, not_measured, names, pooled)
 
 
 def _run_ours(run: PaperRun, scene: PaperScene, method: Method, found: _Found) -> None:
@@ -92,7 +204,6 @@ def _measure(run: PaperRun, scene: PaperScene, method: str, folder: Path, found:
         **scene.folders,
         weights=run.ours.methods.weights,
         lpips=found.lpips,
-        held_out_every=run.layout.held_out_every,
         all_views=run.all_views,
     )
     perform_if_stale(step, found.console)

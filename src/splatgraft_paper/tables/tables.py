@@ -3,16 +3,15 @@
 from dataclasses import dataclass
 
 from splatgraft_paper.benchmark.table import Summary, Table, summarize
+from splatgraft_paper.tables.layout import Kind
 from splatgraft_paper.tables.paper_numbers import (
     DATA_ABLATION,
     ROTATION,
-    SYNCOM,
     SYNTHETIC,
     UPDATES,
     PublishedTable,
 )
-from splatgraft_paper.tables.paper_scene import Kind
-from splatgraft_paper.tables.results import PaperResults
+from splatgraft_paper.tables.run import PaperResults
 
 _FORMATS = {"psnr": "{:.2f}", "fid": "{:.2f}", "minutes": "{:.1f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
 _LESS_IS_BETTER = ("lpips", "fid", "kid", "flip", "minutes")
@@ -21,8 +20,6 @@ _COLUMNS = ("psnr", "ssim", "lpips", "fid", "kid", "flip")
 _NO_TRUTH = ("object_brightness", "darkened_fraction", "brightened_fraction", "detail_kept", "rest_mean_change")
 _NOT_REPEATED = "needs the paper's test splits and models trained without one source; the authors publish neither"
 _NOT_PUBLISHED = "the paper's table has no such row"
-_NOT_IN = {False: "not in the paper", True: "published, but not at hand when this was written"}
-"""By whether it is ComGS' table."""
 
 
 @dataclass
@@ -54,9 +51,7 @@ class ExplainedTable:
 
 
 def paper_tables(results: PaperResults) -> list[ExplainedTable]:
-    """The paper's four tables, the real scenes without truth, and PSNR by scene; of SynCom, its own table."""
-    if results.layout.dataset == "syncom":
-        return [_syncom(results), *_by_scene(results)]
+    """The paper's four tables, the real scenes without truth, and PSNR by scene."""
     return [
         _synthetic(results),
         _rotation(results),
@@ -89,17 +84,6 @@ def _rotation(results: PaperResults) -> ExplainedTable:
             what = "run here" if name in results.ours else "the authors' pictures, measured here"
             rows.append((f"{pose}, {name}, {what}", *_measured(results, "rotation", name, notes, pose=pose)))
     return ExplainedTable(Table(ROTATION.title, _head("pose"), tuple(rows)), tuple(notes.reasons))
-
-
-def _syncom(results: PaperResults) -> ExplainedTable:
-    notes = _Notes([])
-    rows: list[tuple[str, ...]] = []
-    for name in SYNCOM.rows:
-        rows.append((f"{name} number as published", *_published(SYNCOM, name, notes)))
-    for name in dict.fromkeys(["ComGS", *results.methods("syncom")]):
-        what = "run here" if name in results.ours else "its pictures, measured here"
-        rows.append((f"{name}, {what}", *_measured(results, "syncom", name, notes)))
-    return ExplainedTable(Table(SYNCOM.title, _head("method"), tuple(rows)), tuple(notes.reasons))
 
 
 def _data() -> ExplainedTable:
@@ -151,8 +135,8 @@ def _without_truth(results: PaperResults) -> ExplainedTable:
 
 def _by_scene(results: PaperResults) -> list[ExplainedTable]:
     out: list[ExplainedTable] = []
-    for kind in ("synthetic", "rotation", "syncom"):
-        scenes = [scene.name for scene in results.layout.scenes if scene.kind == kind]
+    for kind in ("synthetic", "rotation"):
+        scenes = [scene.name for scene in results.scenes if scene.kind == kind]
         notes = _Notes([])
         rows: list[tuple[str, ...]] = []
         for name in results.methods(kind):
@@ -181,9 +165,9 @@ def _published(table: PublishedTable, row: str, notes: _Notes, *, minutes: bool 
     cells: list[str] = []
     for column in (*(("minutes",) if minutes else ()), *_COLUMNS):
         value = table.value(row, column)
-        reason = _NOT_PUBLISHED if row not in table.rows else _NOT_IN[table is SYNCOM]
+        reason = _NOT_PUBLISHED if row not in table.rows else "not in the paper"
         cells.append(notes.mark(reason) if value is None else _plain(column, value))
-    return [*cells, {ROTATION.key: "3", SYNCOM.key: "16"}.get(table.key, "9")]
+    return [*cells, "3" if table is ROTATION else "9"]
 
 
 def _measured(results: PaperResults, kind: Kind, method: str, notes: _Notes, *, pose: str = "") -> list[str]:
@@ -210,7 +194,7 @@ def _minutes(results: PaperResults, method: str) -> str | None:
 
 
 def _first_missing(results: PaperResults, kind: Kind, method: str) -> tuple[str, str]:
-    names = [scene.name for scene in results.layout.scenes if scene.kind == kind]
+    names = [scene.name for scene in results.scenes if scene.kind == kind]
     return next(((name, method) for name in names if (name, method) in results.missing), ("", method))
 
 
