@@ -20,8 +20,7 @@ import torch
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.exports.export import ExportOptions, export_scene
-from splatgraft.exports.export_source import ExportSource
-from splatgraft.exports.first_view import first_view
+from splatgraft.exports.export_source import ExportSource, first_view
 from splatgraft.folders.export_source import read_export_source
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.rendering import render

@@ -1,8 +1,13 @@
-"""The exported page in Chromium without a network: it shows what our renderer draws, and asks nobody for anything."""
+"""The exported page in Chromium without a network: it shows what our renderer draws, and asks nobody for anything.
 
+The engine inside is also the reader of .glb that is not ours.
+"""
+
+import base64
 import io
 import re
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +15,21 @@ import numpy as np
 import pytest
 import torch
 from editor_driver import ARGUMENTS, browser_path
+from format_files import TOOLS
 from PIL import Image
 from small_transfer import write_transfer
+from test_scenes_of_other_tools import GLB, assert_within
 from waiting import HANG_LIMIT
 
+from splatgraft import formats
 from splatgraft.cli import main
-from splatgraft.exports.first_view import first_view
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.exports.export_source import first_view
 from splatgraft.folders.export_source import read_export_source
+from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.rendering import render
 
+ENGINE = files("splatgraft.exports") / "viewer" / "playcanvas.js"
 SIZE = (480, 360)
 CLOSE_DB = 35.0
 """The scene in 8 bits, drawn by a rasteriser that ends Gaussians earlier than ours and stores colours in 16 bits:
@@ -27,7 +38,6 @@ CLOSE_DB = 35.0
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser that reaches no network."""
     path = browser_path()
     from playwright.sync_api import sync_playwright
 
@@ -86,38 +96,19 @@ def ours(project: Path) -> tuple[torch.Tensor, torch.Tensor]:
     return before, after
 
 
-def test_the_page_shows_what_the_renderer_draws_and_the_buttons_change_it(browser, project, page_file):
+def test_a_story_of_the_page(browser, project, page_file):
+    """It shows what the renderer draws, compares, turns, finds back, and asks for nothing outside."""
     before, after = ours(project)
     assert psnr(before, after) < 28  # what is compared differs
     page = Page(browser, page_file)
-    assert psnr(page.picture(), after) > CLOSE_DB
+    first = page.picture()
+    assert psnr(first, after) > CLOSE_DB
     page.page.get_by_role("button", name="Before").click(force=True)
     assert psnr(page.picture(), before) > CLOSE_DB
     assert page.page.get_by_role("button", name="Before").get_attribute("aria-pressed") == "true"
     page.page.keyboard.press("b")
     assert psnr(page.picture(), after) > CLOSE_DB
-    assert page.errors == []
-    page.context.close()
 
-
-def test_nothing_is_asked_for_outside_the_page(browser, page_file):
-    page = Page(browser, page_file)
-    outside = [url for url in page.requests if not url.startswith(("blob:", "data:")) and url != page_file.as_uri()]
-    assert outside == []
-    # and nothing can be: the page's own policy refuses
-    refused = page.page.evaluate(
-        "() => fetch('https://example.org/').then(() => 'fetched', (error) => String(error))",
-    )
-    assert "Failed to fetch" in refused
-    assert any("Content Security Policy" in error for error in page.errors)
-    page.context.close()
-    addresses = set(re.findall(r"(?:src|href)=\"([^\"]+)\"", page_file.read_text()))
-    assert addresses == set()
-
-
-def test_mouse_keys_and_the_way_back(browser, page_file):
-    page = Page(browser, page_file)
-    first = page.picture()
     page.page.mouse.move(240, 180)
     page.page.mouse.down()
     page.page.mouse.move(340, 200, steps=4)
@@ -131,9 +122,21 @@ def test_mouse_keys_and_the_way_back(browser, page_file):
     for _ in range(5):  # 6 degrees each
         page.page.keyboard.press("ArrowLeft")
     assert psnr(page.picture(), first) < 28
+    assert page.errors == []
+
+    outside = [url for url in page.requests if not url.startswith(("blob:", "data:")) and url != page_file.as_uri()]
+    assert outside == []
+    # and nothing can be: the page's own policy refuses
+    refused = page.page.evaluate(
+        "() => fetch('https://example.org/').then(() => 'fetched', (error) => String(error))",
+    )
+    assert "Failed to fetch" in refused
+    assert any("Content Security Policy" in error for error in page.errors)
     page.context.close()
+    assert re.findall(r"(?:src|href)=\"([^\"]+)\"", page_file.read_text()) == []
 
 
+@pytest.mark.long
 def test_fingers_turn_and_pinch(browser, page_file):
     page = Page(browser, page_file, has_touch=True, is_mobile=True, device_scale_factor=2)
     first = page.picture()
@@ -171,7 +174,7 @@ def test_without_webgl_the_page_says_so(browser, page_file):
     page.context.close()
 
 
-def test_a_title_is_text_and_nothing_else(browser, project, tmp_path):
+def test_one_scene_has_no_buttons_and_its_title_is_text_and_nothing_else(browser, project, tmp_path):
     title = '</title></script><script>document.body.dataset.taken="1"</script>"{}'
     out = tmp_path / "title.html"
     words = ["export", str(project), "--to", str(out), "--layer", "object", "--title", title]
@@ -180,14 +183,54 @@ def test_a_title_is_text_and_nothing_else(browser, project, tmp_path):
     assert page.page.title() == title
     assert page.page.text_content("h1") == title
     assert page.page.get_attribute("body", "data-taken") is None
-    page.context.close()
-
-
-def test_a_scene_alone_has_no_buttons_to_compare(browser, project, tmp_path):
-    out = tmp_path / "one.html"
-    assert main(["export", str(project), "--to", str(out), "--layer", "object"]) == 0
-    page = Page(browser, out)
     assert page.page.locator("#scenes button").count() == 0
     picture = page.picture()
     assert 0.01 < float(((picture - 0.8).abs().amax(2) > 0.05).float().mean()) < 0.6  # a ball before grey
     page.context.close()
+
+
+READ = """async ([text, kind]) => {
+  const device = new pc.WebglGraphicsDevice(document.getElementById("canvas"), {});
+  const options = new pc.AppOptions();
+  options.graphicsDevice = device;
+  options.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem];
+  options.resourceHandlers = [pc.TextureHandler, pc.GSplatHandler, pc.ContainerHandler];
+  const app = new pc.AppBase(document.getElementById("canvas"));
+  app.init(options);
+  const contents = Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
+  const asset = new pc.Asset("scene", kind, { url: "scene.glb", filename: "scene.glb", contents });
+  await new Promise((resolve, reject) => {
+    asset.once("load", resolve);
+    asset.once("error", (error) => reject(new Error(error)));
+    app.assets.add(asset);
+    app.assets.load(asset);
+  });
+  const data = asset.resource.gsplats.flat()[0].resource.gsplatData;
+  const found = {};
+  for (const { name } of data.getElement("vertex").properties) found[name] = [...data.getProp(name)];
+  return found;
+}"""
+
+
+def test_the_engine_reads_our_glb(browser, tmp_path):
+    original = formats.read_gaussians(TOOLS / "scene.ply")
+    formats.write_gaussians(tmp_path / "scene.glb", original)
+    page = browser.new_page()
+    page.set_content('<canvas id="canvas"></canvas>')
+    page.add_script_tag(content=ENGINE.read_text(encoding="utf-8"))
+    text = base64.b64encode((tmp_path / "scene.glb").read_bytes()).decode()
+    columns = {name: torch.tensor(values) for name, values in page.evaluate(READ, [text, "container"]).items()}
+
+    def stacked(*names: str) -> torch.Tensor:
+        return torch.stack([columns[name] for name in names], 1)
+
+    rest = stacked(*(f"f_rest_{i}" for i in range(45))).reshape(40, 3, 15).transpose(1, 2)
+    found = Gaussians(  # the engine keeps linear scales and opacities of a .glb
+        means=stacked("x", "y", "z"),
+        log_scales=stacked("scale_0", "scale_1", "scale_2").log(),
+        quaternions=stacked("rot_0", "rot_1", "rot_2", "rot_3"),
+        opacity_logits=columns["opacity"].logit(),
+        sh=torch.cat([stacked("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest], 1),
+    )
+    assert_within(original, change_axes(found, rdf_from("LUF")), GLB)
+    page.close()

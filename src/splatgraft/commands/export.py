@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from splatgraft.exports.export import ExportOptions, export_scene
-from splatgraft.exports.report_file import write_report_file
+from splatgraft.exports.pages import write_report_file
 from splatgraft.folders.export_source import project_of, read_export_source
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE, Layout
 from splatgraft.project.step import Positional

@@ -13,6 +13,9 @@ _SATURATION_CD_M2 = 78 / (100 * 0.65)
 """Luminance of white at EV 0 and ISO 100."""
 _EV_OF_BRIGHTNESS_0 = 5.0
 """APEX: the speed value of ISO 100."""
+MAX_STOPS = 0.4
+"""Between the darkest and the brightest setting of a capture's photos, above which settings count as different: a third
+of a stop, one step of a camera's dial, which with the rounded numbers on it is up to 0.36 (1/160 s and 1/125 s)."""
 
 
 @dataclass(frozen=True)
@@ -80,21 +83,11 @@ def luminance_scale(exposures: Sequence[Exposure], means: Sequence[float]) -> Lu
     return LuminanceScale(median(white for white, _ in known), median(white * mean for white, mean in known))
 
 
-@dataclass(frozen=True)
-class ConsistencyRule:
-    """When the settings of a capture's photos count as different."""
-
-    most_stops: float = 0.4
-    """Between the darkest and the brightest setting: a third of a stop, one step of a camera's dial, which with the
-    rounded numbers on it is up to 0.36 (1/160 s and 1/125 s)."""
-
-
-def describe_inconsistency(exposures: Sequence[Exposure], rule: ConsistencyRule = ConsistencyRule()) -> str | None:
+def describe_inconsistency(exposures: Sequence[Exposure]) -> str | None:
     """What differs between the settings of a capture's photos and what that leads to, in one line.
 
     Args:
         exposures: Of all photos of a capture; those without data count for nothing.
-        rule: What counts as different.
 
     Returns:
         The line; None where nothing differs, or nothing is known.
@@ -102,7 +95,7 @@ def describe_inconsistency(exposures: Sequence[Exposure], rule: ConsistencyRule 
     known = sorted((value, str(one)) for one in exposures if (value := one.ev100) is not None)
     stops = known[-1][0] - known[0][0] if known else 0.0
     found: list[str] = []
-    if stops > rule.most_stops:
+    if stops > MAX_STOPS:
         found.append(f"exposures from {known[-1][1]} to {known[0][1]}, {stops:.1f} stops apart")
     if automatic := sum(one.auto_white_balance is True for one in exposures):
         of = "" if automatic == len(exposures) else f" in {automatic} of {len(exposures)} photos"

@@ -1,11 +1,11 @@
 """LDR-FLIP (Andersson et al. 2020): the difference that an observer sees when two images alternate on a screen.
 
-Colours are compared after the blur of the eye's contrast sensitivity, edges and points before it. It needs no
-weights.
+Colours are compared after the blur of the eye's contrast sensitivity, edges and points before it. Equation and section
+numbers are those of the paper. The authors' package flip-evaluator gives the same values (a test compares them) but has
+no wheels for Linux on ARM nor for Python 3.14, and every report of `evaluate` with a ground truth has FLIP.
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -14,30 +14,19 @@ from torch import Tensor
 
 from splatgraft.core.images import linear_from_srgb
 
-
-@dataclass(frozen=True)
-class FlipSettings:
-    """Constants of the publication; equation and section numbers are those of the paper of 2020."""
-
-    pixels_per_degree: float = 0.7 * 3840 / 0.7 * math.pi / 180
-    """Of the observer: 67.02, a 4K screen 0.7 m wide at a distance of 0.7 m (Sec. 5)."""
-    achromatic: tuple[tuple[float, float], ...] = ((1.0, 0.0047),)
-    """Contrast sensitivity as a sum of Gaussians (a, b): a sqrt(pi / b) exp(-pi^2 x^2 / b), x in degrees (Table 1)."""
-    red_green: tuple[tuple[float, float], ...] = ((1.0, 0.0053),)
-    """The same for the red-green opponent channel."""
-    blue_yellow: tuple[tuple[float, float], ...] = ((34.1, 0.04), (13.5, 0.025))
-    """The same for the blue-yellow opponent channel."""
-    color_exponent: float = 0.7
-    """q_c, compresses large colour differences (Sec. 4.1.4)."""
-    knee: tuple[float, float] = (0.4, 0.95)
-    """p_c and p_t: differences up to p_c of the largest are spread over [0, p_t] (Sec. 4.1.4)."""
-    feature_width_degrees: float = 0.082
-    """w, from peak to trough of the edge detector (Sec. 4.2.1)."""
-    feature_exponent: float = 0.5
-    """q_f (Sec. 4.2.2)."""
-
-
-SETTINGS = FlipSettings()
+_PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
+"""Of the observer: 67.02, a 4K screen 0.7 m wide at a distance of 0.7 m (Sec. 5)."""
+_SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
+"""Contrast sensitivity of the achromatic, red-green and blue-yellow channel, as sums of Gaussians (a, b):
+a sqrt(pi / b) exp(-pi^2 x^2 / b), x in degrees (Table 1)."""
+_COLOR_EXPONENT = 0.7
+"""q_c, compresses large colour differences (Sec. 4.1.4)."""
+_KNEE = (0.4, 0.95)
+"""p_c and p_t: differences up to p_c of the largest are spread over [0, p_t] (Sec. 4.1.4)."""
+_FEATURE_WIDTH_DEGREES = 0.082
+"""w, from peak to trough of the edge detector (Sec. 4.2.1)."""
+_FEATURE_EXPONENT = 0.5
+"""q_f (Sec. 4.2.2)."""
 VERSION = "LDR-FLIP 2020, own implementation, 67.02 pixels per degree"
 """What a figure of FLIP was computed with."""
 
@@ -56,25 +45,22 @@ _OPPONENT = torch.tensor([[0.0, 116, 0], [500, -500, 0], [0, 200, -200]], dtype=
 _OFFSET = torch.tensor([-16.0, 0, 0], dtype=torch.float64)
 
 
-def flip_map(
-    image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"], *, settings: FlipSettings = SETTINGS
-) -> Float[Tensor, "h w"]:
+def flip_map(image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
     """Compute the visible difference of each pixel.
 
     Args:
         image: sRGB in [0, 1].
         reference: sRGB in [0, 1].
-        settings: Constants of the publication.
 
     Returns:
         Differences in [0, 1]. Symmetric in the two images.
     """
     both = [_opponent(linear_from_srgb(x.double().clamp(0, 1))) for x in (image, reference)]
-    seen = [_hunt(_lab(_as_seen(x, settings))) for x in both]
-    color = _spread(_hyab(seen[0], seen[1]) ** settings.color_exponent, settings)
-    found = [_features((x[..., 0] + 16) / 116, settings) for x in both]
+    seen = [_hunt(_lab(_as_seen(x))) for x in both]
+    color = _spread(_hyab(seen[0], seen[1]) ** _COLOR_EXPONENT)
+    found = [_features((x[..., 0] + 16) / 116) for x in both]
     feature = torch.maximum(*((a - b).abs() for a, b in zip(*found, strict=True)))
-    feature = (feature / math.sqrt(2)) ** settings.feature_exponent
+    feature = (feature / math.sqrt(2)) ** _FEATURE_EXPONENT
     return (color ** (1 - feature)).to(image)
 
 
@@ -91,24 +77,19 @@ def _opponent(linear: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     return (linear @ _XYZ_FROM_LINEAR.T.to(linear) / _WHITE.to(linear)) @ _OPPONENT.T.to(linear) + _OFFSET.to(linear)
 
 
-def _as_seen(opponent: Float[Tensor, "h w 3"], settings: FlipSettings) -> Float[Tensor, "h w 3"]:
+def _as_seen(opponent: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     """Linear RGB after the blur of the eye, clamped to what the screen can show."""
-    channels = (settings.achromatic, settings.red_green, settings.blue_yellow)
-    blurred = torch.stack(
-        [_blur(opponent[..., i], channel, settings) for i, channel in enumerate(channels)], -1
-    )  # fmt: skip
+    blurred = torch.stack([_blur(opponent[..., i], channel) for i, channel in enumerate(_SENSITIVITY)], -1)
     inverse = torch.linalg.inv(_OPPONENT).to(blurred)
     xyz = (blurred - _OFFSET.to(blurred)) @ inverse.T * _WHITE.to(blurred)
     return (xyz @ torch.linalg.inv(_XYZ_FROM_LINEAR).T.to(blurred)).clamp(0, 1)
 
 
-def _blur(
-    values: Float[Tensor, "h w"], gaussians: tuple[tuple[float, float], ...], settings: FlipSettings
-) -> Float[Tensor, "h w"]:
+def _blur(values: Float[Tensor, "h w"], gaussians: tuple[tuple[float, float], ...]) -> Float[Tensor, "h w"]:
     """Blur by a sum of Gaussians, which is one of products of rows and columns."""
-    widest = max(b for _, b in (*settings.achromatic, *settings.red_green, *settings.blue_yellow))
-    radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * settings.pixels_per_degree)
-    x = torch.arange(-radius, radius + 1, dtype=values.dtype, device=values.device) / settings.pixels_per_degree
+    widest = max(b for channel in _SENSITIVITY for _, b in channel)
+    radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * _PIXELS_PER_DEGREE)
+    x = torch.arange(-radius, radius + 1, dtype=values.dtype, device=values.device) / _PIXELS_PER_DEGREE
     rows = [(a * math.sqrt(math.pi / b), torch.exp(-(math.pi**2) * x**2 / b)) for a, b in gaussians]
     total = sum(weight * float(row.sum()) ** 2 for weight, row in rows)
     return torch.stack([weight / total * _separable(values, row, row) for weight, row in rows]).sum(0)
@@ -141,21 +122,19 @@ def _hyab(a: Float[Tensor, "*n 3"], b: Float[Tensor, "*n 3"]) -> Float[Tensor, "
     return (a - b)[..., 0].abs() + (a - b)[..., 1:].norm(dim=-1)
 
 
-def _spread(powered: Float[Tensor, "h w"], settings: FlipSettings) -> Float[Tensor, "h w"]:
+def _spread(powered: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Colour differences mapped to [0, 1]; the largest is between green and blue."""
     primaries = _hunt(_lab(torch.eye(3, dtype=powered.dtype, device=powered.device)[None, 1:]))[0]
-    largest = float(_hyab(primaries[0], primaries[1])) ** settings.color_exponent
-    part, top = settings.knee
+    largest = float(_hyab(primaries[0], primaries[1])) ** _COLOR_EXPONENT
+    part, top = _KNEE
     knee = part * largest
     above = top + (powered - knee) / (largest - knee) * (1 - top)
     return torch.where(powered < knee, powered * top / knee, above)
 
 
-def _features(
-    luminance: Float[Tensor, "h w"], settings: FlipSettings
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+def _features(luminance: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Strength of edges and of points, by first and second derivatives of a Gaussian."""
-    deviation = 0.5 * settings.feature_width_degrees * settings.pixels_per_degree
+    deviation = 0.5 * _FEATURE_WIDTH_DEGREES * _PIXELS_PER_DEGREE
     radius = math.ceil(3 * deviation)
     x = torch.arange(-radius, radius + 1, dtype=luminance.dtype, device=luminance.device)
     gaussian = torch.exp(-(x**2) / (2 * deviation**2))

@@ -11,6 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_TRIALS = 2000
+"""Random planes tried."""
+_REFINEMENTS = 3
+"""Least-squares fits, each to the inliers of the one before."""
+_MIN_POINTS = 50
+"""Fewer points give no plane."""
+
 
 @dataclass(frozen=True)
 class LevelPlaneOptions:
@@ -22,12 +29,6 @@ class LevelPlaneOptions:
     """Least share of all points that lie on the plane."""
     thickness: float = 0.01
     """Largest distance of an inlier, over the median distance of the points from their median."""
-    trials: int = 2000
-    """Random planes tried."""
-    refinements: int = 3
-    """Least-squares fits, each to the inliers of the one before."""
-    least_points: int = 50
-    """Fewer points give no plane."""
 
 
 @dataclass(frozen=True)
@@ -61,25 +62,20 @@ def least_squares_normal(offsets: Float[Tensor, "m 3"]) -> Float[Tensor, "3"]:
 
 
 def dominant_level_plane(
-    points: Float[Tensor, "m 3"],
-    up: Float[Tensor, "3"],
-    seed: int = 0,
-    *,
-    options: LevelPlaneOptions = LevelPlaneOptions(),
+    points: Float[Tensor, "m 3"], up: Float[Tensor, "3"], *, options: LevelPlaneOptions = LevelPlaneOptions()
 ) -> LevelPlane | None:
     """The largest nearly level plane among `points`; None where no plane is level and large enough.
 
     Args:
         points: Sparse surface points, world units.
         up: Unit.
-        seed: Of the random planes.
         options: What counts as clear.
     """
     x, upward = points.double(), up.double()
-    if len(x) < options.least_points:
+    if len(x) < _MIN_POINTS:
         return None
     threshold = options.thickness * (x - x.median(0).values).norm(dim=1).median()
-    normals, on_plane = sample_planes(x, options.trials, seed=seed)
+    normals, on_plane = sample_planes(x, _TRIALS, seed=0)
     normals = torch.nn.functional.normalize(normals, dim=1)
     normals = normals * torch.sign(normals @ upward)[:, None]
     level = normals @ upward > math.cos(math.radians(options.tilt_deg))
@@ -88,7 +84,7 @@ def dominant_level_plane(
     normals, offsets = normals[level], (normals[level] * on_plane[level]).sum(1)
     counts = torch.stack([((x @ n - d).abs() < threshold).sum() for n, d in zip(normals, offsets, strict=True)])
     normal, offset = normals[counts.argmax()], offsets[counts.argmax()]
-    for _ in range(options.refinements):
+    for _ in range(_REFINEMENTS):
         inliers = x[(x @ normal - offset).abs() < threshold]
         if len(inliers) < options.inlier_share * len(x):
             return None

@@ -1,6 +1,5 @@
 """Writes a scene, a part of one, or pictures of it, in the format that the suffix of a file names."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -9,13 +8,10 @@ import torch
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.exports.export_source import ExportSource
-from splatgraft.exports.first_view import first_view
+from splatgraft.exports.export_source import ExportSource, first_view, path_around, upright
+from splatgraft.exports.pages import write_viewer_page
 from splatgraft.exports.pictures import write_picture, write_turntable
-from splatgraft.exports.scene_frame import upright
 from splatgraft.exports.shadow_layer import shadow_layer
-from splatgraft.exports.turntable_video import path_around
-from splatgraft.exports.viewer_page import write_viewer_page
 from splatgraft.formats import WRITTEN_SCENE_SUFFIXES, scene_suffix, write_gaussians
 from splatgraft.formats.scenes.spz import write_spz
 from splatgraft.runtime.progress import Progress, silent
@@ -23,8 +19,14 @@ from splatgraft.runtime.progress import Progress, silent
 _WORLD_SUFFIXES = (".glb", ".usdz")
 """Formats whose y points up and whose unit is a metre."""
 
+_MIN_WIDTH = 16
+"""Pixels."""
 _PART_BACKGROUND = 0.8
 """Grey on which a page shows an object or a shadow alone, sRGB."""
+
+_PICTURES, _TURNTABLES = (".png", ".jpg"), (".mp4", ".gif", ".webp")
+EXPORT_SUFFIXES = (".html", *WRITTEN_SCENE_SUFFIXES, *_PICTURES, *_TURNTABLES)
+"""Suffixes of the formats."""
 
 Layer = Literal["all", "object", "scene", "shadow", "object-with-shadow"]
 
@@ -64,20 +66,46 @@ def export_scene(
         Sentences for the user: what was assumed, left out or turned.
 
     Raises:
-        ValueError: The suffix is another, or the source has not what is asked for.
+        ValueError: The suffix is another, an option is out of range, or the source has not what is asked for.
     """
-    write = _WRITERS.get(scene_suffix(to))
-    if write is None:
+    suffix = scene_suffix(to)
+    if suffix not in EXPORT_SUFFIXES:
         raise ValueError(f"{to}: expected a file that ends in {', '.join(EXPORT_SUFFIXES)}, found '{to.suffix}'")
-    return write(source, to, _Wanted(options, progress))
+    if not 0 <= options.sh_degree <= spherical_harmonics.MAX_DEGREE:
+        raise ValueError(f"--sh-degree: expected 0 to {spherical_harmonics.MAX_DEGREE}, found {options.sh_degree}")
+    if options.width < _MIN_WIDTH:
+        raise ValueError(f"--width: expected {_MIN_WIDTH} pixels or more, found {options.width}")
+    gaussians, said = layer_of(source, options.layer, progress=progress)
+    gaussians = _limited(gaussians, options)
+    if suffix in WRITTEN_SCENE_SUFFIXES:
+        return (*said, *_write_scene(to, gaussians, source, options))
+    view, assumed = first_view(source)
+    said = (*said, *assumed)
+    if suffix in _TURNTABLES:
+        cameras = path_around(source, view, frames=options.frames, width=options.width)
+        return (*said, write_turntable(to, gaussians, cameras, progress=progress))
+    if suffix in _PICTURES:
+        with_alpha = options.layer != "all" and suffix == ".png"
+        write_picture(to, gaussians, view, width=options.width, with_alpha=with_alpha)
+        return said
+    scenes = {source.title: gaussians}
+    if options.layer == "all" and source.pasted is not None:
+        scenes = {"Before": _limited(_finite(source.pasted)[0], options), "After": gaussians}
+    background = 0.0 if options.layer in ("all", "scene") else _PART_BACKGROUND
+    write_viewer_page(to, scenes, view, title=source.title, background=background)
+    return said
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """What a writer is told."""
-
-    options: ExportOptions
-    progress: Progress
+def _write_scene(to: Path, gaussians: Gaussians, source: ExportSource, options: ExportOptions) -> tuple[str, ...]:
+    metadata, suffix, said = source.metadata, scene_suffix(to), ()
+    if options.frame == "world" or (options.frame == "auto" and suffix in _WORLD_SUFFIXES):
+        world_from_capture, metadata, said = upright(source)
+        gaussians = world_from_capture.gaussians(gaussians)
+    if suffix == ".spz":
+        write_spz(to, gaussians, version=options.spz_version)
+    else:
+        write_gaussians(to, gaussians, metadata=metadata)
+    return said
 
 
 def layer_of(source: ExportSource, layer: Layer, *, progress: Progress = silent) -> tuple[Gaussians, tuple[str, ...]]:
@@ -109,15 +137,8 @@ def layer_of(source: ExportSource, layer: Layer, *, progress: Progress = silent)
     return chosen, (said, *left_out)
 
 
-def _layer(source: ExportSource, wanted: _Wanted) -> tuple[Gaussians, tuple[str, ...]]:
-    gaussians, said = layer_of(source, wanted.options.layer, progress=wanted.progress)
-    return _limited(gaussians, wanted.options), said
-
-
 def _limited(gaussians: Gaussians, options: ExportOptions) -> Gaussians:
     """Without bands above the wanted degree."""
-    if not 0 <= options.sh_degree <= spherical_harmonics.MAX_DEGREE:
-        raise ValueError(f"--sh-degree: expected 0 to {spherical_harmonics.MAX_DEGREE}, found {options.sh_degree}")
     return gaussians.with_sh_degree(min(options.sh_degree, gaussians.sh_degree))
 
 
@@ -127,65 +148,3 @@ def _finite(gaussians: Gaussians) -> tuple[Gaussians, tuple[str, ...]]:
     if bool(finite.all()):
         return gaussians, ()
     return gaussians.select(finite), (f"{int((~finite).sum())} Gaussians that are not finite are left out",)
-
-
-def _write_html(source: ExportSource, to: Path, wanted: _Wanted) -> tuple[str, ...]:
-    options = wanted.options
-    after, said = _layer(source, wanted)
-    view, assumed = first_view(source)
-    scenes = {source.title: after}
-    if options.layer == "all" and source.pasted is not None:
-        scenes = {"Before": _limited(_finite(source.pasted)[0], options), "After": after}
-    background = 0.0 if options.layer in ("all", "scene") else _PART_BACKGROUND
-    write_viewer_page(to, scenes, view, title=source.title, background=background)
-    return (*said, *assumed)
-
-
-def _write_scene(source: ExportSource, to: Path, wanted: _Wanted) -> tuple[str, ...]:
-    options = wanted.options
-    gaussians, said = _layer(source, wanted)
-    metadata, suffix = source.metadata, scene_suffix(to)
-    if options.frame == "world" or (options.frame == "auto" and suffix in _WORLD_SUFFIXES):
-        world_from_capture, metadata, about = upright(source)
-        gaussians, said = world_from_capture.gaussians(gaussians), (*said, *about)
-    if suffix == ".spz":
-        write_spz(to, gaussians, version=options.spz_version)
-    else:
-        write_gaussians(to, gaussians, metadata=metadata)
-    return said
-
-
-def _write_picture(source: ExportSource, to: Path, wanted: _Wanted) -> tuple[str, ...]:
-    options = wanted.options
-    gaussians, said = _layer(source, wanted)
-    view, assumed = first_view(source)
-    with_alpha = options.layer != "all" and to.suffix.lower() == ".png"
-    write_picture(to, gaussians, view, width=_required_width(options), with_alpha=with_alpha)
-    return (*said, *assumed)
-
-
-def _write_turntable(source: ExportSource, to: Path, wanted: _Wanted) -> tuple[str, ...]:
-    options = wanted.options
-    gaussians, said = _layer(source, wanted)
-    view, assumed = first_view(source)
-    width = _required_width(options)
-    cameras = path_around(source, view, frames=options.frames, width=width)
-    about = write_turntable(to, gaussians, cameras, progress=wanted.progress)
-    return (*said, *assumed, about)
-
-
-def _required_width(options: ExportOptions) -> int:
-    if options.width < 16:
-        raise ValueError(f"--width: expected 16 pixels or more, found {options.width}")
-    return options.width
-
-
-_WRITERS: dict[str, Callable[[ExportSource, Path, _Wanted], tuple[str, ...]]] = {
-    ".html": _write_html,
-    **dict.fromkeys(WRITTEN_SCENE_SUFFIXES, _write_scene),
-    **dict.fromkeys((".png", ".jpg"), _write_picture),
-    **dict.fromkeys((".mp4", ".gif", ".webp"), _write_turntable),
-}
-
-EXPORT_SUFFIXES = tuple(_WRITERS)
-"""Suffixes of the formats."""

@@ -1,6 +1,8 @@
-"""Pictures of a scene: one from the first view, or a turntable."""
+"""Pictures of a scene: one from the first view, or a turntable as an animation or a video."""
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +15,14 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_image
 from splatgraft.evaluation import write_animation
-from splatgraft.exports.first_view import FirstView
-from splatgraft.exports.turntable_video import FPS, write_video
+from splatgraft.exports.export_source import FirstView
 from splatgraft.rendering import render
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
+
+FPS = 24
+_QUALITY = "19"
+"""Constant rate factor of x264: no loss is seen."""
 
 
 def write_picture(path: Path, gaussians: Gaussians, view: FirstView, *, width: int, with_alpha: bool) -> None:
@@ -61,3 +66,61 @@ def _drawn(gaussians: Gaussians, cameras: Cameras, progress: Progress) -> Iterat
         progress(index, len(cameras), "pictures")
         yield render(gaussians, camera).color[0].clamp(0, 1)
     progress(len(cameras), len(cameras), "pictures")
+
+
+def write_video(path: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
+    """Write sRGB pictures of one size as .mp4; gives the name of the codec.
+
+    H.264 where PyAV is installed, which every player knows; else VP9 by OpenCV, which browsers know. The file appears
+    whole or not at all.
+
+    Raises:
+        ValueError: The encoder does not start.
+    """
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")
+    partial = path.with_name(f".{path.stem}.partial.mp4")
+    try:
+        codec = _by_pyav(partial, frames) if find_spec("av") else _by_opencv(path, partial, frames)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return codec
+
+
+def _by_pyav(path: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
+    import av
+
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = None
+        for frame in frames:
+            pixels = _bytes(frame)
+            if stream is None:
+                stream = container.add_stream("libx264", rate=FPS, options={"crf": _QUALITY})
+                stream.height, stream.width = pixels.shape[:2]
+                stream.pix_fmt = "yuv420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        if stream is not None:
+            container.mux(stream.encode())
+    return "H.264"
+
+
+def _by_opencv(path: Path, partial: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
+    import cv2
+
+    writer = None
+    for frame in frames:
+        pixels = _bytes(frame)
+        if writer is None:
+            size = (pixels.shape[1], pixels.shape[0])
+            writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"vp09"), FPS, size)
+            if not writer.isOpened():
+                raise ValueError(f"{path}: expected OpenCV to encode VP9, found that it cannot; pip install av")
+        writer.write(pixels[..., ::-1])
+    if writer is not None:
+        writer.release()
+    return "VP9"
+
+
+def _bytes(frame: Float[Tensor, "h w 3"]) -> np.ndarray:
+    return np.ascontiguousarray((frame.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())

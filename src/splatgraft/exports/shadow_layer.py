@@ -18,27 +18,23 @@ from splatgraft.exports.export_source import ExportSource
 from splatgraft.rendering import render, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
-
-@dataclass(frozen=True)
-class ShadowLayerOptions:
-    """How the layer is fitted; numbers set by hand on the demo's scenes."""
-
-    views: int = 24
-    """Cameras of the target; every fourth one is left out of the fit and measured."""
-    longest_px: int = 320
-    """Longer side of the pictures."""
-    steps: int = 240
-    """Steps of Adam, one view each."""
-    learning_rate: float = 0.15
-    """Of opacity logits; falls to a tenth."""
-    darkest_ground: float = 0.02
-    """sRGB below which nothing is said about the share of light that is missing."""
-    least_share: float = 0.01
-    """Share of light that a Gaussian must miss to be part of the layer."""
-    least_weight_px: float = 0.5
-    """Pixels that a Gaussian must make up in all views together."""
-    faintest: float = 1 / 255
-    """Opacity below which a Gaussian is left out at the end."""
+_VIEWS = 24
+"""Cameras of the target; every fourth one is left out of the fit and measured. All numbers are set by hand, on the
+demo's scenes."""
+_LONGEST_PX = 320
+"""Longer side of the pictures."""
+_STEPS = 240
+"""Steps of Adam, one view each."""
+_LEARNING_RATE = 0.15
+"""Of opacity logits; falls to a tenth."""
+_DARKEST_GROUND = 0.02
+"""sRGB below which nothing is said about the share of light that is missing."""
+_MIN_SHARE = 0.01
+"""Share of light that a Gaussian must miss to be part of the layer."""
+_MIN_WEIGHT_PX = 0.5
+"""Pixels that a Gaussian must make up in all views together."""
+_FAINTEST = 1 / 255
+"""Opacity below which a Gaussian is left out at the end."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +57,11 @@ class _View:
     darkness: Float[Tensor, "h w"]
 
 
-def shadow_layer(
-    source: ExportSource, options: ShadowLayerOptions = ShadowLayerOptions(), *, progress: Progress = silent
-) -> ShadowLayer:
+def shadow_layer(source: ExportSource, *, progress: Progress = silent) -> ShadowLayer:
     """Fit the layer to the relit scene without its object, against the place.
 
     Args:
         source: The transfer.
-        options: How it is fitted.
         progress: Told of the steps.
 
     Raises:
@@ -79,26 +72,26 @@ def shadow_layer(
             f"--layer shadow: expected a project with its target's scene and cameras, found {source.title} without"
         )
     ground = source.scene.select(~source.is_object)
-    cameras = source.cameras.spread(options.views)
-    views = [_view(camera.limited(options.longest_px), ground, source.place, options) for camera in cameras]
+    cameras = source.cameras.spread(_VIEWS)
+    views = [_view(camera.limited(_LONGEST_PX), ground, source.place) for camera in cameras]
     fitted = [view for index, view in enumerate(views) if index % 4 != 3] or views
     held_out = [view for index, view in enumerate(views) if index % 4 == 3] or views
-    receivers = _receivers(ground, fitted, options)
+    receivers = _receivers(ground, fitted)
     if receivers.count == 0:
         return ShadowLayer(empty(), None)
-    layer = _fitted(receivers, fitted, options, progress)
+    layer = _fitted(receivers, fitted, progress)
     return ShadowLayer(layer, _psnr(layer, held_out))
 
 
-def _view(camera: Cameras, ground: Gaussians, place: Gaussians, options: ShadowLayerOptions) -> _View:
+def _view(camera: Cameras, ground: Gaussians, place: Gaussians) -> _View:
     """A view and the share of light, in sRGB, that the shadow takes."""
     shadowed, before = (render(scene, camera).color[0].clamp(0, 1) for scene in (ground, place))
     level = before.mean(-1)
-    darkness = (1 - shadowed.mean(-1) / level.clamp_min(options.darkest_ground)).clamp(0, 1)
-    return _View(camera, before, shadowed, torch.where(level < options.darkest_ground, 0.0, darkness))
+    darkness = (1 - shadowed.mean(-1) / level.clamp_min(_DARKEST_GROUND)).clamp(0, 1)
+    return _View(camera, before, shadowed, torch.where(level < _DARKEST_GROUND, 0.0, darkness))
 
 
-def _receivers(ground: Gaussians, views: list[_View], options: ShadowLayerOptions) -> Gaussians:
+def _receivers(ground: Gaussians, views: list[_View]) -> Gaussians:
     """The Gaussians on which the shadow falls, black, with the share of light that each misses as opacity."""
     missing, seen = torch.zeros(ground.count), torch.zeros(ground.count)
     for view in views:
@@ -107,17 +100,17 @@ def _receivers(ground: Gaussians, views: list[_View], options: ShadowLayerOption
         columns = operator.blend_transpose(both)
         missing, seen = missing + columns[:, 0], seen + columns[:, 1]
     share = missing / seen.clamp_min(1e-6)
-    kept = (share > options.least_share) & (seen > options.least_weight_px)
+    kept = (share > _MIN_SHARE) & (seen > _MIN_WEIGHT_PX)
     chosen = ground.select(kept)
     opacity = (share[kept] * chosen.opacities).clamp(0.002, 0.98)
     return replace(chosen, opacity_logits=opacity.logit(), sh=dc_from_rgb(torch.zeros(chosen.count, 1, 3)))
 
 
-def _fitted(layer: Gaussians, views: list[_View], options: ShadowLayerOptions, progress: Progress) -> Gaussians:
+def _fitted(layer: Gaussians, views: list[_View], progress: Progress) -> Gaussians:
     logits = layer.opacity_logits.clone().requires_grad_()
-    optimizer = torch.optim.Adam([logits], lr=options.learning_rate)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / options.steps))
-    for step in range(options.steps):
+    optimizer = torch.optim.Adam([logits], lr=_LEARNING_RATE)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / _STEPS))
+    for step in range(_STEPS):
         view = views[step * 7 % len(views)]
         alpha = render(replace(layer, opacity_logits=logits), view.camera).alpha[0]
         # weighted by what lies behind, as that is what the layer changes
@@ -126,9 +119,9 @@ def _fitted(layer: Gaussians, views: list[_View], options: ShadowLayerOptions, p
         loss.backward()
         optimizer.step()
         schedule.step()
-        progress(step + 1, options.steps, "fitting the shadow")
+        progress(step + 1, _STEPS, "fitting the shadow")
     done = replace(layer, opacity_logits=logits.detach())
-    return done.select(done.opacities > options.faintest)
+    return done.select(done.opacities > _FAINTEST)
 
 
 def _psnr(layer: Gaussians, views: list[_View]) -> float:
