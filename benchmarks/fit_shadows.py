@@ -15,8 +15,7 @@ from pathlib import Path
 import torch
 
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.evaluation.measure import luminance_ratio
-from splatgraft.evaluation.regions import find_regions
+from splatgraft.evaluation.measure import find_regions, luminance_ratio
 from splatgraft.relighting import relight
 from splatgraft.relighting.cast_shadows import SHADOW_POWER
 from splatgraft.relighting.shadows.scene_ratio import SceneRatio

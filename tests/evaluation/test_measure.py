@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
-from splatgraft.evaluation.light_change import change_map, describe_change
-from splatgraft.evaluation.measure import ComparedView, compare, measure
-from splatgraft.evaluation.regions import Truth, find_regions, luminance_ratio
+from splatgraft.evaluation.measure import ComparedView, Truth, compare, find_regions, luminance_ratio, measure
+from splatgraft.evaluation.pictures import change_map, describe_change
 
 
 def example_truth(shadow=0.5, seed=0):

@@ -7,9 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from splatgraft.evaluation.measure import ComparedView, measure
+from splatgraft.evaluation.measure import ComparedView, Truth, measure
 from splatgraft.evaluation.pictures import side_by_side, write_animation
-from splatgraft.evaluation.regions import Truth
 from splatgraft.evaluation.report import Report, ReportView, StepTime, write_report
 
 

@@ -8,7 +8,7 @@ import scipy.linalg
 import torch
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.evaluation.regions import Truth, find_regions
+from splatgraft.evaluation.measure import Truth, find_regions
 from splatgraft_paper.benchmark.image_features import frechet_distance, kernel_distance
 from splatgraft_paper.benchmark.measure import disagreement, measure_view, only_region, warp
 from splatgraft_paper.benchmark.table import Benchmark, Row, as_json, markdown, summaries, summarize, tables

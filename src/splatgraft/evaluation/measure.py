@@ -1,15 +1,85 @@
-"""Image metrics against ground truth, per view and as means over views."""
+"""Metrics of pictures against ground truth: regions of a view, metrics of a picture, means over views."""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from jaxtyping import Float
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.flip import flip_map
 from splatgraft.core.image_metrics import psnr, ssim_map
-from splatgraft.evaluation.regions import Regions, Truth, find_regions, luminance_ratio
+from splatgraft.core.images import LUMINANCE, linear_from_srgb
+from splatgraft.core.posed_images import PosedImages
+from splatgraft.runtime.lazy_sequence import LazySequence
+
+SHADOW_RATIO = 0.95
+"""Linear light with the object over linear light without it, below which a pixel counts as shadowed."""
+
+
+_CHANGED = 2 / 255
+"""sRGB difference with and without the object from which a pixel counts as changed; set by hand, as the next three."""
+_RATIO_OFFSET = 0.002
+"""Linear light added to both sides of a ratio: 6/255 in sRGB, below which 8 bits do not resolve a shadow."""
+_OBJECT_MARGIN_PX = 2
+"""Pixels around the object that belong to no region."""
+_REST_MARGIN = 0.01
+"""Margin between changed pixels and the rest, as a share of the image's width; at least 2 pixels."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of one view, with and without the object."""
+
+    image: Float[Tensor, "h w 3"]
+    """The target scene with the object in it, sRGB in [0, 1]."""
+    background: Float[Tensor, "h w 3"]
+    """The same view without the object, sRGB in [0, 1]."""
+    mask: Float[Tensor, "h w"]
+    """Coverage by the object, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Disjoint regions of a view. Pixels in none of them (penumbra, bounce, edges) count only in the whole image."""
+
+    object: Bool[Tensor, "h w"]
+    """More than half covered by the object."""
+    shadow: Bool[Tensor, "h w"]
+    """Outside the object, with linear luminance (3x3 mean) below `SHADOW_RATIO` of that without the object."""
+    rest: Bool[Tensor, "h w"]
+    """Away from all pixels that the object changes in the ground truth."""
+
+
+def find_regions(truth: Truth) -> Regions:
+    """Find the regions of one view from its ground truth."""
+    inside = truth.mask > 0.5
+    margin = max(2, round(truth.mask.shape[1] * _REST_MARGIN))
+    near_object = _dilated(truth.mask > 0, _OBJECT_MARGIN_PX)
+    shadow = (luminance_ratio(truth.image, truth.background) < SHADOW_RATIO) & ~near_object
+    change = _mean_3x3((truth.image - truth.background).abs().amax(-1))
+    rest = ~_dilated((change > _CHANGED) | near_object | shadow, margin)
+    return Regions(object=inside, shadow=shadow, rest=rest)
+
+
+def luminance_ratio(image: Float[Tensor, "h w 3"], background: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+    """Ratio of linear Rec. 709 luminance, `image` over `background`, each averaged over 3x3 pixels against noise."""
+    numerator, denominator = (_mean_3x3(linear_from_srgb(x) @ LUMINANCE.to(x)) for x in (image, background))
+    return (numerator + _RATIO_OFFSET) / (denominator + _RATIO_OFFSET)
+
+
+def _mean_3x3(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    return torch.from_numpy(cv2.blur(values.detach().numpy(), (3, 3), borderType=cv2.BORDER_REPLICATE))
+
+
+def _dilated(region: Bool[Tensor, "h w"], pixels: int) -> Bool[Tensor, "h w"]:
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    return torch.from_numpy(cv2.dilate(region.numpy().astype(np.uint8), kernel)) > 0
+
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
 """A distance between two sRGB images (h, w, 3), such as LPIPS."""
@@ -121,14 +191,17 @@ def _row(view: ComparedView, perceptual: Perceptual | None) -> dict:
 
 
 def _means(rows: Sequence[dict]) -> dict[str, dict[str, float | None]]:
-    out: dict[str, dict[str, float | None]] = {}
-    for which in ("copy_paste", "result"):
-        out[which] = {}
-        for name in rows[0][which] if rows else ():
-            values = [row[which][name] for row in rows if math.isfinite(row[which][name])]
-            joined = max if name == "rest_max_change" else (lambda v: sum(v) / len(v))
-            out[which][name] = joined(values) if values else None
-    return out
+    return {which: _mean_of([row[which] for row in rows]) for which in ("copy_paste", "result")}
+
+
+def _mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float | None]:
+    """Of each metric over the views where it is defined; None where it is in none."""
+    means: dict[str, float | None] = {}
+    for name in rows[0] if rows else ():
+        values = [row[name] for row in rows if math.isfinite(row[name])]
+        joined = max if name == "rest_max_change" else (lambda v: sum(v) / len(v))
+        means[name] = joined(values) if values else None
+    return means
 
 
 def _without_nan(row: dict) -> dict:
@@ -138,3 +211,73 @@ def _without_nan(row: dict) -> dict:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def evaluate(
+    images: Sequence[Float[Tensor, "_ _ 3"]],
+    truth: Sequence[Truth],
+    *,
+    backgrounds: Sequence[Float[Tensor, "_ _ 3"]],
+    perceptual: Perceptual | None = None,
+) -> dict[str, float | None]:
+    """Measure the pictures of a result against the ground truth of the same views.
+
+    Args:
+        images: v pictures (h, w, 3) of the result, sRGB in [0, 1].
+        truth: The ground truth of each view, as `true_views` gives it.
+        backgrounds: A render of the target scene without the object for each view, sRGB in [0, 1]: the error of the
+            reconstruction itself then cancels in `shadow_ratio_rmse` and `rest_*_change`.
+        perceptual: A distance between two (h, w, 3) images such as LPIPS; without it there is no "lpips".
+
+    Returns:
+        `psnr` (dB), `ssim` and `flip` of the whole image and of the regions object, shadow and rest;
+        `shadow_ratio_rmse`, the error of the shadow as a ratio of linear luminance; `rest_max_change` and
+        `rest_mean_change` (sRGB). Each is the mean over the views in which its region has at least 25 pixels (the
+        maximum for `rest_max_change`), and None where no view has.
+
+    Raises:
+        ValueError: There is not one truth and one background per picture.
+    """
+    if not len(images) == len(truth) == len(backgrounds):
+        found = f"{len(images)} images, {len(truth)} truths and {len(backgrounds)} backgrounds"
+        raise ValueError(f"evaluate: expected one truth and one background per image, found {found}")
+    rows = [
+        compare(
+            image.clamp(0, 1),
+            true,
+            regions=find_regions(true),
+            background=background.clamp(0, 1),
+            perceptual=perceptual,
+        )
+        for image, true, background in zip(images, truth, backgrounds, strict=True)
+    ]
+    return _mean_of(rows)
+
+
+def true_views(truth: PosedImages, target: PosedImages) -> LazySequence[Truth]:
+    """The ground truth of every view: the images with the object, the target's images of the same name, the masks.
+
+    Args:
+        truth: A capture of the target with the object really in it, with a mask of the object for every view.
+        target: The capture of the target without the object.
+
+    Returns:
+        One `Truth` per view of `truth`, read when asked for.
+
+    Raises:
+        ValueError: A view of the truth has no mask, or no image of the same name in the target.
+    """
+    for index, path in enumerate(truth.mask_paths or (None,) * len(truth)):
+        if path is None:
+            raise ValueError(f"{truth.image_paths[index]}: expected a mask of the object, found none")
+    index_of = {Path(name).stem: index for index, name in enumerate(target.cameras.names)}
+    stems = [Path(name).stem for name in truth.cameras.names]
+    if missing := [stem for stem in stems if stem not in index_of]:
+        raise ValueError(f"evaluate: expected an image of the target named {missing[0]} as in the truth, found none")
+
+    def read(index: int) -> Truth:
+        mask = truth.mask(index)
+        assert mask is not None
+        return Truth(image=truth.image(index), background=target.image(index_of[stems[index]]), mask=mask)
+
+    return LazySequence(len(truth), read)

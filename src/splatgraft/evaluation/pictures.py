@@ -1,4 +1,4 @@
-"""Pictures for reports: labelled images side by side, and animations as GIF or WebP."""
+"""Pictures for reports: labelled images side by side, animations, and how the transfer changed the light of a view."""
 
 import io
 import math
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from splatgraft.evaluation.measure import SHADOW_RATIO, luminance_ratio
 from splatgraft.runtime.files import atomic_write
 
 _GAP_PX = 6
@@ -97,3 +98,48 @@ def _animated(frames: Sequence[Image.Image], kind: str, *, duration: int, **sett
     buffer = io.BytesIO()
     frames[0].save(buffer, kind, save_all=True, append_images=list(frames[1:]), loop=0, duration=duration, **settings)
     return buffer.getvalue()
+
+
+_DARKER = torch.tensor([0.16, 0.32, 0.78])
+_BRIGHTER = torch.tensor([0.93, 0.55, 0.10])
+_UNCHANGED = torch.tensor([0.93, 0.93, 0.93])
+_NOISE_STOPS = 0.02
+"""Photographic stops; smaller changes stay grey in the change map. The noise between two renders."""
+_FULL_COLOR_STOPS = 1.0
+"""Photographic stops at which the change map has its full colours; set by hand."""
+_EXPONENT = 0.7
+"""Of the colours of the change map; below 1, so that faint shadows stay visible beside strong ones."""
+
+
+def describe_change(
+    result: Float[Tensor, "h w 3"], composite: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
+) -> dict[str, float]:
+    """Describe how the luminance of `result` differs from copy-paste.
+
+    Args:
+        result: the view after light transfer, sRGB in [0, 1].
+        composite: the view before, sRGB in [0, 1].
+        mask: coverage by the object, in [0, 1].
+
+    Returns:
+        object_brightness: mean ratio of linear luminance on the object, 1 where the view shows no object.
+        darkened_fraction: share of the pixels outside the object that lost more than 5% of their light.
+        brightened_fraction: share of these pixels that gained as much.
+    """
+    ratio = luminance_ratio(result, composite)
+    inside, outside = mask > 0.5, mask <= 0
+    surroundings = ratio[outside]
+    return {
+        "object_brightness": float(ratio[inside].mean()) if bool(inside.any()) else 1.0,
+        "darkened_fraction": float((surroundings < SHADOW_RATIO).float().mean()) if len(surroundings) else 0.0,
+        "brightened_fraction": float((surroundings > 1 / SHADOW_RATIO).float().mean()) if len(surroundings) else 0.0,
+    }
+
+
+def change_map(result: Float[Tensor, "h w 3"], composite: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Draw where `result` is darker (blue) or brighter (orange) than `composite`, sRGB in [0, 1]."""
+    full, noise = _FULL_COLOR_STOPS, _NOISE_STOPS
+    stops = luminance_ratio(result, composite).clamp_min(1e-3).log2().clamp(-full, full)[..., None]
+    tint = torch.where(stops < 0, _DARKER, _BRIGHTER)
+    strength = ((stops.abs() - noise).clamp_min(0) / (full - noise)) ** _EXPONENT
+    return _UNCHANGED + strength * (tint - _UNCHANGED)

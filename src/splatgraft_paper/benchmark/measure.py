@@ -15,8 +15,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import list_images, read_rgb, write_image
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.evaluation.measure import SMALLEST_REGION, Perceptual, compare
-from splatgraft.evaluation.regions import Regions, Truth, find_regions
+from splatgraft.evaluation.measure import SMALLEST_REGION, Perceptual, Regions, Truth, compare, find_regions
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.formats import read_capture, read_gaussians
 from splatgraft.project.layout import METRICS_FILE

@@ -15,7 +15,7 @@ from typing import cast
 import torch
 
 from splatgraft.core.images import read_rgb, write_image
-from splatgraft.evaluation.regions import find_regions
+from splatgraft.evaluation.measure import find_regions
 from splatgraft.evaluation.report_page import ViewFiles, html_page, viewer
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.formats import read_capture

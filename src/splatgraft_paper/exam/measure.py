@@ -17,7 +17,7 @@ from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear, write_image
-from splatgraft.evaluation.regions import find_regions
+from splatgraft.evaluation.measure import find_regions
 from splatgraft.relighting import Light, Relit, SourceScene, relight
 from splatgraft.relighting.gain import relight_by_gain
 from splatgraft_paper.benchmark.measure import measure_view

@@ -14,9 +14,8 @@ from torch import Tensor
 from splatgraft.core.flip import flip_map
 from splatgraft.core.image_metrics import psnr, ssim, ssim_map
 from splatgraft.core.images import LUMINANCE, read_mask, read_rgb
-from splatgraft.evaluation.light_change import describe_change
-from splatgraft.evaluation.measure import SMALLEST_REGION, Perceptual
-from splatgraft.evaluation.regions import Truth
+from splatgraft.evaluation.measure import SMALLEST_REGION, Perceptual, Truth
+from splatgraft.evaluation.pictures import describe_change
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.project.layout import METRICS_FILE
 from splatgraft.project.step import Context, Inputs

@@ -3,7 +3,7 @@
 import os
 import platform
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -196,8 +196,8 @@ def _report_warnings(project: Path | None, best: Pictures) -> tuple[ReportWarnin
         if warning.picture is not None and (path := folder / warning.picture).is_file():
             picture = read_rgb(path)
         small = None if picture is None else _at_most(picture, _WARNING_PX)
-        remedy = warning.remedy.replace("PROJECT", str(project))
-        found.append(ReportWarning(label, warning.text, remedy, small))
+        note = replace(warning, remedy=warning.remedy.replace("PROJECT", str(project)))
+        found.append(ReportWarning(label, note, small))
     return tuple(found)
 
 
