@@ -29,10 +29,10 @@ def plain():
 
 
 def cut(capture, *, box=None, prompts=None):
-    seed = seed_selection(capture.scene, capture.cameras, box=box, prompts=prompts)
+    selection, region = seed_selection(capture.scene, capture.cameras, box=box, prompts=prompts)
     views = CutViews(capture.images, capture.cameras, prompts or {})
-    allowed = seed.region.allows(capture.scene.means)
-    return cut_object(views, capture.scene, share=seed.selection, allowed=allowed, cutter=grabcut_mask)
+    allowed = region.allows(capture.scene.means)
+    return cut_object(views, capture.scene, share=selection, allowed=allowed, cutter=grabcut_mask)
 
 
 def overlaps(found, capture):
@@ -63,10 +63,10 @@ def test_what_hangs_on_a_wall_is_cut_without_the_wall():
 
 
 def test_what_is_not_allowed_stays_outside_whatever_the_pictures_say(plain):
-    seed = seed_selection(plain.scene, plain.cameras)
+    selection, _ = seed_selection(plain.scene, plain.cameras)
     left = plain.scene.means[:, 0] < 0
     views = CutViews(plain.images[:4], plain.cameras[:4])
-    again = [cut_object(views, plain.scene, share=seed.selection, allowed=left, cutter=grabcut_mask) for _ in range(2)]
+    again = [cut_object(views, plain.scene, share=selection, allowed=left, cutter=grabcut_mask) for _ in range(2)]
     feature = again[0][1]
     assert float(feature[~left].max()) == 0
     assert float(feature[plain.is_object & left].mean()) > 0.4

@@ -12,7 +12,7 @@ from splatgraft.capture.usable_views import (
     usable_photos,
     usable_views,
 )
-from splatgraft.capture.video import VIDEO_FRAMES, extract_frames, read_video_facts
+from splatgraft.capture.video import VIDEO_FRAMES, describe_video, extract_frames
 from splatgraft.capture.virtual_cameras import VirtualCameraOptions, place_virtual_cameras, render_pictures
 
 __all__ = [
@@ -21,12 +21,12 @@ __all__ = [
     "PoseOptions",
     "PoseReport",
     "VirtualCameraOptions",
+    "describe_video",
     "extract_frames",
     "place_virtual_cameras",
     "pose_photos",
     "predict_pose_seconds",
     "read_doubts",
-    "read_video_facts",
     "readable_views",
     "render_pictures",
     "require_coverage",

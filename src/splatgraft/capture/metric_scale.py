@@ -6,7 +6,6 @@ dictionaries.
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -37,22 +36,15 @@ _MIN_ANGLE = 1e-4
 """Least sum of squared sines of the angles between the rays of a point: a degree between two."""
 
 
-@dataclass(frozen=True)
-class Triangulated:
-    """A point that several pictures show."""
-
-    point: Float[Tensor, "3"]
-    """World units."""
-    miss_px: float
-    """Mean distance of its projections from the given pixels."""
-
-
-def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> Triangulated:
+def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> tuple[Float[Tensor, "3"], float]:
     """The point nearest to the rays of the cameras through their pixels.
 
     Args:
         cameras: Two or more.
         pixels: x and y, one per camera.
+
+    Returns:
+        The point, world units, and the mean distance of its projections from the given pixels.
 
     Raises:
         ValueError: The rays are parallel.
@@ -67,7 +59,7 @@ def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> Triangulated:
     point = torch.linalg.solve(across.sum(0), (across @ cameras.centers.double()[..., None])[..., 0].sum(0))
     pose = cameras.camera_from_world.double()
     seen = (cameras.intrinsics.double() @ (pose[:, :3, :3] @ point + pose[:, :3, 3])[..., None])[..., 0]
-    return Triangulated(point.float(), float((seen[:, :2] / seen[:, 2:] - pixels).norm(dim=1).mean()))
+    return point.float(), float((seen[:, :2] / seen[:, 2:] - pixels).norm(dim=1).mean())
 
 
 def scale_from_length(ends: tuple[Float[Tensor, "3"], Float[Tensor, "3"]], metres: float) -> MetricScale:
@@ -110,10 +102,10 @@ def scale_from_marker(
     chosen = cameras[sorted(views)]
     corners = torch.stack([torch.from_numpy(views[i]) for i in sorted(views)])
     found = [triangulate(chosen, corners[:, corner]) for corner in range(4)]
-    miss = max(each.miss_px for each in found)
+    miss = max(miss_px for _, miss_px in found)
     if miss > _MAX_MISS_PX:
         raise ValueError(f"--marker: expected corners that meet within {_MAX_MISS_PX:g} px, found {miss:.1f} px")
-    points = torch.stack([each.point for each in found])
+    points = torch.stack([point for point, _ in found])
     sides = (points - points.roll(-1, 0)).norm(dim=1)
     spread = float((sides.amax() - sides.amin()) / sides.mean())
     name = f"{key[0].removeprefix('DICT_')} marker {key[1]} of {side_m:g} m in {len(views)} images"

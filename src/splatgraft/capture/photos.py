@@ -92,15 +92,7 @@ def _saved_exif(image: Image.Image) -> bytes:
 
 
 def camera_groups(copies: Sequence[Path], shared: bool) -> list[list[str]]:
-    """File names of the photos that have one camera: equal size and EXIF maker, model and focal length.
-
-    Args:
-        copies: Working copies.
-        shared: Whether photos share cameras at all; else each is a group.
-
-    Returns:
-        Groups in the order of their first photos.
-    """
+    """File names of the working copies by camera, where `shared`: equal size and EXIF maker, model, focal length."""
     if not shared:
         return [[copy.name] for copy in copies]
     groups: dict[tuple[object, ...], list[str]] = {}
@@ -177,9 +169,5 @@ def write_undistorted_mask(mask: Path, path: Path, distortion: Distortion) -> No
     """Write the pinhole image of a working mask as PNG."""
     width, height = distortion.size
     intrinsics = torch.from_numpy(distortion.pinhole())
-    coverage = distortion.undistort(
-        read_mask(mask)[..., None].expand(-1, -1, 3), intrinsics, width=width, height=height
-    )
-    array = (coverage[..., 0].clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    with atomic_write(path) as stream:
-        Image.fromarray(array).save(stream, "PNG")
+    coverage = read_mask(mask)[..., None].expand(-1, -1, 3)
+    write_image(path, distortion.undistort(coverage, intrinsics, width=width, height=height)[..., 0])

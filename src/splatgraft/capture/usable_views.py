@@ -144,11 +144,7 @@ def _without_useless(
 ) -> tuple[tuple[Path | None, ...], tuple[LeftOut, ...]]:
     """The masks that are of use, none where there are none, and the others with their reasons.
 
-    Args:
-        photos: Image files.
-        masks: One each or None, or empty; the photo itself where its alpha channel is the mask.
-        names: What the photos are called.
-        reason_against: Why a photo's mask is not used, empty where it is; a ValueError's message is a reason too.
+    A mask is the photo itself where its alpha channel is the mask; a ValueError's message is a reason too.
     """
     kept, left_out = list(masks), []
     for index, (photo, mask) in enumerate(zip(photos, masks, strict=bool(masks))):

@@ -8,7 +8,6 @@ not add up. Lengths are over the picture's longest side; constants are set by ha
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import tee
 from pathlib import Path
 
@@ -51,36 +50,20 @@ _STANDING_S = 1.0
 _NAMED_CUTS = 5
 
 
-@dataclass(frozen=True)
-class VideoFacts:
-    """What a video file says about itself."""
-
-    width: int
-    """Pixels."""
-    height: int
-    """Pixels."""
-    seconds: float
-    """Duration; 0 where it announces no frames."""
-
-
-def read_video_facts(video: Path) -> VideoFacts:
-    """Read the header and the first frame of a video.
-
-    Args:
-        video: The file.
+def describe_video(video: Path) -> str:
+    """Duration and size of a video, by its header and its first frame.
 
     Raises:
         ValueError: There is no such file, OpenCV cannot read it, or it announces fewer than three frames.
     """
     with _opened(video) as capture:
         is_read, frame = capture.read()
-        frames = _announced(capture)
+        frames, rate = _announced(capture), capture.get(cv2.CAP_PROP_FPS)
         if not is_read or 0 < frames < _MIN_FRAMES:
             found = f"{frames}" if is_read else "none that can be read"
             raise ValueError(f"{video}: expected a video of at least {_MIN_FRAMES} frames, found {found}")
-        rate = capture.get(cv2.CAP_PROP_FPS)
         seconds = frames / rate if math.isfinite(rate) and rate > 0 else 0.0
-        return VideoFacts(frame.shape[1], frame.shape[0], seconds)
+        return f"a video of {seconds:.0f} s, {frame.shape[1]} x {frame.shape[0]}"
 
 
 def extract_frames(

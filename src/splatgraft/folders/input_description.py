@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from splatgraft.capture import MIN_VIEWS, read_video_facts
+from splatgraft.capture import MIN_VIEWS, describe_video
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture, read_gaussians
 from splatgraft.formats.captures.masks import describe_masks, find_photos
@@ -59,9 +59,9 @@ def _described(path: Path) -> InputDescription:
         masks = describe_masks(posed.image_paths, posed.mask_paths)
         return InputDescription("posed capture", f"a capture of {len(posed)} images with poses, {masks}: it is trained")
     if path.is_file():
-        facts = read_video_facts(path)
-        found = f"a video of {facts.seconds:.0f} s, {facts.width} x {facts.height}"
-        return InputDescription("video", f"{found}: frames are taken, poses are found, and it is trained")
+        return InputDescription(
+            "video", f"{describe_video(path)}: frames are taken, poses are found, and it is trained"
+        )
     return _folder_of_photos(path)
 
 

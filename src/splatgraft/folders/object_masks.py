@@ -122,18 +122,18 @@ def cut_masks(
     ratios = (small.cameras.sizes / capture.cameras.sizes).tolist()
     prompts = {index: prompt.scaled(*ratios[index]) for index, prompt in (request.prompts or {}).items()}
     cameras = small.cameras.to(scene.device)
-    seed = seed_selection(scene, cameras, box=request.box, prompts=prompts, known=_known(small, scene))
+    selection, region = seed_selection(scene, cameras, box=request.box, prompts=prompts, known=_known(small, scene))
     pictures = []
     for index in range(len(small)):
         progress(index, len(small), "reading pictures")
         pictures.append((small.image(index) * 255).round().to(torch.uint8))
     images = LazySequence(len(small), lambda index: pictures[index].float() / 255)
     views = CutViews(images, cameras, prompts)
-    allowed = seed.region.allows(scene.means)
-    masks, _ = cut_object(views, scene, share=seed.selection, allowed=allowed, cutter=request.cutter, progress=progress)
+    allowed = region.allows(scene.means)
+    masks, _ = cut_object(views, scene, share=selection, allowed=allowed, cutter=request.cutter, progress=progress)
     sizes = capture.cameras.sizes.tolist()
     grown = ((resize(mask, *sizes[index]) > 0.5).float() for index, mask in enumerate(masks))
-    return replace(_written(capture, grown, folder), region=seed.region)
+    return replace(_written(capture, grown, folder), region=region)
 
 
 def _known(capture: PosedImages, scene: Gaussians) -> Bool[Tensor, "n"] | None:

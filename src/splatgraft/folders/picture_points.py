@@ -96,7 +96,7 @@ def point_in_world(text: str, capture: PosedImages, scene: Gaussians | None, *, 
     clicks = [ViewPrompt(inside=torch.tensor([_numbers(pixel)])) for _, _, pixel in named]
     pixels = [in_camera_pixels(capture, i, click).inside for i, click in zip(indices, clicks, strict=True)]
     if len(set(indices)) > 1:
-        return triangulate(capture.cameras[indices], torch.cat(pixels)).point
+        return triangulate(capture.cameras[indices], torch.cat(pixels))[0]
     if scene is None:
         raise ValueError(f'{option}: expected the point in two images, or a scene (--scene), found only "{text}"')
     found = surface_points(scene, capture.cameras[indices[0]].to(scene.device), pixels[0])

@@ -11,7 +11,7 @@ from splatgraft.segmentation.cut_object import (
 )
 from splatgraft.segmentation.grabcut import grabcut_mask
 from splatgraft.segmentation.lift import LiftOptions, lift_masks
-from splatgraft.segmentation.object_region import ObjectRegion, Seed, default_box, seed_selection
+from splatgraft.segmentation.object_region import ObjectRegion, default_box, seed_selection
 from splatgraft.segmentation.onnx_networks import load_birefnet, load_sam2
 from splatgraft.segmentation.segment import Segmentation, segment
 from splatgraft.segmentation.selection import (
@@ -33,7 +33,6 @@ __all__ = [
     "Keep",
     "LiftOptions",
     "ObjectRegion",
-    "Seed",
     "Segmentation",
     "SelectOptions",
     "SolidifyOptions",

@@ -103,16 +103,6 @@ class ObjectRegion:
         return inside & self.box.grown(_BEYOND).contains(points) if self.is_whole else inside
 
 
-@dataclass(frozen=True)
-class Seed:
-    """The first selection, and where it was looked for."""
-
-    selection: Bool[Tensor, "n"]
-    """Which Gaussians are likely the object's."""
-    region: ObjectRegion
-    """Where they were looked for."""
-
-
 def seed_selection(
     scene: Gaussians,
     cameras: Cameras,
@@ -120,8 +110,8 @@ def seed_selection(
     box: Box | None = None,
     prompts: Mapping[int, ViewPrompt] | None = None,
     known: Bool[Tensor, "n"] | None = None,
-) -> Seed:
-    """Select what is likely the object.
+) -> tuple[Bool[Tensor, "n"], ObjectRegion]:
+    """Select the Gaussians that are likely the object's.
 
     Args:
         scene: n Gaussians.
@@ -129,6 +119,9 @@ def seed_selection(
         box: Around the object, world units; guessed where None.
         prompts: What the user says, by index of the camera, pixels of its picture.
         known: Gaussians that masks of some pictures give to the object; None where there are no masks.
+
+    Returns:
+        Which Gaussians are likely the object's, and the region in which they were looked for.
 
     Raises:
         ValueError: Where nothing tells where the object is, or nothing is there.
@@ -154,7 +147,7 @@ def seed_selection(
             f"object: expected something solid in {region.reason}, found nothing; give its --box, or --prompts with "
             "clicks in two or three pictures"
         )
-    return Seed(selection, region)
+    return selection, region
 
 
 def default_box(capture: PosedImages) -> Box:
