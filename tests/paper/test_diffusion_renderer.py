@@ -13,7 +13,6 @@ import yaml
 from splatgraft_paper.training.relighters import (
     DiffusionRenderer,
     RelightingInput,
-    RenderSize,
     forward_arguments,
     inverse_arguments,
 )
@@ -23,27 +22,6 @@ INVERSE, FORWARD = Path("/data/in"), Path("/data/buffers")
 MAPS = [Path("/maps/a map.hdr"), Path("/maps/it's.hdr"), Path("/maps/c.hdr")]
 
 
-def str2bool(text):
-    """As the programs of cosmos read truth values."""
-    if text.lower() in ("yes", "true", "t", "y", "1"):
-        return True
-    if text.lower() in ("no", "false", "f", "n", "0"):
-        return False
-    raise argparse.ArgumentTypeError("Boolean value expected.")
-
-
-def parser_of(table):
-    """A real argparse parser with the recorded options."""
-    parser = argparse.ArgumentParser(exit_on_error=False)
-    kinds = {"str": str, "int": int, "float": float, "str2bool": str2bool}
-    for entry in table:
-        settings = {key: value for key, value in entry.items() if key not in ("flag", "type")}
-        if "type" in entry:
-            settings["type"] = kinds[entry["type"]]
-        parser.add_argument(entry["flag"], **settings)
-    return parser
-
-
 def merged(defaults, dotlist):
     """As OmegaConf merges a dotlist into a configuration; it reads values as YAML."""
     given = dict(word.split("=", 1) for word in dotlist)
@@ -51,9 +29,10 @@ def merged(defaults, dotlist):
     return defaults | {key: yaml.safe_load(value) for key, value in given.items()}
 
 
-def test_the_svd_programs_take_our_command_lines():
-    parser, size = parser_of(TABLES["svd"]["parser"]), RenderSize.of("svd", 496, 704)
-    known, rest = parser.parse_known_args(inverse_arguments("svd", INVERSE, FORWARD, size))
+def test_the_programs_take_our_command_lines():
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    parser.add_argument("--config", type=str, required=True)
+    known, rest = parser.parse_known_args(inverse_arguments(INVERSE, FORWARD, (448, 704)))
     assert known.config == "configs/rgbx_inference.yaml"
     config = merged(TABLES["svd"]["inverse"], rest)
     # split_list_with_overlap: "Overlap size must be less than the chunk size."
@@ -62,40 +41,12 @@ def test_the_svd_programs_take_our_command_lines():
     assert not config["save_video"]
     assert config["inference_res"] == [448, 704]
     assert config["model_passes"] == ["basecolor", "metallic", "roughness", "normal", "depth"]
-    known, rest = parser.parse_known_args(forward_arguments("svd", FORWARD, INVERSE, MAPS, size))
+    known, rest = parser.parse_known_args(forward_arguments(FORWARD, INVERSE, MAPS, (448, 704)))
     assert known.config == "configs/xrgb_inference.yaml"
     config = merged(TABLES["svd"]["forward"], rest)
     assert config["envlight"] == [str(path) for path in MAPS]
     assert config["image_group_mode"] == "webdataset"
     assert config["save_image"]
-
-
-def test_the_cosmos_programs_take_our_command_lines():
-    table, size = TABLES["cosmos"], RenderSize.of("cosmos", 496, 704)
-    parser = parser_of([*table["common"], *table["inverse"]])
-    found = parser.parse_args(inverse_arguments("cosmos", INVERSE, FORWARD, size))
-    assert (found.dataset_path, found.video_save_folder) == (str(INVERSE), str(FORWARD))
-    assert (found.num_video_frames, found.height, found.width) == (1, 704, 992)
-    assert found.save_image
-    assert not found.save_video
-    parser = parser_of([*table["common"], *table["forward"]])
-    found = parser.parse_args(forward_arguments("cosmos", FORWARD, INVERSE, MAPS, size))
-    assert found.dataset_path == str(FORWARD / "gbuffer_frames")
-    assert found.envlight_ind == [0, 1, 2]
-    assert found.use_custom_envmap
-    assert not found.rotate_light
-    # the forward renderer has no --save_video, and no --envlight: the earlier form of our command line
-    for refused in (["--save_video=False"], ["--envlight=/maps/a.hdr"]):
-        with pytest.raises((SystemExit, argparse.ArgumentError)):
-            parser.parse_args(refused)
-
-
-@pytest.mark.parametrize(("h", "w"), [(496, 704), (704, 496), (1080, 1920), (40, 40)])
-def test_sizes_are_multiples_that_the_models_take(h, w):
-    svd, cosmos = (RenderSize.of(variant, h, w) for variant in ("svd", "cosmos"))
-    assert svd.height % 64 == svd.width % 64 == 0
-    assert cosmos.height % 16 == cosmos.width % 16 == 0
-    assert cosmos.width <= 1280
 
 
 # Stand-ins of the programs: what they read, print, load and write is that of the recorded versions; they darken by the
@@ -141,51 +92,6 @@ def main():
 if __name__ == "__main__":
     main()
 """
-_COSMOS = """
-import argparse, json, pathlib, sys
-import numpy as np
-from PIL import Image
-from cosmos_predict1 import here
-
-def str2bool(v):
-    return {"True": True, "False": False}[v]
-
-class DiffusionRendererPipeline:
-    def __init__(self, **named):
-        with open("loads.txt", "a") as stream: stream.write("PROGRAM\\n")
-
-def parse_arguments():
-    table = json.loads(pathlib.Path("options.json").read_text())["cosmos"]
-    parser = argparse.ArgumentParser()
-    for entry in [*table["common"], *table["PART"]]:
-        settings = {k: v for k, v in entry.items() if k not in ("flag", "type")}
-        if "type" in entry:
-            settings["type"] = {"str": str, "int": int, "float": float, "str2bool": str2bool}[entry["type"]]
-        parser.add_argument(entry["flag"], **settings)
-    return parser.parse_args()
-
-ENV_LIGHT_PATH_LIST = ["asset/not there.hdr"]
-
-def demo(args):
-    DiffusionRendererPipeline(checkpoint_dir=args.checkpoint_dir, height=args.height, width=args.width)
-    given, out = pathlib.Path(args.dataset_path), pathlib.Path(args.video_save_folder)
-    if "PART" == "inverse":
-        for path in given.rglob("*.png"):
-            folder = out / "gbuffer_frames" / path.parent.relative_to(given)
-            folder.mkdir(parents=True, exist_ok=True)
-            for name in args.inference_passes:
-                Image.open(path).resize((args.width, args.height)).save(folder / f"0000.0000.{name}.jpg", quality=100)
-        return
-    for path in given.rglob("*.basecolor.jpg"):
-        for number in args.envlight_ind:
-            assert pathlib.Path(ENV_LIGHT_PATH_LIST[number]).is_file(), ENV_LIGHT_PATH_LIST
-            target = out / f"relit_frames_{number:04d}" / path.relative_to(given).parent / "0000.0000.jpg"
-            target.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(np.asarray(Image.open(path)) // (number + 1)).save(target, quality=100)
-
-if __name__ == "__main__":
-    demo(parse_arguments())
-"""
 
 
 @pytest.fixture
@@ -197,18 +103,11 @@ def python(tmp_path):
     return path
 
 
-def installation(folder, variant, how=lambda text: text):
+def installation(folder, how=lambda text: text):
     folder.mkdir()
     (folder / "options.json").write_text(json.dumps(TABLES))
-    below = folder if variant == "svd" else folder / "cosmos_predict1/diffusion/inference"
-    below.mkdir(parents=True, exist_ok=True)
-    names = {"inverse": "inference_svd_rgbx.py", "forward": "inference_svd_xrgb.py"}
-    if variant == "cosmos":
-        names = {part: f"inference_{part}_renderer.py" for part in names}
-        (folder / "cosmos_predict1" / "__init__.py").write_text("here = True")
-    for part, name in names.items():
-        text = (_SVD if variant == "svd" else _COSMOS).replace("PART", part).replace("PROGRAM", part)
-        (below / name).write_text(how(text))
+    for part, name in {"inverse": "inference_svd_rgbx.py", "forward": "inference_svd_xrgb.py"}.items():
+        (folder / name).write_text(how(_SVD.replace("PART", part).replace("PROGRAM", part)))
     return folder
 
 
@@ -226,15 +125,14 @@ def maps(folder, count):
     return paths
 
 
-@pytest.mark.parametrize("variant", ["svd", "cosmos"])
-def test_many_pictures_and_lights_load_each_model_once(tmp_path, python, variant):
-    folder = installation(tmp_path / "code", variant)
-    renderer, lights = DiffusionRenderer(folder, python, variant), maps(tmp_path / "maps", 3)
+def test_many_pictures_and_lights_load_each_model_once(tmp_path, python):
+    folder = installation(tmp_path / "code")
+    renderer, lights = DiffusionRenderer(folder, python), maps(tmp_path / "maps", 3)
     for draft in drafts(3):
         relit = renderer.relight(draft, lights)
         assert [picture.shape for picture in relit] == [(48, 80, 3)] * 3
         for number, picture in enumerate(relit):
-            # 8 bits, and for cosmos JPEG twice
+            # 8 bits
             assert (picture - draft.image / (number + 1)).abs().max() < 0.02
     assert sorted((folder / "loads.txt").read_text().split()) == ["forward", "inverse"]
     renderer.close()
@@ -243,7 +141,7 @@ def test_many_pictures_and_lights_load_each_model_once(tmp_path, python, variant
 def test_a_program_that_fails_is_one_line_and_the_next_picture_is_made(tmp_path, python):
     once = "def main():\n    import os\n    if not os.path.exists('failed'):\n        open('failed', 'w').close()\n"
     once += "        raise RuntimeError('CUDA out of memory\\n in a kernel')\n"
-    folder = installation(tmp_path / "code", "svd", lambda text: text.replace("def main():\n", once))
+    folder = installation(tmp_path / "code", lambda text: text.replace("def main():\n", once))
     renderer, lights = DiffusionRenderer(folder, python), maps(tmp_path / "maps", 1)
     draft = drafts(1)[0]
     line = r"inference_svd_rgbx.py: expected it to succeed, found RuntimeError: CUDA out of memory in a kernel"
@@ -257,7 +155,7 @@ def test_a_program_that_fails_is_one_line_and_the_next_picture_is_made(tmp_path,
 def test_a_process_that_dies_is_one_line_and_is_started_again(tmp_path, python):
     once = "def main():\n    import os\n    if not os.path.exists('failed'):\n        open('failed', 'w').close()\n"
     once += "        print('Killed', file=sys.stderr, flush=True); os._exit(9)\n"
-    folder = installation(tmp_path / "code", "svd", lambda text: text.replace("def main():\n", once))
+    folder = installation(tmp_path / "code", lambda text: text.replace("def main():\n", once))
     renderer, lights = DiffusionRenderer(folder, python), maps(tmp_path / "maps", 1)
     with pytest.raises(ValueError, match=r"expected it to succeed, found its process ended \(Killed\)"):
         renderer.relight(drafts(1)[0], lights)
@@ -265,21 +163,8 @@ def test_a_process_that_dies_is_one_line_and_is_started_again(tmp_path, python):
     renderer.close()
 
 
-def test_arguments_that_a_parser_refuses_are_told_in_its_words(tmp_path, python):
-    folder = installation(tmp_path / "code", "cosmos")
-    table = json.loads((folder / "options.json").read_text())
-    table["cosmos"]["forward"] = [entry for entry in table["cosmos"]["forward"] if entry["flag"] != "--rotate_light"]
-    (folder / "options.json").write_text(json.dumps(table))
-    renderer = DiffusionRenderer(folder, python, "cosmos")
-    with pytest.raises(ValueError, match=r"found .*error: unrecognized arguments: --rotate_light False"):
-        renderer.relight(drafts(1)[0], maps(tmp_path / "maps", 1))
-    renderer.close()
-
-
 def test_an_installation_that_is_none_is_one_line(tmp_path, python):
-    folder = installation(tmp_path / "code", "svd")
-    line = r"expected an installation of DiffusionRenderer \(cosmos\) with cosmos_predict1"
-    with pytest.raises(ValueError, match=line):
-        DiffusionRenderer(folder, python, "cosmos")
+    with pytest.raises(ValueError, match=r"expected an installation of DiffusionRenderer with inference_svd_rgbx\.py"):
+        DiffusionRenderer(tmp_path, python)
     with pytest.raises(ValueError, match="expected a Python that runs DiffusionRenderer"):
-        DiffusionRenderer(folder, tmp_path / "nowhere")
+        DiffusionRenderer(installation(tmp_path / "code"), tmp_path / "nowhere")

@@ -108,7 +108,7 @@ def flux_loss(tmp_path, times, samples, **options):
     return run, loss, given, joined, answer, t, {role: z.double().numpy() for role, z in latents.items()}
 
 
-@pytest.mark.parametrize("times", ["uniform", "logit-normal", "schnell"])
+@pytest.mark.parametrize("times", ["uniform", "schnell"])
 def test_the_loss_is_equation_1_and_every_noise_level_weighs_the_same(tmp_path, times):
     _, loss, _, joined, v, t, z = flux_loss(tmp_path, times, 64)
     z_t = joined[:, :4]
@@ -137,7 +137,6 @@ def test_the_text_is_the_empty_prompt_for_every_sample(tmp_path):
     assert np.array_equal(given["encoder_hidden_states"], np.repeat(prompt["tokens"][None], 3, 0))
     assert np.array_equal(given["pooled_projections"], np.repeat(prompt["pooled"][None], 3, 0))
     assert not given["txt_ids"].any()
-    assert given.pop("guidance") is None
     assert set(given) == {
         *("hidden_states", "timestep", "encoder_hidden_states", "pooled_projections", "txt_ids", "img_ids")
     }
@@ -153,8 +152,6 @@ def test_times_are_distributed_as_their_option_says(tmp_path):
     assert uniform.min() > 0
     # seeds are fixed: these are the probabilities of such a deviation, not a chance of failing
     assert kstest(uniform, "uniform").pvalue > 0.01
-    middle = drawn("logit-normal")
-    assert kstest(np.log(middle / (1 - middle)), "norm").pvalue > 0.01
     levels, counts = np.unique(drawn("schnell"), return_counts=True)
     assert np.array_equal(levels, [0.25, 0.5, 0.75, 1.0])
     # a quarter of 2000 has a deviation of 19

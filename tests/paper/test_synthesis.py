@@ -7,7 +7,7 @@ import pytest
 
 from splatgraft_paper.synthesis import benchmark, objects, pairs, places
 from splatgraft_paper.synthesis.furniture import placed
-from splatgraft_paper.synthesis.jobs import RenderSize, copy_shared_takes
+from splatgraft_paper.synthesis.jobs import RenderSize
 from splatgraft_paper.synthesis.scene import ARC_LENGTH, camera_arc
 
 
@@ -73,42 +73,3 @@ def test_benchmark_has_the_papers_scenes_and_none_is_a_training_scene():
     size = benchmark.BenchmarkSize(RenderSize(64, 48, 2), 8)
     tested = {benchmark.plan(scene, size)[0].scene.name for scene in benchmark.SCENES}
     assert not trained & tested
-
-
-def rendered_in_name(job, out):
-    """Files as a finished job leaves them, each holding its own name."""
-    for name in ("cameras.json", "exposure.json"):
-        out.mkdir(exist_ok=True)
-        (out / name).write_text(name)
-    for mark in job.files(out):
-        mark.parent.mkdir(exist_ok=True)
-        mark.with_suffix(".png").write_text(f"{mark.parent.name} {mark.stem}")
-        mark.touch()
-
-
-def test_rotations_of_one_object_share_the_takes_without_it(tmp_path):
-    size = benchmark.BenchmarkSize(RenderSize(64, 48, 2), 8)
-    first, other = benchmark.ROTATIONS[0], benchmark.ROTATIONS[1]
-    assert other in benchmark.scenes_with_shared_renders(first)
-    assert benchmark.SCENES[0] in benchmark.scenes_with_shared_renders(first)
-    (target, source), (turned, same) = benchmark.plan(first, size), benchmark.plan(other, size)
-    rendered_in_name(target, tmp_path / "target")
-    rendered_in_name(source, tmp_path / "source")
-    copy_shared_takes(turned, tmp_path / "turned", target, tmp_path / "target")
-    assert sorted(path.name for path in (tmp_path / "turned").iterdir() if path.is_dir()) == ["light", "target"]
-    assert (tmp_path / "turned" / "target" / "0003.png").read_text() == "target 0003"
-    assert not turned.is_done(tmp_path / "turned")
-    copy_shared_takes(same, tmp_path / "same", source, tmp_path / "source")
-    assert same.is_done(tmp_path / "same")
-
-
-def test_incomplete_takes_and_those_of_other_scenes_are_not_copied(tmp_path):
-    size = benchmark.BenchmarkSize(RenderSize(64, 48, 2), 8)
-    target, turned = (benchmark.plan(which, size)[0] for which in benchmark.ROTATIONS[:2])
-    stranger = benchmark.plan(benchmark.SCENES[1], size)[0]
-    rendered_in_name(target, tmp_path / "target")
-    copy_shared_takes(stranger, tmp_path / "stranger", target, tmp_path / "target")
-    assert not (tmp_path / "stranger").exists()
-    (tmp_path / "target" / "target" / "0003.done").unlink()
-    copy_shared_takes(turned, tmp_path / "turned", target, tmp_path / "target")
-    assert not (tmp_path / "turned").exists()

@@ -33,7 +33,6 @@ def test_pairs_become_a_harmonizer_s_folder(tmp_path, capsys):
     assert main(words(tmp_path, "out")) == 0
     printed = capsys.readouterr()
     assert printed.out.strip() == str(tmp_path / "out" / "model")
-    assert "memory: all weights: 1 GB a device" in printed.err
     assert "1 pairs to train on, 1 held out" in printed.err
     names = {path.name for path in (tmp_path / "out" / "model").iterdir()}
     assert names == {"transformer", "vae", "empty_prompt.safetensors", "harmonizer.json"}

@@ -101,7 +101,7 @@ def test_a_trained_adaptation_changes_what_the_base_makes(tmp_path):
 
 
 def test_the_other_condition_is_trained_and_told(tmp_path):
-    run = training(tmp_path, "out", condition="image-background", times="logit-normal", first_layer="zero")
+    run = training(tmp_path, "out", condition="image-background")
     assert run.task.objective.roles == ("target", "composite", "background")
     harmonizer = make_harmonizer(FluxOptions(weights=str(run.train())))
     assert harmonizer.network.variant == "image-background"

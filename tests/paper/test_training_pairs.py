@@ -28,7 +28,7 @@ from splatgraft_paper.training.generate import (
 )
 from splatgraft_paper.training.pairs import crop_to_size, open_relit, open_rendered, split_mixture
 from splatgraft_paper.training.prompts import ANGLES, ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
-from splatgraft_paper.training.relighters import RelightingInput, SilhouetteRelighter, inflated_normals
+from splatgraft_paper.training.relighters import RelightingInput, StandInRelighter
 
 
 def environment(folder: Path, name: str, bright: str) -> Path:
@@ -119,26 +119,15 @@ def test_the_choice_of_photographs_is_balanced():
     assert len(choose_balanced(photographs, 10_000, 0)) == len(photographs)
 
 
-def test_inflated_normals_point_outwards():
-    y, x = torch.meshgrid(torch.arange(41.0), torch.arange(61.0), indexing="ij")
-    normal = inflated_normals((((x - 30) ** 2 + (y - 20) ** 2) < 15**2).float())
-    assert normal[20, 42, 0] > 0.3
-    assert normal[20, 18, 0] < -0.3
-    assert normal[8, 30, 1] > 0.3
-    assert normal[20, 30, 2] > 0.95
-
-
-def test_the_silhouette_relighter_shades_the_lit_side_and_is_named_in_records(tmp_path):
-    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
-    mask = (((x - 30) ** 2 + (y - 20) ** 2) < 15**2).float()
-    draft = RelightingInput("ball", torch.full((40, 60, 3), 0.5), mask)
-    right, left = SilhouetteRelighter().relight(
-        draft, [environment(tmp_path, side, side) for side in ("right", "left")]
-    )
-    assert right[20, 40].mean() > right[20, 20].mean() + 0.1
-    assert left[20, 20].mean() > left[20, 40].mean() + 0.1
-    assert torch.equal(right[mask == 0], draft.image[mask == 0])
-    assert "not DiffusionRenderer" in SilhouetteRelighter().name
+def test_the_stand_in_tints_the_object_alone_and_is_named_in_records(tmp_path):
+    mask = torch.nn.functional.pad(torch.ones(20, 20), (10, 10, 10, 10))
+    draft = RelightingInput("box", torch.full((40, 40, 3), 0.5), mask)
+    red = np.full((16, 32, 3), (0.1, 0.1, 1.0), np.float32)  # in OpenCV's order
+    assert cv2.imwrite(str(tmp_path / "red.hdr"), red)
+    (relit,) = StandInRelighter().relight(draft, [tmp_path / "red.hdr"])
+    assert relit[20, 20, 0] > 0.5 > relit[20, 20, 2]
+    assert torch.equal(relit[mask == 0], draft.image[mask == 0])
+    assert "not DiffusionRenderer" in StandInRelighter().name
 
 
 def test_a_killed_generation_resumes_and_unsuitable_samples_are_recorded(tmp_path):
@@ -158,7 +147,7 @@ def test_a_killed_generation_resumes_and_unsuitable_samples_are_recorded(tmp_pat
             yield SamplePlan(name, "scene", make, {"prompt": f"a {name}", "licence": "shipped"})
 
     lighting = Lighting(
-        SilhouetteRelighter(), [environment(tmp_path / "maps", side, side) for side in ("left", "right")], 2, 0
+        StandInRelighter(), [environment(tmp_path / "maps", side, side) for side in ("left", "right")], 2, 0
     )
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):

@@ -18,7 +18,6 @@ from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE, write_true_li
 from splatgraft_paper.synthesis import benchmark, pairs
 from splatgraft_paper.synthesis.jobs import (
     RenderWorkers,
-    copy_shared_takes,
     read_render_size,
     render_job,
     write_failures,
@@ -118,33 +117,18 @@ class SynthBenchmark:
         chosen, size = self._chosen(), self._size()
         python = self.workers.python(console)
         with locked(self.out):
-            failures = []
-            # pictures that several rotations of one object share are rendered once, with the first of them
-            first = [
-                which
-                for i, which in enumerate(chosen)
-                if not set(chosen[:i]) & set(benchmark.scenes_with_shared_renders(which))
+            tasks = [
+                Task(folder.name, partial(render_job, job, folder, python))
+                for which in chosen
+                for job, folder in zip(benchmark.plan(which, size), self._folders(which), strict=True)
             ]
-            for wave in (first, [which for which in chosen if which not in first]):
-                tasks = []
-                for which in wave:
-                    self._take_over(which, size)
-                    for job, folder in zip(benchmark.plan(which, size), self._folders(which), strict=True):
-                        tasks.append(Task(folder.name, partial(render_job, job, folder, python)))
-                failures += self.workers.run(tasks, console) if tasks else []
+            failures = self.workers.run(tasks, console)
             for which in chosen:
                 target, source = benchmark.plan(which, size)
                 if target.is_done(self._folders(which)[0]) and source.is_done(self._folders(which)[1]):
                     failures += self._gather(which, console)
             write_failures(self.out, failures, console)
         return 1 if failures else 0
-
-    def _take_over(self, which: benchmark.BenchmarkScene, size: benchmark.BenchmarkSize) -> None:
-        for twin in benchmark.scenes_with_shared_renders(which):
-            ours, theirs = benchmark.plan(which, size), benchmark.plan(twin, size)
-            for job, folder, elder, there in zip(ours, self._folders(which), theirs, self._folders(twin), strict=True):
-                if not job.is_done(folder):
-                    copy_shared_takes(job, folder, elder, there)
 
     def _gather(self, which: benchmark.BenchmarkScene, console: Console) -> list[str]:
         out = self.out / which.name

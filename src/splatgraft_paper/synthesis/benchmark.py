@@ -70,15 +70,6 @@ ROTATIONS: tuple[BenchmarkScene, ...] = tuple(
 )
 
 
-def scenes_with_shared_renders(which: BenchmarkScene) -> tuple[BenchmarkScene, ...]:
-    """List the other scenes with the same seeds: only the object's rotation differs, and they share renders."""
-    return tuple(
-        other
-        for other in (*SCENES, *ROTATIONS)
-        if (other.seed, other.object_seed) == (which.seed, which.object_seed) and other != which
-    )
-
-
 @dataclass(frozen=True)
 class BenchmarkSize:
     """Size and number of the benchmark's views."""

@@ -1,11 +1,10 @@
 """Render jobs, their rendering in Blender processes, and the checks and failure lists of the folders they write."""
 
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -134,33 +133,6 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
             (line for line in reversed(tail) if "Error" in line and "freed" not in line), tail[-1] if tail else ""
         )
         raise ValueError(f"{log}: expected Blender to render every picture, found exit code {code}: {said}")
-
-
-def copy_shared_takes(job: Job, out: Path, other: Job, other_out: Path) -> None:
-    """Copy from `other_out` the complete takes that `job` would render identically; existing files of `out` stay.
-
-    The first take determines the exposure: unless it is shared, nothing is copied.
-    """
-    same_setup = (other.scene, other.cameras, other.size, other.seed) == (job.scene, job.cameras, job.size, job.seed)
-    shared = [
-        take
-        for take in job.takes
-        if same_setup
-        and take in other.takes
-        and job.objects.get(take.object) == other.objects.get(take.object)
-        and replace(other, takes=(take,)).is_done(other_out)
-    ]
-    if job.takes[0] not in shared:
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    for name in ("cameras.json", "exposure.json"):
-        shutil.copyfile(other_out / name, out / name)
-    for take in shared:
-        # .done files last: after an interruption, pictures without one are rendered again
-        for path in sorted((other_out / take.name).iterdir(), key=lambda path: path.suffix == ".done"):
-            (out / take.name).mkdir(exist_ok=True)
-            if not (out / take.name / path.name).exists():
-                shutil.copyfile(path, out / take.name / path.name)
 
 
 def check_blender(blender_python: Path) -> str:

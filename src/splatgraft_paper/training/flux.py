@@ -1,7 +1,6 @@
 """Training of FLUX as a harmoniser: rectified flow matching on the velocity (paper, Sec. 5, Eq. 1)."""
 
 import json
-import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -30,18 +29,14 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, save_weights, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, TrainingData, crop_pair_to_size, open_training_data
-from splatgraft_paper.training.recipes import Recipe, TrainingCost, activation_bytes, parse_image_size, plan
+from splatgraft_paper.training.recipes import Recipe, TrainingCost, plan
 from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
-Times = Literal["uniform", "logit-normal", "schnell"]
+Times = Literal["uniform", "schnell"]
 TINY = "tiny"
 """In place of a base model: one of three million weights is made first, in OUT/base."""
 _BASE_PICTURES = 1200
 """Most pictures that the tiny base model's autoencoder is trained on."""
-_RESERVED_BYTES = 1 << 30
-"""For the CUDA context, kernels and fragmentation. An estimate."""
-_TEXT_TOKENS = 512
-"""At most."""
 _LORA_TARGETS = (
     r"(single_)?transformer_blocks\..*"
     r"\.(to_[qkv]|to_out\.0|add_[qkv]_proj|to_add_out|proj_mlp|proj_out|ff(_context)?\.net\.(0\.proj|2))"
@@ -64,7 +59,7 @@ class FluxTrainingOptions:
     lora: int = 0
     """Rank of a low-rank adaptation; 0 trains all weights."""
     times: Times = "uniform"
-    """Noise levels that are trained: all alike, the middle ones more often (Esser et al. 2024), or inference's four."""
+    """Noise levels that are trained: all alike, or the four that inference uses."""
     no_checkpointing: bool = False
     """Keep activations instead of computing them twice: faster, several times the memory."""
     recipe: str | None = None
@@ -199,8 +194,6 @@ def write_lora(path: Path, state: dict[str, Tensor], about: dict[str, str]) -> N
 
 def _level(times: Times, generator: torch.Generator) -> Float[Tensor, ""]:
     """Draw a noise level in (0, 1]."""
-    if times == "logit-normal":
-        return torch.randn((), generator=generator).sigmoid()
     if times == "schnell":
         return torch.tensor(schnell_levels()[int(torch.randint(4, (), generator=generator))])
     return 1 - torch.rand((), generator=generator)
@@ -232,8 +225,6 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
     elif processes.is_main_process and not folder.is_dir():
         _make_tiny_base(folder, data, options.loop.seed, console)
     processes.wait_for_everyone()
-    if recipe is None and processes.is_main_process:
-        console.say(_plan(None, options, FluxFolder.open(folder).config, processes.num_processes)[-1])
     objective = FluxObjective(folder, options, console.say)
     return train_objective(objective, data, out, options.loop, base=folder, console=console)
 
@@ -259,7 +250,6 @@ def _known_config(base: str) -> dict[str, Any]:
 
 
 def _plan(recipe: Recipe | None, options: FluxTrainingOptions, config: dict[str, Any], processes: int) -> list[str]:
-    """Lines that say what will run; the last one is about the memory."""
     loop = options.loop
     width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
     doubles, singles = config.get("num_layers", 19), config.get("num_single_layers", 38)
@@ -273,14 +263,5 @@ def _plan(recipe: Recipe | None, options: FluxTrainingOptions, config: dict[str,
         trained=options.lora * width * (36 * doubles + 20 * singles) if options.lora else parameters,
         processes=processes,
         ema=loop.ema > 0,
-        shards=processes if loop.parallel == "shards" else 1,
-        half=loop.precision != "no",
     )
-    tokens = math.prod(parse_image_size(options.data.size, multiple_of=16)) // 256 + _TEXT_TOKENS
-    tokens *= max(1, loop.batch // (processes * loop.accumulate))
-    activations = activation_bytes(
-        tokens=tokens, width=width, blocks=doubles + singles, checkpointing=not options.no_checkpointing
-    )
-    need = cost.weight_bytes + activations * (1 if cost.half else 2) + _RESERVED_BYTES
-    what = f"lora of rank {options.lora}" if options.lora else "all weights"
-    return [*plan(recipe, cost, loop.rate), f"memory: {what}: {need / 1e9:.0f} GB a device"]
+    return plan(recipe, cost, loop.rate)

@@ -31,7 +31,7 @@ from splatgraft_paper.training.pairs import (
     write_relit_manifest,
     write_sample,
 )
-from splatgraft_paper.training.relighters import DiffusionRenderer, Relighter, RelightingInput, SilhouetteRelighter
+from splatgraft_paper.training.relighters import DiffusionRenderer, Relighter, RelightingInput, StandInRelighter
 
 SHEET_FILE = "sheet.png"
 _REJECTED = "rejected"
@@ -163,8 +163,6 @@ class RelightingOptions:
     """The paper's DiffusionRenderer, in your own installation; or a simple stand-in without a learned model."""
     renderer: Path | None = None
     """Folder of DiffusionRenderer's code."""
-    renderer_variant: Literal["svd", "cosmos"] = "svd"
-    """Which of its two versions."""
     renderer_python: Path | None = None
     """The Python that runs it; the current one where not given."""
 
@@ -181,12 +179,12 @@ class RelightingOptions:
 
     def _relighter(self) -> Relighter:
         if self.relighter == "stand-in":
-            return SilhouetteRelighter()
+            return StandInRelighter()
         if self.renderer is None:
             raise ValueError(
                 "--renderer: expected the folder of DiffusionRenderer's code, found none; or --relighter stand-in"
             )
-        return DiffusionRenderer(self.renderer, self.renderer_python or Path(sys.executable), self.renderer_variant)
+        return DiffusionRenderer(self.renderer, self.renderer_python or Path(sys.executable))
 
 
 _PIPELINE_BYTES = 36 << 30

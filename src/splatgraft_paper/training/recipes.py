@@ -16,11 +16,6 @@ above. An estimate; the paper gives no time."""
 _PAPER_PIXELS = 704 * 496
 _LATENT_BYTES_PER_PIXEL = 16 / 64 * 2
 """16 channels of bfloat16 for 8 x 8 pixels."""
-_BYTES_PER_BLOCK = 54
-"""Activations that a block keeps for its backward pass under autocast, bytes per token and channel; measured by
-tests/paper/test_recipes.py."""
-_BYTES_PER_CHECKPOINT = 2
-"""The same for a block that is computed again in the backward pass."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +107,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class TrainingCost:
-    """What decides how long a training takes and how much memory and disk it needs."""
+    """What decides how long a training takes and how much disk it needs."""
 
     steps: int
     batch: int
@@ -126,10 +121,6 @@ class TrainingCost:
     ema: bool = False
     removal: bool = False
     """Whether the object removal is trained, otherwise FLUX."""
-    shards: int = 1
-    """Processes that share weights, gradients and optimiser."""
-    half: bool = True
-    """Arithmetic in 16 bits."""
 
     @property
     def hours(self) -> float:
@@ -139,33 +130,9 @@ class TrainingCost:
         return self.steps * self.batch * each * pixels / _PAPER_PIXELS / self.processes / 3600
 
     @property
-    def weight_bytes(self) -> int:
-        """Bytes on each device for weights, gradients, optimiser and moving average, without activations.
-
-        A trained parameter takes 4 bytes (float32), its gradient 4, Adam's two moments 8, the moving average 4, and
-        the 16-bit copy that autocast keeps through a pass 2; a frozen parameter takes 2 (bfloat16).
-        """
-        each = 16 + 4 * self.ema + 2 * self.half
-        frozen = self.parameters if self.trained < self.parameters else 0
-        return (self.trained * each + frozen * 2) // self.shards
-
-    @property
     def state_bytes(self) -> int:
         """Of the two states that are kept and the one that is being written: weights, Adam's moments, the average."""
         return 3 * self.trained * (4 + 8 + 4 * self.ema)
-
-
-def activation_bytes(*, tokens: int, width: int, blocks: int, checkpointing: bool = True) -> int:
-    """Estimate the bytes of a transformer's activations that are kept for the backward pass, in 16 bits.
-
-    Args:
-        tokens: of all pairs of a pass, text included.
-        width: channels of a token.
-        blocks: of the transformer.
-        checkpointing: whether activations are computed again in the backward pass.
-    """
-    kept = _BYTES_PER_CHECKPOINT * blocks + _BYTES_PER_BLOCK if checkpointing else _BYTES_PER_BLOCK * blocks
-    return tokens * width * kept
 
 
 def plan(recipe: Recipe | None, cost: TrainingCost, rate: float) -> list[str]:

@@ -205,10 +205,8 @@ def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) 
             processes=count,
             ema=loop.ema > 0,
             removal=True,
-            half=loop.precision != "no",
         )
-        memory = f"memory: {cost.weight_bytes / 1e9:.1f} GB a device for weights and optimiser, and activations"
-        for line in [*plan(recipe, cost, loop.rate), memory]:
+        for line in plan(recipe, cost, loop.rate):
             if processes.is_main_process:
                 console.say(line)
         if options.plan:

@@ -3,7 +3,7 @@
 Started by `diffusion_renderer.py` with DiffusionRenderer's Python, in the folder of its code: nothing of this package
 can be imported here. Standard input has one JSON object per line:
 
-    {"program": "inference_svd_rgbx.py", "arguments": ["--config", ...], "lights": ["/maps/a.hdr", ...]}
+    {"program": "inference_svd_rgbx.py", "arguments": ["--config", ...]}
 
 and standard output gets one line for each: {"error": null}, or {"error": "ValueError: ..."}. What the programs print
 goes to standard error. The classes that load models are replaced in the programs' modules by ones that keep the last
@@ -23,36 +23,31 @@ LOADERS = (
     "CLIPVisionModelWithProjection",
     "CLIPImageProcessor",
 )
-"""Names in the programs of the variant `svd` whose from_pretrained loads weights."""
-PIPELINES = ("DiffusionRendererPipeline",)
-"""Names in the programs of the variant `cosmos` whose call loads weights."""
+"""Names in the programs whose from_pretrained loads weights."""
 
 
 class Kept:
-    """Stands for a class; what its constructor or from_pretrained made last is given again for equal arguments."""
+    """Stands for a class; what its from_pretrained made last is given again for equal arguments."""
 
-    def __init__(self, kind, *, calls):
-        """Keep what `from_pretrained` makes, or where `calls`, what the constructor makes."""
-        self._kind, self._calls, self._key, self._made = kind, calls, None, None
+    def __init__(self, kind):
+        """Keep what `from_pretrained` makes."""
+        self._kind, self._key, self._made = kind, None, None
 
     def __call__(self, *values, **named):
-        """Construct, or give what was constructed last."""
-        return self._once(self._kind, values, named) if self._calls else self._kind(*values, **named)
+        """Construct."""
+        return self._kind(*values, **named)
 
     def from_pretrained(self, *values, **named):
         """Load, or give what was loaded last."""
-        return self._once(self._kind.from_pretrained, values, named)
-
-    def __getattr__(self, name):
-        return getattr(self._kind, name)
-
-    def _once(self, make, values, named):
         key = [_identity(value) for value in values], {name: _identity(value) for name, value in named.items()}
         if key != self._key:
             self._key = self._made = None  # the memory of the last one, before the next is loaded
-            self._made = make(*values, **named)
+            self._made = self._kind.from_pretrained(*values, **named)
             self._key = key
         return self._made
+
+    def __getattr__(self, name):
+        return getattr(self._kind, name)
 
 
 def _identity(value):
@@ -68,22 +63,16 @@ def load(program):
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     spec.loader.exec_module(module)
-    for names, calls in ((LOADERS, False), (PIPELINES, True)):
-        for kind in names:
-            if hasattr(module, kind):
-                setattr(module, kind, Kept(getattr(module, kind), calls=calls))
+    for kind in LOADERS:
+        if hasattr(module, kind):
+            setattr(module, kind, Kept(getattr(module, kind)))
     return module
 
 
 def run(module, job):
     """Call a program as its command line would."""
     sys.argv = [job["program"], *job["arguments"]]
-    if hasattr(module, "ENV_LIGHT_PATH_LIST"):
-        module.ENV_LIGHT_PATH_LIST = job["lights"]  # --envlight_ind counts in this list
-    if hasattr(module, "demo"):
-        module.demo(module.parse_arguments())
-    else:
-        module.main()
+    module.main()
 
 
 def main():
