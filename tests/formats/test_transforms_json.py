@@ -70,8 +70,10 @@ def test_cameras_round_trip_bit_for_bit(tmp_path):
     assert back.names == cameras.names
 
 
-@pytest.mark.parametrize("content", [{"w": 24, "h": 16}, {"w": 24, "h": 16, "k1": -0.05, "k2": 0.01, "cx": 12.5}])
-@pytest.mark.parametrize("factor", [1.0, 0.5])
+@pytest.mark.parametrize(
+    ("content", "factor"),
+    [({"w": 24, "h": 16}, 1.0), ({"w": 24, "h": 16, "k1": -0.05, "k2": 0.01, "cx": 12.5}, 0.5)],
+)
 def test_capture_round_trip(tmp_path, content, factor):
     formats.write_points(tmp_path / "cloud.ply", torch.randn(7, 3), torch.randint(0, 256, (7, 3)) / 255)
     format_files.write_transforms(tmp_path, {**content, "ply_file_path": "cloud.ply"})
@@ -144,25 +146,17 @@ MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
     [
         ({"transform_matrix": SCALED}, {}, "axes of length 2, 2, 2"),
         ({"transform_matrix": MIRRORED}, {}, "determinant -1"),
-        ({"transform_matrix": [[float("nan")] * 4] * 4}, {}, "finite"),
         ({"transform_matrix": [[1, 2], [3]]}, {}, "transform_matrix"),
-        ({"transform_matrix": None}, {}, "transform_matrix"),
-        ({"file_path": "images/9999.png"}, {}, "images/9999.png"),
         ({"file_path": "images/0001.png"}, {}, "twice"),
-        ({"file_path": 3}, {}, "file_path"),
         ({"mask_path": "no.png"}, {}, "no.png"),
         ({}, {"fl_x": -3}, "focal length above 0"),
         ({}, {"fl_x": "20"}, "'20'"),
-        ({}, {"fl_x": float("nan")}, "fl_x"),
         ({}, {"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
         ({}, {"k4": 0.1}, "k4 = 0.1"),
-        ({}, {"k1": -3.0}, "k1, k2, p1, p2, k3 = -3"),
         ({}, {"w": 24.5, "h": 16}, "24.5"),
         ({}, {"w": 24}, "'h'"),
-        ({}, {"w": 48, "h": 48}, "found 24x16"),
         ({}, {"ply_file_path": "none.ply"}, "none.ply"),
-        ({}, {"frames": []}, "at least one frame"),
-        ({}, {"frames": "none"}, "frames"),
+        ({}, {"frames": []}, "a list of 'frames'"),
     ],
 )
 def test_refusals(tmp_path, frame, content, expected):
@@ -205,10 +199,9 @@ def test_one_frame_that_is_not_usable_is_left_out_and_named(tmp_path, frame, exp
     assert not capture.left_out[0].mask_only
 
 
-@pytest.mark.parametrize("content", [b"", b"no image", b"\x89PNG\r\n\x1a\n cut short"])
-def test_one_image_without_a_readable_header_is_left_out_and_named(tmp_path, content):
+def test_one_image_without_a_readable_header_is_left_out_and_named(tmp_path):
     format_files.write_transforms(tmp_path, {"w": 24, "h": 16}, frames=3)
-    (tmp_path / "images/0001.png").write_bytes(content)
+    (tmp_path / "images/0001.png").write_bytes(b"\x89PNG\r\n\x1a\n cut short")
     capture = formats.read_capture(tmp_path)
     assert capture.cameras.names == ("0000.png", "0002.png")
     assert [str(one) for one in capture.left_out] == ["images/0001.png"]
@@ -238,3 +231,10 @@ def test_json_that_is_none(tmp_path):
         for read in (formats.read_capture, formats.read_cameras):
             with pytest.raises(ValueError, match=r"transforms\.json: expected .*found"):
                 read(tmp_path / "transforms.json")
+
+
+def test_transforms_count_before_colmap_whose_images_need_not_exist_for_cameras(tmp_path):
+    format_files.write_colmap(tmp_path / "sparse" / "0")
+    assert formats.read_cameras(tmp_path).names == ("a.png", "b.png")
+    format_files.write_transforms(tmp_path, {})
+    assert formats.read_capture(tmp_path).cameras.names == ("0000.png", "0001.png")

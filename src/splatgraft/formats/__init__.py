@@ -7,7 +7,9 @@ from pathlib import Path
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures import colmap, transforms_json
+from splatgraft.formats.captures.colmap import is_colmap, read_colmap
+from splatgraft.formats.captures.transforms_json import read_json, write_cameras, write_capture
+from splatgraft.formats.captures.views import CaptureFile, ViewRecord, cameras, posed_images
 from splatgraft.formats.scenes.axes import with_axes
 from splatgraft.formats.scenes.compressed_ply import COMPRESSED_PLY, write_compressed_ply
 from splatgraft.formats.scenes.gaussian_glb import read_gaussian_glb, write_gaussian_glb
@@ -176,26 +178,17 @@ def read_capture(path: Path | str) -> PosedImages:
     Raises:
         ValueError: There is none of these at `path`, or a file is broken.
     """
-    path = Path(path)
-    with _readable(path):
-        transforms = _transforms_path(path)
-        return transforms_json.read_capture(transforms) if transforms else colmap.read_capture(path)
+    with _readable(Path(path)):
+        return posed_images(_capture_file(Path(path)))
 
 
 def read_images(path: Path) -> PosedImages:
     """Posed photographs without points, as of a ground truth; a points file need not exist.
 
-    Raises:
-        ValueError: Where no capture exists, or a file is broken.
+    Raises: ValueError where no capture exists, or a file is broken.
     """
     with _readable(path):
-        transforms = _transforms_path(path)
-        return transforms_json.read_images(transforms) if transforms else colmap.read_capture(path)
-
-
-def write_capture(folder: Path, posed_images: PosedImages) -> None:
-    """Write transforms.json and points.ply into an existing folder; image files are referenced, not copied."""
-    transforms_json.write_capture(folder, posed_images)
+        return posed_images(_capture_file(path), with_points=False)
 
 
 def read_cameras(path: Path | str) -> Cameras:
@@ -210,12 +203,8 @@ def read_cameras(path: Path | str) -> Cameras:
     Raises:
         ValueError: There is none of these at `path`, or a file is broken.
     """
-    path = Path(path)
-    with _readable(path):
-        if transforms_json.is_cameras_json(path):
-            return transforms_json.read_cameras_json(path)
-        transforms = _transforms_path(path)
-        return transforms_json.read_cameras(transforms) if transforms else colmap.read_cameras(path)
+    with _readable(Path(path)):
+        return cameras(_capture_file(Path(path)))
 
 
 def list_capture_images(path: Path) -> list[Path]:
@@ -228,15 +217,8 @@ def list_capture_images(path: Path) -> list[Path]:
         ValueError: There is no capture at `path`, or a file is broken.
     """
     with _readable(path):
-        if transforms_json.is_cameras_json(path):
-            return []
-        transforms = _transforms_path(path)
-        return transforms_json.image_files(transforms) if transforms else colmap.image_files(path)
-
-
-def write_cameras(path: Path, cameras: Cameras) -> None:
-    """Write cameras without images as a transforms.json."""
-    transforms_json.write_cameras(path, cameras)
+        views = _capture_file(path).views
+    return [view.image_path for view in views if isinstance(view, ViewRecord) and view.image_path]
 
 
 @contextmanager
@@ -248,17 +230,16 @@ def _readable(path: Path) -> Generator[None]:
         raise ValueError(f"{error.filename or path}: expected a readable file, found {error.strerror}") from error
 
 
-def _transforms_path(path: Path) -> Path | None:
-    """The .json that describes the capture; None where it is a COLMAP folder."""
+def _capture_file(path: Path) -> CaptureFile:
     if path.suffix.lower() == ".json" or path.is_file():
-        return path
+        return read_json(path)
     if not path.is_dir():
         raise ValueError(f"{path}: expected a capture folder or a transforms.json, found nothing there")
     for name in ("transforms.json", "transforms_train.json"):
         if (path / name).is_file():
-            return path / name
-    if colmap.is_colmap(path):
-        return None
+            return read_json(path / name)
+    if is_colmap(path):
+        return read_colmap(path)
     raise ValueError(
         f"{path}: expected transforms.json, or a COLMAP model in sparse/0, "
         f"found {sorted(entry.name for entry in path.iterdir())[:6]}"

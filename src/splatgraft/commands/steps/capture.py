@@ -25,11 +25,12 @@ from splatgraft.folders.capture_files import (
     capture_inputs,
     describe_left_out,
     describe_unposed,
+    description_files,
     exposure_warnings,
     has_poses,
 )
 from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, write_capture
-from splatgraft.formats.captures.given_poses import pose_files, read_given_poses
+from splatgraft.formats.captures.given_poses import read_given_poses
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.project.step import Context, Inputs, Positional
 from splatgraft.runtime.note import Note
@@ -74,7 +75,7 @@ class Capture:
             return {"photos": (self.capture,)}
         photos = find_photos(self.capture)
         files = {"photos": photos.paths, "masks": tuple(mask for mask in photos.masks if mask is not None)}
-        return files if self.poses is None else files | {"poses": pose_files(self.poses)}
+        return files if self.poses is None else files | {"poses": description_files(self.poses)}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the posed capture."""

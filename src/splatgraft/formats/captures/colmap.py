@@ -14,17 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.core.cameras import Cameras
-from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures.views import (
-    MAX_SIDE,
-    ViewRecord,
-    cameras_of,
-    existing_file,
-    fitted_to_file,
-    posed_images_of,
-    rigid,
-)
+from splatgraft.formats.captures.views import MAX_SIDE, CaptureFile, ViewRecord, existing_file, rigid
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
@@ -57,43 +47,6 @@ def is_colmap(folder: Path) -> bool:
     return bool(_model_folders(folder))
 
 
-def read_capture(folder: Path) -> PosedImages:
-    """The largest model, ordered by image name, without images that are not usable.
-
-    Raises: ValueError where no whole model is there, its camera model is not supported, or fewer than half of the
-    images are usable.
-    """
-    source, views, model = _views(folder)
-    points, colors = _read_points(_file(model, "points3D"))
-    return posed_images_of(views, source, folder=folder, points=points, colors=colors)
-
-
-def read_views(folder: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """The photos of the largest model, whose files need not exist, its points and their colours.
-
-    Raises: ValueError where no whole model is there, or its camera model is not supported.
-    """
-    _, views, model = _views(folder)
-    return views, *_read_points(_file(model, "points3D"))
-
-
-def read_cameras(folder: Path) -> Cameras:
-    """The cameras of the largest model; images need not exist.
-
-    Raises: ValueError where no whole model is there, or its camera model is not supported.
-    """
-    source, views, _ = _views(folder)
-    return cameras_of([fitted_to_file(view, source) for view in views], source)[0]
-
-
-def image_files(folder: Path) -> list[Path]:
-    """The image files of the largest model that exist.
-
-    Raises: ValueError where no whole model is there.
-    """
-    return [view.image_path for view in _views(folder)[1] if view.image_path]
-
-
 def _model_folders(folder: Path) -> list[Path]:
     found = [
         path
@@ -110,8 +63,11 @@ def _file(model: Path, stem: str) -> Path:
     raise ValueError(f"{model}: expected {stem}.bin or {stem}.txt, found neither")
 
 
-def _views(folder: Path) -> tuple[Path, list[ViewRecord], Path]:
-    """The file of the largest model's images, these ordered by name, and the model's folder."""
+def read_colmap(folder: Path) -> CaptureFile:
+    """The largest model, ordered by image name.
+
+    Raises: ValueError where no whole model is there, or its camera model is not supported.
+    """
     models = [(path, _read_images(_file(path, "images"))) for path in _model_folders(folder)]
     if not models:
         raise ValueError(f"{folder}: expected a COLMAP model (cameras, images, points3D as .bin or .txt), found none")
@@ -137,7 +93,7 @@ def _views(folder: Path) -> tuple[Path, list[ViewRecord], Path]:
                 distortion=camera.distortion,
             )
         )
-    return source, views, model
+    return CaptureFile(source, folder, views, lambda: _read_points(_file(model, "points3D")))
 
 
 def _pose(image: _Image, source: Path) -> np.ndarray:

@@ -3,13 +3,11 @@
 from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
 
-from jaxtyping import Float
-from torch import Tensor
-
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures import colmap, transforms_json
+from splatgraft.formats.captures.colmap import is_colmap, read_colmap
 from splatgraft.formats.captures.masks import PhotoFiles
-from splatgraft.formats.captures.views import ViewRecord, fitted_to_file, posed_images_of
+from splatgraft.formats.captures.transforms_json import read_json
+from splatgraft.formats.captures.views import CaptureFile, fitted_to_file, posed_images
 
 _MIN_PHOTOS = 3
 """Photos with a pose: below it nothing is seen from two sides and checked by a third."""
@@ -27,19 +25,6 @@ class GivenPoses:
     """Names of the poses whose photo is not there."""
 
 
-def pose_files(source: Path) -> tuple[Path, ...]:
-    """The files that `read_given_poses` reads.
-
-    Raises: ValueError where there is nothing at `source`.
-    """
-    if source.is_file():
-        return (source,)
-    if not source.is_dir():
-        raise ValueError(f"{source}: expected a file or folder with poses, found nothing")
-    suffixes = {".json", ".ply", ".bin", ".txt"}
-    return tuple(sorted(p for p in source.rglob("*") if p.is_file() and p.suffix in suffixes and p.name != "step.json"))
-
-
 def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
     """The `photos` with the poses in `source`; a pose belongs to the photo with its name, whatever its suffix.
 
@@ -50,7 +35,8 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
     Raises:
         ValueError: There is no such thing at `source`, it is broken, or fewer than three photos have a pose.
     """
-    views, points, colors = _read(source)
+    file = _read(source)
+    views = file.records()
     masks = photos.masks or (None,) * len(photos.paths)
     by_stem = {path.stem: (path, mask) for path, mask in zip(photos.paths, masks, strict=True)}
     known = {path.name: path.stem for path in photos.paths}
@@ -69,20 +55,20 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
             f"its first is named {views[0].name}, the first photo {photos.paths[0].name}"
         )
     return GivenPoses(
-        posed=posed_images_of(fitted, source, folder=photos.paths[0].parent, points=points, colors=colors),
+        posed=posed_images(replace(file, folder=photos.paths[0].parent, views=fitted)),
         without_pose=tuple(path.name for path in photos.paths if path.stem not in stems),
         without_photo=tuple(view.name for view, stem in zip(views, stems, strict=True) if stem not in by_stem),
     )
 
 
-def _read(source: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+def _read(source: Path) -> CaptureFile:
     transforms = next((f for f in (source, source / "transforms.json") if f.suffix == ".json" and f.is_file()), None)
     if transforms is not None:
-        return transforms_json.read_views(transforms)
+        return read_json(transforms)
     folder = source.parent if source.is_file() else source
-    if not colmap.is_colmap(folder):
+    if not is_colmap(folder):
         raise ValueError(f"{source}: expected poses (a COLMAP model or transforms.json), found neither")
-    return colmap.read_views(folder)
+    return read_colmap(folder)
 
 
 def _stem(name: str, known: dict[str, str]) -> str:

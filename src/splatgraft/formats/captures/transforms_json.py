@@ -6,7 +6,6 @@ Also reads cameras.json, which the original 3DGS code writes beside a scene.
 import json
 import math
 import os
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,11 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import IMAGE_SUFFIXES, stored_size
-from splatgraft.core.posed_images import LeftOut, PosedImages
+from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures.views import (
+    CaptureFile,
     ViewRecord,
-    cameras_of,
     existing_file,
-    fitted_to_file,
-    posed_images_of,
     rigid,
     view_or_reason,
 )
@@ -38,63 +35,32 @@ _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 _CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
 
-def read_capture(path: Path) -> PosedImages:
-    """The capture that a transforms.json describes, without frames that are not usable (`PosedImages.left_out`).
+def read_json(path: Path) -> CaptureFile:
+    """The capture that a transforms.json describes, or the cameras of a cameras.json, which is a list.
 
-    Raises: ValueError where the file or its points are missing or broken, or fewer than half of the frames are usable.
+    Raises: ValueError where the file is missing or broken as a whole.
     """
-    points, colors = _read_points(path, _load(path))
-    return replace(read_images(path), points=points, point_colors=colors)
+    meta = load(path)
+    if isinstance(meta, list):
+        return _cameras_json(path, meta)
+    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
+        raise ValueError(f"{path}: expected a JSON object with a list of 'frames', found {excerpt(meta)}")
+    views = [
+        view_or_reason(_frame_name(index, frame), partial(_view, path, index, meta, frame))
+        for index, frame in enumerate(meta["frames"])
+    ]
+    if meta.get("ply_file_path") is None:
+        return CaptureFile(path, path.parent, views, _no_points)
+    return CaptureFile(path, path.parent, views, lambda: read_points(path.parent / text(path, meta, "ply_file_path")))
 
 
-def read_images(path: Path) -> PosedImages:
-    """The capture without its points, whose file need not exist.
-
-    Raises: ValueError as `read_capture`.
-    """
-    views, none = _usable_views(path), torch.zeros(0, 3)
-    return posed_images_of(views, path, folder=path.parent, points=none, colors=none)
+def _no_points() -> tuple[Float[Tensor, "0 3"], Float[Tensor, "0 3"]]:
+    return torch.zeros(0, 3), torch.zeros(0, 3)
 
 
-def read_views(path: Path) -> tuple[list[ViewRecord], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """The frames, whose image files need not exist where w and h are given, the points and their colours.
-
-    Raises: ValueError where the file or its points are broken.
-    """
-    meta = _load(path)
-    return _views(path, meta), *_read_points(path, meta)
-
-
-def read_cameras(path: Path) -> Cameras:
-    """The cameras of a transforms.json; images need not exist where it gives w and h.
-
-    Raises: ValueError where the file is missing or broken.
-    """
-    return cameras_of([fitted_to_file(view, path) for view in _views(path, _load(path))], path)[0]
-
-
-def image_files(path: Path) -> list[Path]:
-    """The image files that a transforms.json names and that exist.
-
-    Raises: ValueError where the file is missing or broken.
-    """
-    return [view.image_path for view in _usable_views(path) if isinstance(view, ViewRecord) and view.image_path]
-
-
-def is_cameras_json(path: Path) -> bool:
-    """Whether the file is a JSON list, as cameras.json of the original code is, and not an object."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        return stream.read(64).lstrip().startswith(b"[")
-
-
-def read_cameras_json(path: Path) -> Cameras:
-    """The cameras of a cameras.json; OpenCV axes, principal points at the centre, as the file has none.
-
-    Raises: ValueError where the file is broken.
-    """
-    entries, views = load(path), []
+def _cameras_json(path: Path, entries: list[Any]) -> CaptureFile:
+    """OpenCV axes, principal points at the centre, as the file has none; no images."""
+    views = []
     for index, entry in enumerate(entries):
         if not isinstance(entry, dict):
             raise ValueError(f"{path}: expected camera {index} to be an object, found {type(entry).__name__}")
@@ -114,34 +80,7 @@ def read_cameras_json(path: Path) -> Cameras:
         )
     if not views:
         raise ValueError(f"{path}: expected a list of cameras, found none")
-    return cameras_of(views, path)[0]
-
-
-def _load(path: Path) -> dict[str, Any]:
-    meta = load(path)
-    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list):
-        raise ValueError(f"{path}: expected a JSON object with a list 'frames', found {excerpt(meta)}")
-    if not meta["frames"]:
-        raise ValueError(f"{path}: expected at least one frame, found none")
-    return meta
-
-
-def _read_points(path: Path, meta: dict[str, Any]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    if meta.get("ply_file_path") is None:
-        return torch.zeros(0, 3), torch.zeros(0, 3)
-    return read_points(path.parent / text(path, meta, "ply_file_path"))
-
-
-def _usable_views(path: Path) -> list[ViewRecord | LeftOut]:
-    meta = _load(path)
-    return [
-        view_or_reason(_frame_name(index, frame), partial(_view, path, index, meta, frame))
-        for index, frame in enumerate(meta["frames"])
-    ]
-
-
-def _views(path: Path, meta: dict[str, Any]) -> list[ViewRecord]:
-    return [_view(path, index, meta, frame) for index, frame in enumerate(meta["frames"])]
+    return CaptureFile(path, path.parent, views, _no_points)
 
 
 def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> ViewRecord:

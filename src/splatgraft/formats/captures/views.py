@@ -49,6 +49,30 @@ class ViewRecord:
     mask_path: Path | None = None
 
 
+@dataclass(frozen=True)
+class CaptureFile:
+    """A capture as its file describes it."""
+
+    source: Path
+    """The file, for messages."""
+    folder: Path
+    """Where masks/ is looked for."""
+    views: Sequence[ViewRecord | LeftOut]
+    """One per photograph, or why it is left out."""
+    points: Callable[[], tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]]
+    """Reads sparse points, world units, and their colours, sRGB in [0, 1]."""
+
+    def records(self) -> list[ViewRecord]:
+        """All views.
+
+        Raises: ValueError with the reason where one is left out.
+        """
+        for view in self.views:
+            if isinstance(view, LeftOut):
+                raise ValueError(view.reason)
+        return [view for view in self.views if isinstance(view, ViewRecord)]
+
+
 def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
     """The pose (4, 4) with its rotation made orthonormal in float64.
 
@@ -82,33 +106,19 @@ def existing_file(path: Path) -> Path | None:
         return None
 
 
-def posed_images_of(
-    views: Sequence[ViewRecord | LeftOut],
-    source: Path,
-    *,
-    folder: Path,
-    points: Float[Tensor, "m 3"],
-    colors: Float[Tensor, "m 3"],
-) -> PosedImages:
-    """The capture of `views`, without those whose image is missing or unreadable or does not fit its camera.
+def posed_images(file: CaptureFile, *, with_points: bool = True) -> PosedImages:
+    """The capture without views whose image is missing or unreadable or does not fit its camera.
 
-    Args:
-        views: One per photograph, or why it is left out already.
-        source: The file that describes them, for error messages.
-        folder: Where masks/ is looked for.
-        points: Sparse points, world units.
-        colors: Of the points, sRGB in [0, 1].
-
-    Raises:
-        ValueError: Where fewer than half of the views or of their masks are left, or an image is named twice.
+    Raises: ValueError where fewer than half of the views or of their masks are left, or an image is named twice.
     """
-    checked = [view if isinstance(view, LeftOut) else _usable(view, source, folder) for view in views]
+    checked = [view if isinstance(view, LeftOut) else _usable(view, file.source, file.folder) for view in file.views]
     left_out = [view for view in checked if isinstance(view, LeftOut)]
     kept = [view for view in checked if isinstance(view, ViewRecord)]
-    _require_share(len(kept), left_out, "images", source)
-    fitted, without_mask = _with_masks(kept, folder)
-    _require_share(sum(view.mask_path is not None for view in fitted), without_mask, "masks", source)
-    cameras, distortions = cameras_of(fitted, source)
+    _require_share(len(kept), left_out, "images", file.source)
+    fitted, without_mask = _with_masks(kept, file.folder)
+    _require_share(sum(view.mask_path is not None for view in fitted), without_mask, "masks", file.source)
+    cameras, distortions = _cameras_of(fitted, file.source)
+    points, colors = file.points() if with_points else (torch.zeros(0, 3), torch.zeros(0, 3))
     return PosedImages(
         image_paths=tuple(view.image_path for view in fitted if view.image_path),
         cameras=cameras,
@@ -118,6 +128,14 @@ def posed_images_of(
         distortions=distortions if any(distortions) else (),
         left_out=(*left_out, *without_mask),
     )
+
+
+def cameras(file: CaptureFile) -> Cameras:
+    """The pinhole cameras of the undistorted views; images need not exist.
+
+    Raises: ValueError where a view is not usable.
+    """
+    return _cameras_of([fitted_to_file(view, file.source) for view in file.records()], file.source)[0]
 
 
 def view_or_reason(name: str, read: Callable[[], ViewRecord]) -> ViewRecord | LeftOut:
@@ -202,7 +220,7 @@ def fitted_to_file(view: ViewRecord, source: Path) -> ViewRecord:
     )
 
 
-def cameras_of(views: Sequence[ViewRecord], source: Path) -> tuple[Cameras, tuple[Distortion | None, ...]]:
+def _cameras_of(views: Sequence[ViewRecord], source: Path) -> tuple[Cameras, tuple[Distortion | None, ...]]:
     """The pinhole cameras of the undistorted views, and the distortion of each file.
 
     Raises: ValueError that names `source`, for invalid intrinsics.
