@@ -8,8 +8,7 @@ the card's name, after each part. `--toy` runs the same code at toy size on the 
     renderer      gsplat against the CPU rasteriser: pictures, gradients, W and its transpose; milliseconds
     reconstruct   data/room at draft quality: dB on held-out views, seconds
     paper-size    benchmarks/paper_size.py: lift, relight, render, consolidate
-    harmonize-*   a random-weight harmoniser of the real size at 704x496: stock diffusers and ours, batch 1 to 8;
-                  stored in fp8; compiled
+    harmonize-*   a random-weight harmoniser of the real size at 704x496: stock diffusers and ours; stored in fp8
     lora          one training step of a low-rank adaptation of that network
 """
 
@@ -17,6 +16,7 @@ import argparse
 import json
 import math
 import platform
+import statistics
 import subprocess
 import sys
 import time
@@ -161,44 +161,21 @@ def paper_size(setting: Setting) -> list[Row]:
 
 
 def harmonize_plain(setting: Setting) -> list[Row]:
-    """Stock diffusers one view at a time, then ours in batches."""
-    from harmonize import parts
-
+    """Stock diffusers, then ours with the modulations in a table."""
     from splatgraft.harmonization.flux.baked_modulation import bake
     from splatgraft.harmonization.flux.sampling import schnell_levels
 
     network, size = _network(setting)
-    rows: list[Row] = [{"kind": "stock, batch 1", **parts(network, 1, size, setting.repeats)}]
+    rows = [{"kind": "stock", **_harmonize_times(network, size, setting), "peak_gb": setting.peak_gb()}]
     bake(network.transformer, network.prompt, schnell_levels()[:-1])
-    for batch in (1, 2) if setting.toy else (1, 2, 4, 8):
-        rows.append({"kind": f"ours, batch {batch}", **parts(network, batch, size, setting.repeats)})
-    return [{**row, "peak_gb": setting.peak_gb()} for row in rows]
+    return [*rows, {"kind": "ours", **_harmonize_times(network, size, setting), "peak_gb": setting.peak_gb()}]
 
 
 def harmonize_fp8(setting: Setting) -> list[Row]:
     """Weights stored in 8 bits and cast layer by layer, as `--precision fp8`."""
-    from harmonize import parts
-
     network, size = _network(setting)
     network.transformer.enable_layerwise_casting(storage_dtype=torch.float8_e4m3fn, compute_dtype=network.dtype)
-    batch = 1 if setting.toy else 4
-    found = parts(network, batch, size, setting.repeats)
-    return [{"kind": f"fp8 stored, batch {batch}", **found, "peak_gb": setting.peak_gb()}]
-
-
-def harmonize_compiled(setting: Setting) -> list[Row]:
-    """Ours after torch.compile; the toy compiles with the backend that traces and generates no code."""
-    from harmonize import parts
-
-    from splatgraft.harmonization.flux.baked_modulation import bake
-    from splatgraft.harmonization.flux.sampling import schnell_levels
-
-    network, size = _network(setting)
-    bake(network.transformer, network.prompt, schnell_levels()[:-1])
-    network.transformer.compile_repeated_blocks(**({"backend": "eager"} if setting.toy else {}))
-    batch = 1 if setting.toy else 4
-    found = parts(network, batch, size, setting.repeats)
-    return [{"kind": f"compiled, batch {batch}", **found, "peak_gb": setting.peak_gb()}]
+    return [{"kind": "fp8 stored", **_harmonize_times(network, size, setting), "peak_gb": setting.peak_gb()}]
 
 
 def lora_step(setting: Setting) -> list[Row]:
@@ -236,25 +213,49 @@ PARTS: Mapping[str, Callable[[Setting], list[Row]]] = {
     "paper-size": paper_size,
     "harmonize-plain": harmonize_plain,
     "harmonize-fp8": harmonize_fp8,
-    "harmonize-compiled": harmonize_compiled,
     "lora": lora_step,
 }
 
 
+REAL = {"in_channels": 192, "out_channels": 64}
+TINY = {
+    "in_channels": 192, "out_channels": 64, "num_layers": 1, "num_single_layers": 2, "attention_head_dim": 16,
+    "num_attention_heads": 2, "joint_attention_dim": 4096, "pooled_projection_dim": 768, "axes_dims_rope": (4, 6, 6),
+}  # fmt: skip
+# FLUX.1's vae/config.json
+AUTOENCODER = {
+    "block_out_channels": (128, 256, 512, 512), "down_block_types": ("DownEncoderBlock2D",) * 4,
+    "up_block_types": ("UpDecoderBlock2D",) * 4, "latent_channels": 16, "layers_per_block": 2,
+    "scaling_factor": 0.3611, "shift_factor": 0.1159, "use_quant_conv": False, "use_post_quant_conv": False,
+}  # fmt: skip
+TINY_AUTOENCODER = {**AUTOENCODER, "block_out_channels": (8, 8, 8, 8), "layers_per_block": 1, "norm_num_groups": 4}
+TOKENS = 256
+
+
+def _random_network(kind: Any, settings: dict[str, Any], device: torch.device, dtype: torch.dtype) -> Any:
+    """Make a network with random weights directly on the device, so that 24 GB need not pass through the CPU."""
+    torch.manual_seed(0)
+    with torch.device(device):
+        default = torch.get_default_dtype()
+        torch.set_default_dtype(dtype)
+        try:
+            return kind(**settings).eval().requires_grad_(False)
+        finally:
+            torch.set_default_dtype(default)
+
+
 def _network(setting: Setting) -> tuple[Any, tuple[int, int]]:
     """The harmoniser with random weights, of the real size or tiny, and the size of its images."""
-    from harmonize import AUTOENCODER, REAL, TINY, TINY_AUTOENCODER, TOKENS, random_network
-
     from splatgraft.harmonization.flux.loading import diffusers_library
     from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork
     from splatgraft.harmonization.flux.prompt import PromptEmbedding
 
     dtype = torch.float32 if setting.toy else torch.bfloat16
-    transformer = random_network(
+    transformer = _random_network(
         diffusers_library().FluxTransformer2DModel, TINY if setting.toy else REAL, setting.device, dtype
     )
     weights = TINY_AUTOENCODER if setting.toy else AUTOENCODER
-    autoencoder = Autoencoder(random_network(diffusers_library().AutoencoderKL, weights, setting.device, dtype))
+    autoencoder = Autoencoder(_random_network(diffusers_library().AutoencoderKL, weights, setting.device, dtype))
     tokens = 8 if setting.toy else TOKENS
     prompt = PromptEmbedding(torch.randn(tokens, 4096), torch.randn(768)).to(setting.device, dtype)
     network = FluxNetwork(transformer, autoencoder, prompt, "image-mask", setting.device, dtype)
@@ -266,9 +267,44 @@ def _relative(wanted: torch.Tensor, found: torch.Tensor) -> float:
 
 
 def _median(work: Callable[[], object], setting: Setting) -> float:
-    from harmonize import seconds
+    """Median seconds of `work` after two warm-up runs."""
+    times = []
+    for i in range(setting.repeats + 2):
+        begin = time.perf_counter()
+        work()
+        setting.synchronize()
+        if i >= 2:
+            times.append(time.perf_counter() - begin)
+    return statistics.median(times)
 
-    return seconds(work, setting.device, setting.repeats)
+
+def _harmonize_times(network: Any, size: tuple[int, int], setting: Setting) -> Row:
+    """Seconds of encoding, the four sampling steps, decoding, and the whole harmonisation of a view."""
+    from splatgraft.harmonization import HarmonizerInputs
+    from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer
+    from splatgraft.harmonization.flux.network import pad_by_reflection, velocity
+    from splatgraft.harmonization.flux.sampling import noise, sample, schnell_levels
+
+    (width, height), device = size, network.device
+    pictures = torch.rand(2, 3, height, width)
+    padded = pad_by_reflection(pictures).to(device)
+    h, w = padded.shape[2] // 8, padded.shape[3] // 8
+    conditions, start = torch.randn(1, 32, h, w, device=device), noise((16, h, w), 0).to(device)[None]
+
+    def step(latents: torch.Tensor, level: float) -> torch.Tensor:
+        joined = torch.cat([latents, conditions], 1).to(network.dtype)
+        return velocity(network.transformer, joined, torch.tensor([level], device=device), network.prompt)
+
+    flat, image = torch.zeros(height, width), pictures[0].permute(1, 2, 0).contiguous()
+    view = HarmonizerInputs(image, image, flat, flat, torch.zeros(height, width, 3), image)
+    harmonizer = FluxHarmonizer(network)
+    work: dict[str, Callable[[], object]] = {
+        "encode": lambda: network.autoencoder.encode(padded),
+        "steps": lambda: sample(step, start, schnell_levels()),
+        "decode": lambda: network.autoencoder.decode(start),
+        "whole": lambda: harmonizer.harmonize(view),
+    }
+    return {name: _median(run, setting) for name, run in work.items()}
 
 
 def run_part(name: str, setting: Setting, out: Path) -> None:

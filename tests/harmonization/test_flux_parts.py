@@ -154,12 +154,10 @@ GB = 10**9
 
 
 def test_the_best_precision_that_fits_is_taken():
-    working = working_bytes(pixels=704 * 496, views=1, width=3072)
+    working = working_bytes(pixels=704 * 496, width=3072)
     for free, precision in ((80, "bf16"), (24, "bf16"), (16, "fp8"), (8, "offload")):
         found, reason = choose_precision(parameters=8_640_000_000, working=working, free=free * GB)
         assert found == precision
         assert reason.endswith(f"of {free}.0 GB free")
     with pytest.raises(ValueError, match=r"GPU memory: expected \d.\d GB free even with blocks on the CPU, found 1.0"):
         choose_precision(parameters=8_640_000_000, working=working, free=GB)
-    # 64 views need more than twice what a card of 24 GB has left
-    assert working_bytes(pixels=704 * 496, views=64, width=3072) > 14 * GB

@@ -1,7 +1,7 @@
 """Folders of harmonised views: resumed after a kill, in batches, split over processes and over Ray."""
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ from splatgraft.core.images import read_rgb
 from splatgraft.folders import harmonized_views
 from splatgraft.folders.harmonized_views import Part, finished, harmonize_part, picture_folders
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import CompactOptions, FluxOptions, Harmonized, HarmonizerInputs, NoneOptions
+from splatgraft.harmonization import CompactOptions, Harmonized, HarmonizerInputs, NoneOptions
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import job_of, perform
 from splatgraft.runtime.console import Console
@@ -125,39 +125,27 @@ def test_the_machine_does_not_make_a_result_stale(views):
     done = step(views)
     perform(done, Console())
     assert why_stale(job_of(replace(done, processes=2, ray="local"))) is None
-    method = FluxOptions(weights="hub/id", batch=4, compile=True)
-    assert (
-        job_of(replace(done, method=method)).options
-        == job_of(replace(done, method=FluxOptions(weights="hub/id"))).options
-    )
     assert why_stale(job_of(replace(done, method=CompactOptions(strength=0.5)))) == "strength is now 0.5, was 1.0"
 
 
-@dataclass(frozen=True)
-class WatchedOptions:
-    """A harmoniser of two views a pass, which works only while the next are read and the last ones are written."""
+class Watched:
+    """A harmoniser, as its own options, that works only while the next view is read and the last one is written."""
 
-    read: list[threading.Event]
-    written: list[threading.Event]
-    passes: list[int]
-    views_at_once = 2
+    def __init__(self, read, written):
+        self.read, self.written, self.done = read, written, 0
 
     def make(self, context):
         return self
 
     def harmonize(self, view):
-        raise NotImplementedError
-
-    def harmonize_all(self, views):
-        done = sum(self.passes)
-        later = done + len(views)
+        later = self.done + 1
         assert later >= len(self.read) or self.read[later].wait(20), "the next view is not read beside the model"
-        assert done == 0 or self.written[done - 1].wait(20), "the last view is not written beside the model"
-        self.passes.append(len(views))
-        return [Harmonized(view.prior) for view in views]
+        assert self.done == 0 or self.written[self.done - 1].wait(20), "the last view is not written beside the model"
+        self.done += 1
+        return Harmonized(view.prior)
 
 
-def test_files_are_read_and_written_beside_the_model_in_passes_of_one_size(views, kept, monkeypatch):
+def test_files_are_read_and_written_beside_the_model(views, kept, monkeypatch):
     read, written = ([threading.Event() for _ in range(4)] for _ in range(2))
     original, write = ViewFolder.read, harmonized_views._write
     stems = ViewFolder.open(views).stems
@@ -173,10 +161,9 @@ def test_files_are_read_and_written_beside_the_model_in_passes_of_one_size(views
 
     monkeypatch.setattr(ViewFolder, "read", reading)
     monkeypatch.setattr(harmonized_views, "_write", writing)
-    named, options = [], WatchedOptions(read, written, [])
-    harmonize_part(Part(views, options, kept, device="cpu"), progress=lambda *words: named.append(words[2]))
-    assert options.passes == [2, 1, 1]
-    assert named == ["b", "c", "d"]
+    named = []
+    harmonize_part(Part(views, Watched(read, written), kept, device="cpu"), progress=lambda *w: named.append(w[2]))
+    assert named == ["a", "b", "c", "d"]
     assert finished(kept, ViewFolder.open(views)) == {0, 1, 2, 3}
 
 

@@ -8,8 +8,7 @@ import torch
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.spherical_harmonics import dc_from_rgb
-from splatgraft.harmonization import CompactOptions, harmonize, harmonizer_options, make_harmonizer, render_views
-from splatgraft.harmonization.harmonize import _batches
+from splatgraft.harmonization import harmonize, make_harmonizer, render_views
 from splatgraft.rendering import render
 
 
@@ -80,14 +79,6 @@ def test_all_views_are_harmonised_as_each_alone(name: str, has_confidence: bool)
     assert len(harmonize(views, harmonizer)) == 3
 
 
-def test_batches_hold_consecutive_views_of_one_size() -> None:
-    small, large = (list(render_views(*scene(), cameras().resized(factor))) for factor in (0.5, 1.0))
-    batches = list(_batches([*small, large[0], *small], 2))
-    assert [len(batch) for batch in batches] == [2, 1, 1, 2, 1]
-    assert [view.composite.shape[1] for batch in batches for view in batch] == [20, 20, 20, 40, 20, 20, 20]
-
-
 def test_names_that_there_are_not_are_refused_with_those_that_there_are() -> None:
-    assert harmonizer_options("compact", weights="mine") == CompactOptions(weights="mine")
     with pytest.raises(ValueError, match="expected one of compact, flux, none, found 'magic'"):
         harmonize([], "magic")

@@ -17,22 +17,16 @@ import torch
 
 from splatgraft.core.images import stored_size, write_image
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import (
-    BatchHarmonizer,
-    Harmonized,
-    HarmonizerContext,
-    HarmonizerOptions,
-    make_harmonizer,
-)
+from splatgraft.harmonization import Harmonized, HarmonizerContext, HarmonizerOptions, make_harmonizer
 from splatgraft.project.step import choose_device
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft.runtime.workers import Task, run_tasks
 
-_READERS, _WRITERS = 2, 2
+_READERS, _WRITERS = 1, 2
 """Threads that decode and encode images beside the model: about 0.09 s a view of 704x496 in one thread."""
-_WAITING_GROUPS = 2
-"""Groups of finished views that may wait to be written."""
+_WAITING_VIEWS = 2
+"""Finished views that may wait to be written."""
 _POLL_SECONDS = 0.5
 
 
@@ -85,25 +79,18 @@ def harmonize_part(part: Part, say: Callable[[str], None] = lambda sentence: Non
     width, height = stored_size(views.path("composite", missing[0]))
     context = HarmonizerContext(device=device, views=len(missing), pixels=width * height, say=say)
     harmonizer = make_harmonizer(part.method, context)
-    at_once = harmonizer.views_at_once if isinstance(harmonizer, BatchHarmonizer) else 1
     done = len(views) - len(missing) if part.of == 1 else 0
-    groups = _groups(views, missing, at_once)
-    # files are decoded and encoded beside the model: it waits for the first group alone, and for writing at the end
+    # files are decoded and encoded beside the model: it waits for the first view alone, and for writing at the end
     with ThreadPoolExecutor(_READERS) as readers, ThreadPoolExecutor(_WRITERS) as writers:
-        ahead = [readers.submit(views.read, i) for i in groups[0]]
-        written: deque[Future[None]] = deque()
-        for indices, following in zip(groups, [*groups[1:], []], strict=True):
-            now, ahead = [reading.result() for reading in ahead], [readers.submit(views.read, i) for i in following]
-            if isinstance(harmonizer, BatchHarmonizer):
-                results = harmonizer.harmonize_all(now)
-            else:
-                results = [harmonizer.harmonize(view) for view in now]
-            for index, result in zip(indices, results, strict=True):
-                written.append(writers.submit(_write, part.kept, views.stems[index], result))
-            while len(written) > _WAITING_GROUPS * at_once:
+        ahead, written = readers.submit(views.read, missing[0]), deque[Future[None]]()
+        for index, following in zip(missing, [*missing[1:], None], strict=True):
+            view = ahead.result()
+            ahead = ahead if following is None else readers.submit(views.read, following)
+            written.append(writers.submit(_write, part.kept, views.stems[index], harmonizer.harmonize(view)))
+            if len(written) > _WAITING_VIEWS:
                 written.popleft().result()
-            done += len(indices)
-            progress(done, len(views), views.stems[indices[-1]])
+            done += 1
+            progress(done, len(views), views.stems[index])
         for writing in written:
             writing.result()
     return len(missing)
@@ -146,18 +133,6 @@ def harmonize_with_ray(whole: Part, parts: int, *, address: str, progress: Progr
     gpus = 0 if whole.device == "cpu" else 1
     if failures := run_tasks(tasks, ray_address=address, progress=progress, gpus_each=gpus):
         raise ValueError(failures[0])
-
-
-def _groups(views: ViewFolder, indices: list[int], at_once: int) -> list[list[int]]:
-    """The indices in their order, in groups of views of one size."""
-    groups: list[list[int]] = []
-    sizes = {i: stored_size(views.path("composite", i)) for i in indices} if at_once > 1 else {}
-    for index in indices:
-        if groups and len(groups[-1]) < at_once and sizes[groups[-1][0]] == sizes[index]:
-            groups[-1].append(index)
-        else:
-            groups.append([index])
-    return groups
 
 
 def _write(kept: Path, stem: str, result: Harmonized) -> None:

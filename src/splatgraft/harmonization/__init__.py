@@ -2,7 +2,6 @@
 
 from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize, render_views
 from splatgraft.harmonization.interface import (
-    BatchHarmonizer,
     Harmonized,
     Harmonizer,
     HarmonizerContext,
@@ -15,13 +14,11 @@ from splatgraft.harmonization.methods import (
     FluxOptions,
     HarmonizerOptions,
     NoneOptions,
-    harmonizer_options,
     make_harmonizer,
 )
 
 __all__ = [
     "HARMONIZERS",
-    "BatchHarmonizer",
     "CompactOptions",
     "FluxOptions",
     "Harmonized",
@@ -33,7 +30,6 @@ __all__ = [
     "NoisyStartHarmonizer",
     "NoneOptions",
     "harmonize",
-    "harmonizer_options",
     "make_harmonizer",
     "render_views",
 ]

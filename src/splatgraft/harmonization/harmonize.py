@@ -1,6 +1,6 @@
 """Harmonisation of all views of a composite with one method, and the renders that it takes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Bool, Float
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.harmonization.interface import BatchHarmonizer, Harmonized, Harmonizer, HarmonizerInputs
+from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerInputs
 from splatgraft.harmonization.methods import make_harmonizer
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.rendering.interface import Output
@@ -101,23 +101,8 @@ def harmonize(
     """
     harmonizer = make_harmonizer(method) if isinstance(method, str) else method
     made: list[Harmonized] = []
-    for batch in _batches(views, harmonizer.views_at_once if isinstance(harmonizer, BatchHarmonizer) else 1):
-        if isinstance(harmonizer, BatchHarmonizer):
-            made += harmonizer.harmonize_all(batch)
-        else:
-            made += [harmonizer.harmonize(view) for view in batch]
-        progress(len(made), len(views), f"view {len(made)}")
+    for number, view in enumerate(views, 1):
+        made.append(harmonizer.harmonize(view))
+        progress(number, len(views), f"view {number}")
     confidence = tuple(one.confidence for one in made if one.confidence is not None)
     return HarmonizedViews(tuple(one.image for one in made), confidence if len(confidence) == len(made) else None)
-
-
-def _batches(views: Sequence[HarmonizerInputs], at_once: int) -> Iterator[list[HarmonizerInputs]]:
-    """Consecutive views of one size, at most `at_once` together."""
-    batch: list[HarmonizerInputs] = []
-    for view in views:
-        if batch and (len(batch) == at_once or view.composite.shape != batch[0].composite.shape):
-            yield batch
-            batch = []
-        batch.append(view)
-    if batch:
-        yield batch

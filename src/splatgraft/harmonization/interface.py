@@ -1,6 +1,6 @@
 """Inputs and outputs of all harmonisers, and the protocols that they implement."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -41,7 +41,6 @@ class Harmonized:
     """Confidence in each pixel, in [0, 1]; None where the harmoniser does not estimate it."""
 
 
-@runtime_checkable
 class Harmonizer(Protocol):
     """An image model that harmonises one view at a time."""
 
@@ -54,25 +53,13 @@ class Harmonizer(Protocol):
 class NoisyStartHarmonizer(Protocol):
     """A harmoniser that can start from a partly noisy image, which later iterative updates use (paper, ablations)."""
 
-    def harmonize_from(self, views: Sequence[HarmonizerInputs], strength: float) -> list[Harmonized]:
-        """Harmonise `views`, all of one size, conditioned on their composites, starting from their noisy priors.
+    def harmonize_from(self, view: HarmonizerInputs, strength: float) -> Harmonized:
+        """Harmonise `view`, conditioned on its composite, starting from its noisy prior.
 
         Args:
-            views: In `prior`, renders of the scene to start from.
+            view: In `prior`, a render of the scene to start from.
             strength: Noise level to start from, in (0, 1]; 1 is noise alone.
         """
-        ...
-
-
-@runtime_checkable
-class BatchHarmonizer(Protocol):
-    """A harmoniser that also processes several views of one size in one pass."""
-
-    views_at_once: int
-    """Number of views per pass."""
-
-    def harmonize_all(self, views: Sequence[HarmonizerInputs]) -> list[Harmonized]:
-        """Harmonise `views`, all of one size; results are in the same order."""
         ...
 
 

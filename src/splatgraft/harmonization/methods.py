@@ -1,6 +1,6 @@
 """The harmonisation methods: the options of each, by name, which make its harmoniser."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, Protocol
 
@@ -84,10 +84,6 @@ class FluxOptions:
     """Steps of the diffusion sampling."""
     precision: Literal["auto", "bf16", "fp8", "offload", "float32"] = "auto"
     """How the weights are kept: fp8 in 8 bits, offload on the CPU; auto takes the best that fits the free memory."""
-    batch: int = 1
-    """Views per pass."""
-    compile: bool = False
-    """Compile the network first; worth it from about twenty views on."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
         """Load the network."""
@@ -99,7 +95,7 @@ class FluxOptions:
         from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer
         from splatgraft.harmonization.flux.loading import load_flux
 
-        return FluxHarmonizer(load_flux(self, context), self)
+        return FluxHarmonizer(load_flux(self, context), seed=self.seed, steps=self.sampling_steps)
 
 
 HARMONIZERS: dict[str, type[HarmonizerOptions]] = {
@@ -119,21 +115,8 @@ def make_harmonizer(method: str | HarmonizerOptions, context: HarmonizerContext 
         ValueError: There is no method of that name (the message lists the names), or its weights or packages are
             missing.
     """
-    options = harmonizer_options(method) if isinstance(method, str) else method
-    return options.make(context)
-
-
-def harmonizer_options(name: str, *, weights: str | None = None) -> HarmonizerOptions:
-    """Give the default options of a method.
-
-    Args:
-        name: A key of `HARMONIZERS`.
-        weights: Replaces the default weights; ignored by methods without weights.
-
-    Raises:
-        ValueError: There is no method of that name.
-    """
-    if name not in HARMONIZERS:
-        raise ValueError(f"harmonizer: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
-    options = HARMONIZERS[name]()
-    return replace(options, weights=weights) if weights is not None and hasattr(options, "weights") else options  # pyright: ignore
+    if isinstance(method, str):
+        if method not in HARMONIZERS:
+            raise ValueError(f"harmonizer: expected one of {', '.join(sorted(HARMONIZERS))}, found {method!r}")
+        method = HARMONIZERS[method]()
+    return method.make(context)

@@ -188,7 +188,7 @@ class UpdateIteratively:
         def harmonize_at(scene: Gaussians, strength: float) -> LazySequence:
             views = render_views(composite, is_object, cameras, prior=scene)
             if isinstance(harmonizer, NoisyStartHarmonizer):
-                images = [harmonizer.harmonize_from([view], strength)[0].image.to(device) for view in views]
+                images = [harmonizer.harmonize_from(view, strength).image.to(device) for view in views]
             else:
                 images = [harmonizer.harmonize(view).image.to(device) for view in views]
             return LazySequence(len(images), lambda index: images[index])

@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
-from splatgraft.harmonization import HARMONIZERS, HarmonizerContext, HarmonizerOptions, harmonizer_options
+from splatgraft.harmonization import HARMONIZERS, HarmonizerContext, HarmonizerOptions
 from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerInputs
 from splatgraft_paper.peers.image_editing import ImageEditingOptions
 from splatgraft_paper.peers.mv_colight import MVCoLightOptions
@@ -131,9 +131,8 @@ def method_options(name: str, *, weights: str | None = None) -> HarmonizerOption
     Raises:
         ValueError: There is no method of that name.
     """
-    if name in PEERS:
-        options = PEERS[name]()
-        return replace(options, weights=weights) if weights is not None and hasattr(options, "weights") else options
-    if name not in HARMONIZERS:
-        raise ValueError(f"harmonizer: expected one of {', '.join(sorted([*HARMONIZERS, *PEERS]))}, found {name!r}")
-    return harmonizer_options(name, weights=weights)
+    known = {**HARMONIZERS, **PEERS}
+    if name not in known:
+        raise ValueError(f"harmonizer: expected one of {', '.join(sorted(known))}, found {name!r}")
+    options = known[name]()
+    return replace(options, weights=weights) if weights is not None and hasattr(options, "weights") else options  # pyright: ignore

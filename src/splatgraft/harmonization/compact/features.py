@@ -21,25 +21,19 @@ GRID_BINS = 4
 _IMAGES = ("composite", "background", "mask", "log_ratio", "depth", "normal")
 
 
-@dataclass(frozen=True)
-class CompactEncoding:
-    """How views are encoded for the network; set by hand, and fixed by the weights that were trained with it."""
-
-    ratio_offset: float = 0.004
-    """Linear light added to both sides of a ratio: 1/255 of white, below which a ratio carries no information."""
-    max_log_ratio: float = 3.0
-    """Bound of the prior's log ratio, either sign."""
-    max_log_gain: float = 4.0
-    """Bound of the total log gain that is applied, either sign."""
-    max_log_depth: float = 2.0
-    """Bound of the relative log depth, either sign; also the value where nothing is hit."""
-    log_offset: float = 1 / 64
-    """Linear light added before the logarithm of a colour channel."""
-    luma_gamma: float = 2.2
-    """Brightness axis of the bilateral grid: mean linear light to the power of its inverse."""
-
-
-ENCODING = CompactEncoding()
+# how views are encoded for the network: fixed by the weights that were trained with it
+_RATIO_OFFSET = 0.004
+"""Linear light added to both sides of a ratio: 1/255 of white, below which a ratio carries no information."""
+_MAX_LOG_RATIO = 3.0
+"""Bound of the prior's log ratio, either sign."""
+_MAX_LOG_GAIN = 4.0
+"""Bound of the total log gain that is applied, either sign."""
+_MAX_LOG_DEPTH = 2.0
+"""Bound of the relative log depth, either sign; also the value where nothing is hit."""
+_LOG_OFFSET = 1 / 64
+"""Linear light added before the logarithm of a colour channel."""
+_LUMA_GAMMA = 2.2
+"""Brightness axis of the bilateral grid: mean linear light to the power of its inverse."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +64,7 @@ class CompactInput:
 
     def prior(self) -> Float[Tensor, "b 3 h w"]:
         """The view after light transfer, linear light."""
-        offset = ENCODING.ratio_offset
+        offset = _RATIO_OFFSET
         return ((self.composite + offset) * self.log_ratio.exp() - offset).clamp_min(0)
 
     def to(self, device: torch.device) -> "CompactInput":
@@ -115,7 +109,7 @@ class CompactOutput:
 
 def log_light_ratio(prior: Float[Tensor, "*n"], composite: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Clamped logarithm of prior over composite, both linear light with a small offset."""
-    offset, bound = ENCODING.ratio_offset, ENCODING.max_log_ratio
+    offset, bound = _RATIO_OFFSET, _MAX_LOG_RATIO
     return ((prior + offset) / (composite + offset)).log().clamp(-bound, bound)
 
 
@@ -138,8 +132,8 @@ def apply_output(view: CompactInput, output: CompactOutput) -> Float[Tensor, "b 
     by_normal = torch.einsum("bkhw,bkc->bchw", _harmonics(view.normal), output.object_sh)
     on_object = (1 + up(output.object_prior_scale)) * view.log_ratio + up(output.object_gain) + by_normal
     on_scene = (1 + up(output.scene_prior_scale)) * view.log_ratio + up(output.scene_gain)
-    log_gain = (mask * on_object + (1 - mask) * on_scene).clamp(-ENCODING.max_log_gain, ENCODING.max_log_gain)
-    lit = (view.composite + ENCODING.ratio_offset) * log_gain.exp() - ENCODING.ratio_offset
+    log_gain = (mask * on_object + (1 - mask) * on_scene).clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN)
+    lit = (view.composite + _RATIO_OFFSET) * log_gain.exp() - _RATIO_OFFSET
     lit = lit + mask * _affine(lit, output.object_grid) + (1 - mask) * up(output.scene_added)
     return lit.clamp_min(0)
 
@@ -165,7 +159,7 @@ def compact_input(inputs: HarmonizerInputs) -> CompactInput:
 
 def relative_depth(depth: Float[Tensor, "h w"], mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Log of depth over the object's median depth, clamped to [-2, 2]; 2 where nothing is hit."""
-    hit, bound = depth > 0, ENCODING.max_log_depth
+    hit, bound = depth > 0, _MAX_LOG_DEPTH
     inside = hit & (mask > 0.5)
     known = depth[inside] if bool(inside.any()) else depth[hit]
     median = known.median() if known.numel() else depth.new_ones(())
@@ -174,7 +168,7 @@ def relative_depth(depth: Float[Tensor, "h w"], mask: Float[Tensor, "h w"]) -> F
 
 def _log_encoded(linear: Tensor) -> Tensor:
     """Logarithm of light, scaled to about [-1, 1]."""
-    return (linear + ENCODING.log_offset).log() / 2 + 1
+    return (linear + _LOG_OFFSET).log() / 2 + 1
 
 
 def _harmonics(normal: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 9 h w"]:
@@ -186,7 +180,7 @@ def _harmonics(normal: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 9 h w"]:
 def _affine(lit: Float[Tensor, "b 3 h w"], grid: Float[Tensor, "b 12 l p q"]) -> Float[Tensor, "b 3 h w"]:
     """Difference of colours by the bilateral grid, sliced by pixel position and brightness."""
     b, _, h, w = lit.shape
-    luma = lit.mean(1).clamp(0, 1) ** (1 / ENCODING.luma_gamma) * 2 - 1
+    luma = lit.mean(1).clamp(0, 1) ** (1 / _LUMA_GAMMA) * 2 - 1
     y = (torch.arange(h, device=lit.device) + 0.5) / h * 2 - 1
     x = (torch.arange(w, device=lit.device) + 0.5) / w * 2 - 1
     coordinates = torch.stack([x.expand(b, h, w), y[:, None].expand(b, h, w), luma], -1)[:, None]

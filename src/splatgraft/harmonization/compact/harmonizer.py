@@ -1,7 +1,5 @@
 """The harmoniser `compact`: the network runs at a low resolution, its output is applied at full resolution."""
 
-from dataclasses import dataclass
-
 import torch
 import torch.nn.functional as F
 
@@ -14,17 +12,10 @@ _STRIDE = 16
 """The network halves the image four times."""
 
 
-@dataclass(frozen=True)
-class CompactInference:
-    """Numbers of the inference, set by hand."""
-
-    long_side: int = 256
-    """Pixels of the longer side of the network's input; smaller views are not enlarged."""
-    half_confidence_error: float = 0.05
-    """sRGB; the expected error at which the confidence is one half."""
-
-
-INFERENCE = CompactInference()
+_LONG_SIDE = 256
+"""Pixels of the longer side of the network's input; smaller views are not enlarged."""
+_HALF_CONFIDENCE_ERROR = 0.05
+"""sRGB; the expected error at which the confidence is one half."""
 
 
 class Compact:
@@ -41,12 +32,12 @@ class Compact:
             return Harmonized(image=view.prior)
         full_size = compact_input(view).to(self._device)
         h, w = view.mask.shape
-        factor = min(1.0, INFERENCE.long_side / max(h, w))
+        factor = min(1.0, _LONG_SIDE / max(h, w))
         small = full_size.resized(*(max(_STRIDE, round(side * factor / _STRIDE) * _STRIDE) for side in (h, w)))
         output = self._network(small.channels())
         image = srgb_from_linear(apply_output(full_size, output)[0].clamp(0, 1)).permute(1, 2, 0).cpu()
         error = F.interpolate(output.log_error, size=(h, w), mode="bilinear", align_corners=False)[0, 0].exp().cpu()
         return Harmonized(
             image=torch.lerp(view.prior, image, self._strength),
-            confidence=1 / (1 + (error / INFERENCE.half_confidence_error) ** 2),
+            confidence=1 / (1 + (error / _HALF_CONFIDENCE_ERROR) ** 2),
         )

@@ -22,23 +22,16 @@ SHIPPED = Path(__file__).parent / "compact.safetensors"
 _FORMAT = "splatgraft compact 1"
 
 
-@dataclass(frozen=True)
-class OutputBounds:
-    """Bounds of the outputs, set by hand; weights are valid only for the bounds they were trained with."""
-
-    log_gain: float = 2.0
-    """Of the log gains, either sign."""
-    prior_scale: float = 1.0
-    """Of the difference of the prior's factor from 1, either sign."""
-    added_light: float = 0.25
-    """Of the linear light added off the object, either sign."""
-    affine: float = 0.5
-    """Of the entries of the colour maps' differences, either sign."""
-    initial_log_error: float = -3.0
-    """The log of the expected error before training."""
-
-
-BOUNDS = OutputBounds()
+# bounds of the outputs, either sign: fixed by the weights that were trained with them
+_MAX_LOG_GAIN = 2.0
+_MAX_PRIOR_SCALE = 1.0
+"""Of the difference of the prior's factor from 1."""
+_MAX_ADDED_LIGHT = 0.25
+"""Linear light, off the object."""
+_MAX_AFFINE = 0.5
+"""Of the entries of the colour maps' differences."""
+_INITIAL_LOG_ERROR = -3.0
+"""The log of the expected error before training."""
 
 
 @dataclass(frozen=True)
@@ -104,14 +97,14 @@ class CompactNetwork(nn.Module):
         pooled = torch.cat([on_object, coarse.mean((2, 3))], 1)
         b, _, p, q = coarse.shape
         return CompactOutput(
-            object_prior_scale=BOUNDS.prior_scale * torch.tanh(maps[:, 0:1]),
-            object_gain=_bounded(maps[:, 1:4], BOUNDS.log_gain),
-            object_sh=_bounded(self.by_normal(pooled), BOUNDS.log_gain).reshape(b, SH_COUNT, 3),
-            object_grid=_bounded(self.grid(coarse), BOUNDS.affine).reshape(b, 12, GRID_BINS, p, q),
-            scene_prior_scale=BOUNDS.prior_scale * torch.tanh(maps[:, 4:5]),
-            scene_gain=_bounded(maps[:, 5:8], BOUNDS.log_gain),
-            scene_added=_bounded(maps[:, 8:11], BOUNDS.added_light),
-            log_error=maps[:, 11:12] + BOUNDS.initial_log_error,
+            object_prior_scale=_MAX_PRIOR_SCALE * torch.tanh(maps[:, 0:1]),
+            object_gain=_bounded(maps[:, 1:4], _MAX_LOG_GAIN),
+            object_sh=_bounded(self.by_normal(pooled), _MAX_LOG_GAIN).reshape(b, SH_COUNT, 3),
+            object_grid=_bounded(self.grid(coarse), _MAX_AFFINE).reshape(b, 12, GRID_BINS, p, q),
+            scene_prior_scale=_MAX_PRIOR_SCALE * torch.tanh(maps[:, 4:5]),
+            scene_gain=_bounded(maps[:, 5:8], _MAX_LOG_GAIN),
+            scene_added=_bounded(maps[:, 8:11], _MAX_ADDED_LIGHT),
+            log_error=maps[:, 11:12] + _INITIAL_LOG_ERROR,
         )
 
 

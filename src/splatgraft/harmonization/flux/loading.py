@@ -271,7 +271,7 @@ def load_flux(options: FluxOptions, context: HarmonizerContext) -> FluxNetwork:
     autoencoder = load_autoencoder(vae or local_folder(options.base or BASE, say, parts=()) / "vae")
     precision, reason = options.precision, f"as requested, on {device}"
     if precision == "auto":
-        precision, reason = _best_precision(checked, context, views=options.batch)
+        precision, reason = _best_precision(checked, context)
     say(f"flux: {precision}, {reason}")
     dtype = torch.float32 if precision == "float32" else torch.bfloat16
     transformer = load_transformer(checked, dtype=dtype)
@@ -292,12 +292,10 @@ def load_flux(options: FluxOptions, context: HarmonizerContext) -> FluxNetwork:
             transformer.enable_layerwise_casting(storage_dtype=torch.float8_e4m3fn, compute_dtype=dtype)
         transformer.to(device)
     autoencoder.network.to(device, dtype).eval().requires_grad_(False)
-    if options.compile:
-        transformer.compile_repeated_blocks()
     return FluxNetwork(transformer, autoencoder, prompt.to(device, dtype), variant, device, dtype, starts)
 
 
-def _best_precision(checked: FluxFolder, context: HarmonizerContext, *, views: int) -> tuple[str, str]:
+def _best_precision(checked: FluxFolder, context: HarmonizerContext) -> tuple[str, str]:
     """The best precision that fits the free memory of the device, and why it is taken."""
     if context.device.type != "cuda":
         return "float32", f"on {context.device}; minutes per view at FLUX's size"
@@ -305,21 +303,20 @@ def _best_precision(checked: FluxFolder, context: HarmonizerContext, *, views: i
     return choose_precision(
         # without modulation: 12 width^2 per single block and per stream of a double block
         parameters=checked.width**2 * (24 * doubles + 12 * singles),
-        working=working_bytes(pixels=context.pixels, views=views, width=checked.width),
+        working=working_bytes(pixels=context.pixels, width=checked.width),
         free=torch.cuda.mem_get_info(context.device)[0],
     )
 
 
-def working_bytes(*, pixels: int, views: int, width: int) -> int:
+def working_bytes(*, pixels: int, width: int) -> int:
     """Estimate the largest activations of one pass.
 
     Args:
-        pixels: Of one view; a token covers 256 of them, and text adds 512 tokens.
-        views: Per pass.
+        pixels: Of a view; a token covers 256 of them, and text adds 512 tokens.
         width: Channels of a token.
     """
-    tokens = views * (pixels // 256 + 512) * width * 2 * 40  # about 40 bf16 copies of the transformer's tokens
-    return max(tokens, views * pixels * 256 * 2 * 3)  # the decoder has three copies of 256 channels at full size
+    tokens = (pixels // 256 + 512) * width * 2 * 40  # about 40 bf16 copies of the transformer's tokens
+    return max(tokens, pixels * 256 * 2 * 3)  # the decoder has three copies of 256 channels at full size
 
 
 def choose_precision(*, parameters: int, working: int, free: int) -> tuple[str, str]:
@@ -343,5 +340,5 @@ def choose_precision(*, parameters: int, working: int, free: int) -> tuple[str, 
             return precision, f"needs {need / 1e9:.1f} of {free / 1e9:.1f} GB free"
     raise ValueError(
         f"GPU memory: expected {need / 1e9:.1f} GB free even with blocks on the CPU, found {free / 1e9:.1f} GB; "
-        "close other programs, use smaller views or --batch 1"
+        "close other programs or use smaller views"
     )
