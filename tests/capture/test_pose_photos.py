@@ -29,6 +29,10 @@ BANANAS = Path(__file__).parents[2] / "src" / "splatgraft" / "demo_captures" / "
 needs_colmap = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is an optional extra")
 
 
+def pose(photos, folder, **more):
+    return pose_photos(photos, folder, scratch=folder / "scratch", **more)
+
+
 def photo_paths(folder, count):
     folder.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator().manual_seed(0)
@@ -85,30 +89,30 @@ def test_what_cannot_be_posed_is_said_first(tmp_path, answer, monkeypatch):
     answer()
     photos = photo_paths(tmp_path / "photos", 3)
     with pytest.raises(ValueError, match="at least 3 photos"):
-        pose_photos(PhotoFiles(photos.paths[:2]), tmp_path)
+        pose(PhotoFiles(photos.paths[:2]), tmp_path)
     with pytest.raises(ValueError, match="one photo per name"):
-        pose_photos(PhotoFiles(photos.paths + photo_paths(tmp_path / "b", 1).paths), tmp_path)
+        pose(PhotoFiles(photos.paths + photo_paths(tmp_path / "b", 1).paths), tmp_path)
     write_image(tmp_path / "mask.png", torch.zeros(40, 40, 3))
     with pytest.raises(ValueError, match=r"mask\.png: expected 40x30 px.*found 40x40"):
-        pose_photos(replace(photos, masks=(None, tmp_path / "mask.png", None)), tmp_path)
+        pose(replace(photos, masks=(None, tmp_path / "mask.png", None)), tmp_path)
     photos.paths[1].write_bytes(b"no image")
     with pytest.raises(ValueError, match=r"01\.png"):
-        pose_photos(photos, tmp_path)
+        pose(photos, tmp_path)
     monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"splatgraft\[sfm\]"):
-        pose_photos(photos, tmp_path)
+        pose(photos, tmp_path)
 
 
 def test_under_half_registered_says_what_to_do(tmp_path, answer):
     answer(model_of(2, 8), model_of(3, 8))
     with pytest.raises(ValueError, match=r"half of 8 photos to register, found 3; take more photos"):
-        pose_photos(photo_paths(tmp_path / "photos", 8), tmp_path)
+        pose(photo_paths(tmp_path / "photos", 8), tmp_path)
 
 
 def test_a_doubtful_model_is_sought_once_more_and_the_better_one_is_taken_and_reported(tmp_path, answer):
     said: list[str] = []
     answer(model_of(4, 8) | {"seconds": {"features": 20.0, "mapping": 10.0}}, model_of(7, 8))
-    posed, report = pose_photos(photo_paths(tmp_path / "photos", 8), tmp_path, say=said.append)
+    posed, report = pose(photo_paths(tmp_path / "photos", 8), tmp_path, say=said.append)
     assert "took 30 s (features 20, mapping 10)" in said[0]
     for expected in ("photos with a pose", "once more with more features", "about 10 min", "effort = quick"):
         assert expected in said[1]
@@ -117,7 +121,7 @@ def test_a_doubtful_model_is_sought_once_more_and_the_better_one_is_taken_and_re
     assert "without a pose: 07 (900 features, at most 12 matches: of another place" in str(report)
     assert len(posed) == 7
     assert posed.image(0).shape == (30, 40, 3)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["images", "photos"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["images", "photos", "scratch"]
 
 
 def test_a_full_quick_model_needs_no_second_effort_and_masks_are_undistorted_like_photos(tmp_path, answer):
@@ -126,7 +130,7 @@ def test_a_full_quick_model_needs_no_second_effort_and_masks_are_undistorted_lik
     mask = torch.zeros(30, 40, 3)
     mask[:, :20] = 1
     write_image(tmp_path / "mask.png", mask)
-    posed, _ = pose_photos(replace(photos, masks=(None, tmp_path / "mask.png", None)), tmp_path)
+    posed, _ = pose(replace(photos, masks=(None, tmp_path / "mask.png", None)), tmp_path)
     assert len(left) == 1
     assert [path and path.relative_to(tmp_path).as_posix() for path in posed.mask_paths] == [None, "masks/01.png", None]
     carried = posed.mask(1)
@@ -143,7 +147,7 @@ def test_a_dying_process_is_reported_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(structure_from_motion, "__file__", str(tmp_path / "structure_from_motion.py"))
     monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: object())
     with pytest.raises(ValueError, match="exit code 3: nothing to match"):
-        pose_photos(photo_paths(tmp_path / "photos", 3), tmp_path)
+        pose(photo_paths(tmp_path / "photos", 3), tmp_path)
 
 
 # a phone: 26 mm equivalent is 0.72 longest sides
@@ -279,7 +283,7 @@ def test_true_poses_come_back_and_crops_have_their_optical_axis_where_it_was(tmp
         # around 140, 105 instead of 200, 150
         write_image(path, picture[:210, :280] if i in {3, 6} else picture)
     photos = PhotoFiles(tuple(paths))
-    posed, report = pose_photos(photos, tmp_path, options=PoseOptions(effort="quick"), say=said.append)
+    posed, report = pose(photos, tmp_path, options=PoseOptions(effort="quick"), say=said.append)
     assert report.registered == 10
     # SIFT places features to about a third of a pixel
     assert report.mean_reprojection_px < 1
@@ -311,7 +315,7 @@ def test_bananas_on_a_carpet_are_one_model_with_the_known_poses(tmp_path: Path) 
     Incremental mapping of these smaller photos finds four models, the largest with 8 photos; the global mapper joins
     them.
     """
-    posed, report = pose_photos(find_photos(BANANAS / "images"), tmp_path, options=PoseOptions(effort="quick"))
+    posed, report = pose(find_photos(BANANAS / "images"), tmp_path, options=PoseOptions(effort="quick"))
     # two photos have hardly a feature on the carpet that both SIFT runs find
     assert report.registered >= 13
     known = read_capture(BANANAS)

@@ -1,4 +1,4 @@
-"""What photos tell before poses are sought: sharpness, overlap, brightness and copies, from small grey versions.
+"""What photos tell before poses are sought: sharpness, overlap and brightness, from small grey versions.
 
 Overlap is counted in SIFT matches between photos that follow one another (Lowe 2004: ratio test), verified by epipolar
 geometry (USAC, MAGSAC++). The same matches tell the exposure of each photo against the others, as one surface should
@@ -36,7 +36,7 @@ _MIN_MATCHES = 15
 _CANDIDATES = 20
 """Photos elsewhere in the order with which a photo without a neighbour is matched, at most."""
 _STILL_PX = 0.5
-"""Median shift of the matches below which two photos are one: below what a hand can hold still."""
+"""Shift below which a match does not move: below what a hand can hold still."""
 
 # limits of the findings, measured on the two captures that ship, two public ones and a rendered room
 _FEW = 20
@@ -86,8 +86,6 @@ class Link:
     """Index of another photo."""
     matches: int
     """Verified matches."""
-    shift_px: float
-    """Median shift of the matches, pixels of the grey versions."""
     stops: float
     """How much brighter the second photo shows the same surfaces, median over matches."""
 
@@ -214,9 +212,8 @@ def _link(features: Sequence[_Features], i: int, j: int) -> Link | None:
     verified = _verified(a, b)
     if verified.sum() < _MIN_MATCHES:
         return None
-    shift = float(np.median(np.linalg.norm(a - b, axis=1)[verified]))
     ratio = np.maximum(other.luminance[best[kept]], 1e-4) / np.maximum(one.luminance[kept], 1e-4)
-    return Link(i, j, int(verified.sum()), shift, float(np.median(np.log2(ratio[verified]))))
+    return Link(i, j, int(verified.sum()), float(np.median(np.log2(ratio[verified]))))
 
 
 def _verified(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -275,7 +272,7 @@ def find_in_odd_photos(odd: Sequence[LeftOut], count: int) -> Finding:
 
 
 def find_in_photos(inspection: Inspection, names: Sequence[str], *, has_poses: bool) -> tuple[Finding, ...]:
-    """Sharpness, overlap, movement and brightness.
+    """Sharpness, overlap and brightness.
 
     Args:
         inspection: Of n photos.
@@ -285,7 +282,7 @@ def find_in_photos(inspection: Inspection, names: Sequence[str], *, has_poses: b
     overlap = _overlap(inspection, names)
     if has_poses and overlap.level != "good":
         overlap = Finding("overlap", "good", f"{overlap.text}; poses are given, which need none", photos=overlap.photos)
-    return _sharpness(inspection), overlap, _movement(inspection, names), _exposure(inspection, names)
+    return _sharpness(inspection), overlap, _exposure(inspection, names)
 
 
 def _named(photos: Sequence[str]) -> str:
@@ -317,16 +314,6 @@ def _overlap(inspection: Inspection, names: Sequence[str]) -> Finding:
         return Finding("overlap", "unusable", text + sizes, remedy, apart)
     text = f"{len(apart)} of {n} photos show nothing in common with the rest: {_named(apart)}"
     return Finding("overlap", "doubtful", text, "leave them out, or take photos between them and the rest", apart)
-
-
-def _movement(inspection: Inspection, names: Sequence[str]) -> Finding:
-    still = {link.second for link in inspection.links if link.shift_px < _STILL_PX}
-    copies = tuple(names[i] for i in sorted(still))
-    if not copies:
-        return Finding("movement", "good", "the camera moves from photo to photo")
-    text = f"{len(copies)} of {len(names)} photos show the same as another from the same place: {_named(copies)}"
-    level: Level = "unusable" if 2 * len(copies) > len(names) else "doubtful"
-    return Finding("movement", level, text, "leave copies out; walk around the subject", copies)
 
 
 def _exposure(inspection: Inspection, names: Sequence[str]) -> Finding:

@@ -2,9 +2,7 @@
 
 import json
 import sys
-import tempfile
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -74,7 +72,7 @@ def pose_photos(
     photos: PhotoFiles,
     workspace: Path,
     *,
-    scratch: Path | None = None,
+    scratch: Path,
     options: PoseOptions = PoseOptions(),
     progress: Progress = silent,
     say: Callable[[str], None] = lambda sentence: None,
@@ -88,7 +86,7 @@ def pose_photos(
         photos: At least three, of different names; their masks are used where the whole photos give too little.
         workspace: An existing folder.
         scratch: A folder for features, matches and models, which a run of the same photos and options that was killed
-            left to this one; None keeps nothing.
+            left to this one; made where there is none.
         options: How structure from motion is run.
         progress: Moves a bar.
         say: Takes a sentence before a longer part begins, and the time that each part took.
@@ -105,52 +103,41 @@ def pose_photos(
         raise ValueError(f"{workspace}: expected at least 3 photos to pose, found {len(photos.paths)}")
     efforts = ("quick", "thorough") if options.effort == "auto" else (options.effort,)
     total = len(PHASES) * len(efforts) + 1
-    with _folder(scratch, workspace) as kept:
-        progress(0, total, "reading photos")
-        copies = working_copies(photos.paths, kept / "photos", options.max_size_px)
-        masks = working_masks(photos.masks, copies, kept / "masks")
-        found: list[tuple[dict[str, Any], PoseReport]] = []
-        for attempt, effort in enumerate(efforts):
+    scratch.mkdir(exist_ok=True)
+    progress(0, total, "reading photos")
+    copies = working_copies(photos.paths, scratch / "photos", options.max_size_px)
+    masks = working_masks(photos.masks, copies, scratch / "masks")
+    found: list[tuple[dict[str, Any], PoseReport]] = []
+    for attempt, effort in enumerate(efforts):
 
-            def advance(done: int, message: str, before: int = attempt * len(PHASES)) -> None:
-                progress(before + done, total, message)
+        def advance(done: int, message: str, before: int = attempt * len(PHASES)) -> None:
+            progress(before + done, total, message)
 
-            model = _run(_job(copies, masks, options, kept / effort), advance, say)
-            found.append((model, _report(model, copies)))
-            seconds, cpu = (sum(model[name].values()) for name in ("seconds", "cpu_seconds"))
-            parts = ", ".join(f"{phase} {took:.0f}" for phase, took in model["seconds"].items())
-            say(f"structure from motion took {seconds:.0f} s ({parts}), {cpu:.0f} CPU-s")
-            doubts = "; ".join(map(str, found[-1][1].doubts))
-            if not doubts:
-                break
-            if effort != efforts[-1]:
-                minutes = max(1, round(_THOROUGH_COST * seconds / 60))
-                say(
-                    f"doubtful ({doubts}): all is done once more with more features, which takes about {minutes} min; "
-                    "Ctrl-C ends it, and effort = quick goes on without it"
-                )
-        # by the score of colmap_process/scores.py, where the number of photos is the same for both
-        model, report = max(found, key=lambda pair: pair[1].explained * pair[1].registered)
-        if report.registered < 0.5 * len(copies):
-            raise ValueError(
-                f"{photos.paths[0].parent}: expected at least half of {len(copies)} photos to register, "
-                f"found {report.registered}; {_ADVICE}; without a pose: {', '.join(map(str, report.missing))}"
+        model = _run(_job(copies, masks, options, scratch / effort), advance, say)
+        found.append((model, _report(model, copies)))
+        seconds, cpu = (sum(model[name].values()) for name in ("seconds", "cpu_seconds"))
+        parts = ", ".join(f"{phase} {took:.0f}" for phase, took in model["seconds"].items())
+        say(f"structure from motion took {seconds:.0f} s ({parts}), {cpu:.0f} CPU-s")
+        doubts = "; ".join(map(str, found[-1][1].doubts))
+        if not doubts:
+            break
+        if effort != efforts[-1]:
+            minutes = max(1, round(_THOROUGH_COST * seconds / 60))
+            say(
+                f"doubtful ({doubts}): all is done once more with more features, which takes about {minutes} min; "
+                "Ctrl-C ends it, and effort = quick goes on without it"
             )
-        progress(total - 1, total, "undistorting")
-        posed = _posed_images(model, copies[0].parent, masks, workspace)
+    # by the score of colmap_process/scores.py, where the number of photos is the same for both
+    model, report = max(found, key=lambda pair: pair[1].explained * pair[1].registered)
+    if report.registered < 0.5 * len(copies):
+        raise ValueError(
+            f"{photos.paths[0].parent}: expected at least half of {len(copies)} photos to register, "
+            f"found {report.registered}; {_ADVICE}; without a pose: {', '.join(map(str, report.missing))}"
+        )
+    progress(total - 1, total, "undistorting")
+    posed = _posed_images(model, copies[0].parent, masks, workspace)
     progress(total, total, str(report))
     return posed, report
-
-
-@contextmanager
-def _folder(scratch: Path | None, workspace: Path) -> Generator[Path]:
-    """`scratch`, or a folder that is removed afterwards."""
-    if scratch is not None:
-        scratch.mkdir(exist_ok=True)
-        yield scratch
-        return
-    with tempfile.TemporaryDirectory(prefix=".colmap-", dir=workspace) as folder:
-        yield Path(folder)
 
 
 def _report(model: Mapping[str, Any], copies: Sequence[Path]) -> PoseReport:

@@ -12,8 +12,6 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Generator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +47,9 @@ def main(words: dict[str, Any]) -> None:
     pycolmap.set_random_seed(job.seed)
     with clock.phase("features"):
         find_features(job)
-    best = _Search(job, clock).best()
-    best |= {"unposed": unposed(job.folder / f"{_ALL}.db", best)}
-    _write(job.output, best | {"seconds": clock.seconds, "cpu_seconds": clock.cpu_seconds})
+    best = _search(job, clock)
+    times = {"seconds": clock.seconds, "cpu_seconds": clock.cpu_seconds}
+    _write(job.output, best | {"unposed": unposed(_database(job, _ALL), best)} | times)
 
 
 def _end_with_parent() -> None:
@@ -69,71 +67,62 @@ def _write(path: Path, content: dict[str, Any]) -> None:
     os.replace(partial, path)
 
 
-@dataclass(frozen=True)
-class _Search:
-    """What a search for a model needs; what a killed run finished is not made again."""
+def _search(job: Job, clock: Clock) -> Answer:
+    answers: list[Answer] = []
 
-    job: Job
-    clock: Clock
-
-    def best(self) -> Answer:
-        answers: list[Answer] = []
-        for level, answer in self._candidates(answers):
-            answers.append(answer)
-            if self._is_enough(answer, level):
-                break
-        return _best(answers)
-
-    def _candidates(self, answers: list[Answer]) -> Generator[tuple[str, Answer]]:
-        """Which pairs are matched by then, and a model, which is made when it is asked for; `answers`: those before."""
-        job, (first, *further) = self.job, levels(self.job)
-        self._match(_ALL, first)
-        yield first, self._global(_ALL, first)
-        if job.masks:
-            say(f"{_shortfall(answers, job)}: tried again with the features inside the masks alone")
-            all_features = self._database(_ALL)
-            copy_with_features(all_features, self._database(_MASKED), inside_masks(job, all_features))
-            self._match(_MASKED, first)
-            yield first, self._global(_MASKED, first)
-        for level in further:
-            best = _best(answers)
-            if len(best["images"]) >= _ENOUGH_PHOTOS * len(job.names):
-                break
-            pairs, seconds = unmatched_pairs(job, self._database(best["database"])), self.clock.seconds_per_pair
-            time = f", about {max(1, round(pairs * seconds / 60))} min" if seconds else ""
-            say(f"{_shortfall(answers, job)}: up to {pairs} more pairs of photos are compared{time}")
-            self._match(best["database"], level)
-            yield level, self._global(best["database"], level)
-
-    def _is_enough(self, answer: Answer, level: str) -> bool:
-        """Whether the search may end; more pairs may connect photos that have too few matches so far."""
-        posed, job = len(answer["images"]), self.job
+    def is_enough_after(name: str, level: str) -> bool:
+        """Match the pairs of `level`, make a model, and say whether the search may end with it."""
+        database = _database(job, name)
+        with clock.phase("matching"):
+            clock.pairs += match(job, database, level)
+        answers.append(_answer(job, clock, name, level))
+        posed = len(answers[-1]["images"])
+        # more pairs may connect photos that have too few matches so far
         return (
-            answer["explained"] >= _CLEAR_EXPLAINED
-            and posed >= _ENOUGH_PHOTOS * connected_photos(self._database(_ALL))
+            answers[-1]["explained"] >= _CLEAR_EXPLAINED
+            and posed >= _ENOUGH_PHOTOS * connected_photos(_database(job, _ALL))
             and (level == levels(job)[-1] or posed >= _ENOUGH_PHOTOS * len(job.names))
         )
 
-    def _database(self, name: str) -> Path:
-        return self.job.folder / f"{name}.db"
+    first, *further = levels(job)
+    if is_enough_after(_ALL, first):
+        return _best(answers)
+    if job.masks:
+        say(f"{_shortfall(answers, job)}: tried again with the features inside the masks alone")
+        all_features = _database(job, _ALL)
+        copy_with_features(all_features, _database(job, _MASKED), inside_masks(job, all_features))
+        if is_enough_after(_MASKED, first):
+            return _best(answers)
+    for level in further:
+        best = _best(answers)
+        if len(best["images"]) >= _ENOUGH_PHOTOS * len(job.names):
+            break
+        pairs, seconds = unmatched_pairs(job, _database(job, best["database"])), clock.seconds_per_pair
+        time = f", about {max(1, round(pairs * seconds / 60))} min" if seconds else ""
+        say(f"{_shortfall(answers, job)}: up to {pairs} more pairs of photos are compared{time}")
+        if is_enough_after(best["database"], level):
+            break
+    return _best(answers)
 
-    def _match(self, database: str, level: str) -> None:
-        with self.clock.phase("matching"):
-            self.clock.pairs += match(self.job, self._database(database), level)
 
-    def _global(self, database: str, level: str) -> Answer:
-        method = f"global, {level} pairs{' inside the masks' if database == _MASKED else ''}"
-        path, job = self.job.folder / "answers" / f"{method}.json", self.job
-        if not path.is_file():
-            path.parent.mkdir(exist_ok=True)
-            matched, work = self._database(database), job.folder / "mapping.db"
-            with self.clock.phase("mapping"):
-                models = _global_models(job, with_focals(matched, work, calibrated_focals(matched, job.seed)))
-            with self.clock.phase("refinement"):
-                better = [refined(job, work, models)] if models else []
-            found = best_of(matched, [*models, *better], len(job.names))
-            _write(path, found | {"models": len(models), "method": method, "database": database})
-        return json.loads(path.read_text())
+def _database(job: Job, name: str) -> Path:
+    return job.folder / f"{name}.db"
+
+
+def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
+    """The model of the matches in a database, read from the scratch folder where a killed run left it."""
+    method = f"global, {level} pairs{' inside the masks' if name == _MASKED else ''}"
+    path = job.folder / "answers" / f"{method}.json"
+    if not path.is_file():
+        path.parent.mkdir(exist_ok=True)
+        matched, work = _database(job, name), job.folder / "mapping.db"
+        with clock.phase("mapping"):
+            models = _global_models(job, with_focals(matched, work, calibrated_focals(matched, job.seed)))
+        with clock.phase("refinement"):
+            better = [refined(job, work, models)] if models else []
+        found = best_of(matched, [*models, *better], len(job.names))
+        _write(path, found | {"models": len(models), "method": method, "database": name})
+    return json.loads(path.read_text())
 
 
 def _best(answers: list[Answer]) -> Answer:
