@@ -1,0 +1,280 @@
+"""What only a browser shows: pictures and splats on the canvas, gizmos over both, strokes, photos, sizes of windows."""
+
+import io
+import os
+import random
+import time
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import address_of
+from editor_driver import Window, state_of
+from editor_pages import opened_page
+from PIL import Image
+from test_state import LIGHT
+
+from splatgraft.editor.page.page import Page
+from splatgraft.editor.page.photo_clicks import PhotoView
+from splatgraft.editor.project import Project
+from splatgraft.editor.session import Session
+from splatgraft.formats import read_capture
+from splatgraft.project.toml_edit import with_keys
+from splatgraft.relighting import light_to_json
+
+PANEL_PX = 372
+PHASES = ("Open", "Select", "Place", "Light", "Run")
+DRAFT = "a draft of the light"
+
+
+def screen(window: Window) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(window.page.screenshot())).convert("RGB")).astype(float)
+
+
+def canvas_of(window: Window) -> np.ndarray:
+    return screen(window)[:, :-PANEL_PX]
+
+
+def difference(window: Window, picture: np.ndarray) -> float:
+    """Median difference of the lower half of the canvas from a picture: notifications and gizmos are above."""
+    shown = canvas_of(window)
+    wanted = np.asarray(Image.fromarray(picture).resize((shown.shape[1], shown.shape[0]))).astype(float)
+    return float(np.median(abs(shown - wanted)[shown.shape[0] // 2 : -60]))
+
+
+def wait_for_the_full_light(window: Window) -> None:
+    def is_full() -> bool:
+        caption = window.caption()
+        return "Light transfer" in caption and "draft" not in caption
+
+    window.until(is_full, what="the full light transfer")
+
+
+def picture_of(window: Window) -> np.ndarray:
+    window.show_phase("Run")
+    picture = np.asarray(Image.open(window.download("Picture of this view")).convert("RGB"))
+    window.show_phase("Place")
+    wait_for_the_full_light(window)
+    return picture
+
+
+def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window, page: Page) -> None:
+    window.show_phase("Place")
+    wait_for_the_full_light(window)
+    first = picture_of(window)
+    assert first.shape[1] == 1280
+    assert first.std() > 5
+    # of 255 levels: JPEG, resampling, and rounding to the size of the canvas
+    window.until(lambda: difference(window, first) < 3, what="the picture on the canvas")
+    window.drag((450, 700), (150, 40))
+    window.until(lambda: difference(window, first) > 6, what="another view")
+    second = picture_of(window)
+    window.until(lambda: difference(window, second) < 3, what="the picture of the new view")
+    # without the canvas the window shows splats, which have one colour per Gaussian and no light
+    window.check("Draw on the canvas", False)
+    window.until(lambda: difference(window, second) > 3, what="splats")
+    color = np.array([90, 140, 200])
+
+    def of_cameras() -> int:
+        return int((abs(screen(window) - color).sum(-1) < 60).sum())
+
+    before = of_cameras()
+    window.check("Show the cameras")
+    window.until(lambda: of_cameras() > before + 500, what="cameras in view")
+    # a second window is told that it only watches, and edits when the first one is closed
+    other = Window.opened(window.page.context, address_of(page))
+    notice = "another window edits this project"
+    other.says(notice)
+    assert window.page.get_by_text(notice).count() == 0
+    window.page.close()
+    other.page.get_by_text(notice).wait_for(state="detached")
+    other.show_phase("Run")
+    other.says("not made yet")
+    assert window.unknown_errors() == other.unknown_errors() == []
+    other.page.close()
+
+
+def test_an_arrow_of_the_light_is_dragged_under_drafts(browser: Any, project: Path) -> None:
+    # surroundings of one plane are too little to estimate a light from: one is given
+    (project.parent / "light.json").write_text(light_to_json(LIGHT))
+    project.write_text(with_keys(project.read_text(), "relight", {"given_light": "light.json"}))
+
+    def height_of_the_sun() -> float:
+        light = state_of(project).light
+        assert light is not None
+        return light.sources[0].direction[2]
+
+    with opened_page(project) as page:
+        window = Window.opened(browser, address_of(page))
+        window.show_phase("Light")
+        window.says("sun 53")
+        wait_for_the_full_light(window)
+
+        def drag_and_release() -> None:
+            # the preview shows drafts while the arrow is held
+            window.drag_gizmo((0, -60), lambda: DRAFT in window.caption(), what="a draft of the light")
+            window.page.mouse.up()
+
+        window.act_until(drag_and_release, lambda: height_of_the_sun() > 0.82, what="a higher sun in light.json")
+        wait_for_the_full_light(window)
+        window.page.close()
+
+
+def test_strokes_and_clicks_in_a_photo_select_the_object(window: Window, project: Path) -> None:
+    def strokes() -> tuple[int, int]:
+        """How many Gaussians were added and removed."""
+        found = state_of(project).corrections
+        return (0, 0) if found is None else (int((found > 0).sum()), int((found < 0).sum()))
+
+    window.show_phase("Select")
+    window.says("80 of 224 Gaussians are the object")
+
+    def drag_a_rectangle() -> None:
+        # over the left part of the image, in the middle of the canvas
+        window.page.keyboard.down("Shift")
+        window.drag((300, 200), (160, 500))
+        window.page.keyboard.up("Shift")
+
+    window.act_until(drag_a_rectangle, lambda: strokes()[1] > 0, what="corrections by a rectangle")
+    window.undo_until(project, lambda: strokes() == (0, 0))
+    window.page.keyboard.press("b")
+    window.says("the brush is on")
+    # the ball is in the middle of the canvas; a click, then a drag over it
+    click = partial(window.page.mouse.click, 470, 450)
+    window.act_until(click, lambda: strokes()[1] > 0, what="a click of the brush")
+    one = strokes()[1]
+    window.act_until(lambda: window.drag((422, 430), (100, 40)), lambda: strokes()[1] > one, what="a stroke")
+    window.page.keyboard.press("b")
+    window.says("the brush is off")
+    window.check("Second box")
+    window.click("Add")
+    # the box begins a tenth larger than the object's, and adds what was removed in it
+    window.until(lambda: strokes()[0] >= 80, what="corrections by the box")
+    window.undo_until(project, lambda: strokes() == (0, 0))
+    window.check("Second box", False)
+    click_into_a_photo(window, project)
+    assert window.unknown_errors() == []
+
+
+def click_into_a_photo(window: Window, project: Path) -> None:
+    capture = read_capture(project.parent / "source" / "capture")
+    name, photo = capture.cameras.names[1], Image.open(capture.image_paths[1]).convert("RGB")
+    window.unfold("Points in photos")
+    window.check("Show a photo")
+    window.write("Photo", "2")
+    window.says(name)
+    canvas = window.page.locator("canvas").first.bounding_box()
+    view = PhotoView(photo.size, (round(canvas["width"]), round(canvas["height"])))
+    left, top = view.corner
+    size = (round(photo.width * view.scale), round(photo.height * view.scale))
+    wanted = np.asarray(photo.resize(size)).astype(float)
+
+    def is_shown() -> bool:
+        # the upper half, beside the panel: notifications are below
+        there = canvas_of(window)[round(top) : round(top) + size[1] // 2, round(left) : round(left) + size[0]]
+        # of 255 levels: JPEG and two resamplings
+        return float(np.median(abs(there - wanted[: there.shape[0], : there.shape[1]]))) < 4
+
+    window.until(is_shown, what="the photo on the canvas")
+    spot = (0.6 * photo.width, 0.4 * photo.height)
+    at = (left + view.scale * spot[0], top + view.scale * spot[1])
+    window.act_until(
+        lambda: window.page.mouse.click(*at), lambda: state_of(project).prompts is not None, what="a point in the file"
+    )
+    window.says("1 on the object, 0 beside it")
+    prompts = state_of(project).prompts
+    assert prompts is not None
+    assert list(prompts) == [name]
+    # to a pixel of the window
+    assert prompts[name].inside[0].tolist() == pytest.approx(spot, abs=1.5 / view.scale)
+    window.page.keyboard.press("Control+z")
+    window.until(lambda: state_of(project).prompts is None, what="the click undone")
+    window.check("Show a photo", False)
+    window.until(lambda: not is_shown(), what="the scene again")
+
+
+def test_controls_fit_and_the_scene_is_seen_at_the_sizes_of_a_desktop_a_laptop_and_a_phone(window: Window) -> None:
+    page = window.page
+    for width, height in ((1280, 800), (1024, 700), (372, 800)):
+        page.set_viewport_size({"width": width, "height": height})
+        for phase in PHASES:
+            window.show_phase(phase)
+            names = [f"\u25cf {name}" if name == phase else name for name in PHASES]
+            buttons = [page.get_by_role("button", name=name, exact=True).first for name in names]
+            window.until(lambda buttons=buttons: all(one.is_visible() for one in buttons), what="the steps")
+            boxes = [one.bounding_box() for one in buttons]
+            assert len({round(box["y"]) for box in boxes}) == 1, f"the steps of {phase} wrap: {boxes}"
+            assert boxes[0]["x"] >= 0
+            assert boxes[-1]["x"] + boxes[-1]["width"] <= width
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            # what a field shows is not cut
+            cut = page.evaluate(
+                "Array.from(document.querySelectorAll('input[inputmode]')).filter("
+                "e => e.offsetParent && e.scrollWidth > e.clientWidth + 1).map(e => e.value)"
+            )
+            assert cut == [], f"{phase}: {cut}"
+            # the middle of the scene, where the gizmo is, is not covered
+            assert boxes[0]["x"] > width / 2 or boxes[0]["y"] > height / 2
+    assert window.unknown_errors() == []
+
+
+KEYS = ("g", "d", "b", "s", "Delete", "Escape", "ArrowLeft", "ArrowRight", "Control+z", "Control+Shift+z", "Tab")
+TEXTS = ("0", "-1", "1e30", "nan", "", "0.5", "-", "../../..", "/dev/null", "<b>x</b>", "\u0000", "9" * 400)
+
+
+def act(window: Window, random_: random.Random) -> None:
+    """One random action of a user."""
+    page, kind = window.page, random_.randrange(6)
+    x, y = random_.uniform(5, 1275), random_.uniform(5, 895)
+    if kind == 0:
+        page.mouse.click(x, y)
+    elif kind == 1:
+        window.drag((x, y), (random_.uniform(-200, 200), random_.uniform(-200, 200)))
+    elif kind == 2:
+        page.keyboard.press(random_.choice(KEYS))
+    elif kind == 3:
+        # the panel is where most can go wrong
+        random_.choice(page.get_by_role("button").all()).click(timeout=1000)
+    elif kind == 4:
+        field = random_.choice(page.locator("input:not([type=hidden]):not([type=file])").all())
+        # viser's own setting: with another address the page would be of no server for the rest of the time
+        if not field.input_value(timeout=1000).startswith("ws://"):
+            field.fill(random_.choice(TEXTS), timeout=1000)
+            field.press("Enter", timeout=1000)
+    else:
+        page.mouse.wheel(0, random_.uniform(-300, 300))
+
+
+@pytest.mark.parametrize(
+    "seconds", [3.0, pytest.param(float(os.environ.get("SPLATGRAFT_MONKEY_SECONDS", "30")), marks=pytest.mark.long)]
+)
+def test_random_actions_leave_a_project_that_opens(
+    window: Window, page: Page, project: Path, seconds: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from playwright.sync_api import Error as PlaywrightError
+
+    window.show_phase("Place")
+    random_, end = random.Random(17), time.monotonic() + seconds
+    while time.monotonic() < end:
+        # an element that is gone or covered is not clicked
+        with suppress(PlaywrightError):
+            act(window, random_)
+    # the page still answers
+    window.page.keyboard.press("Escape")
+    window.page.reload()
+    window.page.wait_for_selector(".sg-header")
+    assert window.unknown_errors() == []
+    assert "Traceback" not in capfd.readouterr().err
+    page.close()
+    if (job := page.context.session) is not None and (child := job.jobs._child) is not None:
+        job.jobs.cancel()
+        child.wait()
+    if project.is_file():
+        session = Session(Project(project))
+        assert session.notice is None
+        while session.undo():
+            pass
+        Session(Project(project))
