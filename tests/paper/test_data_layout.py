@@ -7,7 +7,7 @@ from paper_data import put
 
 from splatgraft_paper.tables.layout import download, find_scenes, held_out_stems, match_views, pictures
 from splatgraft_paper.tables.measure_pictures import KnownView, measure_picture, padded_ssim
-from splatgraft_paper.tables.paper_numbers import PAPER_TABLES, SYNTHETIC, published_name
+from splatgraft_paper.tables.paper_numbers import ROTATION, SYNTHETIC, UPDATES, published_name
 
 GREY = torch.full((12, 16, 3), 0.5)
 
@@ -55,16 +55,10 @@ def test_names_of_methods_are_those_of_the_paper():
     ]
 
 
-def test_the_papers_numbers_are_whole_rows_and_its_average_is_that_of_the_sources():
-    for table in PAPER_TABLES:
+def test_the_papers_numbers_are_whole_rows():
+    for table in (SYNTHETIC, ROTATION, UPDATES):
         assert all(len(row) == len(table.columns) for row in table.rows.values())
     assert SYNTHETIC.value("Ours", "psnr") == 22.53
-    data = PAPER_TABLES[2]
-    for name in data.rows:
-        for metric, step in (("psnr", 0.01), ("ssim", 0.001), ("lpips", 0.001), ("fid", 0.01)):
-            three = [data.value(name, f"{source} {metric}") for source in ("Blender", "FLUX", "ORIDa")]
-            # all four are rounded to the same step
-            assert abs(sum(three) / 3 - data.value(name, f"average {metric}")) <= 1.01 * step
 
 
 def test_metrics_follow_what_is_known_of_a_view():
@@ -78,16 +72,6 @@ def test_metrics_follow_what_is_known_of_a_view():
     assert "psnr_object" in with_mask
     assert "psnr_shadow" not in with_mask
     assert "shadow_ratio_rmse" in measure_picture(image, KnownView(truth=truth, mask=mask, background=truth))
-    alone = measure_picture(image, KnownView(composite=truth, mask=mask))
-    assert set(alone) == {
-        "object_brightness",
-        "darkened_fraction",
-        "brightened_fraction",
-        "detail_kept",
-        "rest_mean_change",
-    }
-    # sRGB times 0.9 keeps 0.9 of every gradient
-    assert alone["detail_kept"] == pytest.approx(0.9, abs=1e-5)
 
 
 def test_padded_ssim_counts_border_pixels_beside_zeros():

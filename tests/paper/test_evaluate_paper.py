@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from paper_data import PLAIN, REAL, STEMS, parts_of_view, put, write_data
+from paper_data import PLAIN, STEMS, parts_of_view, put, write_data
 from random_lpips import write_random_lpips
 from shapes import ring, surfels
 
@@ -65,30 +65,20 @@ def read_rgb_of(stem):
     return parts_of_view(stem)[0]
 
 
-def test_the_tables_have_published_numbers_beside_measured_ones_and_reasons_for_empty_cells(measured):
+def test_the_tables_have_published_numbers_beside_measured_ones_and_notes_say_what_is_missing(measured):
     text = (measured.out / "paper.md").read_text()
     assert "| Ours, as published | 22.53 | 0.840 | 0.214 | 55.86 | 0.0413 |" in text
     line = next(row for row in text.splitlines() if row.startswith("| GS-IR, the authors' pictures, measured here"))
     # both scenes show the same pictures, so the interval of their mean is a point
     assert line.count("[") == 3
     assert line.endswith("| 2 |")
-    assert "the folder has no pictures of GShader" in text
+    assert "| GShader, the authors' pictures, measured here | – | – | – | – | – | – | 0 |" in text
     assert "--measure-only: nothing was run" in text
-    assert "the authors publish neither" in text
-    assert "lpips: not measured" in text.lower() or "lpips" in text.lower()
+    assert "Not measured: lpips" in text
     page = (measured.out / "index.html").read_text()
     assert "figures/synthetic.png" in page
     assert (measured.out / "figures" / "rotation.png").is_file()
-
-
-def test_a_scene_without_truth_has_the_numbers_that_need_none(measured):
-    rows, _ = by_scene_and_method(measured)
-    values = rows[REAL, "Ours"]["values"]
-    assert "psnr_whole" not in values
-    # halfway from 1.4 times the truth back to it: darker than the composite
-    assert 0.5 < values["object_brightness"] < 1
-    assert values["darkened_fraction"] > 0
-    assert 0 < values["detail_kept"] < 1.2
+    assert (measured.out / "figures" / "real.png").is_file()
 
 
 def test_pictures_of_another_size_or_of_other_views_are_said_and_leave_their_cells_empty(measured, tmp_path):

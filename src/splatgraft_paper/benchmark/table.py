@@ -126,6 +126,12 @@ class Table:
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
 
+    def markdown(self) -> str:
+        """Format it with its title."""
+        lines = ["| " + " | ".join(cells) + " |" for cells in (self.head, *self.rows)]
+        lines.insert(1, "|" + " --- |" * len(self.head))
+        return f"### {self.title}\n\n" + "\n".join(lines)
+
 
 def tables(benchmark: Benchmark) -> list[Table]:
     """Make the tables: metrics by region, light, poses, time, and PSNR by scene."""
@@ -149,11 +155,7 @@ def tables(benchmark: Benchmark) -> list[Table]:
 
 def markdown(benchmark: Benchmark) -> str:
     """Format all tables and notes as Markdown."""
-    parts = []
-    for table in tables(benchmark):
-        lines = ["| " + " | ".join(cells) + " |" for cells in (table.head, *table.rows)]
-        lines.insert(1, "|" + " --- |" * len(table.head))
-        parts.append(f"### {table.title}\n\n" + "\n".join(lines))
+    parts = [table.markdown() for table in tables(benchmark)]
     notes = [f"- {note}" for note in (*benchmark.notes, *benchmark.not_run, *_missing(benchmark))]
     return "\n\n".join([*parts, "\n".join(notes)]) + "\n"
 

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from splatgraft.core.flip import flip_map
 from splatgraft.core.image_metrics import psnr, ssim, ssim_map
-from splatgraft.core.images import LUMINANCE, read_mask, read_rgb
+from splatgraft.core.images import read_mask, read_rgb
 from splatgraft.evaluation.measure import SMALLEST_REGION, Perceptual, Truth
-from splatgraft.evaluation.pictures import describe_change
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.project.layout import METRICS_FILE
 from splatgraft.project.step import Context, Inputs
@@ -39,8 +38,6 @@ class KnownView:
     """Coverage by the object, in [0, 1]."""
     background: Float[Tensor, "h w 3"] | None = None
     """Without the object."""
-    composite: Float[Tensor, "h w 3"] | None = None
-    """With the object pasted in."""
 
 
 def measure_picture(
@@ -55,10 +52,8 @@ def measure_picture(
 
     Returns:
         With a truth: `psnr_whole`, `ssim_whole`, `ssim_padded_whole`, `flip_whole`, and `lpips_whole` where asked for;
-        with a mask also those of the object; with a background too, those of the shadow and of the rest. With a
-        composite and a mask, whether or not there is a truth: `object_brightness`, `darkened_fraction`,
-        `brightened_fraction` (`describe_change`), `detail_kept` (gradients on the object over those of the composite)
-        and `rest_mean_change` (away from object and shadow; only without a truth). nan where a region is too small.
+        with a mask also those of the object; with a background too, those of the shadow and of the rest. nan where a
+        region is too small.
     """
     out: dict[str, float] = {}
     if known.truth is not None and known.mask is not None and known.background is not None:
@@ -68,8 +63,6 @@ def measure_picture(
         out |= _whole_and_object(image, known.truth, known.mask, perceptual)
     if known.truth is not None:
         out["ssim_padded_whole"] = float(padded_ssim(image, known.truth))
-    if known.composite is not None and known.mask is not None:
-        out |= _change(image, known.composite, known.mask, with_truth=known.truth is not None)
     return out
 
 
@@ -105,28 +98,6 @@ def _whole_and_object(
         mixed = torch.where(inside[..., None], image, truth)
         out["lpips_object"] = float(perceptual(mixed, truth)) if large_enough else math.nan
     return out
-
-
-def _change(
-    image: Float[Tensor, "h w 3"], composite: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"], *, with_truth: bool
-) -> dict[str, float]:
-    """What was done to the composite: needs no truth."""
-    out = describe_change(image, composite, mask)
-    inside = mask > 0.5
-    before, after = _gradient(composite)[inside].sum(), _gradient(image)[inside].sum()
-    large_enough = int(inside.sum()) >= SMALLEST_REGION and float(before) > 0
-    out["detail_kept"] = float(after / before) if large_enough else math.nan
-    if not with_truth:
-        rest = mask <= 0
-        out["rest_mean_change"] = float((image - composite).abs().amax(-1)[rest].mean()) if rest.any() else math.nan
-    return out
-
-
-def _gradient(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-    """Length of the gradient of luminance, by forward differences; zero in the last row and column."""
-    grey = image @ LUMINANCE.to(image)
-    rows, columns = F.pad(grey.diff(dim=0), (0, 0, 0, 1)), F.pad(grey.diff(dim=1), (0, 1))
-    return torch.hypot(rows, columns)
 
 
 @dataclass(frozen=True)
@@ -230,7 +201,7 @@ def _known(files: Mapping[str, Mapping[str, Path]], stem: str, size: Size) -> Kn
         return _of_size(read_rgb(files[role][stem]), files[role][stem], size) if role in files else None
 
     mask = _of_size(read_mask(files["masks"][stem]), files["masks"][stem], size) if "masks" in files else None
-    return KnownView(read("truth"), mask, read("background"), read("composite"))
+    return KnownView(read("truth"), mask, read("background"))
 
 
 def _of_size(image: Tensor, path: Path, size: Size) -> Tensor:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 _FIVE = ("psnr", "ssim", "lpips", "fid", "kid")
-_FOUR = ("psnr", "ssim", "lpips", "fid")
 
 
 @dataclass(frozen=True)
@@ -47,29 +46,6 @@ ROTATION = PublishedTable(
         "P2": (24.16, 0.9097, 0.1639, 45.78, 0.0160),
     },
 )
-DATA_ABLATION = PublishedTable(
-    "data",
-    "Data ablation of the harmonisation model, single views (the paper's Table 3)",
-    tuple(f"{source} {metric}" for source in ("Blender", "FLUX", "ORIDa", "average") for metric in _FOUR),
-    {
-        "Ours": (
-            27.08, 0.893, 0.124, 33.86, 28.34, 0.892, 0.108, 25.13,
-            30.08, 0.865, 0.170, 74.64, 28.50, 0.883, 0.134, 44.54,
-        ),
-        "w/o Blender": (
-            25.69, 0.870, 0.164, 47.78, 28.28, 0.890, 0.106, 26.90,
-            29.71, 0.863, 0.160, 86.49, 27.89, 0.874, 0.143, 53.72,
-        ),
-        "w/o FLUX": (
-            26.98, 0.895, 0.122, 34.64, 24.70, 0.852, 0.147, 46.23,
-            30.41, 0.868, 0.163, 70.19, 27.36, 0.872, 0.144, 50.36,
-        ),
-        "w/o ORIDa": (
-            26.93, 0.890, 0.130, 35.93, 28.29, 0.892, 0.104, 24.66,
-            29.92, 0.887, 0.126, 73.46, 28.38, 0.890, 0.120, 44.68,
-        ),
-    },
-)  # fmt: skip
 UPDATES = PublishedTable(
     "updates",
     "Iterative dataset update against one consolidation (the paper's Table 4)",
@@ -80,8 +56,6 @@ UPDATES = PublishedTable(
         "w/Geometric": (68.0, 21.55, 0.820, 0.230, 60.47, 0.0477),
     },
 )
-PAPER_TABLES = (SYNTHETIC, ROTATION, DATA_ABLATION, UPDATES)
-"""All tables of the paper, in its order."""
 
 SCENES = {
     "synthetic": 9,

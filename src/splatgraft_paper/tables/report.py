@@ -1,4 +1,4 @@
-"""Files of a run on the authors' data set: tables as Markdown, JSON and a page, and the paper's figures of pictures."""
+"""The paper's tables with its numbers beside those measured here, and its figures: as Markdown, JSON and a page."""
 
 import json
 import shlex
@@ -15,26 +15,30 @@ from torch import Tensor
 from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.evaluation import side_by_side
 from splatgraft.evaluation.report_page import html_page
-from splatgraft_paper.benchmark.table import table_section
+from splatgraft_paper.benchmark.table import Table, summarize, table_section
 from splatgraft_paper.tables.layout import Kind, PaperScene, held_out_stems, match_views, pictures
-from splatgraft_paper.tables.paper_numbers import SCENES
+from splatgraft_paper.tables.paper_numbers import ROTATION, SCENES, SYNTHETIC, UPDATES, PublishedTable
 from splatgraft_paper.tables.run import METRIC_VERSIONS, PaperResults
-from splatgraft_paper.tables.tables import ExplainedTable, paper_tables
 
-_ROW_HEIGHT = 200
-"""Pixels of a picture in a figure."""
+_FORMATS = {"psnr": "{:.2f}", "fid": "{:.2f}", "minutes": "{:.1f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
+_LESS_IS_BETTER = ("lpips", "fid", "kid", "flip", "minutes")
+_KEYS = {"psnr": "psnr_whole", "ssim": "ssim_padded_whole", "lpips": "lpips_whole", "flip": "flip_whole"}
+_COLUMNS = ("psnr", "ssim", "lpips", "fid", "kid", "flip")
+_EMPTY = "–"
+"""A cell without a number; the notes say why."""
 _FIGURES: dict[Kind, tuple[str, ...]] = {
     "synthetic": ("composite", "GS-IR", "GShader", "3DGS-DR", "Ours", "truth"),
     "real": ("background", "composite", "GS-IR", "GShader", "3DGS-DR", "Ours"),
     "rotation": ("composite", "Ours", "truth"),
 }
 """Columns of the paper's figures of 3D results; our methods come before the last."""
+_ROW_HEIGHT = 200
+"""Pixels of a picture in a figure."""
 
 
 def write_paper_report(out: Path, results: PaperResults) -> Path:
     """Write index.html, paper.md, paper.json and figures/; returns the page."""
-    tables, notes = paper_tables(results), protocol_notes(results)
-    figures = _figures(out, results)
+    tables, notes, figures = paper_tables(results), protocol_notes(results), _figures(out, results)
     shown = [f"![{path.stem}]({path.relative_to(out).as_posix()})" for path in figures]
     text = [*(table.markdown() for table in tables), *shown, "\n".join(f"- {note}" for note in notes)]
     (out / "paper.md").write_text("\n\n".join(text) + "\n")
@@ -45,12 +49,48 @@ def write_paper_report(out: Path, results: PaperResults) -> Path:
         for path in figures
     )
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)
-    protocol = f"<section><h2>Protocol</h2><ul>{items}</ul></section>"
-    body = "".join(_section(table) for table in tables) + images + protocol
-    subtitle = "Published numbers beside those measured here; numbers in brackets name the reason of an empty cell."
+    body = "".join(map(table_section, tables)) + images
+    body += f"<section><h2>Protocol</h2><ul>{items}</ul></section>"
     page = out / "index.html"
-    page.write_text(html_page("The paper's tables", subtitle, body, views=()))
+    page.write_text(html_page("The paper's tables", "Published numbers beside those measured here.", body, views=()))
     return page
+
+
+def paper_tables(results: PaperResults) -> list[Table]:
+    """The paper's tables of scenes with truth (1, 2 and 4), and PSNR by scene."""
+    synthetic: list[tuple[str, ...]] = []
+    for name in dict.fromkeys([*SYNTHETIC.rows, *results.methods("synthetic")]):
+        if name in SYNTHETIC.rows:
+            synthetic.append((f"{name}, as published", *_published(SYNTHETIC, name, _COLUMNS)))
+        synthetic.append((_named(name, results), *_measured(results, "synthetic", name)))
+    rotation: list[tuple[str, ...]] = []
+    for pose in ROTATION.rows:
+        rotation.append((f"{pose}, as published", *_published(ROTATION, pose, _COLUMNS)))
+        for name in dict.fromkeys(["Ours", *results.methods("rotation")]):
+            rotation.append((f"{pose}, {_named(name, results)}", *_measured(results, "rotation", name, pose)))
+    updates: list[tuple[str, ...]] = []
+    for name, schedule in {"Ours": "once", "w/Linear": "linear", "w/Geometric": "geometric"}.items():
+        updates.append((f"{name}, as published", *_published(UPDATES, name, ("minutes", *_COLUMNS))))
+        updates.append((_named(name, results), _EMPTY, *_measured(results, "synthetic", name)))
+        for method in results.ours:
+            if "+" in method and (method.partition("@")[2] or "once") == schedule:
+                cells = _measured(results, "synthetic", method)
+                updates.append((_named(method, results), _minutes(results, method), *cells))
+    head = (*map(_title, _COLUMNS), "scenes")
+    tables = [
+        Table(SYNTHETIC.title, ("method", *head), tuple(synthetic)),
+        Table(ROTATION.title, ("pose", *head), tuple(rotation)),
+        Table(UPDATES.title, ("schedule", _title("minutes"), *head), tuple(updates)),
+    ]
+    for kind in ("synthetic", "rotation"):
+        scenes = [scene.name for scene in results.scenes if scene.kind == kind]
+        rows = []
+        for name in results.methods(kind):
+            values = {item.scene.name: item.values.get("psnr_whole") for item in results.of(kind, name)}
+            rows.append((name, *(_text("psnr", values.get(scene)) for scene in scenes)))
+        if rows:
+            tables.append(Table(f"PSNR by scene: {kind}", ("method", *scenes), tuple(rows)))
+    return tables
 
 
 def protocol_notes(results: PaperResults) -> list[str]:
@@ -76,21 +116,58 @@ def protocol_notes(results: PaperResults) -> list[str]:
     return list(dict.fromkeys(notes))
 
 
+def _named(method: str, results: PaperResults) -> str:
+    return f"{method}, " + ("run here" if method in results.ours else "the authors' pictures, measured here")
+
+
+def _title(metric: str) -> str:
+    return f"{metric.upper() if metric != 'minutes' else metric} {'↓' if metric in _LESS_IS_BETTER else '↑'}"
+
+
+def _published(table: PublishedTable, row: str, columns: Sequence[str]) -> list[str]:
+    return [*(_text(column, table.value(row, column)) for column in columns), "3" if table is ROTATION else "9"]
+
+
+def _measured(results: PaperResults, kind: Kind, method: str, pose: str = "") -> list[str]:
+    found = [item for item in results.of(kind, method, pose) if "psnr_whole" in item.values]
+    cells: list[str] = []
+    for column in _COLUMNS:
+        if column in ("fid", "kid"):
+            cells.append(_text(column, results.pooled.get((kind, pose, method), {}).get(column)))
+            continue
+        summary = summarize([item.values.get(_KEYS[column]) for item in found])
+        cells.append(_text(column, None if summary is None else summary.mean))
+        if summary is not None and summary.scenes > 1:
+            cells[-1] += f" [{_text(column, summary.low)}, {_text(column, summary.high)}]"
+    return [*cells, str(len(found))]
+
+
+def _minutes(results: PaperResults, method: str) -> str:
+    found = [item.seconds for item in results.of("synthetic", method) if item.seconds]
+    spent = [sum(seconds.get(step, 0.0) for step in ("harmonize", "consolidate", "update")) for seconds in found]
+    return _text("minutes", sum(spent) / len(spent) / 60 if spent else None)
+
+
+def _text(metric: str, value: float | None) -> str:
+    return _EMPTY if value is None else _FORMATS.get(metric, "{:.4f}").format(value)
+
+
 def _as_json(results: PaperResults, notes: Sequence[str]) -> dict[str, object]:
+    measured = [
+        {
+            "scene": item.scene.name,
+            "kind": item.scene.kind,
+            "pose": item.scene.pose,
+            "method": item.method,
+            "by": "this software" if item.method in results.ours else "the authors",
+            "values": dict(item.values),
+            "protocol": dict(item.protocol),
+            "seconds": dict(item.seconds),
+        }
+        for item in results.measured
+    ]
     return {
-        "measured": [
-            {
-                "scene": item.scene.name,
-                "kind": item.scene.kind,
-                "pose": item.scene.pose,
-                "method": item.method,
-                "by": "this software" if item.method in results.ours else "the authors",
-                "values": dict(item.values),
-                "protocol": dict(item.protocol),
-                "seconds": dict(item.seconds),
-            }
-            for item in results.measured
-        ],
+        "measured": measured,
         "pooled": [{"kind": k, "pose": p, "method": m, **v} for (k, p, m), v in results.pooled.items()],
         "missing": [{"scene": s, "method": m, "reason": r} for (s, m), r in results.missing.items()],
         "not_measured": dict(results.not_measured),
@@ -99,19 +176,13 @@ def _as_json(results: PaperResults, notes: Sequence[str]) -> dict[str, object]:
     }
 
 
-def _section(explained: ExplainedTable) -> str:
-    items = "".join(f"<li>{escape(reason)}</li>" for reason in explained.reasons)
-    return table_section(explained.table) + (f"<ol>{items}</ol>" if items else "")
-
-
 def _figures(out: Path, results: PaperResults) -> list[Path]:
     """One sheet of pictures for each kind of scene, as the paper's figures of 3D results."""
     found: list[Path] = []
     for kind, columns in _FIGURES.items():
-        ours = [name for name in results.ours if any(results.of(kind, name))]
-        wanted = (*columns[:-1], *ours, columns[-1])
+        wanted = (*columns[:-1], *results.ours, columns[-1])
         scenes = [scene for scene in results.scenes if scene.kind == kind]
-        rows = [row for scene in scenes if (row := _figure_row(out, scene, wanted, results)) is not None]
+        rows = [row for scene in scenes if (row := _figure_row(out, scene, wanted)) is not None]
         if rows:
             width = max(row.shape[1] for row in rows)
             padded = [torch.nn.functional.pad(row, (0, 0, 0, width - row.shape[1], 0, 4), value=1.0) for row in rows]
@@ -121,27 +192,18 @@ def _figures(out: Path, results: PaperResults) -> list[Path]:
     return found
 
 
-def _figure_row(
-    out: Path, scene: PaperScene, columns: Sequence[str], results: PaperResults
-) -> Float[Tensor, "h w 3"] | None:
+def _figure_row(out: Path, scene: PaperScene, columns: Sequence[str]) -> Float[Tensor, "h w 3"] | None:
     """The middle held-out view of a scene by each column that has a picture of it."""
-    folders = {name: scene.folders.get(name) or scene.results.get(name) for name in columns}
-    for name in results.ours:
-        folder = out / "scenes" / scene.name / "pictures" / name.replace("/", "-")
-        folders[name] = folder if folder.is_dir() else None
-    if folders.get("composite") is None:
-        folders["composite"] = scene.results.get("Composite")
-    reference = scene.folders.get("truth") or scene.folders.get("composite")
-    reference = reference or next((folder for folder in folders.values() if folder is not None), None)
+    ours = {name: out / "scenes" / scene.name / "pictures" / name.replace("/", "-") for name in columns}
+    folders = {name: path for name, path in ours.items() if path.is_dir()} | dict(scene.results) | dict(scene.folders)
+    reference = folders.get("truth") or folders.get("composite")
     if reference is None:
         return None
     stems = list(pictures(reference))
     held = held_out_stems(stems)
-    view = held[len(held) // 2]
-    labels, shown = [], []
+    view, labels, shown = held[len(held) // 2], [], []
     for name in columns:
-        folder = folders.get(name)
-        matched = match_views(stems, pictures(folder))[0] if folder is not None else {}
+        matched = match_views(stems, pictures(folders[name]))[0] if name in folders else {}
         if view in matched:
             image = read_rgb(matched[view])
             labels.append(f"{scene.name}: {name}" if not labels else name)

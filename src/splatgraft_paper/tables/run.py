@@ -77,20 +77,6 @@ class PaperResults:
         chosen = [item for item in self.measured if item.scene.kind == kind and item.method == method]
         return [item for item in chosen if pose in ("", item.scene.pose)]
 
-    def reason(self, kind: Kind, method: str, metric: str) -> str:
-        """Why a cell is empty."""
-        if metric in self.not_measured:
-            return f"{metric}: {self.not_measured[metric]}"
-        scenes = [scene for scene in self.scenes if scene.kind == kind]
-        if not scenes:
-            return f"the folder has no {kind} scenes"
-        reasons = [text for scene in scenes if (text := self.missing.get((scene.name, method)))]
-        if reasons:
-            return reasons[0]
-        if not any(method in scene.results for scene in scenes) and method not in self.ours:
-            return f"the folder has no pictures of {method}"
-        return "no scene has the truth that this needs"
-
 
 def read_measured(scene: PaperScene, method: str, folder: Path, seconds: Mapping[str, float] | None = None) -> Measured:
     """Read what `MeasurePictures` wrote."""
