@@ -85,7 +85,7 @@ def scale_from_marker(
 
     Args:
         images: sRGB in [0, 1], one per camera.
-        cameras: Of the pictures.
+        cameras: Cameras of the pictures.
         side_m: Length of the black square's side, metres.
         progress: Called per picture.
 

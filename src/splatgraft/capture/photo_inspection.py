@@ -95,7 +95,7 @@ class Inspection:
     """What was found in n photos."""
 
     blur: tuple[float, ...]
-    """Of each photo, in [0, 1]; 0 is sharp."""
+    """Blur of each photo, in [0, 1]; 0 is sharp."""
     links: tuple[Link, ...]
     """Pairs of photos that show the same place, as far as they were looked for."""
     groups: tuple[tuple[int, ...], ...]
@@ -275,8 +275,8 @@ def find_in_photos(inspection: Inspection, names: Sequence[str], *, has_poses: b
     """Sharpness, overlap and brightness.
 
     Args:
-        inspection: Of n photos.
-        names: Of the photos.
+        inspection: The figures of n photos.
+        names: The photos' names.
         has_poses: Whether the photos have poses, so that no matches between them are needed.
     """
     overlap = _overlap(inspection, names)

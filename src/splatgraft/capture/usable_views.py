@@ -43,7 +43,7 @@ _BLUR_OCTAVES = 1.5
 rendered) the softest photo lies 0.4 to 0.8 below; 9 px of motion blur or a Gaussian blur of 2 px take off 1.5 to 3,
 mostly 2.4."""
 _BLUR_DEVIATIONS = 4.0
-"""And this many robust standard deviations (1.4826 median absolute deviations) below it."""
+"""Robust standard deviations (1.4826 median absolute deviations) below the median, at least, of a blurred photo."""
 _COARSE_HALVINGS = 4
 """A blur that is wide enough to take coarse detail as well must not pass for sharp: a sixteenth holds up to 16 px."""
 _COARSE_PX = 8

@@ -191,7 +191,7 @@ def choose_frames(
 
     Args:
         path: Motion up to each frame, over the picture's longest side.
-        sharpness: Of each frame, any unit.
+        sharpness: Sharpness of each frame, any unit.
         shots: Number of the shot of each frame, from 0 up.
         count: Largest number of frames; one more per shot may come.
 

@@ -55,17 +55,17 @@ _HOLLOW_SHARE = 0.08
 
 # candidate positions, and what occludes them
 _DISTANCES = (2.4, 1.7, 3.4, 1.2)
-"""From the centre, around the dense part, the best first: at 2.4 it fills the picture."""
+"""Distances of eyes around the dense part from its centre, the best first: at 2.4 it fills the picture."""
 _ELEVATIONS_DEG = (20.0, 42.0)
-"""Of the rings around the dense part."""
+"""Elevations of the rings around the dense part."""
 _CLEAR = 1.1
 """Distance from the centre towards the eye beyond which anything occludes the dense part."""
 _CLEAR_AT_EDGES = 0.35
 """Distance from the eye, over that of the centre, below which anything occludes the picture."""
 _HEIGHTS = (0.2, 0.6, 0.0)
-"""Of eyes within the scene above the centre, the best first."""
+"""Heights of eyes within the scene above the centre, the best first."""
 _ELEVATIONS_WITHIN_DEG = (0.0, -25.0)
-"""Of views out of the scene."""
+"""Elevations of views out of the scene."""
 _STEP_BACK = 0.3
 """Horizontal distance of eyes within the scene from the centre, against the view."""
 _CLEAR_WITHIN, _CLEAR_AT_EDGES_WITHIN = 0.3, 0.15
@@ -83,13 +83,13 @@ class VirtualCameraOptions:
     """Pictures to render of a trained scene that comes without photographs."""
 
     views: int = 36
-    """Of a trained scene: number of pictures to render; fewer where the view is blocked."""
+    """Number of pictures to render of a trained scene; fewer where the view is blocked."""
     look: Literal["around", "within"] = "around"
-    """Of a trained scene: at its dense part from all around, or outwards from its middle, as in a room."""
+    """Whether a trained scene is seen from around its dense part, or outwards from its middle, as in a room."""
     picture_width: int = 640
-    """Of these pictures, pixels; their height is three quarters of it."""
+    """Width of these pictures, pixels; their height is three quarters of it."""
     up: tuple[float, float, float] | None = None
-    """Of a trained scene: its up direction; found from its largest level surface where not given."""
+    """Up direction of a trained scene; found from its largest level surface where not given."""
 
     def __post_init__(self) -> None:
         """Raises: ValueError where there would be too few views, or up has no length."""
@@ -214,8 +214,8 @@ def estimate_scene_up(
 
     Args:
         points: Centres of solid Gaussians.
-        centre: Of the dense part.
-        radius: Of the dense part, world units.
+        centre: Centre of the dense part.
+        radius: Radius of the dense part, world units.
 
     Returns:
         A unit vector, and the reason for it, for the user.

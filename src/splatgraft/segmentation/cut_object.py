@@ -54,7 +54,7 @@ class CutViews:
     images: Sequence[Float[Tensor, "_ _ 3"]]
     """sRGB in [0, 1], one per camera."""
     cameras: Cameras
-    """Of the pictures, on the device of the scene."""
+    """Cameras of the pictures, on the device of the scene."""
     prompts: Mapping[int, ViewPrompt] = field(default_factory=dict)
     """Points and rectangles by index of the picture, in its pixels."""
 
@@ -64,7 +64,7 @@ class Agreement:
     """Intersection over union of each picture's mask and the rendered selection."""
 
     names: tuple[str, ...]
-    """Of the pictures."""
+    """Names of the pictures."""
     iou: Float[Tensor, "v"]
     """In [0, 1]; nan where neither mask nor selection shows in the picture."""
 
@@ -176,7 +176,7 @@ def measure_agreement(
     Args:
         masks: One per camera, of its size, in [0, 1].
         scene: n Gaussians.
-        cameras: Of the masks.
+        cameras: Cameras of the masks.
         selection: The object's Gaussians.
         progress: Called per picture.
     """

@@ -37,7 +37,7 @@ def grabcut_mask(image: Float[Tensor, "h w 3"], evidence: Evidence) -> Float[Ten
 
     Args:
         image: sRGB in [0, 1].
-        evidence: Of the object in this picture.
+        evidence: What is known of the object in this picture.
 
     Returns:
         The object's mask, 0 or 1.

@@ -115,7 +115,7 @@ def seed_selection(
 
     Args:
         scene: n Gaussians.
-        cameras: Of the capture, on the device of `scene`.
+        cameras: Cameras of the capture, on the device of `scene`.
         box: Around the object, world units; guessed where None.
         prompts: What the user says, by index of the camera, pixels of its picture.
         known: Gaussians that masks of some pictures give to the object; None where there are no masks.
@@ -168,7 +168,7 @@ def guess_region(
     """The region of the object that the cameras look at, or that a user pointed at.
 
     Args:
-        cameras: Of the capture.
+        cameras: Cameras of the capture.
         points: Surface points, world units; may be empty.
         pointed_at: Points on the object, world units; None where nobody pointed.
 
@@ -206,7 +206,7 @@ def region_of_box(cameras: Cameras, points: Float[Tensor, "m 3"], box: Box) -> O
     """The region of a box that a user gave, without the support that it may cut.
 
     Args:
-        cameras: Of the capture.
+        cameras: Cameras of the capture.
         points: Surface points, world units.
         box: As given.
     """

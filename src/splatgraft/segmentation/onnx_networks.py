@@ -36,7 +36,7 @@ _SAM2_MARGIN = 0.05
 """Added around the box of the 3D selection at each side, over its width and height; set by hand."""
 _IMAGENET_MEAN = torch.tensor([0.485, 0.456, 0.406])
 _IMAGENET_STD = torch.tensor([0.229, 0.224, 0.225])
-"""Of sRGB in [0, 1]."""
+"""Mean and deviation of sRGB in [0, 1] with which the networks were trained."""
 _CUDA = "CUDAExecutionProvider"
 
 

@@ -62,7 +62,7 @@ class Clock:
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
     """Wall-clock time."""
     cpu_seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
-    """Of all threads."""
+    """CPU time of all threads."""
     pairs: int = 0
     """Pairs matched so far."""
 
@@ -79,5 +79,5 @@ class Clock:
 
     @property
     def seconds_per_pair(self) -> float:
-        """Of matching; 0 where none was measured."""
+        """Seconds that matching takes per pair; 0 where none was measured."""
         return self.seconds["matching"] / self.pairs if self.pairs else 0.0

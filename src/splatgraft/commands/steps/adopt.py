@@ -62,7 +62,7 @@ def misfit_of(scene: SceneFile, points: Float[Tensor, "m 3"]) -> str | None:
 
     Args:
         scene: As read.
-        points: Of its capture, in the same frame if they belong together.
+        points: Points of its capture, in the same frame if they belong together.
     """
     means = scene.gaussians.means
     means = means[means.isfinite().all(1)]

@@ -59,7 +59,7 @@ class Capture:
     accept_doubtful: bool = False
     """Whether `run` goes on with poses that are not plausible; without it, it stops after this step."""
     axes: str | None = None
-    """Of a trained scene: directions of x, y and z (RDF: right, down, front), where those of its format are wrong."""
+    """Directions of x, y and z of a trained scene (RDF: right, down, front), where those of its format are wrong."""
     options: PoseOptions = field(default_factory=PoseOptions)
     look: VirtualCameraOptions = field(default_factory=VirtualCameraOptions)
 

@@ -220,7 +220,7 @@ def _agreement_notes(agreement: Agreement, sheet: Path, picture: Path) -> list[N
     """How well the masks agree, and what is wrong with that.
 
     Args:
-        agreement: Of masks and selection.
+        agreement: How well masks and selection agree.
         sheet: Where the picture will lie.
         picture: Where it lies while the step runs.
     """
