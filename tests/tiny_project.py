@@ -1,5 +1,6 @@
 """A project so small that every step takes a second: a ball on a plane, photographed by our own renderer."""
 
+import hashlib
 import shutil
 import tempfile
 from dataclasses import replace
@@ -112,6 +113,12 @@ def copy_of(project: Path, root: Path) -> Path:
     for name in ("photos", project.name):
         shutil.copytree(project.parent / name, root / name)
     return root / project.name
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Hashes of all files of a result but step.json, by path."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "step.json"]
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 if __name__ == "__main__":

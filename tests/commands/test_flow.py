@@ -1,6 +1,5 @@
 """The whole job on a tiny scene, through the commands: done once, redone only where stale, whole after every kill."""
 
-import hashlib
 import json
 import os
 import random
@@ -9,11 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from tiny_project import ball, photograph, plane, write_project
+from killing import Killed, killed_at_write
+from tiny_project import ball, contents, photograph, plane
 
 from splatgraft.cli import main
 from splatgraft.commands.steps.harmonize import Harmonize
@@ -28,18 +29,9 @@ from splatgraft.workflow.flow import read_flow
 STEPS = ("segment", "compose", "relight", "render", "harmonize", "consolidate", "evaluate")
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A project that was run from beginning to end; tests copy it."""
-    path = write_project(tmp_path_factory.mktemp("tiny"))
-    assert main(["run", str(path)]) == 0
-    return path
-
-
 @pytest.fixture
-def project(finished: Path, tmp_path: Path) -> Path:
-    shutil.copytree(finished.parents[1], tmp_path / "copy")
-    return tmp_path / "copy" / "project" / "project.toml"
+def project(copy_project: Callable[[], Path]) -> Path:
+    return copy_project() / "project.toml"
 
 
 def stale(project: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
@@ -47,11 +39,6 @@ def stale(project: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
     assert main(["status", str(project)]) == 0
     lines = capsys.readouterr().out.splitlines()[1:]
     return {line.split()[0]: line.split("stale: ")[1] for line in lines if "stale: " in line}
-
-
-def contents(folder: Path) -> dict[str, str]:
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "step.json"]
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def test_everything_is_made_and_fresh_wherever_the_project_lies(
@@ -72,8 +59,8 @@ def test_the_report_is_the_last_line_of_a_run(project: Path, capsys: pytest.Capt
     assert capsys.readouterr().out.splitlines()[-1] == str(project.parent / "report" / "index.html")
 
 
-def test_without_a_harmoniser_the_result_is_the_relit_composite(finished: Path) -> None:
-    layout = read_flow(finished).layout
+def test_without_a_harmoniser_the_result_is_the_relit_composite(finished_project: Path) -> None:
+    layout = read_flow(finished_project).layout
     relit, result = read_gaussians(layout.relit / "scene.ply"), read_gaussians(layout.result / "scene.ply")
     # images of 8 bits are off by at most half a level, which counts as unchanged: every colour is kept bit for bit
     assert torch.equal(relit.sh, result.sh)
@@ -155,8 +142,8 @@ def test_a_run_up_to_a_step_needs_only_the_inputs_of_that_step(
     assert "transforms.json: expected" in capsys.readouterr().err
 
 
-def test_the_recorded_options_of_harmonize_are_those_of_version_0_1_0(finished: Path) -> None:
-    record = read_record(read_flow(finished).layout.harmonized)
+def test_the_recorded_options_of_harmonize_are_those_of_version_0_1_0(finished_project: Path) -> None:
+    record = read_record(read_flow(finished_project).layout.harmonized)
     assert record is not None
     # other options, or an option less, would make every result of that version stale
     assert record.options == {
@@ -223,27 +210,35 @@ def test_no_masks_are_cut_from_the_images_and_the_choice_is_said(
 
 
 def test_killed_inside_any_step_earlier_results_stay_whole_and_run_finishes(project: Path) -> None:
-    """Every step is asked for again and shot down at a random moment of its work, then all is brought up to date."""
+    """Every step is asked for again and killed at one of its writes, then all is brought up to date."""
     generator = random.Random(0)
     wanted = {step.out: contents(step.out) for _, step in read_flow(project)}
-    killed = 0
-    for name, step in read_flow(project):
-        words = [sys.executable, "-m", "splatgraft", "run", str(project), "--to", name, "--force", name]
-        run = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=_environment())
-        at_work = step.out.with_name(f".{step.out.name}.new")
-        while run.poll() is None and not at_work.exists():
-            time.sleep(0.001)
-        time.sleep(generator.choice((0.0, 0.01, 0.1, 0.3)))
-        run.send_signal(signal.SIGKILL)
-        killed += run.wait() == -signal.SIGKILL
+    for name, _ in read_flow(project):
+        # the lock, the checkpoint and the new folder are the first writes; each step has at least ten
+        with pytest.raises(Killed), killed_at_write(generator.randrange(4, 10)):
+            main(["run", str(project), "--to", name, "--force", name])
         assert {folder: contents(folder) for folder in wanted} == wanted
-    # a step of 60 small iterations can be through before the shot
-    assert killed >= 6
     shutil.rmtree(project.parent / "source" / "scene")
     assert main(["run", str(project), "--force", "consolidate"]) == 0
     # the same seeds give the same files, however often a run was cut
     assert {folder: contents(folder) for folder in wanted} == wanted
     assert not list(project.parent.rglob(".*.checkpoint"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_killed_process_leaves_earlier_results_whole_and_the_next_run_finishes(project: Path, number: int) -> None:
+    wanted = {step.out: contents(step.out) for _, step in read_flow(project)}
+    words = [sys.executable, "-m", "splatgraft", "run", str(project), "--force", "target/reconstruct"]
+    run = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=_environment())
+    while not (project.parent / "target" / ".scene.new").exists():
+        assert run.poll() is None
+        time.sleep(0.001)
+    run.send_signal(number)
+    assert run.wait() == -number
+    assert {folder: contents(folder) for folder in wanted} == wanted
+    # the lock died with its holder
+    assert main(["run", str(project)]) == 0
+    assert {folder: contents(folder) for folder in wanted} == wanted
 
 
 def test_a_killed_training_goes_on_from_its_checkpoint(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """Where there is no room on the disk, a run ends with one line, and what was there before is still whole."""
 
+import errno
 import os
 import re
 import resource
@@ -9,18 +10,38 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_flow import contents
-from tiny_project import write_project
+from tiny_project import contents, copy_of
 
 from splatgraft.cli import main
+from splatgraft.commands.steps.render import Render
+from splatgraft.project.step import Context
 from splatgraft.workflow.flow import read_flow
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = write_project(tmp_path_factory.mktemp("full"))
-    assert main(["run", str(path)]) == 0
-    return path
+def finished(finished_project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return copy_of(finished_project, tmp_path_factory.mktemp("full")) / "project.toml"
+
+
+def test_a_writer_without_room_is_one_line_and_the_earlier_result_stays(
+    finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def write(self: Render, folder: Path, context: Context) -> None:
+        (folder / "half").write_text("half")
+        try:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        except OSError:
+            # as PyTorch's writer does while it closes the file
+            raise RuntimeError("unexpected pos 64 vs 0")  # noqa: B904
+
+    monkeypatch.setattr(Render, "write", write)
+    out = read_flow(finished).steps["render"].out
+    wanted = contents(out)
+    assert main(["run", str(finished), "--to", "render", "--force", "render"]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"splatgraft: {out}: expected room to write the result, found the disk full")
+    assert contents(out) == wanted
+    assert not list(finished.parent.rglob(".*.new"))
 
 
 def run(project: Path, *words: str, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
@@ -35,6 +56,7 @@ def run(project: Path, *words: str, most_bytes: int | None = None) -> subprocess
     return subprocess.run(command, preexec_fn=limited, env=source, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.long
 def test_files_beyond_the_limit_are_one_line_and_earlier_results_stay(finished: Path) -> None:
     wanted = {step.out: contents(step.out) for _, step in read_flow(finished)}
     # the largest files of these steps are some hundred kB (scenes), some kB (pictures) and some kB (turntable)
@@ -51,6 +73,7 @@ def test_files_beyond_the_limit_are_one_line_and_earlier_results_stay(finished: 
     assert {folder: contents(folder) for folder in wanted} == wanted
 
 
+@pytest.mark.long
 def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(finished: Path, tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()

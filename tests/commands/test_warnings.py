@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 from test_exposure_messages import exposed, fixed
-from tiny_project import write_project
+from tiny_project import copy_of, write_project
 
 from splatgraft.cli import main
 from splatgraft.core.similarity import Similarity
@@ -62,9 +62,9 @@ def test_a_warning_is_recorded_with_its_picture_relative_to_the_result(
 
 
 @pytest.fixture(scope="module")
-def warned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def warned(finished_project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project whose object stands where nothing was captured, so that there is no light to be found."""
-    path = write_project(tmp_path_factory.mktemp("warned"))
+    path = copy_of(finished_project, tmp_path_factory.mktemp("warned")) / "project.toml"
     far = Similarity(1.0, torch.eye(3), torch.tensor([500.0, 0.0, 0.0]))
     write_placement(path.parent / "placement.json", Placement(objects=(ObjectPlacement(target_from_object=far),)))
     assert main(["run", str(path)]) == 0
@@ -99,7 +99,7 @@ def test_a_report_that_lacks_a_warning_is_stale(warned: Path, capsys: pytest.Cap
 
 
 def test_exposures_are_warned_of_once_in_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_project(tmp_path)
+    path = write_project(tmp_path, "[reconstruct]\niterations = 2\nbudget = 100\n")
     for side in ("source", "target"):
         exposed(tmp_path / "photos" / side, [fixed(1 / 60), fixed(1 / 15)])
     assert main(["run", str(path), "--to", "reconstruct"]) == 0

@@ -2,14 +2,13 @@
 
 import json
 import os
-import signal
-import subprocess
-import sys
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
 import torch
+from killing import Killed, killed_at_write
 
 from splatgraft.project.layout import Layout
 from splatgraft.project.record import Job, read_record, why_stale
@@ -147,48 +146,27 @@ def test_missing_input_and_damaged_record_are_told_by_file(tmp_path: Path) -> No
             why_stale(job(tmp_path / "scene"))
 
 
-# Kills itself at the n-th system call that changes the file system; prints how many there are when it survives.
-KILLED_SWAP = """
-import os, signal, sys
-from pathlib import Path
-from splatgraft.project.record import Job
-from splatgraft.project.step import replacing
-from splatgraft.project.step import job_of
-
-fatal, seen = int(sys.argv[2]), 0
-def count(event, arguments):
-    global seen
-    if event in ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "shutil.rmtree", "ctypes.dlsym"):
-        seen += 1
-        if seen == fatal:
-            os.kill(os.getpid(), signal.SIGKILL)
-sys.addaudithook(count)
-with replacing(Job(step="step", folder=Path(sys.argv[1]), inputs={}, options={})) as folder:
-    (folder / "scene.ply").write_text("later")
-    (folder / "points.ply").write_text("later")
-print("survived")
-"""
-
-
-def test_killed_anywhere_the_folder_holds_one_whole_result(tmp_path: Path) -> None:
+def test_killed_at_any_write_the_folder_holds_one_whole_result(tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     states = set()
-    for fatal in range(1, 200):
+    for writes in range(200):
         finish(job(scene), "earlier")
-        run = subprocess.run(
-            [sys.executable, "-c", KILLED_SWAP, str(scene), str(fatal)], capture_output=True, text=True, check=False
-        )
-        assert run.returncode in (0, -signal.SIGKILL), run.stderr
+        survived = False
+        with suppress(Killed), killed_at_write(writes):
+            with replacing(job(scene)) as folder:
+                (folder / "scene.ply").write_text("later")
+                (folder / "points.ply").write_text("later")
+            survived = True
         texts = {path.name: path.read_text() for path in scene.glob("*.ply")}
         assert texts in ({"scene.ply": "earlier"}, {"scene.ply": "later", "points.ply": "later"})
         assert read_record(scene) is not None
-        states.add((run.returncode, texts["scene.ply"]))
+        states.add((survived, texts["scene.ply"]))
         finish(job(scene), "after")
         assert [p.name for p in tmp_path.iterdir()] == ["scene"]
-        if run.returncode == 0:
+        if survived:
             break
-    # the loop ran past the last call, and some kills came before and some after the swap
-    assert states == {(0, "later"), (-signal.SIGKILL, "earlier"), (-signal.SIGKILL, "later")}
+    # the loop ran past the last write, and some kills came before and some after the swap
+    assert states == {(True, "later"), (False, "earlier"), (False, "later")}
 
 
 def test_what_a_kill_between_two_renames_left_is_put_back(tmp_path: Path) -> None:
@@ -199,18 +177,13 @@ def test_what_a_kill_between_two_renames_left_is_put_back(tmp_path: Path) -> Non
     assert (tmp_path / "scene" / "scene.ply").read_text() == "earlier"
 
 
-def test_one_run_at_a_time_and_the_lock_dies_with_its_holder(tmp_path: Path) -> None:
-    script = "import sys, time; from pathlib import Path; from splatgraft.project.step import locked\n"
-    script += "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
-    holder = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "scene")], stdout=subprocess.PIPE)
-    try:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == b"held\n"
+def test_one_run_at_a_time(tmp_path: Path) -> None:
+    with locked(tmp_path / "scene"):
         with pytest.raises(ValueError, match=r"scene: expected no other run at work here"), locked(tmp_path / "scene"):
             pass
-    finally:
-        holder.kill()
-        holder.communicate()
+        # another folder is free
+        with locked(tmp_path / "other"):
+            pass
     with locked(tmp_path / "scene"):
         pass
 

@@ -19,6 +19,9 @@ from splatgraft.runtime.settings import read_toml
 from splatgraft.workflow.flow import Flow, read_flow
 from splatgraft.workflow.run import run_steps
 
+DRAFT = {"quality": "draft"}
+"""Keys of [reconstruct] of a first try."""
+
 
 @dataclass(frozen=True)
 class Try:
@@ -61,7 +64,7 @@ class Try:
                 raise ValueError(f"{project}: expected a project of these captures, found others; name --out FOLDER")
             console.say(f"{project}: goes on with what is there")
             return
-        text = with_keys(init.text(), "reconstruct", {"quality": "draft"})
+        text = with_keys(init.text(), "reconstruct", DRAFT)
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(project) as stream:
             stream.write(text.encode())
