@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from splatgraft.consolidation import ConsolidateOptions, DescentOptions, consolidate
+from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import psnr
@@ -125,7 +125,7 @@ def compare_methods(problem: Problem, loss: ImageLoss, iterations: int) -> str:
     runs = {
         "fast": options,
         "fast with tint and flow per view (the default)": ConsolidateOptions(loss=loss),
-        "adam": replace(options, method="adam", reference=DescentOptions(iterations=iterations)),
+        "adam": replace(options, method="adam", iterations=iterations),
     }
     results = {}
     for name, choice in runs.items():
@@ -155,15 +155,13 @@ def compare_losses(problem: Problem, passes: int) -> None:
     except ValueError as error:
         print(f"without LPIPS: {error}")
     settings = {"A: 0.8 px": (0.8, 44.0), "B: 1.5 px": (1.5, 44.0), "C: fine jitter": (0.8, 8.0)}
-    polish = ConsolidateOptions().polish
     rows = [("equations alone", ConsolidateOptions(polish_passes=0, view_error=False))]
     rows += [
-        (name, ConsolidateOptions(loss=loss, view_error=False, polish_passes=passes, polish=polish))
-        for name, loss in losses.items()
+        (name, ConsolidateOptions(loss=loss, view_error=False, polish_passes=passes)) for name, loss in losses.items()
     ]
     rows += [("per-view tint and flow, equations alone", ConsolidateOptions(polish_passes=0))]
     rows += [
-        (f"per-view tint and flow, {name}", ConsolidateOptions(loss=loss, polish_passes=passes, polish=polish))
+        (f"per-view tint and flow, {name}", ConsolidateOptions(loss=loss, polish_passes=passes))
         for name, loss in losses.items()
     ]
     rows += [("default", ConsolidateOptions())]

@@ -8,7 +8,6 @@ import torch
 
 from splatgraft.composition import (
     PlaceOptions,
-    RestOptions,
     compose,
     hidden_fraction,
     object_base,
@@ -263,7 +262,7 @@ def test_the_box_rests_upright_with_its_foot_on_the_table_in_any_source_frame(mo
     cameras, turned = move.cameras(OWN), move.gaussians(thing)
     base = object_base(turned, up=estimate_up(cameras))
     where = torch.tensor([0.2, 0.1, TABLE + 0.2])
-    found, _ = rest_on_surface(room(), base, point=where, up=UP, options=RestOptions(scale=1 / move.scale))
+    found, _ = rest_on_surface(room(), base, point=where, up=UP, scale=1 / move.scale)
     placed = found.gaussians(turned)
     low, high = placed.means[:, 2].quantile(0.02), placed.means[:, 2].quantile(0.98)
     # percentiles include each Gaussian's own extent of about 2 cm on the sides
@@ -274,17 +273,20 @@ def test_the_box_rests_upright_with_its_foot_on_the_table_in_any_source_frame(mo
 
 
 def test_yaw_turns_and_offset_shifts():
-    thing = box((0, 0, 0.15), (0.1, 0.04, 0.15))
-    base = object_base(thing, up=UP)
+    base = object_base(box((0, 0, 0.15), (0.1, 0.04, 0.15)), up=UP)
     where, flat = torch.tensor([0.0, 0, 1.0]), room(floaters=0)
     plain, _ = rest_on_surface(flat, base, point=where, up=UP)
-    options = RestOptions(yaw_deg=90.0, offset=(0.1, 0.0, 0.0))
-    turned, _ = rest_on_surface(flat, base, point=where, up=UP, options=options)
+    turned, _ = rest_on_surface(flat, base, point=where, up=UP, yaw_deg=90.0)
     x = torch.tensor([1.0, 0, 0])
     # the normal is measured, to a fraction of a degree
     assert torch.allclose(turned.rotation @ x, plain.rotation @ torch.tensor([0.0, 1, 0]), atol=0.02)
-    foot = turned.points(base.point) - plain.points(base.point)
-    assert torch.allclose(foot, torch.tensor([0.1, 0, 0]), atol=1e-5)
+    options = PlaceOptions(point=(0.0, 0.0, 1.0), scale=1.0, yaw_deg=0.0)
+    placed, shifted = (
+        place_object(flat, THING, cameras=(ring_of_cameras(), OWN), options=replace(options, offset=offset))
+        for offset in ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    )
+    moved = shifted.target_from_object.translation - placed.target_from_object.translation
+    assert torch.allclose(moved, torch.tensor([0.1, 0, 0]), atol=1e-5)
 
 
 def test_an_automatic_place_is_on_the_table_in_sight_and_free():

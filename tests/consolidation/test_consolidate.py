@@ -14,7 +14,6 @@ from memory_checkpoint import KilledError, MemoryCheckpoint
 
 from splatgraft.consolidation import (
     ConsolidateOptions,
-    DescentOptions,
     consolidate,
     geometric_schedule,
     iterative_update,
@@ -27,7 +26,7 @@ from splatgraft.rendering import render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
 PLAIN = ConsolidateOptions(view_error=False)
-ADAM = ConsolidateOptions(method="adam", loss=l1, reference=DescentOptions(iterations=24, save_every=8))
+ADAM = ConsolidateOptions(method="adam", loss=l1, iterations=24)
 
 
 def score(scene, relit) -> float:
@@ -103,7 +102,8 @@ def test_the_number_of_threads_changes_time_alone(relit):
     assert (found[0] - found[1]).abs().max() < 1e-3 / 255
 
 
-def test_a_killed_descent_resumes_to_the_same_bits(relit):
+def test_a_killed_descent_resumes_to_the_same_bits(relit, monkeypatch):
+    monkeypatch.setattr("splatgraft.consolidation.color_fit._SAVE_EVERY", 8)
     whole = consolidate(relit.composite, relit.cameras, relit.images, ADAM)
     memory = MemoryCheckpoint()
 

@@ -8,7 +8,7 @@ from conftest import ball, basis_towards, ring, views_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatgraft.consolidation.consolidate import drop_higher_bands, restrict_to_changes
+from splatgraft.consolidation.color_fit import drop_higher_bands, restrict_to_changes
 from splatgraft.core.gaussians import concatenate
 from splatgraft.fitting import adam
 from splatgraft.rendering import RenderOptions, render

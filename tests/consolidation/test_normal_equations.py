@@ -5,14 +5,14 @@ from dataclasses import replace
 import torch
 from conftest import ball, basis_towards, ring, views_of
 
-from splatgraft.consolidation.consolidate import drop_higher_bands
+from splatgraft.consolidation import normal_equations
+from splatgraft.consolidation.color_fit import drop_higher_bands
 from splatgraft.consolidation.normal_equations import _build_equations, _select_ridge, solve
-from splatgraft.consolidation.options import SolveOptions
 from splatgraft.consolidation.view_errors import CorrectedTargets
 from splatgraft.rendering import render
 
 
-def test_equals_dense_ridge_regression():
+def test_equals_dense_ridge_regression(monkeypatch):
     # colours far above the clamp, so that the problem is linear
     scene = ball(40, degree=1, seed=3)
     scene = replace(scene, sh=scene.sh.abs() * torch.tensor([1.0, 0.1, 0.1, 0.1])[:, None] + 0.2)
@@ -20,10 +20,11 @@ def test_equals_dense_ridge_regression():
     generator = torch.Generator().manual_seed(4)
     images = [torch.rand(32, 32, 3, generator=generator) for _ in range(5)]
     weights = [torch.rand(32, 32, generator=generator) for _ in range(5)]
-    options = SolveOptions(rounds=1, steps=120, prior_px=0.5, band_ridges=(0.1,))
+    for name, value in {"_ROUNDS": 1, "_STEPS": 120, "_PRIOR_PX": 0.5, "_BAND_RIDGES": (0.1,)}.items():
+        monkeypatch.setattr(normal_equations, name, value)
     prior = scene.sh.clone()
     views = views_of(scene, cameras, images, weights=weights)
-    found = solve(prior, CorrectedTargets(views, estimated=False), options)
+    found = solve(prior, CorrectedTargets(views, estimated=False))
 
     rows, right, seen = [], [], torch.zeros(40, dtype=torch.float64)
     for index in range(5):
@@ -50,21 +51,21 @@ def test_an_unseen_gaussian_keeps_its_prior():
     cameras = ring(4, 32)
     images = list(0.5 * render(scene, cameras).color)
     prior = scene.sh.clone()
-    found = solve(prior, CorrectedTargets(views_of(scene, cameras, images), estimated=False), SolveOptions())
+    found = solve(prior, CorrectedTargets(views_of(scene, cameras, images), estimated=False))
     assert torch.equal(found[50:], prior[50:])
     assert not torch.equal(found[:50], prior[:50])
 
 
-def test_the_ridge_follows_how_much_the_views_disagree():
+def test_the_ridge_follows_how_much_the_views_disagree(monkeypatch):
     scene, cameras = ball(200, degree=2, seed=6), ring(12)
     images = render(scene, cameras).color
     prior = drop_higher_bands(scene.sh)
-    options = SolveOptions(band_ridges=(0.001, 0.1, 10.0))
+    monkeypatch.setattr(normal_equations, "_BAND_RIDGES", (0.001, 0.1, 10.0))
 
     def chosen(pictures) -> float:
         targets = CorrectedTargets(views_of(scene, cameras, list(pictures)), estimated=False)
-        equations = _build_equations(prior, targets.views, 0.1, options.prior_px)
-        return _select_ridge(prior, targets, equations, options)
+        equations = _build_equations(prior, targets.views, 0.1)
+        return _select_ridge(prior, targets, equations)
 
     # the scene has higher bands, and views that agree show them; a gain of 40% per view drowns them
     gains = torch.exp(0.4 * torch.randn(12, 1, 1, 3, generator=torch.Generator().manual_seed(7)))
@@ -80,7 +81,7 @@ def test_tints_are_taken_off_before_the_colours_are_fitted():
 
     def error(estimated) -> float:
         targets = CorrectedTargets(views_of(scene, cameras, list(images * gains)), estimated)
-        found = replace(scene, sh=solve(prior, targets, SolveOptions()))
+        found = replace(scene, sh=solve(prior, targets))
         return float((render(found, cameras).color - images).square().mean().sqrt())
 
     assert error(True) < error(False)

@@ -1,6 +1,6 @@
 """Compose: place objects in a target scene, by given transforms or on a surface found for them."""
 
-from splatgraft.composition.object_base import ObjectBase, RestOptions, object_base, rest_on_surface
+from splatgraft.composition.object_base import ObjectBase, object_base, rest_on_surface
 from splatgraft.composition.placement import Placed, PlaceOptions, compose, place_object
 from splatgraft.composition.places import Suggestion, hidden_fraction, suggest_places
 from splatgraft.composition.support_surface import Support, support_below
@@ -13,7 +13,6 @@ __all__ = [
     "PlaceOptions",
     "Placed",
     "PlacedObject",
-    "RestOptions",
     "Suggestion",
     "Support",
     "compose",

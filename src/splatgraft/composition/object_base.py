@@ -112,25 +112,14 @@ def _quantile(values: Float[Tensor, "n"], weight: Float[Tensor, "n"], share: flo
     return values[order[min(index, len(values) - 1)]]
 
 
-@dataclass(frozen=True)
-class RestOptions:
-    """Scale, yaw and offset of the resting object."""
-
-    scale: float = 1.0
-    """Size in the target over size in the object's own capture."""
-    yaw_deg: float = 0.0
-    """Rotation about the surface's normal, counterclockwise seen from above."""
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Added to the position, world units of the target."""
-
-
 def rest_on_surface(
     target: Gaussians,
     base: ObjectBase,
     *,
     point: Float[Tensor, "3"],
     up: Float[Tensor, "3"],
-    options: RestOptions = RestOptions(),
+    scale: float = 1.0,
+    yaw_deg: float = 0.0,
 ) -> tuple[Similarity, Support]:
     """`target_from_object` that rests `base` on the surface below `point`, along its normal, and that surface.
 
@@ -139,14 +128,14 @@ def rest_on_surface(
         base: The object's base, in its own capture.
         point: On or above the surface, in the target.
         up: Of the target, of any length but zero.
-        options: Scale, yaw and offset.
+        scale: Size in the target over size in the object's own capture.
+        yaw_deg: Rotation about the surface's normal, counterclockwise seen from above.
 
     Raises:
         ValueError: Where no surface lies below `point`.
     """
-    support = support_below(target, point, up=up, radius=options.scale * base.radius)
-    yaw = rotation_about(support.normal, math.radians(options.yaw_deg))
+    support = support_below(target, point, up=up, radius=scale * base.radius)
+    yaw = rotation_about(support.normal, math.radians(yaw_deg))
     rotation = yaw @ rotation_between(base.up, support.normal)
-    place = support.point + torch.tensor(options.offset).to(support.point)
-    translation = place - options.scale * rotation @ base.point
-    return Similarity(scale=options.scale, rotation=rotation.float(), translation=translation.float()), support
+    translation = support.point - scale * rotation @ base.point
+    return Similarity(scale=scale, rotation=rotation.float(), translation=translation.float()), support

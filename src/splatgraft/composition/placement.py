@@ -3,12 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatgraft.composition.object_base import ObjectBase, RestOptions, object_base, rest_on_surface
+from splatgraft.composition.object_base import ObjectBase, object_base, rest_on_surface
 from splatgraft.composition.places import Suggestion, hidden_fraction, scale_in_view, suggest_places
 from splatgraft.composition.support_surface import Support, support_below
 from splatgraft.core.cameras import Cameras
@@ -89,13 +90,14 @@ def place_object(
     up = estimate_up(target_cameras)
     base = object_base(object_, up=estimate_up(source_cameras), surroundings=surroundings)
     found = _best_place(target, base, target_cameras, up, options)
-    point, rest = found.point, RestOptions(scale=found.scale, yaw_deg=options.yaw_deg or 0.0, offset=options.offset)
-    move, support = rest_on_surface(target, base, point=point, up=up, options=rest)
+    place = partial(rest_on_surface, target, base, point=found.point, up=up, scale=found.scale)
+    move, support = place(yaw_deg=options.yaw_deg or 0.0)
     if options.yaw_deg is None:
         yaw = facing_yaw_deg(
             _towards(source_cameras, base, move), target_cameras.centers - support.point, up=support.normal
         )
-        move, support = rest_on_surface(target, base, point=point, up=up, options=replace(rest, yaw_deg=yaw))
+        move, support = place(yaw_deg=yaw)
+    move = replace(move, translation=move.translation + torch.tensor(options.offset).to(move.translation))
     hidden = hidden_fraction(target, move.gaussians(object_), cameras=target_cameras)
     unseen = unseen_share(_towards(source_cameras, base, move), target_cameras.centers - support.point)
     return Placed(

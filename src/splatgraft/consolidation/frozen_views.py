@@ -18,6 +18,7 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras, Window
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import ViewOperator, view_operator
+from splatgraft.runtime.lazy_sequence import LazySequence
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,6 @@ class Views:
         self._cached_bytes = 0
 
     def __len__(self) -> int:
-        """How many there are."""
         return len(self.cameras)
 
     def restricted(self, active: Bool[Tensor, "n"], windows: Sequence[Window | None]) -> "Views":
@@ -118,8 +118,8 @@ class Views:
         restricted = Views(
             self.composite,
             self.cameras[chosen].cropped(kept),
-            _Cropped(self.images, chosen, kept),
-            weights=None if self.weights is None else _Cropped(self.weights, chosen, kept),
+            _cropped(self.images, chosen, kept),
+            weights=None if self.weights is None else _cropped(self.weights, chosen, kept),
             options=self.options,
         )
         if not bool(active.all()):
@@ -203,22 +203,12 @@ class Views:
         return image
 
 
-@dataclass(frozen=True)
-class _Cropped:
-    """Chosen images of a sequence, cropped."""
+def _cropped(images: ImageSequence, chosen: list[int], windows: list[Window]) -> ImageSequence:
+    def read(index: int) -> Tensor:
+        left, top, right, bottom = windows[index]
+        return images[chosen[index]][top:bottom, left:right]
 
-    whole: ImageSequence
-    chosen: list[int]
-    windows: list[Window]
-
-    def __len__(self) -> int:
-        """How many there are."""
-        return len(self.chosen)
-
-    def __getitem__(self, index: int, /) -> Tensor:
-        """The cropped image."""
-        left, top, right, bottom = self.windows[index]
-        return self.whole[self.chosen[index]][top:bottom, left:right]
+    return LazySequence(len(chosen), read)
 
 
 def memory_bytes(value: object) -> int:

@@ -13,10 +13,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.consolidation.frozen_views import Views
-from splatgraft.consolidation.options import SolveOptions
 from splatgraft.consolidation.view_errors import CorrectedTargets
 from splatgraft.runtime.progress import Progress, silent
 
+_ROUNDS, _STEPS = 3, 6
+"""Times that targets are corrected and the equations solved, each from the last solution; and steps of conjugate
+gradient per round, which blend every view once and apply the transpose once."""
+_PRIOR_PX = 0.1
+"""Ridge towards the composite's colour, pixels: it decides only Gaussians that no view sees."""
+_BAND_RIDGES = (0.003, 0.02, 0.1)
+"""Ridges of the higher bands to choose from, as shares of the pixels that the Gaussian makes up. Which one predicts
+held-out views best depends on how much the views disagree. Below ten views: the largest."""
 _FACTORED_AT_ONCE = 2**14
 """Gaussians per batch of Cholesky factorisations, which bounds the memory."""
 _SUMMED_AT_ONCE = 2**12
@@ -42,9 +49,9 @@ class _Equations:
     ridge: Float[Tensor, "m k"]
     """Weight of the prior, pixels."""
 
-    def with_ridge(self, band_ridge: float, prior_px: float) -> "_Equations":
+    def with_ridge(self, band_ridge: float) -> "_Equations":
         """The same with another ridge for the higher bands."""
-        return replace(self, ridge=_ridge(self.seen, self.ridge.shape[1], band_ridge, prior_px))
+        return replace(self, ridge=_ridge(self.seen, self.ridge.shape[1], band_ridge))
 
     def apply(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m k 3"]:
         """The matrix times coefficients."""
@@ -58,42 +65,34 @@ class _Equations:
 
 @torch.no_grad()
 def solve(
-    prior: Float[Tensor, "m k 3"],
-    targets: CorrectedTargets,
-    options: SolveOptions,
-    *,
-    progress: Progress = silent,
+    prior: Float[Tensor, "m k 3"], targets: CorrectedTargets, *, progress: Progress = silent
 ) -> Float[Tensor, "m k 3"]:
     """The colours with the least squared error over all views, with a ridge towards `prior`.
 
     Args:
         prior: Coefficients of the active Gaussians, from which the solution starts.
         targets: Views and their corrected images, refined between rounds.
-        options: Rounds, steps and ridges; the ridge of the higher bands is chosen by cross-validation.
         progress: Called after each round.
     """
-    trials = len(options.band_ridges) if len(targets.views) >= 2 * _HOLD_OUT_EVERY else 0
-    total = options.rounds + trials + 1
+    trials = len(_BAND_RIDGES) if len(targets.views) >= 2 * _HOLD_OUT_EVERY else 0
+    total = _ROUNDS + trials + 1
     progress(0, total, "setting up the equations")
     # the strongest ridge first: colours that hardly depend on the view cannot fit a view's own error as a highlight
-    equations = _build_equations(prior, targets.views, max(options.band_ridges), options.prior_px)
+    equations = _build_equations(prior, targets.views, max(_BAND_RIDGES))
     sh, error = prior, 0.0
-    for turn in range(options.rounds):
+    for turn in range(_ROUNDS):
         residual, error = _residual(sh, targets, equations.which, refine=turn > 0)
         targets.center()
         if turn == 1 and trials > 1:
-            chosen = _select_ridge(prior, targets, equations, options)
-            equations = equations.with_ridge(chosen, options.prior_px)
+            equations = equations.with_ridge(_select_ridge(prior, targets, equations))
         residual -= equations.ridge[..., None] * (sh - prior)
-        sh = sh + _conjugate_gradient(residual, equations, options.steps)
+        sh = sh + _conjugate_gradient(residual, equations)
         progress(turn + 1 + (trials if turn else 0), total, f"rmse {error:.4f}")
     progress(total, total, f"rmse {error:.4f}")
     return sh
 
 
-def _select_ridge(
-    prior: Float[Tensor, "m k 3"], targets: CorrectedTargets, equations: _Equations, options: SolveOptions
-) -> float:
+def _select_ridge(prior: Float[Tensor, "m k 3"], targets: CorrectedTargets, equations: _Equations) -> float:
     """The ridge whose short solution without every 5th view predicts those views best (cross-validation).
 
     Of many views some are enough, evenly spaced: the ridge is one number, and a share of the pixels that are seen.
@@ -106,14 +105,14 @@ def _select_ridge(
     equations = replace(equations, seen=equations.seen * (compared / count))
     residual, _ = _residual(prior, targets, fitted, refine=False)
     errors = {}
-    for band_ridge in options.band_ridges:
-        trial = replace(equations, which=fitted).with_ridge(band_ridge, options.prior_px)
-        sh = prior + _conjugate_gradient(residual, trial, options.steps)
+    for band_ridge in _BAND_RIDGES:
+        trial = replace(equations, which=fitted).with_ridge(band_ridge)
+        sh = prior + _conjugate_gradient(residual, trial)
         errors[band_ridge] = _error(sh, targets, held_out)
     return min(errors, key=errors.__getitem__)
 
 
-def _build_equations(prior: Float[Tensor, "m k 3"], views: Views, band_ridge: float, prior_px: float) -> _Equations:
+def _build_equations(prior: Float[Tensor, "m k 3"], views: Views, band_ridge: float) -> _Equations:
     """Blocks sum_v (W^T W 1) b b^T: W is non-negative, so these row sums bound what neighbours add to a Gaussian."""
     m, k = prior.shape[:2]
     blocks, seen = prior.new_zeros(m, k, k), prior.new_zeros(m, 1)
@@ -123,16 +122,16 @@ def _build_equations(prior: Float[Tensor, "m k 3"], views: Views, band_ridge: fl
         share = view.blend_transpose(share if weight is None else share * weight[..., None])
         view.expansion.add_squares(share, blocks)
         seen += share
-    ridge = _ridge(seen, k, band_ridge, prior_px)
+    ridge = _ridge(seen, k, band_ridge)
     blocks.diagonal(dim1=1, dim2=2).add_(ridge)
     for part in blocks.split(_FACTORED_AT_ONCE):  # in place: the blocks are the largest thing in memory
         part.copy_(torch.cholesky_inverse(torch.linalg.cholesky(part)))
     return _Equations(views, range(len(views)), seen, inverse=blocks, ridge=ridge)
 
 
-def _ridge(seen: Float[Tensor, "m 1"], k: int, band_ridge: float, prior_px: float) -> Float[Tensor, "m k"]:
-    higher = (seen * band_ridge + prior_px).expand(-1, k - 1)
-    return torch.cat([torch.full_like(seen, prior_px), higher], 1)
+def _ridge(seen: Float[Tensor, "m 1"], k: int, band_ridge: float) -> Float[Tensor, "m k"]:
+    higher = (seen * band_ridge + _PRIOR_PX).expand(-1, k - 1)
+    return torch.cat([torch.full_like(seen, _PRIOR_PX), higher], 1)
 
 
 def _residual(
@@ -162,12 +161,12 @@ def _difference(targets: CorrectedTargets, index: int, picture: Float[Tensor, "h
     return difference if weight is None else difference * weight[..., None]
 
 
-def _conjugate_gradient(residual: Float[Tensor, "m k 3"], equations: _Equations, steps: int) -> Float[Tensor, "m k 3"]:
-    """`steps` steps on the correction, each colour channel by itself; the products are summed in double precision."""
+def _conjugate_gradient(residual: Float[Tensor, "m k 3"], equations: _Equations) -> Float[Tensor, "m k 3"]:
+    """Steps on the correction, each colour channel by itself; the products are summed in double precision."""
     solution = torch.zeros_like(residual)
     conditioned = torch.bmm(equations.inverse, residual)
     direction, before = conditioned, _dot(residual, conditioned)
-    for _ in range(steps):
+    for _ in range(_STEPS):
         image_of = equations.apply(direction)
         length = before / _dot(direction, image_of).clamp_min(1e-30)
         solution += length * direction

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from splatgraft.composition import ObjectBase, PlaceOptions, RestOptions, object_base, place_object, rest_on_surface
+from splatgraft.composition import ObjectBase, PlaceOptions, object_base, place_object, rest_on_surface
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
@@ -174,12 +174,10 @@ def drop_to_surface(
     base_point = target_from_object.points(item.base.point)
     # start at half the object's height: a sunk object is lifted, and surfaces above the object are ignored
     above = base_point + 0.5 * target_from_object.scale * item.base.height * torch.nn.functional.normalize(up, dim=0)
-    straight, support = rest_on_surface(
-        target, item.base, point=above, up=up, options=RestOptions(scale=target_from_object.scale)
-    )
+    straight, support = rest_on_surface(target, item.base, point=above, up=up, scale=target_from_object.scale)
     twist = _twist_about(target_from_object.rotation @ straight.rotation.T, support.normal)
-    options = RestOptions(scale=target_from_object.scale, yaw_deg=math.degrees(twist))
-    return rest_on_surface(target, item.base, point=above, up=up, options=options)[0]
+    scale = target_from_object.scale
+    return rest_on_surface(target, item.base, point=above, up=up, scale=scale, yaw_deg=math.degrees(twist))[0]
 
 
 def align_up(item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]) -> Similarity:
@@ -233,14 +231,14 @@ def place_beside(
     size = target_from_object.scale * item.base.height
     step = _BESIDE * target_from_object.scale * _reach(item)
     old = float(target_from_object.points(item.base.point) @ up)
-    options = RestOptions(scale=target_from_object.scale)
+    scale = target_from_object.scale
     for turn in range(_DIRECTIONS):
         angle = 2 * math.pi * turn / _DIRECTIONS
         shift = step * (math.cos(angle) * across + math.sin(angle) * along)
         shifted = _shifted(target_from_object, shift)
         above = shifted.points(item.base.point) + 0.5 * size * up
         try:
-            support = rest_on_surface(target, item.base, point=above, up=up, options=options)[1]
+            support = rest_on_surface(target, item.base, point=above, up=up, scale=scale)[1]
         except ValueError:
             continue  # nothing lies below there
         drop = float(support.point @ up) - old

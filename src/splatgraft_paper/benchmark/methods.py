@@ -10,7 +10,6 @@ from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
 from splatgraft.consolidation import (
     ConsolidateOptions,
-    DescentOptions,
     geometric_schedule,
     iterative_update,
     linear_schedule,
@@ -199,8 +198,7 @@ class UpdateIteratively:
 
     def _consolidation(self) -> ConsolidateOptions:
         if self.loss == "paper":
-            descent = DescentOptions(iterations=self.iterations)
-            return ConsolidateOptions(method="adam", loss=lpips_and_l1(self.weights), reference=descent)
+            return ConsolidateOptions(method="adam", loss=lpips_and_l1(self.weights), iterations=self.iterations)
         loss = {"fourier": windowed_fourier, "l1-dssim": l1_dssim}.get(self.loss)
         return ConsolidateOptions(loss=loss or lpips_vgg(self.weights))
 

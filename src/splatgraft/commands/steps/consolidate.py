@@ -1,6 +1,6 @@
 """The command `consolidate`: the colours of a scene are fitted to harmonised views."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -71,14 +71,12 @@ class Consolidate:
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
 
     def _options(self) -> ConsolidateOptions:
-        standard = ConsolidateOptions()
-        return replace(
-            standard,
+        return ConsolidateOptions(
             method=self.method,
             loss=self._loss(),
             view_error=self.nuisance == "tint-flow",
             polish_passes=self.passes,
-            reference=replace(standard.reference, iterations=self.iterations),
+            iterations=self.iterations,
             rendering=RenderOptions(low_pass=self.low_pass),
         )
 

@@ -7,7 +7,7 @@ decreasing noise (paper: ablation Iterative Dataset Update, after Haque 2023, In
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatgraft.consolidation.frozen_views import Views
 from splatgraft.consolidation.normal_equations import solve
-from splatgraft.consolidation.options import ConsolidateOptions, DescentOptions, ImageSequence
+from splatgraft.consolidation.options import ConsolidateOptions, ImageSequence
 from splatgraft.consolidation.view_errors import CorrectedTargets
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras, Window
@@ -31,6 +31,26 @@ _VISIBLE_SHARE = 1.0 / 255
 """Share of a pixel that active Gaussians make up, from which it lies in the window: one grey level."""
 _MARGIN_PX = 16
 """Border of the windows, so that windowed losses and SSIM see the surroundings."""
+
+_SAVE_EVERY = 500
+"""Iterations of a descent between two checkpoints."""
+
+
+@dataclass(frozen=True)
+class _Rates:
+    """Learning rates of Adam on the colours."""
+
+    first: float
+    """Of band 0."""
+    rest_ratio: float
+    """That of the higher bands over that of band 0."""
+    final_ratio: float
+    """The last over the first, approached along a cosine."""
+
+
+_PAPER = _Rates(first=0.0025, rest_ratio=0.05, final_ratio=1.0)
+"""3DGS's feature_lr and its 1/20, constant as in the paper."""
+_POLISH = _Rates(first=0.03, rest_ratio=0.1, final_ratio=0.02)
 
 HarmonizeAt = Callable[[Gaussians, float], ImageSequence]
 """From the current scene and a noise strength in (0, 1] to one harmonised image per camera."""
@@ -77,7 +97,8 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
         sh = optimize_colors(
             drop_higher_bands(composite.sh),
             CorrectedTargets(views, estimated=False),
-            options.reference,
+            _PAPER,
+            iterations=options.iterations,
             loss=options.loss,
             seed=options.seed,
             progress=progress,
@@ -93,11 +114,13 @@ def _consolidate_fast(composite: Gaussians, views: Views, options: ConsolidateOp
     active = slice(None) if views.active is None else views.active
     targets = CorrectedTargets(views, options.view_error)
     prior = drop_higher_bands(composite.sh)[active]
-    sh = solve(prior, targets, options.solve, progress=progress)
+    sh = solve(prior, targets, progress=progress)
     targets.keep()
     if options.polish_passes:
-        polish = replace(options.polish, iterations=options.polish_passes * len(views))
-        sh = optimize_colors(sh, targets, polish, loss=options.loss, seed=options.seed, progress=progress)
+        steps = options.polish_passes * len(views)
+        sh = optimize_colors(
+            sh, targets, _POLISH, iterations=steps, loss=options.loss, seed=options.seed, progress=progress
+        )
     colors = composite.sh.clone()
     colors[active] = sh
     return replace(composite, sh=colors)
@@ -207,23 +230,25 @@ def drop_higher_bands(sh: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k 3"]:
 def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
     sh: Float[Tensor, "m k 3"],
     targets: CorrectedTargets,
-    options: DescentOptions,
+    learning_rates: _Rates,
     *,
+    iterations: int,
     loss: ImageLoss,
-    seed: int = 0,
+    seed: int,
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Float[Tensor, "m k 3"]:
-    """Colours after `options.iterations` steps of Adam over views in shuffled order; only visible Gaussians change.
+    """Colours after `iterations` steps of Adam over views in shuffled order; only visible Gaussians change.
 
     Args:
         sh: Initial coefficients of the active Gaussians.
         targets: Views and their corrected images.
-        options: Rates and number of iterations.
+        learning_rates: Of the bands, over the iterations.
+        iterations: Steps, one view each.
         loss: Distance from the render to the target.
         seed: Of the order of views.
         progress: Called after each iteration.
-        checkpoint: Where the state is saved every `options.save_every` iterations.
+        checkpoint: Where the state is saved every 500 iterations.
 
     Raises:
         ValueError: Where a gradient is not finite, which a loss that divides can cause.
@@ -235,20 +260,20 @@ def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
     if saved is not None:
         start, sh = int(saved["iteration"]), saved["sh"].clone()
         moments = adam.Moments({"sh": saved["first"].clone()}, {"sh": saved["second"].clone()}, saved["steps"].clone())
-    shares = torch.full((3 * sh.shape[1],), options.rest_ratio, device=sh.device)
+    shares = torch.full((3 * sh.shape[1],), learning_rates.rest_ratio, device=sh.device)
     shares[:3] = 1.0
-    for iteration in range(start, options.iterations):
+    for iteration in range(start, iterations):
         index = _view_of(iteration, len(views), seed)
         view = views[index]
         colors = view.colors(sh).requires_grad_()
         picture = view.draw(colors)
         picture, target = _weighted_pair(picture, targets.target(index), views.weight(index))
         value = loss(picture, target)
-        rates = options.rate * _decay(iteration / options.iterations, options.final_ratio) * shares
+        rates = learning_rates.first * _decay(iteration / iterations, learning_rates.final_ratio) * shares
         if not view.expansion.descend(sh, torch.autograd.grad(value, colors)[0], moments=moments, rates=rates):
             name = views.cameras.names[index]
             raise ValueError(f"consolidate: expected finite gradients, found others in {name} at iteration {iteration}")
-        if (iteration + 1) % options.save_every == 0:
+        if (iteration + 1) % _SAVE_EVERY == 0:
             checkpoint.save(
                 {
                     "iteration": iteration + 1,
@@ -258,7 +283,7 @@ def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
                     "steps": moments.steps,
                 }
             )
-        progress(iteration + 1, options.iterations, f"loss {float(value.detach()):.4f}")
+        progress(iteration + 1, iterations, f"loss {float(value.detach()):.4f}")
     return sh
 
 
