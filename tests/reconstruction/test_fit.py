@@ -8,9 +8,9 @@ from memory_checkpoint import KilledError, MemoryCheckpoint
 
 from splatgraft.core import cameras as camera_values
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.reconstruction.fit import FitOptions, LearningRates, ViewColors, fit
+from splatgraft.reconstruction.fit import LearningRates, ViewColors, fit
 from splatgraft.reconstruction.image_pyramid import Level, Pyramid
-from splatgraft.reconstruction.options import Sampling
+from splatgraft.reconstruction.options import ReconstructOptions, Sampling
 from splatgraft.rendering import render
 
 
@@ -50,8 +50,8 @@ def views_of(scene: Gaussians, gains: tuple[float, ...] = (1.0,) * 6) -> Pyramid
 def test_colours_alone_are_recovered_and_all_else_stays():
     truth = blobs(60, 4)
     start = replace(truth, sh=torch.zeros_like(truth.sh))
-    options = FitOptions(iterations=120, rates=LearningRates(sh=0.05, sh_higher=0.05))
-    fitted = fit(start, views_of(truth), options=options)
+    rates = LearningRates(sh=0.05, sh_higher=0.05)
+    fitted = fit(start, views_of(truth), options=ReconstructOptions(iterations=120), rates=rates)
     assert torch.equal(fitted.means, truth.means)
     assert torch.equal(fitted.opacity_logits, truth.opacity_logits)
     before, after = (
@@ -65,7 +65,7 @@ def test_colours_alone_are_recovered_and_all_else_stays():
 def test_every_field_that_has_a_rate_moves():
     truth = blobs(60, 5)
     rates = LearningRates(means=1e-3, log_scales=1e-3, quaternions=1e-3, opacity_logits=1e-3, sh=1e-3)
-    fitted = fit(truth, views_of(blobs(60, 6)), options=FitOptions(iterations=6, rates=rates))
+    fitted = fit(truth, views_of(blobs(60, 6)), options=ReconstructOptions(iterations=6), rates=rates)
     for name in rates.active():
         assert not torch.equal(getattr(fitted, name), getattr(truth, name)), name
     assert torch.equal(fitted.sh[:, 1:], truth.sh[:, 1:])
@@ -75,8 +75,8 @@ def test_a_killed_fit_resumes_bit_for_bit(monkeypatch):
     monkeypatch.setattr("splatgraft.reconstruction.fit._CHECKPOINT_SECONDS", -1.0)
     views, start = views_of(blobs(60, 7)), blobs(60, 8)
     rates = LearningRates(means=1e-2, means_final=1e-4, log_scales=1e-2, quaternions=1e-2, opacity_logits=1e-2, sh=1e-2)
-    options = FitOptions(iterations=40, rates=rates, seed=3)
-    whole = fit(start, views, options=options)
+    options = ReconstructOptions(iterations=40, seed=3)
+    whole = fit(start, views, options=options, rates=rates)
     checkpoint = MemoryCheckpoint()
 
     def die(done: int, total: int, message: str) -> None:
@@ -84,10 +84,10 @@ def test_a_killed_fit_resumes_bit_for_bit(monkeypatch):
             raise KilledError
 
     with pytest.raises(KilledError):
-        fit(start, views, options=options, progress=die, checkpoint=checkpoint)
+        fit(start, views, options=options, rates=rates, progress=die, checkpoint=checkpoint)
     assert checkpoint.state is not None
     assert 0 < checkpoint.state["iteration"] < 40
-    resumed = fit(start, views, options=options, checkpoint=checkpoint)
+    resumed = fit(start, views, options=options, rates=rates, checkpoint=checkpoint)
     for name in rates.active():
         assert torch.equal(getattr(whole, name), getattr(resumed, name)), name
 
@@ -98,8 +98,8 @@ def test_colours_that_differ_between_views_do_not_enter_the_scene():
     grey = replace(truth, sh=torch.zeros_like(truth.sh))
     errors = []
     for rate in (0.0, 0.01):
-        options = FitOptions(iterations=240, rates=LearningRates(sh=0.02), view_color_rate=rate)
-        fitted = fit(grey, tinted, options=options)
+        rates = LearningRates(sh=0.02, view_colors=rate)
+        fitted = fit(grey, tinted, options=ReconstructOptions(iterations=240), rates=rates)
         errors.append(float((fitted.sh - truth.sh).abs().median()))
     # the gains' mean is 1, so the scene's colours are those before the gains
     assert errors[1] < 0.7 * errors[0]
@@ -118,7 +118,7 @@ def test_the_mean_of_the_views_colours_stays_the_identity():
 def test_what_is_not_finite_is_an_error_that_says_so():
     broken = replace(blobs(20, 9), sh=torch.full((20, 4, 3), float("nan")))
     with pytest.raises(ValueError, match="found a loss of nan at step 0"):
-        fit(broken, views_of(blobs(20, 9)), options=FitOptions(iterations=3, rates=LearningRates(sh=0.1)))
+        fit(broken, views_of(blobs(20, 9)), options=ReconstructOptions(iterations=3), rates=LearningRates(sh=0.1))
 
 
 def test_rates_fall_as_3dgs_says():

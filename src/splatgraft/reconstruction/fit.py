@@ -18,6 +18,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import adam, l1_dssim
 from splatgraft.reconstruction.image_pyramid import Pyramid, View
+from splatgraft.reconstruction.options import ReconstructOptions
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.process import interruption_held
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
@@ -45,8 +46,10 @@ class LearningRates:
     """Band 0."""
     sh_higher: float = 0.0
     """Bands 1 to 3; 3DGS takes a twentieth of band 0."""
+    view_colors: float = 0.0
+    """Each view's own affine map of colours at the start, from where it falls to 0 along half a cosine; 0 fits none."""
     final: float = 1.0
-    """Factor on all rates but that of the means at the end; reached along half a cosine in the last third."""
+    """Factor on the other rates at the end; reached along half a cosine in the last third."""
 
     def active(self) -> tuple[str, ...]:
         """Names of the fields that are fitted."""
@@ -109,24 +112,6 @@ class ViewColors:
 
 
 @dataclass(frozen=True)
-class FitOptions:
-    """Length and learning rates of a fit."""
-
-    iterations: int
-    """Steps; each sees one view."""
-    rates: LearningRates
-    """Learning rates; fields with rate 0 are not fitted."""
-    view_color_rate: float = 0.0
-    """Learning rate of each view's colours at the start, from where it falls to 0 along half a cosine; 0 fits none."""
-    seed: int = 0
-    """Seed of the order of views and of random backgrounds."""
-    rendering: RenderOptions = field(default_factory=RenderOptions)
-    """Background, low-pass and near plane."""
-    random_background: bool = False
-    """Whether each step draws the scene over another colour, by chance, instead of that of `rendering`."""
-
-
-@dataclass(frozen=True)
 class FitState:
     """Everything besides options and views that the next step depends on."""
 
@@ -166,11 +151,12 @@ Control = Callable[[FitState, Step], FitState]
 """Called after every step; may add, change and remove Gaussians, and store tensors in `memory`."""
 
 
-def fit(
+def fit(  # noqa: PLR0913 - with progress and checkpoint
     gaussians: Gaussians,
     views: Pyramid,
     *,
-    options: FitOptions,
+    options: ReconstructOptions,
+    rates: LearningRates,
     control: Control | None = None,
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
@@ -180,7 +166,8 @@ def fit(
     Args:
         gaussians: Start of the fit; stays unchanged.
         views: Cameras and target images, at least one.
-        options: Length and rates.
+        options: Length, seed and background.
+        rates: Of the fields that are fitted, and of the views' colours.
         control: Called after every step, as for density control.
         progress: Called every ten steps.
         checkpoint: Where the state is saved every 30 seconds and on Ctrl-C, and from which a run is resumed.
@@ -188,19 +175,19 @@ def fit(
     Raises:
         ValueError: Where loss or gradients are not finite.
     """
-    names = options.rates.active()
+    names = rates.active()
     saved = checkpoint.load()
     state = _start(gaussians, names, len(views)) if saved is None else _unpacked(saved, gaussians.device)
     last_save, recent = time.monotonic(), 0.0
     with interruption_held() as interrupted:
-        while state.iteration < options.iterations:
-            state, value, step = _stepped(state, views, names, options)
+        while state.iteration < options.all_iterations:
+            state, value, step = _stepped(state, views, rates, options)
             if control is not None:
                 state = control(state, step)
             recent = value if recent == 0 else 0.95 * recent + 0.05 * value
-            if state.iteration % _REPORT_EVERY == 0 or state.iteration == options.iterations:
+            if state.iteration % _REPORT_EVERY == 0 or state.iteration == options.all_iterations:
                 message = f"loss {recent:.4f}, {state.gaussians.count / 1000:.1f}k Gaussians"
-                progress(state.iteration, options.iterations, message)
+                progress(state.iteration, options.all_iterations, message)
             due = interrupted() or time.monotonic() - last_save > _CHECKPOINT_SECONDS
             if due and not isinstance(checkpoint, NoCheckpoint):
                 checkpoint.save(_packed(state))
@@ -211,10 +198,10 @@ def fit(
 
 
 def _stepped(
-    state: FitState, views: Pyramid, names: tuple[str, ...], options: FitOptions
+    state: FitState, views: Pyramid, rates: LearningRates, options: ReconstructOptions
 ) -> tuple[FitState, float, Step]:
     """The state after one step on one view, the loss, and what the control sees."""
-    done = state.iteration / options.iterations
+    names, done = rates.active(), state.iteration / options.all_iterations
     visit, place = divmod(state.iteration, len(views))
     # each pass visits all views in an order that depends on seed and pass only
     index = int(torch.randperm(len(views), generator=_generator(options.seed, visit))[place])
@@ -222,7 +209,7 @@ def _stepped(
     rendering = _rendering_of(view, state.iteration, options)
     leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
     drawn = render(replace(state.gaussians, **leaves), view.camera, options=rendering)
-    fits_colors = options.view_color_rate > 0
+    fits_colors = rates.view_colors > 0
     colors = state.view_colors.of(index).requires_grad_(fits_colors)
     picture = drawn.color[0] @ colors[:, :3].T + colors[:, 3] if fits_colors else drawn.color[0]
     loss = l1_dssim(picture, view.image)
@@ -232,11 +219,11 @@ def _stepped(
     found = torch.autograd.grad(loss, [*leaves.values(), *([colors] if fits_colors else [])])
     gradients = dict(zip(names, found[: len(names)], strict=True))
     if fits_colors:
-        rate = options.view_color_rate * (0.5 + 0.5 * math.cos(math.pi * done))
+        rate = rates.view_colors * (0.5 + 0.5 * math.cos(math.pi * done))
         state = replace(state, view_colors=state.view_colors.updated(index, found[-1], rate))
     values = {name: leaf.detach() for name, leaf in leaves.items()}
-    rates = {name: options.rates.at(name, done, v[0].numel() if len(v) else 1) for name, v in values.items()}
-    if not adam.step(values, gradients, moments=state.moments, rates=rates, visible=drawn.visible[0]):
+    of_fields = {name: rates.at(name, done, v[0].numel() if len(v) else 1) for name, v in values.items()}
+    if not adam.step(values, gradients, moments=state.moments, rates=of_fields, visible=drawn.visible[0]):
         raise _diverged(state, "a gradient that is not finite")
     step = Step(view.camera, drawn.visible[0], gradients, picture.detach() - view.image, rendering)
     return replace(state, iteration=state.iteration + 1), value, step
@@ -253,9 +240,9 @@ def _generator(seed: int, number: int, plus: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed((seed * 1_000_003 + number) % 2**62 + plus)
 
 
-def _rendering_of(view: View, iteration: int, options: FitOptions) -> RenderOptions:
+def _rendering_of(view: View, iteration: int, options: ReconstructOptions) -> RenderOptions:
     """How the view is drawn in an iteration."""
-    rendering = options.rendering
+    rendering = RenderOptions(background=options.background)
     if view.low_pass_px2 is not None:
         rendering = replace(rendering, low_pass_px2=view.low_pass_px2)
     if options.random_background:

@@ -16,12 +16,11 @@ from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.reconstruction.cost import require_memory
 from splatgraft.reconstruction.density import DensityControl
 from splatgraft.reconstruction.far_shell import shell_points, shell_radius, shows_surroundings
-from splatgraft.reconstruction.fit import FitOptions, FitState, LearningRates, Step, fit
+from splatgraft.reconstruction.fit import FitState, LearningRates, Step, fit
 from splatgraft.reconstruction.image_pyramid import Pyramid, read_pyramid
 from splatgraft.reconstruction.initialization import SeedPoints, from_points, looked_at, random_seeds, scene_extent
 from splatgraft.reconstruction.options import ReconstructOptions
 from splatgraft.reconstruction.plane_sweep import sweep
-from splatgraft.rendering import RenderOptions
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 _PUBLISHED_ITERATIONS = 30_000
@@ -104,15 +103,8 @@ def reconstruct(
         wider = state.gaussians.with_sh_degree(degree)
         return replace(state, gaussians=wider, moments=state.moments.padded("sh", wider.sh.shape[1]))
 
-    fit_options = FitOptions(
-        iterations=options.all_iterations,
-        rates=_rates(capture.cameras, options.all_iterations),
-        seed=options.seed,
-        view_color_rate=_COLOR_RATE if options.photo_colors else 0.0,
-        rendering=RenderOptions(background=options.background),
-        random_background=bool(options.random_background),
-    )
-    fitted = fit(start, views, options=fit_options, control=control, progress=progress, checkpoint=checkpoint)
+    rates = _rates(capture.cameras, options)
+    fitted = fit(start, views, options=options, rates=rates, control=control, progress=progress, checkpoint=checkpoint)
     return fitted.with_sh_degree(options.sh_degree)
 
 
@@ -147,10 +139,10 @@ def _start(capture: PosedImages, views: Pyramid, options: ReconstructOptions, *,
     return replace(start, opacity_logits=torch.full_like(start.opacity_logits, opacity).logit())
 
 
-def _rates(cameras: Cameras, iterations: int) -> LearningRates:
+def _rates(cameras: Cameras, options: ReconstructOptions) -> LearningRates:
     """3DGS's published rates, higher for shorter runs."""
     extent = scene_extent(cameras)
-    shorter = max(1.0, _PUBLISHED_ITERATIONS / iterations)
+    shorter = max(1.0, _PUBLISHED_ITERATIONS / options.all_iterations)
     means_factor = min(_MAX_MEANS, shorter**_MEANS_POWER)
     factor = min(_MAX_OTHERS, shorter**_OTHERS_POWER)
     return LearningRates(
@@ -161,5 +153,6 @@ def _rates(cameras: Cameras, iterations: int) -> LearningRates:
         opacity_logits=0.025 * factor,
         sh=0.0025 * factor,
         sh_higher=0.0025 / 20 * factor,
+        view_colors=_COLOR_RATE if options.photo_colors else 0.0,
         final=_SHORT_RUN_FINAL if shorter > 1 else 1.0,
     )
