@@ -10,10 +10,8 @@ WIDTH, HEIGHT = 160, 120
 MATRIX = torch.tensor([[130.0, 0, 83], [0, 134, 57], [0, 0, 1]], dtype=torch.float64)
 LENSES = [
     (0.1, 0, 0, 0, 0),
-    (-0.15, 0, 0, 0, 0),
     (-0.12, 0.03, 0, 0, 0),
     (0.08, -0.03, 0.004, -0.006, 0.002),
-    (0, 0, 0.01, 0, 0),
 ]
 
 
@@ -89,28 +87,20 @@ def test_no_border_is_empty_and_none_is_wasted(coefficients):
 
 
 def test_sizes_scale_the_pinhole_and_the_picture():
-    whole = lens(LENSES[3])
+    whole = lens(LENSES[2])
     doubled = Distortion(
         intrinsics=torch.diag(torch.tensor([2.0, 2, 1], dtype=torch.float64)) @ MATRIX,
         coefficients=whole.coefficients,
         size=(2 * WIDTH, 2 * HEIGHT),
     )
     assert np.allclose(doubled.pinhole(), np.diag([2, 2, 1]) @ whole.pinhole(), atol=1e-9)
-    image = through_the_lens(LENSES[3])
+    image = through_the_lens(LENSES[2])
     pinhole = torch.from_numpy(whole.pinhole())
     served_smaller = torch.diag(torch.tensor([0.5, 0.5, 1], dtype=torch.float64)) @ pinhole
     one = whole.undistort(image, pinhole, width=WIDTH, height=HEIGHT)
     other = doubled.undistort(image, served_smaller, width=WIDTH // 2, height=HEIGHT // 2)
     # maps in float32 to 1e-5 px, but OpenCV rounds them to 1/32 px: slope 5 / 130 / 32 where one falls over
     assert (one - other).abs().max() < 2 * 5 / 120 / 32
-
-
-def test_masks_take_the_same_way():
-    image = through_the_lens(LENSES[0])
-    pinhole = torch.from_numpy(lens(LENSES[0]).pinhole())
-    grey = lens(LENSES[0]).undistort(image, pinhole, width=WIDTH, height=HEIGHT)
-    rgb = lens(LENSES[0]).undistort(image[..., None].repeat(1, 1, 3), pinhole, width=WIDTH, height=HEIGHT)
-    assert torch.equal(grey[..., None].expand(-1, -1, 3), rgb)
 
 
 @pytest.mark.parametrize("coefficients", [(-3.0, 0, 0, 0, 0), (0, -9.0, 0, 0, 0), (0, 0, 5.0, 0, 0)])

