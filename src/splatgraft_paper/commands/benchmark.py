@@ -24,7 +24,7 @@ class EvaluateBenchmark:
     """Measure methods on scenes with ground truth; finished results are kept."""
 
     scenes: Positional
-    """Folder of scenes that `synth benchmark` made; `evaluate paper` reads the authors' data set."""
+    """Folder of scenes that `paper synth benchmark` made; `paper tables` reads the authors' data set."""
     out: Path = Path("benchmark")
     """Folder for index.html, benchmark.json, benchmark.md and all results."""
     methods: tuple[str, ...] = ("copy-paste", "reinhard", "gain", "transfer", "true-light")

@@ -32,7 +32,7 @@ class GeneratedPairs:
     out: Positional
     """Folder for one folder per sample, manifest.jsonl and sheet.png with all samples."""
     removal: Path
-    """The folder model/ that `splatgraft train removal` wrote."""
+    """The folder model/ that `splatgraft paper train removal` wrote."""
     relighting: RelightingOptions = field(default_factory=RelightingOptions)
     base: str = "black-forest-labs/FLUX.1-schnell"
     """Folder or hub id of FLUX with its text encoders; needs pip install 'splatgraft[text]'."""

@@ -162,7 +162,7 @@ class SynthCheck:
     """Check every picture of a folder of pairs or benchmark scenes, and list the damaged and empty ones."""
 
     out: Positional
-    """The folder that `synth pairs` or `synth benchmark` wrote."""
+    """The folder that `paper synth pairs` or `paper synth benchmark` wrote."""
 
     def execute(self, console: Console) -> int:
         """Rewrite the manifest of pairs; 1 where something is faulty."""
@@ -180,7 +180,7 @@ class SynthSheet:
     """Write one picture with all scenes of a folder."""
 
     out: Positional
-    """The folder that `synth pairs` or `synth benchmark` wrote."""
+    """The folder that `paper synth pairs` or `paper synth benchmark` wrote."""
     picture: Path | None = None
     """Where to write it; sheet.png in the folder where not given."""
     columns: int = 6

@@ -31,7 +31,7 @@ class EvaluatePaper:
     methods: tuple[str, ...] = (
         "copy-paste", "transfer", PAPERS_OWN, "off+flux/l1-dssim", f"{PAPERS_OWN}@linear", f"{PAPERS_OWN}@geometric",
     )  # fmt: skip
-    """Methods of ours to run, as `evaluate benchmark` names them; off+flux/paper is the paper's own."""
+    """Methods of ours to run, as `paper benchmark` names them; off+flux/paper is the paper's own."""
     only: tuple[str, ...] = ()
     """Names of scenes; all where none is given."""
     all_views: bool = False

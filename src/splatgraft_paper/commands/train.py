@@ -23,7 +23,7 @@ from splatgraft_paper.training.removal import RemovalTrainingOptions, train_remo
 
 @dataclass(frozen=True)
 class TrainFlux:
-    """Train the paper's harmoniser; a killed run is continued. Many GPUs: `torchrun -m splatgraft train`."""
+    """Train the paper's harmoniser; a killed run is continued. Many GPUs: `torchrun -m splatgraft paper train`."""
 
     out: Positional
     """Folder for the model, states, log and validation pictures."""
@@ -70,7 +70,7 @@ class TrainCompact:
     out: Positional
     """Folder for compact.safetensors, priors/, state, log and validation pictures."""
     pairs: Path
-    """Folder that `splatgraft synth pairs` rendered."""
+    """Folder that `splatgraft paper synth pairs` rendered."""
     loop: CompactOptions = field(default_factory=CompactOptions)
     held_out: HeldOutOptions = field(default_factory=HeldOutOptions)
     variants: int = 1

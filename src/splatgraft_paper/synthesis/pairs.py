@@ -237,7 +237,7 @@ def read_manifest(out: Path) -> list[PairSample]:
     path = out / "manifest.jsonl"
     if not path.is_file():
         raise ValueError(
-            f"{path}: expected the manifest of rendered pairs, found none (splatgraft synth pairs makes one)"
+            f"{path}: expected the manifest of rendered pairs, found none (splatgraft paper synth pairs makes one)"
         )
     samples = []
     for number, line in enumerate(path.read_text().splitlines(), 1):

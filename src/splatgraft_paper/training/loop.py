@@ -12,6 +12,7 @@ DataLoader's processes before the state is saved).
 """
 
 import json
+import math
 import os
 import pickle
 import shutil
@@ -351,8 +352,8 @@ class _Loop:
         norm = self._processes.clip_grad_norm_(list(self._trained.values()), self._options.clip or float("inf"))
         norm = norm.full_tensor() if hasattr(norm, "full_tensor") else norm  # pyright: ignore
         value = float(self._processes.reduce(total, "mean"))
-        if not (abs(value) < float("inf") and bool(torch.isfinite(norm))):
-            self._stop_at_broken_loss(passes, value)
+        if not (math.isfinite(value) and bool(torch.isfinite(norm))):
+            self._stop_at_broken_loss(passes)
         self._optimizer.step()
         self._optimizer.zero_grad()
         for name, average in self._average.items():
@@ -365,26 +366,20 @@ class _Loop:
         return self._processes.device
 
     @torch.no_grad()
-    def _stop_at_broken_loss(self, passes: list[list[Any]], value: float) -> None:
-        """Name the items at fault, and save the weights where they are whole: they are those of the step before."""
+    def _stop_at_broken_loss(self, passes: list[list[Any]]) -> None:
+        """Save the weights, which are those of the step before, and name the items whose loss is not finite."""
         from accelerate.utils import gather_object
 
-        wrong = f"a finite loss at step {self.step + 1}, found {value}"
-        if abs(value) < float("inf"):
-            wrong = f"a finite gradient at step {self.step + 1}, found none"
-        broken = []
-        for items, positions in zip(passes, self._positions(self.step), strict=True):
-            for item, position in zip(items, positions, strict=True):
-                if not abs(float(self._task.loss(self._call, [item]))) < float("inf"):
-                    broken.append(self._task.name(position))
-        names = list(dict.fromkeys(gather_object(broken)))
-        cause = f"for {', '.join(names)}" if names else "from pairs that are finite one by one"
-        if self._is_finite():
-            self._optimizer.zero_grad()
-            self.save()
-        else:
-            cause = "for all pairs, as the weights had diverged before"
-        raise ValueError(f"training: expected {wrong} {cause}; {self._kept_state()}")
+        items = [item for own in passes for item in own]
+        drawn = zip(items, (at for own in self._positions(self.step) for at in own), strict=True)
+        broken = [self._task.name(at) for item, at in drawn if not self._task.loss(self._call, [item]).isfinite()]
+        names = ", ".join(dict.fromkeys(gather_object(broken))) or "pairs that are finite one by one"
+        self._optimizer.zero_grad()
+        self.save()
+        raise ValueError(
+            f"training: expected a finite loss and gradient at step {self.step + 1}, found none for {names}; "
+            f"{self._kept_state()}"
+        )
 
     def _is_finite(self) -> bool:
         parts = (p.to_local() if hasattr(p, "to_local") else p for p in self._trained.values())  # pyright: ignore

@@ -55,7 +55,7 @@ class CompactPairs:
         """Read all pairs; about 0.6 MB each at 240x160.
 
         Args:
-            pairs: folder that `splatgraft synth pairs` rendered.
+            pairs: folder that `splatgraft paper synth pairs` rendered.
             priors: folders of `write_priors`, one per variant of the perturbed lights.
             held_out: which pairs are held out.
             progress: called after each scene.
