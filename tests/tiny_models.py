@@ -70,7 +70,7 @@ def removal_folder(folder: Path) -> Path:
     """Stable Diffusion 2's layout (unet/, vae/), tiny."""
     from diffusers import UNet2DConditionModel
 
-    from splatgraft.harmonization.flux.prompt import write_tensors
+    from splatgraft.harmonization.flux.tensor_file import write_tensors
 
     torch.manual_seed(3)
     UNet2DConditionModel(

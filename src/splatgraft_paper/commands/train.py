@@ -131,7 +131,8 @@ class TrainEmbed:
 
     def execute(self, console: Console) -> int:
         """Write the file."""
-        from splatgraft.harmonization.flux.prompt import PromptEmbedding, prompt_file, write_prompt, write_tensors
+        from splatgraft.harmonization.flux.prompt import PromptEmbedding, prompt_file, write_prompt
+        from splatgraft.harmonization.flux.tensor_file import write_tensors
 
         base = self.base or _BASES[self.kind]
         out = self.out or prompt_file(base)

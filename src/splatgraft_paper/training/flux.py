@@ -21,8 +21,9 @@ from splatgraft.harmonization.flux.loading import (
     widen_transformer,
 )
 from splatgraft.harmonization.flux.network import FirstLayer, Variant, velocity
-from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, read_prompt, write_tensors
+from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, read_prompt
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
+from splatgraft.harmonization.flux.tensor_file import write_tensors
 from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from splatgraft.core.images import resize, write_image
 from splatgraft.harmonization.flux.loading import diffusers_library
-from splatgraft.harmonization.flux.prompt import one_line
+from splatgraft.harmonization.flux.tensor_file import one_line
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft_paper.training.pairs import (

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.image_metrics import psnr, ssim
-from splatgraft.harmonization.flux.prompt import read_tensors, write_tensors
+from splatgraft.harmonization.flux.tensor_file import read_tensors, write_tensors
 from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_folder

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from splatgraft.harmonization.flux.loading import diffusers_library, load_autoencoder, local_folder, read_config
 from splatgraft.harmonization.flux.network import pad_by_reflection, widen_layer
-from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, read_tensors
+from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt
 from splatgraft.harmonization.flux.sampling import noise
+from splatgraft.harmonization.flux.tensor_file import read_tensors
 from splatgraft.runtime.console import Console
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, save_weights, train_objective

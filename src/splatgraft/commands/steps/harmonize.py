@@ -53,9 +53,8 @@ class Harmonize:
         return files
 
     def recorded_options(self) -> dict[str, Any]:
-        """The options in step.json: those of all methods, so that results made by version 0.1.0 stay up to date."""
-        defaults = {key: value for kind in HARMONIZERS.values() for key, value in vars(kind()).items()}
-        return plain_options({"method": self.method.name, **defaults, **vars(self.method)})
+        """The options in step.json: the method and its own."""
+        return plain_options({"method": self.method.name, **vars(self.method)})
 
     def write(self, folder: Path, context: Context) -> None:
         """Make one image per view."""

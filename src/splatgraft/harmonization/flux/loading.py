@@ -16,8 +16,9 @@ import torch
 
 from splatgraft.harmonization.flux.baked_modulation import bake
 from splatgraft.harmonization.flux.network import Autoencoder, FirstLayer, FluxNetwork, Variant, widen_layer
-from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, one_line, read_prompt
+from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, read_prompt
 from splatgraft.harmonization.flux.sampling import schnell_levels
+from splatgraft.harmonization.flux.tensor_file import one_line
 from splatgraft.harmonization.interface import HarmonizerContext
 from splatgraft.harmonization.methods import FluxOptions
 from splatgraft.runtime.hub import hub_folder
@@ -80,7 +81,7 @@ class FluxFolder:
     transformer: Path
     """Where the transformer's config.json is."""
     config: dict[str, Any]
-    """The transformer's config.json, with diffusers' defaults where it leaves sizes out."""
+    """The transformer's config.json."""
 
     @staticmethod
     def open(folder: Path) -> "FluxFolder":
@@ -123,8 +124,8 @@ class FluxFolder:
                 f"{self.transformer}: expected a harmoniser, found FLUX itself; train one by `splatgraft paper train "
                 "flux` or give --lora"
             )
-        names = (self.folder.name, self.folder.resolve().name, self.transformer.resolve().parent.name)
-        declared = declared_variant(self.folder) or next((name for name in names if name in VARIANTS), None)
+        name = self.folder.resolve().name
+        declared = declared_variant(self.folder) or (name if name in VARIANTS else None)
         if requested != "auto" and declared not in (None, requested):
             raise ValueError(f"{self.folder}: expected {requested} (--variant), found {declared}")
         return _known(declared if requested == "auto" else requested, self.folder)

@@ -1,17 +1,13 @@
-"""The empty prompt's text embeddings, read from a file so that no text encoder is loaded; .safetensors files."""
+"""The empty prompt's text embeddings, read from a file so that no text encoder is loaded."""
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 from torch import Tensor
 
-from splatgraft.runtime.files import atomic_write
+from splatgraft.harmonization.flux.tensor_file import read_tensors, write_tensors
 
 PROMPT_FILE = "empty_prompt.safetensors"
 
@@ -67,29 +63,3 @@ def read_prompt(path: Path, *, tokens_width: int, pooled_width: int) -> PromptEm
     if {name: shape[-1:] for name, shape in shapes.items()} != {"tokens": (tokens_width,), "pooled": (pooled_width,)}:
         raise ValueError(f"{path}: expected tokens (n, {tokens_width}) and pooled ({pooled_width},), found {shapes}")
     return PromptEmbedding(found["tokens"], found["pooled"])
-
-
-def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Read all tensors of a .safetensors file.
-
-    Raises:
-        ValueError: The file is missing, truncated or of another format.
-    """
-    try:
-        return load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise ValueError(f"{path}: expected a whole .safetensors file, found {one_line(error)}") from error
-
-
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, str] | None = None) -> None:
-    """Write a .safetensors file atomically; `about` goes into its metadata, as JSON."""
-    # one key: safetensors writes several in an order that differs from run to run
-    metadata = {"splatgraft": json.dumps(dict(about), sort_keys=True)} if about else None
-    content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, metadata)
-    with atomic_write(path) as stream:
-        stream.write(content)
-
-
-def one_line(error: Exception) -> str:
-    """Type and message of an error in one line; the message is cut at 200 characters."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
