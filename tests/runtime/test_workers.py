@@ -52,6 +52,7 @@ def test_an_error_that_is_no_fault_of_the_data_is_raised(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.long
 def test_two_ray_workers_and_one_is_killed(tmp_path):
     ray = pytest.importorskip("ray")
     here = {"env_vars": {"PYTHONPATH": str(Path(__file__).parent)}}

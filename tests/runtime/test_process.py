@@ -1,11 +1,14 @@
-"""Child processes: exit code, working directory, standard input, log, lines as they come, no process left behind."""
+"""Child processes leave nothing behind; a process ends with threads at work; a page opens where there is a desktop."""
 
 import os
+import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 
-from splatgraft.runtime.process import last_line, run_logged
+from splatgraft.runtime.process import last_line, open_page, run_logged
 
 
 def python(program: str) -> list[str]:
@@ -68,3 +71,48 @@ def test_a_program_that_does_not_exist_is_named(tmp_path):
 
 def test_a_log_without_lines(tmp_path):
     assert last_line(tmp_path / "none") == ""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="xdg-open is of Linux desktops")
+def test_a_page_is_opened_by_the_desktop_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opener = tmp_path / "xdg-open"
+    opener.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/part && mv {tmp_path}/part {tmp_path}/opened\n')
+    opener.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert not open_page(tmp_path / "index.html")
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert open_page(tmp_path / "index.html")
+    while not (tmp_path / "opened").exists():
+        time.sleep(0.01)
+    assert (tmp_path / "opened").read_text() == f"{tmp_path / 'index.html'}\n"
+    opener.unlink()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert not open_page(tmp_path / "index.html")
+
+
+PROGRAM = """
+import sys, threading, torch
+from splatgraft.runtime.process import end_process
+
+begun = threading.Event()
+
+def compute():
+    while True:
+        a = torch.rand(300, 300, requires_grad=True)
+        torch.linalg.svd((a @ a).detach())
+        begun.set()
+
+threading.Thread(target=compute, daemon=True).start()
+begun.wait()
+sys.stdout.write("the last words")
+end_process(3)
+"""
+
+
+def test_a_process_ends_with_its_status_while_a_thread_is_in_torch() -> None:
+    ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
+    assert ended.returncode == 3, ended.stderr
+    assert ended.stdout == "the last words"
+    assert ended.stderr == ""
