@@ -11,6 +11,7 @@ from splatgraft.folders.export_source import project_of, read_export_source
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE, Layout
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.note import Note
 from splatgraft.workflow.run import stale_steps
 
 
@@ -78,10 +79,17 @@ class Export:
         try:
             stale = [name for name in stale_steps(root) if self.page == "report" or name != "evaluate"]
         except ValueError as error:  # the results are there, whatever became of the photos
-            console.warn(f"{root}: expected to know whether the result is up to date, found that {error}")
+            console.tell(
+                Note(f"{root}: expected to know whether the result is up to date, found that {error}", "warning")
+            )
             return
         if stale:
-            console.warn(f"{root}: {', '.join(stale)} is out of date; `splatgraft run {root}` renews what is exported")
+            console.tell(
+                Note(
+                    f"{root}: {', '.join(stale)} is out of date; `splatgraft run {root}` renews what is exported",
+                    "warning",
+                )
+            )
 
 
 COMMAND = Export

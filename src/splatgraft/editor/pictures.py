@@ -13,11 +13,11 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.memo import Memo
 from splatgraft.editor.relit_preview import RelitPreview, largest_coverage_indices
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
 from splatgraft.rendering import render
-from splatgraft.runtime.memo import Memo
 
 PictureKind = Literal[
     "Copy-paste",

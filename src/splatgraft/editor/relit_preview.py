@@ -18,6 +18,7 @@ from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.memo import Memo
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
 from splatgraft.relighting import Light, RelightOptions, Relit, SourceScene
@@ -27,7 +28,6 @@ from splatgraft.relighting.layers import assemble_layers, pasted
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.prepared_object import PreparedObject, SourceLight, find_source_light, prepare_object
 from splatgraft.relighting.scene_light import SceneLight, find_scene_light
-from splatgraft.runtime.memo import Memo
 
 _KEPT_SOURCE_LIGHTS = 8
 """Objects and source scenes whose old light is kept."""

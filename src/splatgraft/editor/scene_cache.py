@@ -14,6 +14,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
+from splatgraft.editor.memo import Memo
 from splatgraft.editor.placement import PlaceableObject, placeable_object
 from splatgraft.editor.project import ProjectFiles
 from splatgraft.editor.scene_sample import SceneSample, read_sample, sample_count
@@ -22,7 +23,6 @@ from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.formats.gaussian_flags import read_flags
 from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.relighting import SourceScene
-from splatgraft.runtime.memo import Memo
 
 _LARGE_BYTES = 12_000_000
 """A file below is read within a tenth of a second."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from splatgraft.core.exposure import LuminanceScale, describe_inconsistency, luminance_scale
 from splatgraft.core.images import list_images, mean_luminance
@@ -9,6 +10,7 @@ from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.formats import list_capture_images
 from splatgraft.formats.captures.colmap import is_colmap
 from splatgraft.formats.captures.exif import read_exposure
+from splatgraft.runtime.note import Note
 
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
 _NAMED = 8
@@ -67,13 +69,16 @@ def camera_files(path: Path) -> tuple[Path, ...]:
     raise ValueError(f"{path}: expected transforms.json, or a COLMAP model in sparse/0, found neither")
 
 
-def describe_left_out(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[str]:
-    """What of the capture at `path` is not used: one line with number and names, then a line per kind of reason.
+def describe_left_out(
+    path: Path, kept: int, left_out: Sequence[LeftOut], level: Literal["minor", "warning"] = "minor"
+) -> list[Note]:
+    """What of the capture at `path` is not used: a note with number and names, then one said per kind of reason.
 
     Args:
         path: The capture.
         kept: Images that are used.
         left_out: The others, and masks that are not used.
+        level: The level of the first note.
     """
     if not left_out:
         return []
@@ -88,7 +93,7 @@ def describe_left_out(path: Path, kept: int, left_out: Sequence[LeftOut]) -> lis
         f"left out: {reasons[0]}" + (f" (and {len(reasons) - 1} more alike)" if len(reasons) > 1 else "")
         for reasons in alike.values()
     ]
-    return [head, *lines[:_NAMED]]
+    return [Note(head, level), *map(Note, lines[:_NAMED])]
 
 
 def exposure_warnings(name: Path, photos: Sequence[Path]) -> list[str]:

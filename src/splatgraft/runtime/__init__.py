@@ -1,1 +1,1 @@
-"""Infrastructure: atomic files and folders, worker pools, child processes, memoising, settings, console."""
+"""Infrastructure: files, processes, workers, kernels, settings, progress, notes and the console."""

@@ -1,9 +1,8 @@
 """Console output while steps run: one progress bar per step, or lines without a terminal, and messages of one line."""
 
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from pathlib import Path
 
 import rich.console
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
@@ -37,17 +36,6 @@ class Console:
             sentence = f"{note.text} {note.remedy}".rstrip()
             self.say(sentence if note.level == "said" else f"warning: {sentence}")
             self._warned += [] if note.level == "said" else [note]
-
-    def warn(self, sentence: str, *, picture: Path | None = None, minor: bool = False) -> None:
-        """Print a warning."""
-        self.tell(Note(sentence, "minor" if minor else "warning", picture=picture))
-
-    def warn_at_length(self, sentences: Sequence[str], *, minor: bool = False) -> None:
-        """Warn with the first sentence, where there is one, and print the others, which explain it."""
-        for sentence in sentences[:1]:
-            self.warn(sentence, minor=minor)
-        for sentence in sentences[1:]:
-            self.say(sentence)
 
     @contextmanager
     def collecting(self) -> Generator[list[Note]]:

@@ -118,9 +118,7 @@ class Capture:
 
     def _say_left_out(self, kept: int, left_out: Sequence[LeftOut], context: Context) -> None:
         level = "minor" if _FEW * len(left_out) <= kept else "warning"
-        head, *reasons = describe_left_out(self.capture, kept, left_out) or [""]
-        if head:
-            context.console.tell(Note(head, level), *map(Note, reasons))
+        context.console.tell(*describe_left_out(self.capture, kept, left_out, level))
 
     def _with_given_poses(self, poses: Path, context: Context) -> PosedImages:
         """Photos with the poses of another program."""

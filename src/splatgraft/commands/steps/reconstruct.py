@@ -55,7 +55,7 @@ class Reconstruct:
     def write(self, folder: Path, context: Context) -> None:
         """Make scene.ply, and metrics.json where views are held out."""
         capture = readable_views(read_capture(self.capture), progress=context.progress)
-        context.console.warn_at_length(describe_left_out(self.capture, len(capture), capture.left_out), minor=True)
+        context.console.tell(*describe_left_out(self.capture, len(capture), capture.left_out))
         require_coverage(capture, str(self.capture))
         device = choose_device(self.options.device, context.console)
         options = replace(self.options, device=str(device))

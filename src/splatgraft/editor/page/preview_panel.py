@@ -14,6 +14,7 @@ import viser
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
+from splatgraft.editor.memo import Memo
 from splatgraft.editor.page.context import VIEW_ORDER, PageContext
 from splatgraft.editor.page.scene_view import Canvas, camera_from_viser
 from splatgraft.editor.pictures import (
@@ -28,7 +29,6 @@ from splatgraft.editor.pictures import (
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState
 from splatgraft.editor.worker import LatestOnlyWorker
-from splatgraft.runtime.memo import Memo
 
 _MAX_DRAFT_SECONDS = 1.5
 """Where drafts of the light take longer, pictures without the light transfer are shown first."""
