@@ -1,10 +1,9 @@
-"""Consolidation: closer to the images, geometry unchanged, reproducible, bounded memory; iterative updates."""
+"""Consolidation: closer to the images, geometry unchanged, reproducible, bounded memory."""
 
 import os
 import subprocess
 import sys
 from dataclasses import fields, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numba
@@ -12,13 +11,7 @@ import pytest
 import torch
 from memory_checkpoint import KilledError, MemoryCheckpoint
 
-from splatgraft.consolidation import (
-    ConsolidateOptions,
-    consolidate,
-    geometric_schedule,
-    iterative_update,
-    linear_schedule,
-)
+from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.core.gaussians import concatenate
 from splatgraft.core.image_metrics import psnr
 from splatgraft.fitting.perceptual_losses import l1
@@ -136,38 +129,6 @@ def test_numbers_that_are_not_finite_are_refused(relit):
 def test_no_views_are_refused(relit):
     with pytest.raises(ValueError, match="at least one view"):
         consolidate(relit.composite, relit.cameras[[]], [])
-
-
-def test_schedules_run_from_full_noise_to_a_tenth():
-    assert linear_schedule() == pytest.approx((1.0, 0.775, 0.55, 0.325, 0.1))
-    geometric = geometric_schedule()
-    assert geometric[0] == 1.0
-    assert geometric[-1] == pytest.approx(0.1)
-    ratios = [b / a for a, b in pairwise(geometric)]
-    assert ratios == pytest.approx([0.1**0.25] * 4)
-    assert linear_schedule(1) == geometric_schedule(1) == (1.0,)
-
-
-def test_each_update_harmonises_renders_of_the_one_before(relit):
-    seen = []
-
-    def harmonize_at(scene, strength):
-        seen.append((scene, strength))
-        return relit.images
-
-    options = ConsolidateOptions(view_error=False, polish_passes=1)
-    out = iterative_update(relit.composite, relit.cameras, harmonize_at, (1.0, 0.5), options)
-    assert [strength for _, strength in seen] == [1.0, 0.5]
-    assert seen[0][0] is relit.composite
-    wanted = torch.stack(relit.images)
-    scores = [float(psnr(render(scene, relit.cameras).color, wanted)) for scene in (relit.composite, seen[1][0], out)]
-    assert scores[1] > scores[0]
-    assert scores[2] == scores[1]  # the same images give the same scene
-
-
-def test_strengths_outside_the_range_are_refused(relit):
-    with pytest.raises(ValueError, match=r"strengths in \(0, 1\]"):
-        iterative_update(relit.composite, relit.cameras, lambda scene, strength: relit.images, (1.0, 0.0))
 
 
 MEASURE = """

@@ -11,7 +11,6 @@ pytest.importorskip("diffusers")
 
 from tiny_models import CHANNELS, flux_folder, quiet, tiny_autoencoder, tiny_transformer
 
-from splatgraft.consolidation import geometric_schedule, linear_schedule
 from splatgraft.harmonization import (
     FluxOptions,
     HarmonizerContext,
@@ -23,6 +22,7 @@ from splatgraft.harmonization.flux.loading import BASE, FluxFolder
 from splatgraft.harmonization.flux.network import Autoencoder, velocity
 from splatgraft.harmonization.flux.prompt import prompt_file
 from splatgraft.harmonization.flux.sampling import noise
+from splatgraft_paper.benchmark.methods import STRENGTHS
 
 pytestmark = list(quiet)
 WIDE = CHANNELS * 12
@@ -209,9 +209,9 @@ def test_on_cuda_in_bf16_it_is_about_that_of_the_cpu(folder):
 # ------------------------------------------------------------------ iterative updates (paper, ablations)
 
 
-@pytest.mark.parametrize("schedule", [linear_schedule, geometric_schedule])
+@pytest.mark.parametrize("schedule", ["linear", "geometric"])
 def test_each_level_of_a_schedule_reaches_the_network_with_the_noise_that_belongs_to_it(folder, monkeypatch, schedule):
-    strengths, seen = schedule(), []
+    strengths, seen = STRENGTHS[schedule], []
     harmonizer = flux(folder, strengths=strengths)
     assert isinstance(harmonizer, NoisyStartHarmonizer)
 
@@ -238,7 +238,7 @@ def test_each_level_of_a_schedule_reaches_the_network_with_the_noise_that_belong
 
 
 def test_all_noise_is_the_ordinary_harmonisation_and_does_not_see_the_prior(folder):
-    harmonizer, shown = flux(folder, strengths=linear_schedule()), view()
+    harmonizer, shown = flux(folder, strengths=STRENGTHS["linear"]), view()
     whole = harmonizer.harmonize_from(shown, 1.0).image
     assert torch.equal(whole, flux(folder).harmonize(shown).image)
     other = replace(shown, prior=1 - shown.prior)

@@ -1,13 +1,10 @@
 """Consolidation: fit the colours of a composite to independently harmonised views (paper, Multi-View Consolidation)."""
 
-from splatgraft.consolidation.color_fit import consolidate, geometric_schedule, iterative_update, linear_schedule
+from splatgraft.consolidation.color_fit import consolidate
 from splatgraft.consolidation.options import ConsolidateOptions, ImageSequence
 
 __all__ = [
     "ConsolidateOptions",
     "ImageSequence",
     "consolidate",
-    "geometric_schedule",
-    "iterative_update",
-    "linear_schedule",
 ]

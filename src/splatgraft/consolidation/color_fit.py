@@ -1,12 +1,10 @@
 """Consolidation: fits the SH colours of a composite to independently harmonised views; geometry and opacity stay.
 
 Two methods: the paper's gradient descent (section Multi-View Consolidation), and least squares by normal equations on
-what the harmoniser changed, followed by a short descent. `iterative_update` harmonises and consolidates in turn, with
-decreasing noise (paper: ablation Iterative Dataset Update, after Haque 2023, Instruct-NeRF2NeRF).
+what the harmoniser changed, followed by a short descent.
 """
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -51,9 +49,6 @@ class _Rates:
 _PAPER = _Rates(first=0.0025, rest_ratio=0.05, final_ratio=1.0)
 """3DGS's feature_lr and its 1/20, constant as in the paper."""
 _POLISH = _Rates(first=0.03, rest_ratio=0.1, final_ratio=0.02)
-
-HarmonizeAt = Callable[[Gaussians, float], ImageSequence]
-"""From the current scene and a noise strength in (0, 1] to one harmonised image per camera."""
 
 
 def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services of every long stage
@@ -132,51 +127,6 @@ def _check_counts(cameras: Cameras, images: ImageSequence, weights: ImageSequenc
     for kind, sequence in (("image", images), ("weight", weights)):
         if sequence is not None and len(sequence) != len(cameras):
             raise ValueError(f"consolidate: expected one {kind} per camera, found {len(sequence)} for {len(cameras)}")
-
-
-def iterative_update(
-    composite: Gaussians,
-    cameras: Cameras,
-    harmonize_at: HarmonizeAt,
-    strengths: Sequence[float],
-    options: ConsolidateOptions = ConsolidateOptions(),
-    *,
-    progress: Progress = silent,
-) -> Gaussians:
-    """The scene after one consolidation per strength, each on images harmonised from renders of the one before.
-
-    Args:
-        composite: The start of each consolidation.
-        cameras: Of the views.
-        harmonize_at: Conditions on the composite and adds noise to renders of the scene that it is given, which the
-            paper found sharper.
-        strengths: Noise strengths in (0, 1], one per update.
-        options: Of each consolidation.
-        progress: Of each consolidation.
-
-    Raises:
-        ValueError: Where a strength is outside (0, 1].
-    """
-    if any(not 0 < strength <= 1 for strength in strengths):
-        raise ValueError(f"iterative update: expected strengths in (0, 1], found {tuple(strengths)}")
-    scene = composite
-    for strength in strengths:
-        scene = consolidate(composite, cameras, harmonize_at(scene, strength), options, progress=progress)
-    return scene
-
-
-def linear_schedule(updates: int = 5, first: float = 1.0, last: float = 0.1) -> tuple[float, ...]:
-    """Noise strengths from `first` to `last` with equal differences."""
-    return tuple(first + (last - first) * _share(i, updates) for i in range(updates))
-
-
-def geometric_schedule(updates: int = 5, first: float = 1.0, last: float = 0.1) -> tuple[float, ...]:
-    """Noise strengths from `first` to `last` with equal ratios."""
-    return tuple(first * (last / first) ** _share(i, updates) for i in range(updates))
-
-
-def _share(index: int, count: int) -> float:
-    return index / (count - 1) if count > 1 else 0.0
 
 
 @torch.no_grad()

@@ -8,12 +8,7 @@ from splatgraft.commands.steps.consolidate import Consolidate
 from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
-from splatgraft.consolidation import (
-    ConsolidateOptions,
-    geometric_schedule,
-    iterative_update,
-    linear_schedule,
-)
+from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import lpips_and_l1, lpips_vgg, windowed_fourier
@@ -40,6 +35,11 @@ from splatgraft_paper.peers.methods import method_options
 Prior = Literal["off", "gain", "transplat", "transfer", "true-light"]
 Loss = Literal["fourier", "l1-dssim", "lpips", "paper"]
 Schedule = Literal["once", "linear", "geometric"]
+STRENGTHS = {
+    "linear": tuple(1.0 + (0.1 - 1.0) * (i / 4) for i in range(5)),
+    "geometric": tuple(0.1 ** (i / 4) for i in range(5)),
+}
+"""Noise of five updates from 1 to 0.1, with equal differences or ratios (paper: Iterative Dataset Update)."""
 _NAMES = {"copy-paste": "off", "reinhard": "off+reinhard", "flux": "off+flux"}
 _GRAMMAR = "PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], NAME=FOLDER, or " + ", ".join(_NAMES)
 
@@ -178,7 +178,7 @@ class UpdateIteratively:
         )
         cameras = read_cameras(self.cameras).to(device)
         options = method_options(self.harmonizer, weights=self.model)
-        strengths = linear_schedule() if self.schedule == "linear" else geometric_schedule()
+        strengths = STRENGTHS[self.schedule]
         say = context.console.say
         harmonizer = make_harmonizer(options, HarmonizerContext(device=device, say=say, strengths=strengths))
         if not isinstance(harmonizer, NoisyStartHarmonizer):
@@ -192,8 +192,10 @@ class UpdateIteratively:
                 images = [harmonizer.harmonize(view).image.to(device) for view in views]
             return LazySequence(len(images), lambda index: images[index])
 
-        consolidation = self._consolidation()
-        scene = iterative_update(prior, cameras, harmonize_at, strengths, consolidation, progress=context.progress)
+        scene = prior
+        for strength in strengths:
+            images = harmonize_at(scene, strength)
+            scene = consolidate(prior, cameras, images, self._consolidation(), progress=context.progress)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
 
     def _consolidation(self) -> ConsolidateOptions:
@@ -271,12 +273,12 @@ def run_method(
     seconds["render"] = perform_if_stale(render, console)
     harmonized = scene.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
     seconds["harmonize"] = perform_if_stale(Harmonize(views, harmonized, options, device=settings.device), console)
-    consolidate = Consolidate(prior, views, harmonized, result, lpips_weights=settings.weights, device=settings.device)
+    step = Consolidate(prior, views, harmonized, result, lpips_weights=settings.weights, device=settings.device)
     if method.loss == "paper":
-        consolidate = replace(consolidate, loss="lpips-l1", method="adam", iterations=settings.iterations)
+        step = replace(step, loss="lpips-l1", method="adam", iterations=settings.iterations)
     else:
-        consolidate = replace(consolidate, loss=method.loss)
-    seconds["consolidate"] = perform_if_stale(consolidate, console)
+        step = replace(step, loss=method.loss)
+    seconds["consolidate"] = perform_if_stale(step, console)
     return result / SCENE_FILE, seconds
 
 
