@@ -87,7 +87,7 @@ class OridaPairs:
     out: Positional
     """Folder for one folder per photograph, manifest.jsonl and sheet.png with all samples."""
     orida: Path
-    """A folder with index.csv (image, mask, background, object, scene), or OBJECT/SCENE/images, masks, background.*."""
+    """A folder with index.csv: a table with the columns image, mask, background (files), object and scene."""
     relighting: RelightingOptions = field(default_factory=RelightingOptions)
     number: int = 2000
     """Number of photographs."""
