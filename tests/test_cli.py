@@ -110,7 +110,7 @@ def test_extras_are_those_of_the_package() -> None:
         for module, package in extra.packages.items():
             assert any(line.lower().startswith(package) for line in declared[name])
             assert extra_providing(f"{module}.inner") == name
-    assert set(OPTIONAL_DEPENDENCIES) == set(declared) - {"dev", "docs"}
+    assert set(OPTIONAL_DEPENDENCIES) == set(declared) - {"dev", "docs", "paper"}
 
 
 def test_doctor_says_what_is_missing_and_how_to_get_it(
