@@ -29,14 +29,7 @@ _METRICS = (
         False,
         "Distance between the features that a trained network computes from both images.",
     ),
-    (
-        "object_psnr",
-        "Object",
-        "PSNR, dB",
-        "{:.2f}",
-        True,
-        "Only pixels that the object covers.",
-    ),
+    ("object_psnr", "Object", "PSNR, dB", "{:.2f}", True, "Only pixels that the object covers."),
     (
         "shadow_psnr",
         "Shadow band",

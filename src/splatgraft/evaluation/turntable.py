@@ -10,6 +10,11 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.directions import tangents
 
+_FULL_CIRCLE_GAP_DEG = 75.0
+"""With a wider angle than this without captured cameras, the path is an arc back and forth; set by hand."""
+_SMOOTHING_DEG = 20.0
+"""Standard deviation, in angle, of the weights by which captured distances and heights are averaged; set by hand."""
+
 
 @dataclass(frozen=True)
 class TurntableOptions:
@@ -19,10 +24,6 @@ class TurntableOptions:
     """Frames in one loop."""
     zoom: float = 1.25
     """Focal length over the median of the captured cameras."""
-    full_circle_gap_deg: float = 75.0
-    """With a wider angle than this without captured cameras, the path is an arc that is traversed back and forth."""
-    smoothing_deg: float = 20.0
-    """Standard deviation of the weights, in angle, by which captured distances and heights are averaged."""
 
 
 def turntable_cameras(
@@ -51,10 +52,10 @@ def turntable_cameras(
     offset = cameras.centers.double() - center.double()
     x, y, height = offset @ across, offset @ along, offset @ up
     distance, azimuth = torch.hypot(x, y), torch.atan2(y, x)
-    path = _loop_of_angles(azimuth, options)
+    path = _loop_of_angles(azimuth, options.frames)
     difference = torch.remainder(path[:, None] - azimuth[None] + math.pi, 2 * math.pi) - math.pi
     # softmax of log weights: no underflow far from all cameras, where the nearest one decides
-    weights = torch.softmax(-0.5 * (difference / math.radians(options.smoothing_deg)) ** 2, dim=1)
+    weights = torch.softmax(-0.5 * (difference / math.radians(_SMOOTHING_DEG)) ** 2, dim=1)
     ring, level = weights @ distance, weights @ height
     eyes = center.double() + (ring * path.cos())[:, None] * across + (ring * path.sin())[:, None] * along
     eyes = eyes + level[:, None] * up
@@ -64,12 +65,12 @@ def turntable_cameras(
     return pinhole(poses, focal, width=width, height=height_px, prefix="turntable")
 
 
-def _loop_of_angles(azimuth: Float[Tensor, "v"], options: TurntableOptions) -> Float[Tensor, "frames"]:
+def _loop_of_angles(azimuth: Float[Tensor, "v"], frames: int) -> Float[Tensor, "frames"]:
     ordered = azimuth.sort().values
     gaps = torch.cat([ordered[1:] - ordered[:-1], ordered[:1] + 2 * math.pi - ordered[-1:]])
     widest = int(gaps.argmax())
-    phase = torch.arange(options.frames, dtype=torch.float64) / options.frames
-    if float(gaps[widest]) <= math.radians(options.full_circle_gap_deg):
+    phase = torch.arange(frames, dtype=torch.float64) / frames
+    if float(gaps[widest]) <= math.radians(_FULL_CIRCLE_GAP_DEG):
         return ordered[0] + 2 * math.pi * phase
     start = ordered[(widest + 1) % len(ordered)]
     arc = 2 * math.pi - float(gaps[widest])
