@@ -15,6 +15,8 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from splatgraft.capture.usable_views import MIN_VIEWS
 from splatgraft.core.exposure import Exposure, describe_inconsistency
@@ -164,19 +166,11 @@ def blur_of(photo: Grey) -> float:
 
 def _groups(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, ...], ...]:
     """Connected components of `count` photos, the largest first."""
-    label = list(range(count))
-
-    def root(i: int) -> int:
-        while label[i] != i:
-            i = label[i]
-        return i
-
-    for i, j in pairs:
-        label[root(i)] = root(j)
-    groups: dict[int, list[int]] = {}
-    for i in range(count):
-        groups.setdefault(root(i), []).append(i)
-    return tuple(sorted(map(tuple, groups.values()), key=len, reverse=True))
+    rows = np.array(list(pairs), int).reshape(-1, 2)
+    graph = coo_array((np.ones(len(rows), bool), (rows[:, 0], rows[:, 1])), shape=(count, count))
+    number, label = connected_components(graph, directed=False)
+    groups = [tuple(np.flatnonzero(label == k).tolist()) for k in range(number)]
+    return tuple(sorted(groups, key=len, reverse=True))
 
 
 def _features(sift: cv2.SIFT, photo: Grey) -> _Features:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 from splatgraft.core.exposure import LuminanceScale, describe_inconsistency, luminance_scale
 from splatgraft.core.images import list_images, mean_luminance
@@ -15,6 +14,8 @@ from splatgraft.runtime.note import Note
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
 _NAMED = 8
 """Most images that a message names."""
+_FEW = 4
+"""Photos kept per photo left out from which on the capture is not in doubt; set by hand."""
 
 
 def has_poses(path: Path) -> bool:
@@ -44,14 +45,14 @@ def capture_inputs(path: Path, capture: PosedImages, *, masks: bool = False) -> 
     return inputs
 
 
-def describe_unposed(path: Path, capture: PosedImages) -> str | None:
-    """One line where most of the images beside those of the capture at `path` have no pose, else None."""
+def unposed_notes(path: Path, capture: PosedImages) -> list[Note]:
+    """A warning where most of the images beside those of the capture at `path` have no pose."""
     folders = {image.parent for image in capture.image_paths}
     total = sum(len(list_images(folder)) for folder in folders)
     if len(capture) >= 0.5 * total:
-        return None
+        return []
     found = f"only {len(capture)} of the {total} images in {min(folders)} have a pose"
-    return f"{path}: {found}; the others are not used"
+    return [Note(f"{path}: {found}; the others are not used", "warning")]
 
 
 def camera_files(path: Path) -> tuple[Path, ...]:
@@ -69,16 +70,13 @@ def camera_files(path: Path) -> tuple[Path, ...]:
     raise ValueError(f"{path}: expected transforms.json, or a COLMAP model in sparse/0, found neither")
 
 
-def describe_left_out(
-    path: Path, kept: int, left_out: Sequence[LeftOut], level: Literal["minor", "warning"] = "minor"
-) -> list[Note]:
-    """What of the capture at `path` is not used: a note with number and names, then one said per kind of reason.
+def left_out_notes(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[Note]:
+    """What of the capture at `path` is not used: a warning with number and names, then a note per kind of reason.
 
     Args:
         path: The capture.
         kept: Images that are used.
         left_out: The others, and masks that are not used.
-        level: The level of the first note.
     """
     if not left_out:
         return []
@@ -93,16 +91,17 @@ def describe_left_out(
         f"left out: {reasons[0]}" + (f" (and {len(reasons) - 1} more alike)" if len(reasons) > 1 else "")
         for reasons in alike.values()
     ]
-    return [Note(head, level), *map(Note, lines[:_NAMED])]
+    level = "minor" if _FEW * len(left_out) <= kept else "warning"
+    return [Note(head, level), *(Note(line) for line in lines[:_NAMED])]
 
 
-def exposure_warnings(name: Path, photos: Sequence[Path]) -> list[str]:
-    """At most one line that starts with `name`, where the photos' exposures differ or white balance was automatic.
+def exposure_notes(name: Path, photos: Sequence[Path]) -> list[Note]:
+    """At most one warning that starts with `name`, where the photos' exposures differ or white balance was automatic.
 
     Raises: ValueError where a photo is no readable image.
     """
     found = describe_inconsistency([read_exposure(photo) for photo in photos])
-    return [] if found is None else [f"{name}: {found}"]
+    return [] if found is None else [Note(f"{name}: {found}", "minor")]
 
 
 def read_luminance_scale(cameras: Path) -> LuminanceScale | None:

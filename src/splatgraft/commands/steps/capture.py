@@ -1,6 +1,5 @@
 """The command `capture`: photos, a video, a posed capture or a trained scene become a folder with transforms.json."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,23 +19,20 @@ from splatgraft.capture import (
     write_reduced,
 )
 from splatgraft.core.images import write_image
-from splatgraft.core.posed_images import LeftOut, PosedImages
+from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import (
     capture_inputs,
-    describe_left_out,
-    describe_unposed,
     description_files,
-    exposure_warnings,
+    exposure_notes,
     has_poses,
+    left_out_notes,
+    unposed_notes,
 )
 from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, write_capture
 from splatgraft.formats.captures.given_poses import read_given_poses
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.project.step import Context, Inputs, Positional
 from splatgraft.runtime.note import Note
-
-_FEW = 4
-"""Photos kept per photo left out from which on the capture is not in doubt; set by hand."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +81,12 @@ class Capture:
             posed = self._pictures(folder, context)
         elif has_poses(self.capture):
             posed = self._taken_over(context)
-            self._warn_of_exposures(posed.image_paths, context)
+            context.console.tell(*exposure_notes(self.capture, posed.image_paths))
             if self.max_side > 0:
                 posed = write_reduced(posed, folder, self.max_side, progress=context.progress)
         else:
             photos = self._photos(folder, context)
-            self._warn_of_exposures(photos.paths, context)
+            context.console.tell(*exposure_notes(self.capture, photos.paths))
             posed, report = pose_photos(
                 photos,
                 folder,
@@ -110,20 +106,15 @@ class Capture:
         given = read_capture(self.capture)
         masks = describe_masks(given.image_paths, given.mask_paths)
         context.console.say(f"{self.capture}: {len(given)} posed images, {len(given.points)} points; {masks}")
-        if (warning := describe_unposed(self.capture, given)) is not None:
-            context.console.tell(Note(warning, "warning"))
+        context.console.tell(*unposed_notes(self.capture, given))
         posed = usable_views(given, keep_odd=self.keep_odd, progress=context.progress)
-        self._say_left_out(len(posed), posed.left_out, context)
+        context.console.tell(*left_out_notes(self.capture, len(posed), posed.left_out))
         return posed
-
-    def _say_left_out(self, kept: int, left_out: Sequence[LeftOut], context: Context) -> None:
-        level = "minor" if _FEW * len(left_out) <= kept else "warning"
-        context.console.tell(*describe_left_out(self.capture, kept, left_out, level))
 
     def _with_given_poses(self, poses: Path, context: Context) -> PosedImages:
         """Photos with the poses of another program."""
         photos = self._photos(self.out, context)
-        self._warn_of_exposures(photos.paths, context)
+        context.console.tell(*exposure_notes(self.capture, photos.paths))
         given = read_given_poses(poses, photos)
         say = context.console.say
         say(f"{poses}: poses of {len(given.posed)} of {len(photos.paths)} photos, {len(given.posed.points)} points")
@@ -152,9 +143,6 @@ class Capture:
             point_colors=found.point_colors,
         )
 
-    def _warn_of_exposures(self, photos: Sequence[Path], context: Context) -> None:
-        context.console.tell(*(Note(warning, "minor") for warning in exposure_warnings(self.capture, photos)))
-
     def _photos(self, folder: Path, context: Context) -> PhotoFiles:
         if not self.capture.is_dir():
             frames, notes = extract_frames(self.capture, folder / "frames", progress=context.progress)
@@ -162,9 +150,9 @@ class Capture:
             return PhotoFiles(tuple(frames))
         found = find_photos(self.capture)
         kept, odd = usable_photos(found.paths, str(self.capture), keep_odd=self.keep_odd, progress=context.progress)
-        self._say_left_out(len(kept), odd, context)
         photos, empty = usable_masks(found.only(kept))
-        self._say_left_out(len(kept), empty, context)
+        for left_out in (odd, empty):
+            context.console.tell(*left_out_notes(self.capture, len(kept), left_out))
         masks = describe_masks(photos.paths, photos.masks)
         context.console.say(f"{self.capture}: {len(photos.paths)} photos; {masks}")
         return photos

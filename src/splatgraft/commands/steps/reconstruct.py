@@ -12,7 +12,7 @@ from splatgraft.capture import readable_views, require_coverage
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import fit_color, psnr, ssim
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.folders.capture_files import capture_inputs, describe_left_out, exposure_warnings
+from splatgraft.folders.capture_files import capture_inputs, exposure_notes, left_out_notes
 from splatgraft.formats import read_capture, write_gaussians
 from splatgraft.project.layout import METRICS_FILE, SCENE_FILE
 from splatgraft.project.record import read_record
@@ -55,7 +55,7 @@ class Reconstruct:
     def write(self, folder: Path, context: Context) -> None:
         """Make scene.ply, and metrics.json where views are held out."""
         capture = readable_views(read_capture(self.capture), progress=context.progress)
-        context.console.tell(*describe_left_out(self.capture, len(capture), capture.left_out))
+        context.console.tell(*left_out_notes(self.capture, len(capture), capture.left_out))
         require_coverage(capture, str(self.capture))
         device = choose_device(self.options.device, context.console)
         options = replace(self.options, device=str(device))
@@ -66,9 +66,9 @@ class Reconstruct:
             threads = torch.get_num_threads()
             seconds = predict_cpu_seconds(capture.cameras, options) / threads
             context.console.say(f"time: about {describe_duration(seconds)} on {threads} idle cores, half or twice that")
-        warnings = exposure_warnings(self.capture, capture.image_paths)
+        warnings = exposure_notes(self.capture, capture.image_paths)
         if read_record(self.capture) is None:  # of its own results the command `capture` has said it
-            context.console.tell(*(Note(warning, "minor") for warning in warnings))
+            context.console.tell(*warnings)
         if options.photo_colors is None:
             options = replace(options, photo_colors=bool(warnings))
             if warnings:
