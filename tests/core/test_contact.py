@@ -8,7 +8,7 @@ from shapes import surfels
 
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
-from splatgraft.core.contact import press_supports
+from splatgraft.core.contact import flatten_contact_layers
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
 from splatgraft.core.rotations import rotation_about
@@ -79,8 +79,8 @@ def test_the_foot_on_a_thick_floor_is_seen_from_the_side_as_without_a_floor(thin
     inside, alone = shown(thing(), floor())
     middle = slice(56, 72)
     hidden = (alone - inside).sum(0)[middle]
-    # of 100 px per unit, three deviations of heights are 0.11, pressed to a fifth 2 px; two widths of the Gaussians in
-    # the plane are 0.06, at 15 degrees 1.6 px. Not pressed, the floor hides 9 px of the box.
+    # of 100 px per unit, three deviations of heights are 0.11, flattened to a fifth 2 px; two widths of the Gaussians
+    # in the plane are 0.06, at 15 degrees 1.6 px. Not flattened, the floor hides 9 px of the box.
     assert float(hidden.max()) < 3.6
     # above that nothing is hidden
     assert float((alone - inside)[:56, middle].max()) < 0.01
@@ -88,63 +88,63 @@ def test_the_foot_on_a_thick_floor_is_seen_from_the_side_as_without_a_floor(thin
 
 def test_far_gaussians_keep_every_bit_and_near_ones_their_colour_and_opacity():
     target = floor()
-    pressed = press_supports(target, [ball()])
-    changed = (pressed.means != target.means).any(1)
+    flattened = flatten_contact_layers(target, [ball()])
+    changed = (flattened.means != target.means).any(1)
     away = target.means[:, :2].norm(dim=1)
     assert int(changed.sum()) > 50
     # twice the radius of the bounding sphere and twice the width of the Gaussians
     assert float(away[changed].max()) < 2.2 * (RADIUS + 0.05)
-    assert same_bits(pressed.select(~changed), target.select(~changed))
-    assert torch.equal(pressed.sh, target.sh)
-    assert torch.equal(pressed.opacity_logits, target.opacity_logits)
+    assert same_bits(flattened.select(~changed), target.select(~changed))
+    assert torch.equal(flattened.sh, target.sh)
+    assert torch.equal(flattened.opacity_logits, target.opacity_logits)
 
 
 def test_centres_move_along_the_normal_and_heights_shrink_by_one_factor():
     target = floor()
-    pressed = press_supports(target, [box()])
+    flattened = flatten_contact_layers(target, [box()])
     aside = target.means[:, :2].abs().amax(1)
     inside = (aside > 0.15) & (aside < 0.19) & (target.means[:, 2].abs() < 0.06)
-    before, after = target.means[inside], pressed.means[inside]
+    before, after = target.means[inside], flattened.means[inside]
     # the fitted plane is tilted by less than noise / (reach x sqrt(n)) = 0.03 / (0.3 x 30): 0.003 of the 0.1 moved
     torch.testing.assert_close(after[:, :2], before[:, :2], rtol=0, atol=0.001)
     factor = after[:, 2].std() / before[:, 2].std()
     assert float(factor) < 0.25
-    widths = pressed.scales[inside].min(1).values
+    widths = flattened.scales[inside].min(1).values
     torch.testing.assert_close(widths, torch.full_like(widths, 0.2 * THICKNESS), rtol=0.05, atol=0)
 
 
 @pytest.mark.parametrize("height", [0.2, 1.0])
 def test_nothing_changes_below_a_floating_ball(height):
     target = floor()
-    assert press_supports(target, [ball(height)]) is target
+    assert flatten_contact_layers(target, [ball(height)]) is target
 
 
 def test_nothing_changes_without_a_surface_an_object_or_anything_opaque():
     target = floor()
     cloud = replace(target, means=torch.rand(target.count, 3, generator=torch.Generator().manual_seed(1)) - 0.5)
     faint = replace(ball(), opacity_logits=torch.full((4000,), -5.0))
-    assert press_supports(cloud, [ball(-RADIUS)]) is cloud
-    assert press_supports(target, [empty(), faint]) is target
-    assert press_supports(target, []) is target
-    assert press_supports(empty(), [ball()]).count == 0
+    assert flatten_contact_layers(cloud, [ball(-RADIUS)]) is cloud
+    assert flatten_contact_layers(target, [empty(), faint]) is target
+    assert flatten_contact_layers(target, []) is target
+    assert flatten_contact_layers(empty(), [ball()]).count == 0
 
 
 def test_no_hole_is_dug_for_a_buried_ball():
     target = floor()
-    pressed = press_supports(target, [ball(-RADIUS)])
+    flattened = flatten_contact_layers(target, [ball(-RADIUS)])
     deviation = (NOISE**2 + THICKNESS**2) ** 0.5
-    moved = pressed.means[:, 2] - target.means[:, 2]
+    moved = flattened.means[:, 2] - target.means[:, 2]
     # the upper Gaussians come down to one deviation below the middle: from three above at most
     assert float(moved.min()) > -4.1 * deviation
-    assert float(pressed.means[:, 2].min()) >= float(target.means[:, 2].min())
+    assert float(flattened.means[:, 2].min()) >= float(target.means[:, 2].min())
 
 
 def test_a_wall_beside_the_object_is_not_pressed():
     both = concatenate([floor(), wall()])
     higher = (torch.arange(both.count) >= floor().count) & (both.means[:, 2] > 0.2)
-    pressed = press_supports(both, [ball()])
-    assert same_bits(pressed.select(higher), both.select(higher))
-    assert not same_bits(pressed, both)
+    flattened = flatten_contact_layers(both, [ball()])
+    assert same_bits(flattened.select(higher), both.select(higher))
+    assert not same_bits(flattened, both)
 
 
 def test_a_leaf_that_lies_on_the_floor_and_two_objects_are_safe():
@@ -153,13 +153,13 @@ def test_a_leaf_that_lies_on_the_floor_and_two_objects_are_safe():
     )
     far = ball(center=(1.2, 0.0))
     target = floor()
-    pressed = press_supports(target, [leaf, far])
-    assert bool(pressed.means.isfinite().all())
-    assert bool(pressed.log_scales.isfinite().all())
+    flattened = flatten_contact_layers(target, [leaf, far])
+    assert bool(flattened.means.isfinite().all())
+    assert bool(flattened.log_scales.isfinite().all())
     for one in (leaf, far):
-        alone = press_supports(target, [one])
+        alone = flatten_contact_layers(target, [one])
         changed = (alone.means != target.means).any(1)
-        assert bool((pressed.means != target.means).any(1)[changed].all())
+        assert bool((flattened.means != target.means).any(1)[changed].all())
 
 
 def test_a_book_on_the_table_beside_the_foot_keeps_its_shape():
@@ -167,8 +167,8 @@ def test_a_book_on_the_table_beside_the_foot_keeps_its_shape():
     top = torch.stack([x, y, torch.full_like(x, 0.09)], -1).reshape(-1, 3)
     book = surfels(top, torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(top), 1), width=0.01)
     both = concatenate([floor(), book])
-    pressed = press_supports(both, [ball()])
-    moved = (pressed.means - both.means).norm(dim=1)[-book.count :]
+    flattened = flatten_contact_layers(both, [ball()])
+    moved = (flattened.means - both.means).norm(dim=1)[-book.count :]
     inner = (top[:, 0] > 0.4) & (top[:, 0] < 0.55) & (top[:, 1].abs() < 0.15)
     # its edge counts in part, as the floor is next to it
     assert float(moved[inner].max()) == 0.0
@@ -180,15 +180,15 @@ def test_a_cup_on_the_table_beside_the_foot_keeps_its_shape():
     wall_ = 0.08 * outward + torch.stack([torch.full_like(up, 0.4), torch.zeros_like(up), up], -1).reshape(-1, 3)
     cup = surfels(wall_, outward, width=0.01)
     both = concatenate([floor(), cup])
-    pressed = press_supports(both, [ball()])
-    assert same_bits(pressed.select(torch.arange(both.count) >= floor().count), cup)
+    flattened = flatten_contact_layers(both, [ball()])
+    assert same_bits(flattened.select(torch.arange(both.count) >= floor().count), cup)
 
 
 def test_the_result_does_not_depend_on_frame_and_scale():
     target, thing = floor(), box()
     move = Similarity(3.0, rotation_about(torch.tensor([0.6, 0.0, 0.8]), 0.7), torch.tensor([5.0, -2.0, 1.0]))
-    expected = move.gaussians(press_supports(target, [thing]))
-    found = press_supports(move.gaussians(target), [move.gaussians(thing)])
+    expected = move.gaussians(flatten_contact_layers(target, [thing]))
+    found = flatten_contact_layers(move.gaussians(target), [move.gaussians(thing)])
     # float32 at coordinates up to 10: 1e-6 each
     torch.testing.assert_close(found.means, expected.means, rtol=0, atol=2e-4)
     torch.testing.assert_close(found.covariances, expected.covariances, rtol=1e-2, atol=1e-5)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from splatgraft.core.contact import press_supports
+from splatgraft.core.contact import flatten_contact_layers
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.splitting import split_wide_around
@@ -47,7 +47,7 @@ class Composite:
     def merged(self) -> tuple[Gaussians, Bool[Tensor, "m"]]:
         """The target's kept Gaussians, then the objects' in order, none split; and which belong to an object.
 
-        What an object stands on is pressed flat around its foot, so that it does not cover it.
+        What an object stands on is flattened around its foot, so that it does not cover it.
         """
         gaussians = self._merged_gaussians()
         return gaussians, torch.arange(gaussians.count, device=gaussians.device) >= self.kept_count
@@ -75,4 +75,4 @@ class Composite:
         kept = self.target.select(~self.erased) if bool(self.erased.any()) else self.target
         # an empty object must not even widen the harmonics: it is the identity
         parts = [placed.in_target() for placed in self.objects if placed.gaussians.count]
-        return concatenate([press_supports(kept, parts), *parts]) if parts else kept
+        return concatenate([flatten_contact_layers(kept, parts), *parts]) if parts else kept

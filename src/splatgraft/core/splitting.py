@@ -5,7 +5,7 @@ Used for Gaussians of the target around an object (`split_wide_around`) and for 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -74,30 +74,25 @@ def _pieces_by_opacity(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 6"]:
     return (low + share[:, None] * (high - low))[:, 1:]
 
 
-@dataclass(frozen=True)
-class SplitOptions:
-    """Which Gaussians around an object are split; all values were set by hand on the benchmark scenes."""
-
-    least_width: float = 0.25
-    """Least standard deviation along the widest axis, object radii."""
-    least_opacity: float = 0.02
-    """Fainter Gaussians are not split."""
-    reach: float = 1.5
-    """Largest distance of a centre from the object's, object radii; two standard deviations are added to it."""
-    farthest: float = 6.0
-    """Largest distance of a centre in any case, object radii."""
-    rounds: int = 6
-    """How many times the pieces that are still too wide are split again, at most."""
-    most_per_round: int = 4000
-    """Most Gaussians split per round and object; a scene of a million small Gaussians has none that wide."""
+# which Gaussians around an object are split; set by hand on the benchmark scenes
+_MIN_WIDTH = 0.25
+"""Least standard deviation along the widest axis, object radii."""
+_MIN_OPACITY = 0.02
+"""Fainter Gaussians are not split."""
+_REACH = 1.5
+"""Largest distance of a centre from the object's, object radii; two standard deviations are added to it."""
+_FARTHEST = 6.0
+"""Largest distance of a centre in any case, object radii."""
+_ROUNDS = 6
+"""How many times the pieces that are still too wide are split again, at most."""
+_MAX_PER_ROUND = 4000
+"""Most Gaussians split per round and object; a scene of a million small Gaussians has none that wide."""
 
 
 def split_wide_around(
     gaussians: Gaussians,
     is_object: Bool[Tensor, "n"],
     objects: Sequence[Gaussians],
-    *,
-    options: SplitOptions = SplitOptions(),
 ) -> tuple[Gaussians, Bool[Tensor, "m"]]:
     """Split the wide Gaussians of a composite's target that lie around its objects.
 
@@ -109,7 +104,6 @@ def split_wide_around(
         gaussians: n Gaussians of the composite: the target's, then the objects'.
         is_object: Which of them belong to an object.
         objects: The placed objects, in the frame of `gaussians`.
-        options: What counts as wide and as near.
 
     Returns:
         The m Gaussians after splitting, pieces in the place of their whole, and which of them belong to an object.
@@ -119,16 +113,16 @@ def split_wide_around(
             continue
         middle = 0.5 * (one.means.quantile(0.01, dim=0) + one.means.quantile(0.99, dim=0))
         radius = float((one.means - middle).norm(dim=1).quantile(0.99))
-        farthest = torch.tensor(options.farthest * radius, device=gaussians.device)
-        for _ in range(options.rounds):
+        farthest = torch.tensor(_FARTHEST * radius, device=gaussians.device)
+        for _ in range(_ROUNDS):
             widest, axis = gaussians.scales.max(1)
             away = (gaussians.means - middle).norm(dim=1)
-            near = away < torch.minimum(options.reach * radius + 2 * widest, farthest)
-            wide = (widest > options.least_width * radius) & (gaussians.opacities > options.least_opacity)
+            near = away < torch.minimum(_REACH * radius + 2 * widest, farthest)
+            wide = (widest > _MIN_WIDTH * radius) & (gaussians.opacities > _MIN_OPACITY)
             score = widest * (~is_object & near & wide)
             if not bool((score > 0).any()):
                 break
-            chosen = score.argsort(descending=True)[: min(options.most_per_round, int((score > 0).sum()))]
+            chosen = score.argsort(descending=True)[: min(_MAX_PER_ROUND, int((score > 0).sum()))]
             keep = torch.ones_like(is_object)
             keep[chosen] = False
             pieces, parent = split_along(gaussians.select(chosen), axis[chosen])
