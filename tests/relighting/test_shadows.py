@@ -1,30 +1,40 @@
-"""Shadows on the scene: near lights, sources behind a pane, rough layers of Gaussians, and the limit of the bounce."""
+"""Shadows: against rays and closed forms, fitted to views, at edges of wide Gaussians; kernels in several threads."""
 
 import math
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
 from shapes import ring, surfels
 
 from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting import Light, LightSource, RelightOptions, relight
+from splatgraft.relighting.layers import pasted
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.light.samples import sample_light
+from splatgraft.relighting.shadows import view_fit
 from splatgraft.relighting.shadows.scene_ratio import object_shadow_maps, scene_ratio
-from splatgraft.rendering import render
+from splatgraft.relighting.shadows.view_fit import _FittedView, _solved, gaussians_in_view
+from splatgraft.rendering import render, view_operator
 
+IDENTITY = Similarity(1.0, torch.eye(3), torch.zeros(3))
 DARK = fit_ambient(torch.full((3,), 1e-6))
 WHOLE = RelightOptions(most_added=0.0, fitted_views=0)
 CENTER = torch.tensor([0.0, 0.0, 0.5])
 RADIUS = 0.3
 
 
-def floor(half=1.5, count=200, height=0.0) -> Gaussians:
+def floor(half=1.5, count=150, height=0.0) -> Gaussians:
     """A floor at z = 0 whose Gaussians lie off it by `height`, a standard deviation."""
     x = torch.linspace(-half, half, count)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
@@ -34,8 +44,8 @@ def floor(half=1.5, count=200, height=0.0) -> Gaussians:
 
 
 def ball(gray=0.0) -> Gaussians:
-    around = even_directions(8000)
-    return surfels(RADIUS * around + CENTER, around, width=0.007, srgb=gray)
+    around = even_directions(5000)
+    return surfels(RADIUS * around + CENTER, around, width=0.009, srgb=gray)
 
 
 def cameras(height=1.5):
@@ -50,9 +60,17 @@ def from_above(*, x=0.0, irradiance=3.0, ambient=DARK, **more) -> Light:
 
 def relit_ball(light, *, target=None, gray=0.0, options=WHOLE, views=None):
     target = floor() if target is None else target
-    placed = (PlacedObject(ball(gray), Similarity(1.0, torch.eye(3), torch.zeros(3))),)
+    placed = (PlacedObject(ball(gray), IDENTITY),)
     composite = Composite(target, placed, torch.zeros(target.count, dtype=torch.bool))
     return relight(composite, cameras() if views is None else views, light=light, options=options)
+
+
+def ground_points(camera):
+    """Where the rays of the pixels meet z = 0, and the rays."""
+    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    pose, k = camera.world_from_camera[0], camera.intrinsics[0]
+    rays = torch.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], torch.ones_like(u)], -1) @ pose[:3, :3].T
+    return pose[:3, 3] - rays * (pose[2, 3] / rays[..., 2:]), rays
 
 
 def lost_light(relit):
@@ -64,11 +82,11 @@ def lost_light(relit):
 @pytest.mark.parametrize("distance", [0.8, 1.5, math.inf])
 def test_the_shadow_of_a_ball_is_as_wide_as_rays_from_the_lamp_make_it(distance):
     lost, points = lost_light(relit_ball(from_above(angular_radius_deg=0.5, distance=distance)))
-    radius = (float((lost > 0.5).sum()) * (3.0 / 199) ** 2 / math.pi) ** 0.5
+    radius = (float((lost > 0.5).sum()) * (3.0 / 149) ** 2 / math.pi) ** 0.5
     # the cone of rays that touch the ball, where it meets the floor
     sine = RADIUS / distance
     truth = RADIUS if math.isinf(distance) else (distance + 0.5) * sine / math.sqrt(1 - sine**2)
-    # a third of the 0.015 between receivers, and 0.5% for splats that stand out of the ball by half of their width
+    # a quarter of the 0.02 between receivers, and 0.5% for splats that stand out of the ball by half of their width
     assert radius == pytest.approx(truth, abs=0.005 + 0.005 * truth)
     away = points[:, :2].norm(dim=1)
     assert float(lost[away < 0.9 * truth].min()) > 0.9
@@ -93,8 +111,8 @@ def test_a_source_is_not_blocked_by_what_the_scene_shows_in_its_place():
 def test_low_light_leaves_no_acne_on_a_rough_layer():
     # a low sun and as much ambient light: acne would leave only the ambient part, without a shadow to cast
     light = from_above(x=4.0, irradiance=12.0, angular_radius_deg=1.0, ambient=fit_ambient(torch.full((3,), 0.3)))
-    smooth, _ = lost_light(relit_ball(light, target=floor(half=3.0, count=300)))
-    rough, _ = lost_light(relit_ball(light, target=floor(half=3.0, count=300, height=0.01)))
+    smooth, _ = lost_light(relit_ball(light, target=floor(half=3.0, count=200)))
+    rough, _ = lost_light(relit_ball(light, target=floor(half=3.0, count=200, height=0.01)))
     umbra = smooth > 0.9 * smooth.max()
     # receivers 0.01 too high or low move the edge of a shadow by 0.04, so some of the umbra's receivers leave it
     assert float(rough[umbra].median()) > 0.95 * float(smooth[umbra].median())
@@ -121,10 +139,7 @@ def test_shadows_fitted_to_views_stand_where_the_surface_is_seen():
             linear_from_srgb(render(g, camera).color[0].clamp(0, 1)).mean(-1)
             for g in (layer, relit.shaded().select(~relit.is_object))
         )
-        v, u = torch.meshgrid(torch.arange(192) + 0.5, torch.arange(256) + 0.5, indexing="ij")
-        pose, k = camera.world_from_camera[0], camera.intrinsics[0]
-        rays = torch.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], torch.ones_like(u)], -1) @ pose[:3, :3].T
-        points = pose[:3, 3] - rays * (pose[2, 3] / rays[..., 2:])
+        points, rays = ground_points(camera)
         to_center = CENTER - points
         along = to_center @ towards
         truth = torch.where(((to_center**2).sum(-1) - along**2) < RADIUS**2, 0.04, 1.0)
@@ -167,3 +182,229 @@ def test_an_even_sky_leaves_no_light_where_a_ball_touches_the_floor():
     truth = 1 - (1 + (away / RADIUS) ** 2) ** -1.5
     # 32 directions stand for the whole sky, so a cone of 0.35 rad leaves a part of its rim; and `darkest` is left
     torch.testing.assert_close(found, truth, rtol=0, atol=0.05)
+
+
+SUN = torch.nn.functional.normalize(torch.tensor([0.5, -0.3, 0.8]), dim=0)
+
+
+@cache
+def edge_cameras():
+    turns = torch.arange(6) / 6 * 2 * math.pi
+    eyes = torch.stack([2.2 * turns.cos(), 2.2 * turns.sin(), torch.full((6,), 1.5)], 1)
+    poses = look_at(eyes, torch.tensor([-0.2, 0.1, 0.1]), torch.tensor([0.0, 0.0, 1.0]))
+    return pinhole(poses, 240.0, width=256, height=192)
+
+
+def edge_plane(width) -> Gaussians:
+    x = torch.arange(-1.5, 1.5, 1.5 * width)
+    grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(grid), 1)
+    points = torch.cat([grid, torch.zeros(len(grid), 1)], 1)
+    return surfels(points, up, width=width, thickness=min(0.1 * width, 0.002))
+
+
+def dark_ball(center) -> Gaussians:
+    around = even_directions(10000)
+    return surfels(RADIUS * around + center, around, width=RADIUS / 55, srgb=0.0, thickness=RADIUS / 550)
+
+
+def sun(radius_deg) -> LightSource:
+    x, y, z = SUN.tolist()
+    return LightSource((x, y, z), (3.0, 3.0, 3.0), angular_radius_deg=radius_deg)
+
+
+def error(width, options) -> float:
+    """RMSE of the ratio of light after to before, over the shadow beside the ball."""
+    center = torch.tensor([0.0, 0.0, RADIUS])
+    plane, dark = edge_plane(width), dark_ball(center)
+    # hardly any sky: its part of the ratio is left out of the truth
+    light = Light((sun(0.25),), fit_ambient(torch.full((3,), 1e-3)))
+    composite = Composite(plane, (PlacedObject(dark, IDENTITY),), torch.zeros(plane.count, dtype=torch.bool))
+    relit = relight(composite, edge_cameras(), light=light, options=options)
+    camera = edge_cameras()[3]
+    before, after = render(plane, camera), render(relit.shaded().select(~relit.is_object), camera)
+    ratio = linear_from_srgb(after.color[0]).mean(-1) / linear_from_srgb(before.color[0]).mean(-1).clamp_min(1e-3)
+    ground, _ = ground_points(camera)
+    away = center - ground
+    shadow = (away**2).sum(-1) - (away @ SUN) ** 2 < RADIUS**2
+    band = shadow & (render(dark, camera).alpha[0] < 0.001) & (before.alpha[0] > 0.9)
+    return float(((ratio - 0.04)[band] ** 2).mean().sqrt())  # 0.04: the darkest shadow
+
+
+@pytest.mark.parametrize(
+    ("width", "most", "share"),
+    # measured 0.249 and 0.145 (0.536 and 0.195 unsplit), an eighth more is allowed; an edge that lies one pixel off,
+    # as splats' order makes it, costs 0.13 in a picture of this size
+    [(0.15, 0.28, 0.6), (0.03, 0.165, 0.85)],
+)
+def test_wide_gaussians_hold_a_hard_shadow_once_they_are_split(width, most, share):
+    split, whole = error(width, RelightOptions()), error(width, RelightOptions(most_added=0.0))
+    assert split < most
+    assert split < share * whole
+
+
+def seen_from(view, relit, plane, ground) -> torch.Tensor:
+    """Light left at points of the ground, as a picture shows it."""
+    camera = edge_cameras()[view]
+    before, after = render(plane, camera), render(relit, camera)
+    ratio = linear_from_srgb(after.color[0]).mean(-1) / linear_from_srgb(before.color[0]).mean(-1).clamp_min(1e-3)
+    pose, k = camera.world_from_camera[0], camera.intrinsics[0]
+    local = (ground - pose[:3, 3]) @ pose[:3, :3]
+    pixels = local[:, :2] / local[:, 2:] * k[0, 0] + torch.stack([k[0, 2], k[1, 2]])
+    height, wide = ratio.shape
+    places = 2 * pixels / torch.tensor([wide, height]) - 1
+    return torch.nn.functional.grid_sample(ratio[None, None], places[None, None], align_corners=False)[0, 0, 0]
+
+
+def test_an_edge_stands_in_one_place_from_all_sides():
+    # high enough that no view of its shadow is hidden; its own Gaussians are left out of the pictures
+    plane, dark = edge_plane(0.03), dark_ball(torch.tensor([0.0, 0.0, 2 * RADIUS]))
+    composite = Composite(plane, (PlacedObject(dark, IDENTITY),), torch.zeros(plane.count, dtype=torch.bool))
+    light = Light((sun(5.0),), fit_ambient(torch.full((3,), 0.25)))
+    relit = relight(composite, edge_cameras(), light=light)
+    side = torch.linspace(-0.4, 0.4, 60)
+    under = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2) - 2 * RADIUS / 0.8 * torch.tensor(
+        [0.5, -0.3]
+    )
+    ground = torch.cat([under, torch.zeros(len(under), 1)], 1)
+
+    def disagreement(one) -> float:
+        scene = one.shaded().select(~one.is_object)
+        return float((seen_from(0, scene, plane, ground) - seen_from(3, scene, plane, ground)).abs().mean())
+
+    flat = replace(relit, slope=torch.zeros_like(relit.slope))
+    assert float(seen_from(0, relit.shaded().select(~relit.is_object), plane, ground).min()) < 0.5
+    # measured 0.031 and 0.054 split, 0.014 and 0.070 whole; an eighth more is allowed
+    assert disagreement(relit) < 0.65 * disagreement(flat)
+
+
+def test_a_slope_too_small_to_square_changes_nothing():
+    """Squares below 1e-38 are 0 in float32: a length of 0 under a slope that is not."""
+    points, up = torch.rand(20, 3), torch.tensor([[0.0, 0.0, 1.0]]).repeat(20, 1)
+    scene = surfels(points, up, width=0.1, thickness=0.01, srgb=0.5)
+    relit = pasted(Composite(scene, (), torch.zeros(20, dtype=torch.bool)), "")
+    relit = replace(relit, shadow=torch.full((20, 3), 0.4))
+    flat = relit.shaded()
+    for size in (1e-12, 1e-25, 1e-40):
+        sloped = replace(relit, slope=torch.full((20, 3), size)).shaded()
+        assert torch.isfinite(sloped.sh).all()
+        assert torch.allclose(sloped.sh[:, :1], flat.sh[:, :1])
+        assert float(sloped.sh[:, 1:].abs().max()) < 1e-6
+
+
+def cloud(count: int, *, seed: int) -> Gaussians:
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    return Gaussians(0.5 * draw(count, 3), -2 + 0.3 * draw(count, 3), draw(count, 4), draw(count), draw(count, 1, 3))
+
+
+def views_around(views: int) -> Cameras:
+    angle = torch.arange(views) / views * 2 * math.pi
+    eyes = torch.stack([2 * angle.cos(), 2 * angle.sin(), torch.full((views,), 0.7)], 1)
+    return pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 40.0, width=40, height=32)
+
+
+def test_a_view_has_the_gaussians_whose_centres_project_to_its_surroundings():
+    scene, camera = cloud(4000, seed=0), views_around(3)[1].cropped([(5, 3, 30, 20)])
+    widths = scene.scales.max(1).values
+    which, drawn = gaussians_in_view(scene.means, widths, camera)
+    local = scene.means.double() @ camera.camera_from_world[0, :3, :3].double().T
+    local = local + camera.camera_from_world[0, :3, 3]
+    seen = local @ camera.intrinsics[0].double().T
+    pixels, px = seen[:, :2] / seen[:, 2:], widths * camera.intrinsics[0, 0, 0] / local[:, 2]
+    beside = torch.maximum(-pixels, pixels - camera.sizes[0]).amax(1) / px
+    wanted = (local[:, 2] > 0) & (beside < 3)
+    found = torch.zeros(4000, dtype=torch.bool)
+    found[which] = True
+    # float32 coordinates of some ten pixels, over widths of a pixel and more
+    clear = (beside - 3).abs() > 1e-4
+    assert torch.equal(found[clear], wanted[clear])
+    assert 100 < len(which) < 3900
+    assert torch.allclose(drawn.double(), px[which].double(), rtol=1e-5)
+
+
+def test_the_solver_equals_sirt_with_dense_matrices():
+    scene, cameras = cloud(120, seed=1), views_around(3)
+    generator = torch.Generator().manual_seed(2)
+    receivers, values = 80, 0.5 + 0.5 * torch.rand(80, generator=generator)
+    views, matrices = [], []
+    for camera in cameras:
+        which, drawn = gaussians_in_view(scene.means, scene.scales.max(1).values, camera)
+        operator = view_operator(scene.select(which), camera)
+        first = int((which < receivers).sum())
+        target = operator.alpha * (0.3 + 0.7 * torch.rand(operator.alpha.shape, generator=generator))
+        directions = torch.nn.functional.normalize(scene.means[which[:first]] - camera.centers[0], dim=1)
+        wide = drawn[:first] > view_fit._NARROWEST_PX
+        views.append(_FittedView(which[:first], len(which), operator, target, directions, wide))
+        dense = torch.zeros(target.numel(), 120)
+        dense[:, which] = operator.blend(torch.eye(len(which))).reshape(-1, len(which))
+        matrices.append(dense.double())
+    found = _solved(values, views)
+
+    least = view_fit._DARKEST ** (1 / view_fit._GAMMA)
+    value, slope = torch.cat([values, torch.ones(40)]).double(), torch.zeros(120, 3).double()
+    weight = sum(dense.sum(0) for dense in matrices)
+    step = torch.where(weight > view_fit._MIN_WEIGHT, 1 / weight, 0)
+    step[receivers:] = 0
+    rays = [torch.nn.functional.normalize(scene.means - c.centers[0], dim=1).double() for c in cameras]
+    for _ in range(view_fit._ROUNDS):
+        change, turn = torch.zeros(120).double(), torch.zeros(120, 3).double()
+        for dense, view, towards in zip(matrices, views, rays, strict=True):
+            back = dense.T @ (view.target.flatten() - dense @ (value + (slope * towards).sum(1)))
+            change, turn = change + back, turn + back[:, None] * towards
+        value = torch.where(step > 0, (value + step * change).clamp(least, 1), value)
+        slope = slope + step[:, None] * turn
+        most = torch.minimum(view_fit._MAX_SLOPE * value, 1 - value)[:, None]
+        slope = slope * (most / slope.norm(dim=1, keepdim=True).clamp_min(1e-9)).clamp_max(1)
+    assert torch.equal(found[2], step[:receivers] > 0)
+    # five rounds of float32 sums over some 100 pixels of size 1, divided by their weight
+    assert float((found[0] - value[:receivers]).abs().max()) < 1e-4
+    assert float((found[1] - slope[:receivers]).abs().max()) < 1e-4
+
+
+PROGRAM = """
+import threading
+import torch
+from splatgraft.core.directions import even_directions, frames_along
+from splatgraft.relighting.normals import estimate_normals
+from splatgraft.relighting.shadows.shadow_maps import Window, occluders_of, splat_depth_maps, visibility
+from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.rendering import render
+
+n = 3000
+points = even_directions(n)
+quaternions = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1)
+ball = Gaussians(points, torch.full((n, 3), -3.0), quaternions, torch.zeros(n), torch.zeros(n, 1, 3))
+eyes = torch.tensor([[3.0, 0.0, 1.0], [0.0, 3.0, 1.0]])
+cameras = pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 60.0, width=64, height=48)
+window = Window(torch.zeros(3), 1.5, frames_along(even_directions(8)))
+
+def maps():
+    found = splat_depth_maps(occluders_of(ball), window, size=64, with_color=False)
+    visibility(found, points, points, bias=0.1)
+
+def again(work):
+    for _ in range(30):
+        work()
+
+maps(), estimate_normals(ball, cameras), render(ball, cameras)
+works = (maps, lambda: estimate_normals(ball, cameras), lambda: render(ball, cameras))
+threads = [threading.Thread(target=again, args=(work,)) for work in works]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+print("all ended")
+"""
+
+
+@pytest.mark.long
+def test_threads_may_light_and_render_at_once_without_openmp():
+    environment = {**os.environ, "NUMBA_THREADING_LAYER": "workqueue"}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stderr[-500:]
+    assert done.stdout.strip() == "all ended"

@@ -1,0 +1,428 @@
+"""The light at a place: its panorama, the evidence of shading and highlights, the estimate in scenes of known light."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from shapes import UP, ring, surfels
+
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.bounds import BoundingSphere
+from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.composite import PlacedObject
+from splatgraft.core.directions import even_directions, fit_sh
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.core.similarity import Similarity
+from splatgraft.core.spherical_harmonics import dc_from_rgb
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
+from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
+from splatgraft.relighting.light.light import Light, fit_ambient
+from splatgraft.relighting.light.panorama import (
+    DIRECTIONS,
+    Surroundings,
+    cube_cameras,
+    cube_directions,
+    nearest_directions,
+    render_panorama,
+)
+from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
+from splatgraft.relighting.normals import estimate_normals
+
+
+def shell(colors, directions, *, radius=2.0, spread=0.12):
+    n = len(directions)
+    return Gaussians(
+        means=directions * radius,
+        log_scales=torch.full((n, 3), math.log(spread)),
+        quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        opacity_logits=torch.full((n,), 8.0),
+        sh=dc_from_rgb(colors)[:, None],
+    )
+
+
+def test_solid_angles_sum_to_the_sphere_and_directions_are_balanced():
+    directions, area = cube_directions(16)
+    assert float(area.sum()) == pytest.approx(4 * math.pi, rel=1e-5)  # float32 sum of 1536 terms
+    assert (directions * area[..., None]).sum((0, 1, 2)).abs().max() < 1e-4
+    second = torch.einsum("fhwi,fhwj,fhw->ij", directions, directions, area)
+    # midpoint rule with 16 pixels per 90 degrees: error of order (1/8)^2 / 12 of 4 pi / 3
+    assert (second - torch.eye(3) * 4 * math.pi / 3).abs().max() < 0.02
+
+
+def test_directions_are_those_of_the_cameras():
+    directions, _ = cube_directions(8)
+    cameras = cube_cameras(torch.tensor([1.0, 2, 3]), 8)
+    points = cameras.centers[:, None, None] + 5 * directions
+    rotation, shift = cameras.camera_from_world[:, :3, :3], cameras.camera_from_world[:, :3, 3]
+    in_camera = torch.einsum("fij,fhwj->fhwi", rotation, points) + shift[:, None, None]
+    pixels = in_camera[..., :2] / in_camera[..., 2:] * 4 + 4
+    x = torch.arange(8) + 0.5
+    # float32 of coordinates of order 10
+    assert (pixels[..., 0] - x).abs().max() < 1e-4
+    assert (pixels[..., 1] - x[:, None]).abs().max() < 1e-4
+    assert (torch.linalg.det(cameras.world_from_camera[:, :3, :3]) - 1).abs().max() < 1e-6
+
+
+def test_light_is_seen_in_its_direction_in_linear_light():
+    directions = even_directions(3000)
+    colors = torch.where(directions[:, 2:] > 0, torch.tensor([0.9, 0.6, 0.3]), torch.tensor([0.2, 0.2, 0.2]))
+    scene = shell(colors, directions)
+    seen = render_panorama(scene, torch.zeros(3), size=32)
+    assert seen.coverage > 0.99
+    above = seen.radiance[seen.directions[..., 2] > 0.3]
+    # blends only like with like away from the border; alpha near 1 leaves 8 bits of float noise
+    assert (above - linear_from_srgb(torch.tensor([0.9, 0.6, 0.3]))).abs().max() < 2e-3
+
+
+def test_coverage_is_the_captured_share():
+    directions = even_directions(3000)
+    half = directions[directions[:, 2] > 0]
+    seen = render_panorama(shell(torch.full((len(half), 3), 0.5), half), torch.zeros(3), size=32)
+    # the rim of Gaussians of 0.12 / 2 rad reaches about two of them below the border: at most 6% of the sphere
+    assert 0.48 < seen.coverage < 0.57
+
+
+def test_near_things_are_left_out():
+    directions = even_directions(3000)
+    near = shell(torch.zeros(300, 3), even_directions(300), radius=0.3, spread=0.05)
+    far = shell(torch.full((3000, 3), 0.7), directions)
+    seen = render_panorama(concatenate([near, far]), torch.zeros(3), size=16, nearest=0.5)
+    serialized = render_panorama(far, torch.zeros(3), size=16, nearest=0.5)
+    assert torch.equal(seen.radiance, serialized.radiance)
+
+
+def test_wide_gaussians_close_by_are_not_smeared_over_the_horizon():
+    # a sky, and under the point a table of discs as wide as they are far
+    sky = shell(torch.full((3000, 3), 0.7), even_directions(3000), radius=6.0, spread=0.36)
+    x = torch.linspace(-0.6, 0.6, 5)
+    grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    table = Gaussians(
+        means=torch.cat([grid, torch.full((25, 1), -0.25)], 1),
+        log_scales=torch.tensor([0.2, 0.2, 0.01]).log().repeat(25, 1),
+        quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(25, 1),
+        opacity_logits=torch.full((25,), 4.0),
+        sh=dc_from_rgb(torch.tensor([0.9, 0.1, 0.1])).repeat(25, 1)[:, None],
+    )
+    seen = render_panorama(concatenate([sky, table]), torch.zeros(3), size=32, nearest=0.1)
+    level = seen.directions[..., 2].abs() < 0.1
+    found = seen.radiance[level]
+    assert (found[:, 0] - found[:, 1]).abs().max() < 0.02
+
+
+REGION = BoundingSphere(torch.zeros(3), 1.0)
+
+
+def high_views():
+    turn = torch.arange(24) / 24 * 2 * math.pi
+    eyes = torch.stack([2.5 * turn.cos(), 2.5 * turn.sin(), 1.6 + 0.8 * (3 * turn).sin()], 1)
+    return pinhole(look_at(eyes, torch.zeros(3), UP), 100.0, width=128, height=96)
+
+
+def polished(looks, sun):
+    """A lobe of cos^16 around the mirrored sun, for unit directions from a camera down to the plane."""
+    return ((looks * torch.tensor([1.0, 1.0, -1.0])) @ sun).clamp_min(0) ** 16
+
+
+def rough(looks, sun):
+    """Light that a rough dielectric reflects: GGX of alpha .5 with Smith's masking of both sides and Fresnel."""
+    alpha, view = 0.5, -looks
+    half = torch.nn.functional.normalize(view + sun, dim=1)
+    spread = alpha**2 / (math.pi * (half[:, 2] ** 2 * (alpha**2 - 1) + 1) ** 2)
+
+    def shadow(cosine):  # height-correlated, as in Heitz 2014
+        return 0.5 * (torch.sqrt(1 + alpha**2 * (1 / cosine**2 - 1)) - 1)
+
+    masking = 1 / (1 + shadow(view[:, 2]) + shadow(sun[2]))
+    fresnel = 0.04 + 0.96 * (1 - (half * view).sum(1)) ** 5
+    return spread * masking * fresnel / (4 * view[:, 2])
+
+
+def table(sun, gloss, reflected=polished):
+    """A plane whose harmonics of degree 3 hold a diffuse gray and what it reflects of `sun`."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.cat([(torch.rand(3000, 2, generator=generator) - 0.5) * 2, torch.zeros(3000, 1)], 1)
+    looks = even_directions(600)
+    looks = looks[looks[:, 2] < -0.1]  # from a camera down to the plane
+    gray = srgb_from_linear(0.2 + gloss * reflected(looks, sun))
+    sh = torch.linalg.lstsq(spherical_harmonics.basis(looks, 3), (gray - 0.5)[:, None]).solution
+    flat = surfels(points, UP.repeat(len(points), 1), width=0.04)
+    return replace(flat, sh=sh[None].repeat(len(points), 1, 3))
+
+
+def towards(height_deg, azimuth):
+    height = math.radians(height_deg)
+    return torch.tensor([math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height)])
+
+
+def evidence_of(scene):
+    evidence = find_highlights(scene, estimate_normals(scene, high_views()), high_views(), region=REGION)
+    assert evidence is not None
+    return evidence
+
+
+def explained_by_each(evidence):
+    k = len(DIRECTIONS)
+    return evidence.explained_with_more(torch.zeros(k), torch.arange(k), torch.ones(k))
+
+
+@pytest.mark.parametrize("azimuth", [0.3, 4.5])
+def test_highlights_on_a_bare_table_give_the_direction(azimuth):
+    sun = towards(38, azimuth)
+    evidence = evidence_of(table(sun, gloss=0.4))
+    single = torch.eye(len(DIRECTIONS))
+    explained = explained_by_each(evidence)
+    best = DIRECTIONS[explained.argmax()]
+    # directions lie 11 degrees apart; harmonics of degree 3 shift the peak of the lobe by up to 6
+    assert math.degrees(math.acos(float(best @ sun))) < 12
+    assert float(explained.max()) > 0.5
+    assert float(explained[7]) == pytest.approx(evidence.explained(single[7]), abs=1e-4)
+    # a light beside it changes the share as when it is computed anew
+    index = torch.arange(0, len(single), 20)
+    both = 2 * single[explained.argmax()] + 3 * single[index]
+    more = evidence.explained_with_more(2 * single[explained.argmax()], index, 3 * torch.ones(len(index)))
+    assert torch.allclose(more, torch.tensor([evidence.explained(light) for light in both]), atol=1e-4)
+
+
+def test_a_rough_table_gives_the_height_of_a_sun_though_it_is_brightest_at_flat_views():
+    """Along the mirrored direction alone the sun is found 14 degrees too low."""
+    sun = towards(50, 1.0)
+    best = DIRECTIONS[explained_by_each(evidence_of(table(sun, gloss=0.6, reflected=rough))).argmax()]
+    assert math.degrees(math.acos(float(best @ sun))) < 12
+
+
+def test_each_material_has_its_own_gloss():
+    """One gloss for all explains what the glossy half shows by half, as the matt half denies it."""
+    sun = towards(38, 1.0)
+    glossy = table(sun, 0.4).select(torch.arange(1500))
+    matt = table(sun, 0.0).select(torch.arange(1500, 3000))
+    less_red = matt.sh.clone()
+    less_red[:, 0, 0] -= 0.15 / 0.2820948
+    matt = replace(matt, sh=less_red)
+    whole = explained_by_each(evidence_of(table(sun, 0.4))).max()
+    assert float(explained_by_each(evidence_of(concatenate([glossy, matt]))).max()) > 0.9 * float(whole)
+
+
+def test_matt_tables_and_flat_colours_have_no_highlights():
+    scene = table(UP, gloss=0.0)
+    normals = estimate_normals(scene, high_views())
+    evidence = find_highlights(scene, normals, high_views(), region=REGION)
+    # what is left is the rounding of float32, 1e-5
+    assert evidence is None or evidence.variance < 1e-10
+    assert find_highlights(scene.with_sh_degree(0), normals, high_views(), region=REGION) is None
+
+
+COUNT = len(DIRECTIONS)
+
+
+def receivers(points: torch.Tensor, visibility: torch.Tensor | None = None) -> ShadingEvidence:
+    """Gray, level surfaces."""
+    n = len(points)
+    return ShadingEvidence(
+        region=BoundingSphere(torch.zeros(3), 1.0),
+        points=points,
+        normals=UP.repeat(n, 1),
+        visibility=torch.ones(n, COUNT) if visibility is None else visibility,
+        colors=torch.full((n, 3), 0.2),
+        weights=torch.full((n,), 1 / n),
+        material=torch.zeros(n, dtype=torch.int64),
+    )
+
+
+def surroundings(clipped: torch.Tensor) -> Surroundings:
+    """All seen, gray but for what is clipped, and far away."""
+    radiance = torch.where(clipped > 0, 1.0, 0.3)[:, None].repeat(1, 3)
+    return Surroundings(radiance, torch.ones(COUNT), clipped, DIRECTIONS, torch.full((COUNT,), 1e4))
+
+
+def test_a_light_twice_as_far_as_the_region_is_wide_shines_from_where_it_stands():
+    towards = torch.tensor([math.cos(math.radians(40)), 0.0, math.sin(math.radians(40))])
+    k = int(nearest_directions(towards[None]))
+    distances = torch.full((COUNT,), math.inf)
+    distances[k] = 2.0
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0], [-0.8, 0.0, 0.0]])
+    found = receivers(points).transport(distances)[:, k]
+    # a small patch that faces the middle: both cosines over the square of the distance
+    light = 2 * DIRECTIONS[k].double()
+    away = light - points.double()
+    apart = away.norm(dim=1)
+    expected = away[:, 2] * (away @ DIRECTIONS[k].double()) / apart**4
+    # rows are scaled to sum to 1, and one of 320 directions changes that by a percent
+    assert (found / found[0]).tolist() == pytest.approx((expected / expected[0]).tolist(), rel=0.02)
+    assert float(found[1] / found[0]) > 1.5
+
+
+def test_surroundings_at_infinity_are_seen_alike_from_everywhere():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(20, 3, generator=generator) - 0.5
+    evidence = receivers(points, torch.rand(20, COUNT, generator=generator))
+    far = evidence.transport(torch.full((COUNT,), math.inf))
+    # infinity counts as 10,000 units: float32 of directions
+    assert torch.allclose(far, evidence.transport(), atol=1e-5)
+    assert torch.allclose(receivers(points).transport().sum(1), torch.ones(20))
+
+
+def test_a_window_above_its_reflection_on_a_table_may_be_a_source():
+    azimuth = torch.atan2(DIRECTIONS[:, 1], DIRECTIONS[:, 0]).abs()
+    height = torch.rad2deg(torch.asin(DIRECTIONS[:, 2]))
+    window = (azimuth < 0.4) & (height > -5) & (height < 20)
+    reflection = (azimuth < 0.4) & (height < -5) & (height > -60)
+    around = surroundings((window | reflection).float())
+    surfaces = receivers(torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) - 0.5)
+    problem = radiance_problem(LightEvidence(surfaces, None, around, around, UP))
+    (patch,) = problem.patches
+    members = problem.clipped[patch.members]
+    assert set(window.nonzero()[:, 0].tolist()) <= set(members.tolist())
+    assert float(height[members].min()) > -8.1
+
+
+def views(levels=(0.0,)):
+    """Twelve cameras on one circle, for each level that they look at."""
+    eyes = ring().centers
+    poses = torch.cat([look_at(eyes, torch.tensor([0.0, 0.0, level]), UP) for level in levels])
+    return pinhole(poses, 100.0, width=128, height=96)
+
+
+def sunlit_scene(sun, strength):
+    """Balls on a floor of one material, lit by `sun` and an even sky; shadows by exact ray casting."""
+    generator = torch.Generator().manual_seed(1)
+    centers = torch.tensor([[1.0, 0.2, 0.25], [-0.6, 0.9, 0.25], [-0.7, -0.8, 0.25], [0.5, -1.1, 0.25]])
+    grid = (torch.rand(12000, 2, generator=generator) - 0.5) * 5
+    points = [torch.cat([grid, torch.zeros(len(grid), 1)], 1)]
+    normals = [UP.repeat(len(grid), 1)]
+    for center in centers:
+        around = even_directions(900)
+        points.append(center + 0.25 * around)
+        normals.append(around)
+    point, normal = torch.cat(points), torch.cat(normals)
+    lit = (normal @ sun).clamp_min(0)
+    for center in centers:
+        away = center - point - 1e-3 * normal
+        along = away @ sun
+        hit = (along > 0) & ((away**2).sum(1) - along**2 < 0.25**2)
+        lit = torch.where(hit & ((point - center).norm(dim=1) > 0.26), 0, lit)
+    gray = 0.15 * (1 + strength * lit)
+    keep = (point[:, None, :2] - centers[:, :2]).norm(dim=-1).min(1).values > 0.05
+    keep |= point[:, 2] > 0.01
+    return surfels(point[keep], normal[keep], width=0.03, srgb=srgb_from_linear(gray)[keep, None].repeat(1, 3))
+
+
+def estimated(scene, cameras=None) -> Light:
+    place = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
+    found = estimate_light(scene, place, views() if cameras is None else cameras)
+    assert isinstance(found, EstimatedLight)
+    return found.light
+
+
+def main_direction(light):
+    """Of most irradiance."""
+    normals = even_directions(2000)
+    return normals[light.irradiance(normals).sum(1).argmax()]
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 2.1])
+def test_shadows_give_the_direction_of_a_sun_that_no_camera_saw(azimuth):
+    sun = torch.nn.functional.normalize(torch.tensor([0.78 * math.cos(azimuth), 0.78 * math.sin(azimuth), 0.8]), dim=0)
+    light = estimated(sunlit_scene(sun, strength=3.0))
+    # directions lie 11 degrees apart
+    assert math.degrees(math.acos(float(torch.tensor(light.sources[0].direction) @ sun))) < 11
+    facing, away = light.irradiance(torch.stack([sun, torch.tensor([-1.0, -1.0, 1.0]) * sun])).mean(1)
+    # sky 1, sun 3: the true ratio is 1 + 3 over about 1 + 3 max(0, cos); within a factor of two
+    truth = 4 / (1 + 3 * max(0.0, float(sun[2] ** 2 - sun[0] ** 2 - sun[1] ** 2)))
+    assert truth / 2 < float(facing / away) < truth * 2
+
+
+def test_an_even_sky_gives_an_even_light():
+    light = estimated(sunlit_scene(UP, strength=0.0))
+    up, side = light.irradiance(torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])).mean(1)
+    # the ground takes half of the sky from a wall
+    assert float(up / side) < 3
+
+
+def windowed_room(window, radius_deg, white=1.0):
+    """A shell of radius 20 with a bright disc towards `window`, and a floor that it lights."""
+    shell = even_directions(6000)
+    bright = shell @ window > math.cos(math.radians(radius_deg))
+    rgb = torch.where(bright[:, None], white, 0.4).repeat(1, 3)
+    return concatenate([surfels(20 * shell, -shell, width=0.6, srgb=rgb), sunlit_scene(window, strength=3.0)])
+
+
+@pytest.mark.parametrize(("radius_deg", "white"), [(10, 0.99), (14, 1.0)])
+def test_a_clipped_window_is_a_source_where_it_was_photographed(radius_deg, white):
+    window = torch.nn.functional.normalize(torch.tensor([0.8, 0.3, 0.15]), dim=0)
+    main = estimated(windowed_room(window, radius_deg, white), views((0.0, 1.5))).sources[0]
+    # half the patch's radius: its edge is ragged by the splats' width, 3 degrees
+    assert math.degrees(math.acos(min(1.0, float(torch.tensor(main.direction) @ window)))) < 5
+    # brighter than the camera recorded: white over its solid angle is 0.095
+    assert main.luminance > 0.2
+    if radius_deg == 14:  # wide enough that it is no sun behind a window
+        assert main.name == "window"
+        assert main.distance == pytest.approx(20, rel=0.05)
+
+
+def test_without_surfaces_to_compare_the_light_is_what_was_photographed():
+    shell = even_directions(6000)
+    light = estimated(surfels(20 * shell, -shell, width=0.6, srgb=torch.full((6000, 3), 0.5)), views((0.0, 1.5)))
+    normals = even_directions(50)
+    # sRGB 0.5 is 0.214
+    assert torch.allclose(light.irradiance(normals), torch.full((50, 3), 0.214 * math.pi), rtol=0.25)
+
+
+def test_the_estimate_does_not_depend_on_the_world_axes():
+    sun = torch.nn.functional.normalize(torch.tensor([0.6, -0.5, 0.8]), dim=0)
+    scene = sunlit_scene(sun, strength=3.0)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2))).Q
+    turn = turn * torch.linalg.det(turn)
+    turned_scene = PlacedObject(scene, Similarity(1.0, turn, torch.zeros(3))).in_target()
+    cameras = views()
+    poses = cameras.world_from_camera.clone()
+    poses[:, :3] = turn @ poses[:, :3]
+    place = BoundingSphere(turn @ torch.tensor([0.0, 0.0, 0.3]), 0.3)
+    found = estimate_light(turned_scene, place, replace(cameras, world_from_camera=poses))
+    assert isinstance(found, EstimatedLight)
+    assert math.degrees(math.acos(min(1.0, float(torch.tensor(found.light.sources[0].direction) @ (turn @ sun))))) < 11
+
+
+def test_a_harmonic_fit_of_half_the_sphere_recovers_an_even_light():
+    around = even_directions(2000)
+    ambient = fit_ambient(torch.tensor([0.2, 0.3, 0.4]))
+    values = torch.tensor([0.2, 0.3, 0.4]).repeat(2000, 1)
+    half = (around[:, 2] < 0).float()
+    # the ridge takes a few parts in 1e3 where half is unseen
+    assert torch.allclose(fit_sh(around, values, half), ambient, atol=5e-3)
+
+
+PLACE = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
+
+
+def room() -> Gaussians:
+    """A floor in a gray shell."""
+    generator = torch.Generator().manual_seed(0)
+    floor = torch.cat([(torch.rand(4000, 2, generator=generator) - 0.5) * 5, torch.zeros(4000, 1)], 1)
+    shell = even_directions(4000)
+    return concatenate(
+        [surfels(floor, UP.repeat(4000, 1), width=0.05, srgb=0.4), surfels(20 * shell, -shell, width=0.7, srgb=0.7)]
+    )
+
+
+@pytest.mark.parametrize(("count", "degree"), [(1, 0), (12, 3)])
+def test_few_views_and_no_bands_give_a_finite_light(count, degree):
+    light = estimate_light(room().with_sh_degree(degree), PLACE, ring(count))
+    assert isinstance(light, EstimatedLight)
+    found = light.light.irradiance(even_directions(50))
+    assert bool(torch.isfinite(found).all())
+    # sRGB 0.7 is 0.448; the seen part of the room is that and the floor's 0.133
+    assert 0.1 * math.pi < float(found.mean()) < 0.9 * math.pi
+
+
+@pytest.mark.parametrize(("field", "value"), [("sh", math.nan), ("sh", -1e30), ("means", math.nan), ("means", 1e30)])
+def test_values_that_are_not_finite_or_huge_leave_the_light_finite(field, value):
+    scene = room()
+    changed = getattr(scene, field).clone()
+    changed[::97] = value
+    light = estimate_light(replace(scene, **{field: changed}), PLACE, ring())
+    assert isinstance(light, EstimatedLight)
+    found = light.light.irradiance(even_directions(50))
+    assert bool(torch.isfinite(found).all())
+    assert float(found.max()) < 100

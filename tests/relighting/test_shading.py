@@ -1,0 +1,411 @@
+"""Shading of objects: normals, nearest neighbours, gloss of materials, one gain for all, pieces of split Gaussians."""
+
+import math
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from shapes import UP, ring, surfels
+
+from splatgraft.composition import compose
+from splatgraft.core import spherical_harmonics
+from splatgraft.core.bounds import BoundingSphere, bounding_sphere
+from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.composite import Composite, PlacedObject
+from splatgraft.core.directions import even_directions
+from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.core.rotations import rotation_from_quaternion
+from splatgraft.core.similarity import Similarity
+from splatgraft.core.spherical_harmonics import basis, colors, dc_from_rgb, rgb_from_dc
+from splatgraft.core.splitting import split_along
+from splatgraft.relighting import RelightOptions, SourceScene, relight
+from splatgraft.relighting.gain import local_gain, mean_light, relight_by_gain
+from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
+from splatgraft.relighting.light.panorama import Panorama, cube_directions
+from splatgraft.relighting.light.samples import sample_light
+from splatgraft.relighting.materials import ReflectedLight, estimate_materials, gloss_bands, reflected_light
+from splatgraft.relighting.nearest_neighbours import nearest_neighbours
+from splatgraft.relighting.normals import estimate_normals
+from splatgraft.relighting.object_views import fuse_normals, object_views
+from splatgraft.relighting.shading import apply_gain
+from splatgraft.rendering import render
+
+ORIGIN = BoundingSphere(torch.zeros(3), 0.5)
+
+
+def blobs(points, width) -> Gaussians:
+    """Round Gaussians, whose own shape tells no normal."""
+    n = len(points)
+    return Gaussians(
+        means=points,
+        log_scales=torch.full((n, 3), math.log(width)),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        opacity_logits=torch.full((n,), 3.0),
+        sh=dc_from_rgb(torch.full((n, 1, 3), 0.5)),
+    )
+
+
+def noisy_ball(noise=0.01, count=1500):
+    """Centres scattered in depth by 2% of the radius, as those of a short reconstruction are."""
+    around = even_directions(count)
+    depth = 0.5 + noise * torch.randn(count, 1, generator=torch.Generator().manual_seed(0))
+    return blobs(depth * around, 0.03), around
+
+
+def all_around(distance=2.5, size=96):
+    poses = look_at(distance * even_directions(16), torch.zeros(3), torch.tensor([0.3, 0.1, 1.0]))
+    return pinhole(poses, 100.0, width=size, height=size)
+
+
+def angles_deg(one, other):
+    return (one * other).sum(1).clamp(-1, 1).acos().rad2deg()
+
+
+def box(half=0.3, count=16) -> tuple[Gaussians, torch.Tensor]:
+    x = torch.linspace(-half, half, count)
+    grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    points, normals = [], []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            face = torch.zeros(len(grid), 3)
+            face[:, [a for a in range(3) if a != axis]] = grid
+            face[:, axis] = sign * half
+            points.append(face)
+            normals.append(torch.eye(3)[axis].mul(sign).expand(len(grid), 3))
+    return blobs(torch.cat(points), 0.6 * 2 * half / count), torch.cat(normals)
+
+
+def test_a_smooth_surface_is_within_the_bound():
+    ball, truth = noisy_ball()
+    neighbours = estimate_normals(ball, all_around())
+    fused = fuse_normals(ball, object_views(ball, ORIGIN, all_around()), neighbours, radius=0.5)
+    assert angles_deg(fused.vectors, truth).median() < 4  # the bound for objects, degrees
+    assert (angles_deg(fused.vectors, truth) < 90).all()
+
+
+def test_depth_keeps_edges_that_neighbours_round_off():
+    body, truth = box()
+    neighbours = estimate_normals(body, all_around())
+    views = object_views(body, bounding_sphere(body), all_around())
+    fused = fuse_normals(body, views, neighbours, radius=0.5)
+    # one Gaussian from the edge: the nearest 16 lie on both faces
+    near = (body.means.abs().sort(1).values[:, 1] > 0.24) & (body.means.abs().sort(1).values[:, 1] < 0.29)
+    before, after = (float(angles_deg(n.vectors, truth)[near].mean()) for n in (neighbours, fused))
+    assert after < 0.8 * before
+
+
+def test_both_sides_of_a_thin_plate_face_outward():
+    x = torch.linspace(-0.4, 0.4, 25)
+    grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    side = torch.tensor([0.03]).expand(len(grid), 1)
+    plate = blobs(torch.cat([torch.cat([grid, side], 1), torch.cat([grid, -side], 1)]), 0.015)
+    truth = torch.cat([side.sign(), -side.sign()]) * torch.tensor([[0.0, 0.0, 1.0]])
+    neighbours = estimate_normals(plate, all_around())
+    fused = fuse_normals(plate, object_views(plate, bounding_sphere(plate), all_around()), neighbours, radius=0.6)
+    inner = (plate.means[:, :2].abs() < 0.3).all(1)
+    assert angles_deg(fused.vectors, truth)[inner].median() < 10  # the blobs' own bumps are a few degrees
+    assert (angles_deg(fused.vectors, truth)[inner] < 90).float().mean() > 0.98
+
+
+def test_without_views_the_estimate_by_neighbours_stays():
+    ball, _ = noisy_ball()
+    away = all_around()
+    away.world_from_camera[:, :3, 3] *= -1  # every camera looks away from the ball
+    views = object_views(ball, ORIGIN, away)
+    assert views == ()
+    neighbours = estimate_normals(ball, all_around())
+    fused = fuse_normals(ball, views, neighbours, radius=0.5)
+    assert torch.allclose(fused.vectors, neighbours.vectors, atol=1e-6)
+    assert torch.equal(fused.confidence, neighbours.confidence)
+
+
+@pytest.mark.parametrize("n", [1, 9, 700])
+def test_neighbours_are_the_nearest(n):
+    generator = torch.Generator().manual_seed(n)
+    # dense clusters, strays far away and repeated points, as captures have them
+    points = torch.randn(n, 3, generator=generator) ** 5
+    points[n // 2 :] *= 1e-3
+    points[: n // 5] = points[n // 5 : 2 * (n // 5)]
+    found = nearest_neighbours(points, count=16)
+    assert found.shape == (n, min(16, n))
+    away = (points[:, None] - points[None]).norm(dim=-1)
+    expected = away.sort(1).values[:, :16]
+    # float32: two parts in 1e7 of the coordinates, up to 1e3
+    assert torch.allclose(away.gather(1, found.long()).sort(1).values, expected, atol=1e-4)
+    assert all(len(set(row)) == len(row) for row in found.tolist())
+
+
+def test_no_points_have_no_neighbours():
+    assert nearest_neighbours(torch.zeros(0, 3), count=16).shape == (0, 0)
+
+
+def test_normals_of_a_ball_point_outwards():
+    around = even_directions(3000)
+    ball = surfels(0.3 * around, around, width=0.01, srgb=torch.full((3000, 3), 0.5))
+    found = estimate_normals(ball, ring())
+    above = around[:, 2] > -0.2  # the cameras do not see the underside
+    # neighbours lie within 3 degrees on the ball
+    assert ((found.vectors * around).sum(1)[above] > math.cos(math.radians(5))).float().mean() > 0.99
+    assert found.confidence[above].mean() > 0.7
+
+
+def test_split_pieces_look_like_the_whole():
+    one = surfels(torch.tensor([[0.0, 0.0, 0.0]]), UP[None], width=0.3, srgb=(0.8, 0.4, 0.2))
+    camera = pinhole(look_at(torch.tensor([[0.0, 0.3, 4.0]]), torch.zeros(3), UP), 160.0, width=96, height=96)
+    for opacity in (0.1, 0.5, 0.9):
+        whole = Gaussians(one.means, one.log_scales, one.quaternions, torch.logit(torch.tensor([opacity])), one.sh)
+        pieces, origin = split_along(whole, torch.tensor([0]))
+        assert torch.equal(origin, torch.zeros(5, dtype=torch.long))
+        a, b = render(whole, camera), render(pieces, camera)
+        # the table errs by up to 0.038 at opacity 0.9; each of five pieces is cut where it falls under 1/255
+        assert (a.alpha - b.alpha).abs().max() < 0.038 + 5 / 255
+        inside = a.alpha > 0.05
+        assert ((a.alpha - b.alpha)[inside] ** 2).mean().sqrt() < 0.02
+        assert torch.equal(pieces.sh, whole.sh.repeat(5, 1, 1))
+
+
+COUNT = 1500
+AROUND = even_directions(COUNT)
+GRAY = torch.tensor([0.2, 0.15, 0.1])
+
+
+def lamp(x, y, z) -> Light:
+    length = math.sqrt(x * x + y * y + z * z)
+    source = LightSource((x / length, y / length, z / length), (2.0, 2.0, 2.0), angular_radius_deg=10.0)
+    return Light(sources=(source,), ambient=fit_ambient(torch.full((3,), 0.3)))
+
+
+def at_ball(light: Light) -> ReflectedLight:
+    samples = sample_light(light)
+    return reflected_light(light, samples, torch.ones(COUNT, len(samples)))
+
+
+def glossy_ball(light: Light, reflectance, *, concentration=6.0, dielectric=False) -> Gaussians:
+    """A ball with a lobe as bands of degree 3; directions behind the surface show what those in front do."""
+    views = even_directions(400)
+    cosine = (views @ AROUND.T).T.abs()
+    in_front = views - ((views @ AROUND.T).T + cosine)[..., None] * AROUND[:, None]
+    lobe = at_ball(light).radiance(in_front + 2 * cosine[..., None] * AROUND[:, None], concentration)
+    lobe = lobe * torch.tensor(reflectance)
+    if dielectric:
+        lobe = lobe * (0.04 + 0.96 * (1 - cosine.clamp(0, 1)) ** 5)[..., None]
+    target = srgb_from_linear(GRAY + lobe) - 0.5
+    sh = torch.einsum("vk,nvc->nkc", basis(views, 3), target) * (4 * math.pi / len(views))
+    width = 1.2 * 0.3 * math.sqrt(4 * math.pi / COUNT) / 2
+    return replace(surfels(0.3 * AROUND, AROUND, width=width), opacity_logits=torch.full((COUNT,), 4.0), sh=sh)
+
+
+def materials_of(body: Gaussians, light: Light):
+    cameras = all_around(distance=2.0, size=64)
+    views = object_views(body, bounding_sphere(body), cameras)
+    return estimate_materials(body, AROUND, views, at_ball(light))
+
+
+@pytest.mark.parametrize("concentration", [3.0, 6.0])
+def test_a_lobe_is_found_again(concentration):
+    light = lamp(1, 0, 1)
+    found = materials_of(glossy_ball(light, (0.3, 0.2, 0.1), concentration=concentration), light)
+    # bands of degree 3 hold most of such lobes; belief, pixels and blur each take some of it
+    assert torch.allclose(found.reflectance.median(0).values, torch.tensor([0.3, 0.2, 0.1]), rtol=0.35)
+    assert float(found.concentration.median()) in (concentration / 2, concentration, 2 * concentration)
+    assert not found.dielectric.float().mean() > 0.5
+    assert float((found.matt - GRAY).abs().median()) < 0.25 * float(GRAY.mean())
+
+
+def test_matt_things_stay_matt():
+    light = lamp(1, 0, 1)
+    for body in (
+        glossy_ball(light, (0.0, 0.0, 0.0)),
+        replace(glossy_ball(light, (0.3, 0.3, 0.3)), sh=dc_from_rgb(torch.full((COUNT, 1, 3), 0.4))),
+    ):
+        found = materials_of(body, light)
+        assert float(found.share.max()) < 0.02
+        layer = gloss_bands(body, AROUND, found, at_ball(lamp(-1, 0, 1)), shade=torch.ones(COUNT, 3))
+        assert float(layer.abs().max()) < 0.05
+
+
+def test_noise_that_the_light_does_not_explain_is_no_gloss():
+    light, body = lamp(1, 0, 1), glossy_ball(lamp(1, 0, 1), (0.0, 0.0, 0.0))
+    bands = 0.1 * torch.randn(COUNT, 15, 3, generator=torch.Generator().manual_seed(0))
+    noisy = replace(body, sh=torch.cat([body.sh[:, :1], bands], 1))
+    assert float(materials_of(noisy, light).share.mean()) < 0.05
+
+
+def test_without_a_view_nothing_is_glossy():
+    light = lamp(1, 0, 1)
+    found = estimate_materials(glossy_ball(light, (0.3, 0.3, 0.3)), AROUND, (), at_ball(light))
+    assert not bool(found.glossy.any())
+
+
+def test_a_highlight_moves_to_the_new_light():
+    old, new = lamp(1, 0, 1), lamp(-1, 0, 1)
+    body, truth = glossy_ball(old, (0.3, 0.2, 0.1)), glossy_ball(new, (0.3, 0.2, 0.1))
+    found = materials_of(body, old)
+    layer = gloss_bands(body, AROUND, found, at_ball(new), shade=torch.ones(COUNT, 3))
+    moved = torch.cat([body.sh[:, :1], torch.zeros(COUNT, 15, 3)], 1) + layer
+    for eye in (torch.tensor([1.0, 0.0, 0.5]), torch.tensor([-1.0, 0.0, 0.5])):
+        view = -torch.nn.functional.normalize(eye, dim=0).expand(COUNT, 3)
+        front = (AROUND * -view).sum(1) > 0.3
+
+        def error(sh, view=view, front=front):
+            off = linear_from_srgb(colors(sh, view)) - linear_from_srgb(colors(truth.sh, view))
+            return float((off[front] ** 2).mean())
+
+        # the lobe is known up to belief and blur: a quarter of its amplitude, a sixteenth of the squared error
+        assert error(moved) < 0.15 * error(body.sh)
+
+
+@pytest.mark.parametrize("reflectance", [0.5, 0.0])
+def test_the_report_names_a_mirror(reflectance):
+    # bands of degree 3 hold the mirror image of such a sky exactly, so that the sharpest lobe fits best
+    sky = fit_ambient(torch.full((3,), 0.6))
+    sky[2] += 0.8
+    sky[6] += 0.4
+    light = Light(sources=(), ambient=sky)
+    body = glossy_ball(light, (reflectance,) * 3, concentration=1000.0)
+    cameras = all_around(distance=2.0, size=64)
+    far = surfels(20 * even_directions(500), -even_directions(500), width=0.1)
+    placed = PlacedObject(body, Similarity(1.0, torch.eye(3), torch.zeros(3)))
+    composite = Composite(far, (placed,), torch.zeros(far.count, dtype=torch.bool))
+    source = SourceScene(empty(), cameras, light=light, normals=AROUND)
+    report = relight(
+        composite, cameras, sources=(source,), light=lamp(1, 0, 1), options=RelightOptions(fitted_views=0)
+    ).report
+    assert any("is a mirror, whose reflections are only blurred" in note.text for note in report) == (reflectance > 0)
+
+
+def panorama(radiance, alpha=None, size=16):
+    directions, area = cube_directions(size)
+    alpha = torch.ones(6, size, size) if alpha is None else alpha
+    radiance = torch.as_tensor(radiance).expand(6, size, size, 3)
+    return Panorama(radiance=radiance, alpha=alpha, directions=directions, solid_angles=area)
+
+
+def random_gaussians(n=40, k=16, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=g),
+        log_scales=torch.randn(n, 3, generator=g),
+        quaternions=torch.randn(n, 4, generator=g),
+        opacity_logits=torch.randn(n, generator=g),
+        sh=torch.randn(n, k, 3, generator=g) * 0.05,
+    )
+
+
+def test_uniform_light_gives_the_ratio_of_radiances():
+    found = local_gain(
+        panorama([0.4, 0.4, 0.4]), panorama([0.6, 0.4, 0.3]), source_up=UP, target_up=torch.tensor([0.0, 1, 0])
+    )
+    # float32 sums over 1536 pixels
+    assert torch.allclose(found.gain, torch.tensor([1.5, 1.0, 0.75]), atol=1e-4)
+    assert not found.held_back
+    assert found.source_coverage == pytest.approx(1, abs=1e-5)
+
+
+def test_light_from_above_counts_and_from_straight_below_hardly():
+    directions, _ = cube_directions(32)
+    bright = torch.ones(6, 32, 32, 3)
+    above = panorama(bright * (directions[..., 2:] > 0.8), size=32)
+    below = panorama(bright * (directions[..., 2:] < -0.8), size=32)
+    up_light, down_light = mean_light(above, UP)[0], mean_light(below, UP)[0]
+    # caps of equal size: weights (1 + z)/2 average 0.95 and 0.05
+    assert torch.allclose(up_light / down_light, torch.full((3,), 19.0), rtol=0.15)  # the cap's edge in pixels
+
+
+def test_same_light_changes_no_bit():
+    place = panorama([0.3, 0.5, 0.2])
+    found = local_gain(place, place, source_up=UP, target_up=UP)
+    assert torch.equal(found.gain, torch.ones(3))
+    object_ = random_gaussians()
+    assert torch.equal(apply_gain(object_, found.gain).sh, object_.sh)
+
+
+def test_gains_beyond_the_limits_are_held_back_and_reported():
+    found = local_gain(panorama([0.01, 0.01, 0.01]), panorama([0.9, 0.9, 0.9]), source_up=UP, target_up=UP)
+    assert torch.allclose(found.gain, torch.full((3,), 4.0))
+    assert found.held_back
+    assert "held back" in found.describe()
+    tinted = local_gain(panorama([0.1, 0.1, 0.1]), panorama([0.1, 0.1, 0.001]), source_up=UP, target_up=UP)
+    spread = tinted.gain.log() - tinted.gain.log().mean()
+    assert spread.abs().max() < 2 * math.log(1.6)
+
+
+def test_an_empty_panorama_changes_nothing():
+    nothing = panorama([0.0, 0.0, 0.0], alpha=torch.zeros(6, 16, 16))
+    found = local_gain(nothing, panorama([0.5, 0.5, 0.5]), source_up=UP, target_up=UP)
+    assert torch.equal(found.gain, torch.ones(3))
+    assert found.held_back
+    assert found.source_coverage == 0
+
+
+def test_gain_multiplies_linear_light_of_the_mean_colour():
+    object_, gain = random_gaussians(), torch.tensor([1.4, 0.8, 0.5])
+    before = linear_from_srgb(spherical_harmonics.rgb_from_dc(object_.sh[:, 0]))
+    after = linear_from_srgb(spherical_harmonics.rgb_from_dc(apply_gain(object_, gain).sh[:, 0]))
+    assert torch.allclose(after, before * gain, atol=1e-5)  # float32 powers there and back
+
+
+def test_higher_bands_follow_to_first_order():
+    object_, gain = random_gaussians(), torch.tensor([1.4, 0.8, 0.5])
+    directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    exact = srgb_from_linear(linear_from_srgb(spherical_harmonics.colors(object_.sh, directions)) * gain)
+    found = spherical_harmonics.colors(apply_gain(object_, gain).sh, directions)
+    # deviations are about 0.05 * 1.1 = 0.06 rms, 0.2 at most; the curve's second derivative is under 1 for these gains
+    assert (found - exact).abs().max() < 0.5 * 0.2**2
+    assert (found - exact).abs().mean() < 0.5 * 0.06**2
+
+
+def room(color, *, n=2500, radius=2.0, spread=0.12):
+    return replace(
+        blobs(radius * even_directions(n), spread),
+        opacity_logits=torch.full((n,), 8.0),
+        sh=dc_from_rgb(torch.tensor(color)).repeat(n, 1, 1),
+    )
+
+
+def cameras():
+    eyes = torch.tensor([[1.5, 0.0, 0.5], [0.0, 1.5, 0.5], [-1.5, 0.0, 0.5], [0.0, -1.5, 0.5]])
+    up = torch.tensor([0.0, 0, 1])
+    return pinhole(look_at(eyes, torch.zeros(3), up), 100.0, width=64, height=48)
+
+
+MOVE = Similarity(
+    scale=1.0,
+    rotation=rotation_from_quaternion(torch.tensor([[0.9, 0.0, 0.0, 0.4]]))[0],
+    translation=torch.tensor([0.2, 0.1, 0.0]),
+)
+
+
+def test_the_ratio_of_two_uniform_rooms_is_put_on_the_object():
+    light = torch.tensor([1.5, 1.0, 0.8])
+    source_color = torch.tensor([0.5, 0.5, 0.5])
+    target_color = srgb_from_linear(linear_from_srgb(source_color) * light)
+    thing = room([0.4, 0.5, 0.6], n=200, radius=0.1, spread=0.02)
+    composite = compose(room(target_color.tolist()), [thing], target_from_objects=[MOVE])
+    source = SourceScene(room(source_color.tolist()), cameras())
+    relit, report = relight_by_gain(composite, cameras(), sources=[source])
+    before, after = (linear_from_srgb(rgb_from_dc(c.objects[0].gaussians.sh[:, 0])) for c in (composite, relit))
+    # uniform shells give their colour in every pixel; opacity of 0.9997 and coverage of over 0.99 leave 1%
+    assert torch.allclose(after / before, light.expand(200, 3), rtol=0.01)
+    assert "Exposure and white balance" in report[0].text
+    assert torch.equal(relit.target.sh, composite.target.sh)
+
+
+@pytest.mark.parametrize("scene", [empty(), None])
+def test_an_unknown_or_empty_source_changes_no_bit(scene):
+    thing = room([0.4, 0.5, 0.6], n=200, radius=0.1, spread=0.02)
+    composite = compose(room([0.5, 0.5, 0.5]), [thing, empty()], target_from_objects=[MOVE, MOVE])
+    source = None if scene is None else SourceScene(scene, cameras())
+    relit, report = relight_by_gain(composite, cameras(), sources=[source, None])
+    for field in fields(Gaussians):
+        same = (getattr(c.objects[0].gaussians, field.name) for c in (composite, relit))
+        assert torch.equal(*same)
+    assert all("pasted as it is" in note.text and note.in_doubt for note in report)
+
+
+def test_one_source_per_object_is_required():
+    composite = compose(room([0.5, 0.5, 0.5]), [], target_from_objects=[])
+    assert relight_by_gain(composite, cameras(), sources=[])[1] == ()
+    with pytest.raises(ValueError, match="expected 0 source scenes, found 1"):
+        relight_by_gain(composite, cameras(), sources=[None])
