@@ -19,10 +19,9 @@ from torch import Tensor
 from splatgraft.runtime.files import atomic_write
 
 WRITTEN_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp"})
-IMAGE_SUFFIXES = WRITTEN_SUFFIXES | {".heic", ".heif"}
+_HEIF_SUFFIXES = frozenset({".heic", ".heif"})
+IMAGE_SUFFIXES = WRITTEN_SUFFIXES | _HEIF_SUFFIXES
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-_HEIF_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
-"""At byte 8 of a HEIF file, after `ftyp` (ISO/IEC 23008-12)."""
 _TURNED_SIDEWAYS = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
 _FROM_RIGHT, _FROM_BELOW = (2, 3, 7, 8), (3, 4, 6, 7)
@@ -294,7 +293,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
     """
     if not path.is_file():
         raise ValueError(f"{path}: expected an image file, found none")
-    formats = (*_FORMATS, *_heif_format(path))
+    formats = (*_FORMATS, "HEIF") if _with_heif(path) else _FORMATS
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # odd metadata, and sizes that the next check refuses
@@ -306,24 +305,19 @@ def opened(path: Path) -> Iterator[Image.Image]:
         raise ValueError(f"{path}: expected a readable image, found {type(error).__name__}: {error}") from error
 
 
-def _heif_format(path: Path) -> tuple[str, ...]:
-    """Pillow's name of HEIF where the file is one, with the plugin loaded; else nothing.
+def _with_heif(path: Path) -> bool:
+    """Whether the file is HEIF by its suffix; Pillow's plugin is then loaded.
 
     Raises: ValueError where the plugin is not installed.
     """
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(12)
-    except OSError:
-        return ()  # worded by Pillow's opening
-    if head[4:8] != b"ftyp" or head[8:] not in _HEIF_BRANDS:
-        return ()
+    if path.suffix.lower() not in _HEIF_SUFFIXES:
+        return False
     if find_spec("pillow_heif") is None:
         raise ValueError(f"{path}: expected pillow-heif to read HEIC (pip install 'splatgraft[heic]'), found none")
     import pillow_heif
 
     pillow_heif.register_heif_opener()
-    return ("HEIF",)
+    return True
 
 
 def write_image(path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"]) -> None:

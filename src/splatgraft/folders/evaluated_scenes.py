@@ -17,6 +17,7 @@ from splatgraft.formats import read_cameras, read_gaussians, read_images
 from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.project.layout import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
 from splatgraft.rendering import render
+from splatgraft.runtime.lazy_sequence import LazySequence
 
 _CUT_OBJECT = 0.25
 """What the coverage of an object counts that the picture's rim cuts; set by hand."""
@@ -93,10 +94,6 @@ class EvaluatedScenes:
         color = render(scene, camera).color
         return color[0].cpu().clamp(0, 1)
 
-    def pictures(self, index: int) -> Pictures:
-        """One of the target's views."""
-        return self.pictures_from(self.cameras[index])
-
     def pictures_from(self, camera: Cameras) -> Pictures:
         """One view from any camera."""
         coverage = render(self.composite, camera, features=self.is_object[:, None].float()).features
@@ -109,41 +106,56 @@ class EvaluatedScenes:
         )
 
 
-class TrueViews(Sequence[ComparedView]):
-    """Every view of the truth with renders from the same camera, made when asked for."""
+@dataclass(frozen=True)
+class TrueViews:
+    """The images of a ground truth, matched with those of the target without the object."""
 
-    def __init__(
-        self, scenes: EvaluatedScenes, truth: Path, *, target_capture: Path | None, harmonized: Path | None
-    ) -> None:
+    truth: PosedImages
+    """With the object really there, and a mask for every view."""
+    target: PosedImages
+    backgrounds: tuple[int, ...]
+    """For each view of the truth the index of the target's image of the same name."""
+    harmonized_stems: frozenset[str]
+    """Views that the consolidation used, without suffix."""
+
+    @staticmethod
+    def read(truth: Path, target_capture: Path | None, harmonized: Path | None) -> "TrueViews":
         """Match the views of the truth with the target's.
 
         Raises: ValueError where the truth has no masks or the target no image of the same name.
         """
-        self._scenes, self._truth = scenes, read_images(truth)
+        views = read_images(truth)
         if target_capture is None:
             raise ValueError("--ground-truth: expected --target-capture, the images without the object, found none")
-        if not self._truth.mask_paths or None in self._truth.mask_paths:
+        if not views.mask_paths or None in views.mask_paths:
             raise ValueError(f"{truth}: expected a mask for every view of the ground truth, found some missing")
-        self._target = read_images(target_capture)
-        self._backgrounds = _matched(self._truth, self._target, target_capture)
-        used = read_cameras(harmonized / CAMERAS_FILE).names if harmonized is not None else self._target.cameras.names
-        self._harmonized_stems = {Path(name).stem for name in used}
+        target = read_images(target_capture)
+        places = {Path(name).stem: index for index, name in enumerate(target.cameras.names)}
+        stems = [Path(name).stem for name in views.cameras.names]
+        if missing := [stem for stem in stems if stem not in places]:
+            raise ValueError(
+                f"{target_capture}: expected an image named {missing[0]} as in the ground truth, found none"
+            )
+        used = target.cameras.names if harmonized is None else read_cameras(harmonized / CAMERAS_FILE).names
+        return TrueViews(
+            views, target, tuple(places[stem] for stem in stems), frozenset(Path(name).stem for name in used)
+        )
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the views."""
-        return self._truth.cameras.names
+    def pictures(self, scenes: EvaluatedScenes, index: int) -> Pictures:
+        """One view with its truth."""
+        shown = scenes.pictures_from(self.truth.cameras[index].to(scenes.result.device))
+        held_out = Path(shown.name).stem not in self.harmonized_stems
+        return replace(shown, truth=self.truth.image(index), held_out=held_out)
 
-    def __len__(self) -> int:
-        return len(self._truth)
+    def compared(self, scenes: EvaluatedScenes) -> Sequence[ComparedView]:
+        """Every view with renders from the same camera, made when asked for."""
+        return LazySequence(len(self.truth), lambda index: self._compared(scenes, index))
 
-    def __getitem__(self, index: int) -> ComparedView:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if not 0 <= index < len(self):
-            raise IndexError(index)
-        shown, mask = self.pictures(index), self._truth.mask(index)
+    def _compared(self, scenes: EvaluatedScenes, index: int) -> ComparedView:
+        shown, mask = self.pictures(scenes, index), self.truth.mask(index)
         assert shown.truth is not None
         assert mask is not None
-        background = self._target.image(self._backgrounds[index])
+        background = self.target.image(self.backgrounds[index])
         return ComparedView(
             name=shown.name,
             held_out=shown.held_out,
@@ -152,13 +164,6 @@ class TrueViews(Sequence[ComparedView]):
             background=shown.before,
             truth=Truth(image=shown.truth, background=background, mask=mask),
         )
-
-    def pictures(self, index: int) -> Pictures:
-        """One view with its truth."""
-        camera = self._truth.cameras[index].to(self._scenes.result.device)
-        shown = self._scenes.pictures_from(camera)
-        held_out = Path(shown.name).stem not in self._harmonized_stems
-        return Pictures(**{**vars(shown), "truth": self._truth.image(index), "held_out": held_out})
 
 
 def truth_files(truth: Path | None, target_capture: Path | None) -> tuple[Path, ...]:
@@ -169,12 +174,3 @@ def truth_files(truth: Path | None, target_capture: Path | None) -> tuple[Path, 
             for part in capture_inputs(path, read_images(path), masks=True).values():
                 files += part
     return tuple(files)
-
-
-def _matched(truth: PosedImages, target: PosedImages, folder: Path) -> list[int]:
-    """For each view of the truth the index of the target's view of the same name."""
-    places = {Path(name).stem: index for index, name in enumerate(target.cameras.names)}
-    stems = [Path(name).stem for name in truth.cameras.names]
-    if missing := [stem for stem in stems if stem not in places]:
-        raise ValueError(f"{folder}: expected an image named {missing[0]} as in the ground truth, found none")
-    return [places[stem] for stem in stems]

@@ -2,7 +2,7 @@
 
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import torch
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.evaluation import (
+    ComparedView,
     Report,
     ReportView,
     ReportWarning,
@@ -92,10 +93,13 @@ class Evaluate:
         metrics, missing = None, {}
         truth = None
         if self.ground_truth is not None:
-            truth = TrueViews(scenes, self.ground_truth, target_capture=self.target_capture, harmonized=self.views)
-            metrics, missing = self._measure(truth, context)
-        shown = _spread(len(truth.names if truth else scenes.cameras), self.pictured)
-        pictures = [(truth or scenes.with_width(self.width)).pictures(index) for index in shown]
+            truth = TrueViews.read(self.ground_truth, self.target_capture, self.views)
+            metrics, missing = self._measure(truth.compared(scenes), context)
+        if truth is not None:
+            pictures = [truth.pictures(scenes, index) for index in _spread(len(truth.truth), self.pictured)]
+        else:
+            sized = scenes.with_width(self.width)
+            pictures = [sized.pictures_from(sized.cameras[i]) for i in _spread(len(sized.cameras), self.pictured)]
         changes = [describe_change(p.result, p.copy_paste, p.mask) for p in pictures]
         best = max(pictures, key=lambda p: p.prominence)
         self._write_pictures(folder, best)
@@ -116,14 +120,14 @@ class Evaluate:
         )
         write_report(folder, report, views=(_report_view(p) for p in pictures), turntable=turntable)
 
-    def _measure(self, truth: TrueViews, context: Context) -> tuple[dict, dict[str, str]]:
+    def _measure(self, views: Sequence[ComparedView], context: Context) -> tuple[dict, dict[str, str]]:
         try:
             perceptual, missing = lpips_vgg(self.lpips_weights), {}
         except ValueError as error:
             if self.lpips_weights is not None:
                 raise
             perceptual, missing = None, {"lpips": str(error)}
-        return measure(truth, perceptual), missing
+        return measure(views, perceptual), missing
 
     def _write_pictures(self, folder: Path, best: Pictures) -> None:
         write_image(folder / "before.png", best.before)
