@@ -169,7 +169,6 @@ def measure_view(
 
     Args:
         image: the method's result, sRGB in [0, 1].
-        truth: the ground truth.
         background: the method's render without the object, sRGB in [0, 1].
         perceptual: adds LPIPS. That of a region compares the truth with a copy that has the region's pixels of `image`.
 
@@ -209,9 +208,7 @@ def warp(
     """Warp the second camera's image into the first camera's view.
 
     Args:
-        image: of the second camera.
         depth: of the second camera, along the optical axis; 0 where nothing is hit.
-        cameras: the two cameras.
         into_depth: depth of the first camera.
 
     Returns:
@@ -250,9 +247,7 @@ def disagreement(
 
     Args:
         images: of a method, by index of the view.
-        depths: true depth of all views.
         masks: coverage by the object of all views; pixels within an eighth of the image's width of it are compared.
-        cameras: of all views.
 
     Returns:
         None where no consecutive views have images.

@@ -227,12 +227,6 @@ def run_method(
 ) -> tuple[Path, dict[str, float]]:
     """Run the stale steps of a method on a scene.
 
-    Args:
-        method: The method.
-        scene: The composite and its cameras.
-        settings: Weights, device, length of the paper's consolidation.
-        console: Takes progress and messages.
-
     Returns:
         The resulting scene, a .ply, and the seconds of each of the method's own steps.
 

@@ -117,13 +117,7 @@ def unmeasurable_metrics(folder: Path | None) -> dict[str, str]:
 
 
 def collect_results(run: BenchmarkRun, missing: dict[str, str], failures: list[str]) -> Benchmark:
-    """Read the measured values of all methods on all scenes.
-
-    Args:
-        run: The run.
-        missing: Metrics that were not measured, with the reason.
-        failures: One line per scene that failed as a whole.
-    """
+    """Read the measured values of all methods on all scenes."""
     rows, not_run, floors = [], [f"not run: {line}" for line in failures], []
     counts: set[int] = set()
     for method in run.methods:

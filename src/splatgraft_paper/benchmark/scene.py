@@ -120,11 +120,7 @@ def compose_scene(
     """Reconstruct both captures without the held-out views, segment the object and place it at its true pose.
 
     Args:
-        ground_truth: The files of the scene.
-        work: Folder of all results.
-        options: Of both reconstructions.
         device: Where to segment.
-        console: Takes progress and messages.
 
     Raises:
         ValueError: A part of the scene is missing or damaged.

@@ -39,7 +39,6 @@ def relight_by_irradiance_ratio(
     """Multiply the linear colours of every object by irradiance at its new place over that at its old one.
 
     Args:
-        composite: Target scene and placed objects.
         sources: Per object the scene that it was taken from; None where that is not known.
 
     Returns:
@@ -65,12 +64,7 @@ def relight_by_irradiance_ratio(
 
 
 def project(panorama: Panorama, degree: int = _DEGREE) -> Float[Tensor, "k 3"]:
-    """Coefficients of a panorama's linear radiance; directions that were not captured are as bright as the others.
-
-    Args:
-        panorama: Radiance from all directions.
-        degree: Of the expansion.
-    """
+    """Coefficients of a panorama's linear radiance; directions that were not captured are as bright as the others."""
     weight = panorama.alpha * panorama.solid_angles
     mean = (panorama.radiance * weight[..., None]).sum((0, 1, 2)) / weight.sum().clamp_min(1e-12)
     filled = panorama.radiance * panorama.alpha[..., None] + mean * (1 - panorama.alpha[..., None])
@@ -85,12 +79,7 @@ def irradiance_of(coefficients: Float[Tensor, "k 3"], normals: Float[Tensor, "n 
 
 
 def irradiance_ratio(target: Float[Tensor, "n 3"], source: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Factor on linear colours, floored and limited.
-
-    Args:
-        target: Irradiance at the new place.
-        source: Irradiance at the old place.
-    """
+    """Factor on linear colours, floored and limited."""
     floored = [x.clamp_min(_FLOOR * float(x.mean().clamp_min(1e-8))) for x in (target, source)]
     return (floored[0] / floored[1]).clamp(1 / _MAX_RATIO, _MAX_RATIO)
 

@@ -133,8 +133,6 @@ def evaluate_scene(scene: ExamScene, rows: Sequence[str], picture: Path) -> Scen
     """Make and measure the rows of a scene.
 
     Args:
-        scene: The scene.
-        rows: Names of `ROWS`.
         picture: A .png to write: held-out views one above the other; pasted, the transfer, the one with all ground
             truth, the truth side by side.
     """
@@ -194,10 +192,6 @@ LIGHT_ERRORS = ("rms", "level", "tint", "direction_deg")
 
 def light_errors(estimated: Light, truth: Light) -> dict[str, float]:
     """Measure an estimated light against the true one.
-
-    Args:
-        estimated: The estimate.
-        truth: In the same frame.
 
     Returns:
         `rms`: of log2 of the ratio of gray irradiance over even normals, stops; `level`: its mean, positive where the

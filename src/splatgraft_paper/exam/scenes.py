@@ -62,10 +62,7 @@ def render_scene(which: BenchmarkScene, out: Path, blender_python: Path, *, jobs
     """Render what is missing of a scene.
 
     Args:
-        which: The scene.
         out: Folder of the exam; receives renders/ and scenes/.
-        blender_python: A Python with bpy.
-        jobs: Blender processes at a time.
 
     Returns:
         The scene's folder, as `synth benchmark` lays it out.
@@ -129,8 +126,6 @@ def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: C
     Args:
         folder: As `render_scene` leaves it; without surface.npy no normals are known.
         work: Receives both reconstructions, the object and the composite.
-        options: Of both reconstructions.
-        console: Takes progress.
 
     Raises:
         ValueError: A file is missing or damaged.
@@ -200,7 +195,6 @@ def scenes_in(folders: Sequence[Path], works: Sequence[Path]) -> list[TrainingSc
     """All scenes with known light in folders of exams.
 
     Args:
-        folders: Each holds scenes.
         works: Their reconstructions, in the same order.
     """
     return [
@@ -228,7 +222,6 @@ def seen_surface(surface: Float[Tensor, "m 6"], cameras: Cameras) -> Float[Tenso
 
     Args:
         surface: Positions and unit normals of m points, ten or more per cell.
-        cameras: That the object was captured with.
     """
     points, normals = surface[:, :3], surface[:, 3:]
     middle, size = points.mean(0), float((points - points.mean(0)).norm(dim=1).max())

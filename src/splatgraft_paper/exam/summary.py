@@ -66,25 +66,9 @@ def summary_markdown(results: Sequence[SceneResult]) -> str:
     for metric in METRICS:
         lines = [[r.name, *(_text(r.rows.get(row, {}).get(metric), metric) for row in rows)] for r in results]
         parts.append(f"## {_METRIC_TITLES[metric]}\n\n{_table(['scene', *rows], lines)}")
-    parts.append(f"## Errors of the light\n\n{_light_table(results)}")
     parts.append(f"## Summary\n\n{_rows_table(rows, results)}\n\n{_spread_table(results)}")
     parts.append("## Notes\n\n" + "\n".join(f"- {r.name}: {note}" for r in results for note in r.notes))
     return "\n\n".join(parts) + "\n"
-
-
-def _light_table(results: Sequence[SceneResult]) -> str:
-    head = [
-        "scene",
-        *(f"{place} {name}" for place in ("new", "old") for name in LIGHT_ERRORS),
-        "ratio level",
-        "normals",
-    ]
-    lines = []
-    for r in results:
-        places = [r.light.get(place) or {} for place in ("new", "old")]
-        values = [_text(place.get(name), name) for place in places for name in LIGHT_ERRORS]
-        lines.append([r.name, *values, _text(r.ratio_level, "level"), _text(r.normals_deg, "direction_deg")])
-    return _table(head, lines)
 
 
 def _rows_table(rows: Sequence[str], results: Sequence[SceneResult]) -> str:

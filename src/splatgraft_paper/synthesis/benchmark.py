@@ -169,15 +169,7 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
 
 
 def draw_scene(rng: random.Random, name: str, kind: str, seeds: tuple[int, int], size: BenchmarkSize) -> BenchmarkScene:
-    """Draw the seeds of a scene and its object; those whose scene has no room for the cameras are drawn again.
-
-    Args:
-        rng: Is advanced.
-        name: Of the scene.
-        kind: Of the scene.
-        seeds: First seed and the one behind the last.
-        size: Number of views.
-    """
+    """Draw the seeds of a scene and its object; those whose scene has no room for the cameras are drawn again."""
     while True:
         scene = BenchmarkScene(name, kind, rng.randrange(*seeds), rng.randrange(*seeds))
         try:
@@ -206,10 +198,8 @@ def sparse_points(
 
     Args:
         folder: a rendered take with depth.
-        cameras: of the take.
         count: number of points over all cameras, at most.
         noise: standard deviation of the depth, as a share of it.
-        seed: of the sampling.
 
     Returns:
         Positions in metres and sRGB colours; the sky has no points.
@@ -236,9 +226,7 @@ def gather_capture(rendered: Path, take: str, out: Path, *, passes: tuple[str, .
     """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply.
 
     Args:
-        rendered: Folder of the job.
         take: Its name, with color, and depth where `points` is set.
-        out: Receives the capture.
         passes: Names of folders: images, masks, depth.
         points: Whether sparse points are made of the depths.
     """

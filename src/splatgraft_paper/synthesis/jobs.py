@@ -113,9 +113,7 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
     """Render what is missing in `out`; can be interrupted and repeated.
 
     Args:
-        job: what to render.
         out: receives the pictures, job.json and render.log.
-        blender_python: a Python with bpy.
 
     Raises:
         ValueError: Blender fails; the message has its last error line.

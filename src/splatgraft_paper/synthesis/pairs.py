@@ -125,8 +125,6 @@ def match_statistics(
     """Shift and scale the relit object to the mean and deviation per channel of the object in the scene (Sec. 5.2).
 
     Args:
-        relit: the object in another light, sRGB.
-        target: the object in the scene, sRGB.
         mask: weights of the statistics, in [0, 1].
     """
     weight = mask[..., None] / mask.sum().clamp_min(1e-6)
@@ -146,7 +144,6 @@ def composite(
 
     Args:
         relit: colours of the object, not multiplied by its coverage.
-        background: the scene without the object.
         mask: M, coverage in [0, 1].
     """
     return mask[..., None] * relit + (1 - mask[..., None]) * background
@@ -204,10 +201,6 @@ def find_defect(sample: PairSample) -> str | None:
 
 def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
     """Check every pair and write manifest.jsonl.
-
-    Args:
-        out: folder of the manifest.
-        folders: rendered folders in it.
 
     Returns:
         The number of sound pairs, and the defects of the others.

@@ -211,10 +211,7 @@ def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> 
     """Place five cameras on a random short arc that look at the object's place (paper, Sec. 5.2).
 
     Args:
-        scene: gives bounds and obstacles.
-        place: of the object.
         object_height: metres.
-        seed: of the arc.
 
     Raises:
         ValueError: no free arc is found.
@@ -241,11 +238,7 @@ def capture_cameras(scene: Scene, place: Place, object_height: Number, count: in
     """Place cameras all around the object in three rings of different heights, ordered by ring and azimuth.
 
     Args:
-        scene: gives bounds and obstacles.
-        place: of the object.
         object_height: metres.
-        count: number of cameras.
-        seed: of the jitter.
 
     Raises:
         ValueError: too little of the surroundings is free.

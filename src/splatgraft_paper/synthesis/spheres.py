@@ -44,8 +44,6 @@ def render_spheres(seed: int, *, width: int, height: int, lights: int) -> Sphere
 
     Args:
         seed: of places, colours and suns.
-        width: pixels.
-        height: pixels.
         lights: suns besides that of the scene.
     """
     rng = np.random.default_rng(seed)

@@ -136,7 +136,6 @@ def match_views(wanted: Sequence[str], found: dict[str, Path]) -> tuple[dict[str
     """Which picture of a method shows which view.
 
     Args:
-        wanted: Names of all views, in their order.
         found: The method's pictures by stem, in their order.
 
     Returns:

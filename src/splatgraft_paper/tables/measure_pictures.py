@@ -47,8 +47,6 @@ def measure_picture(
 
     Args:
         image: A method's picture of the view, sRGB in [0, 1].
-        known: Of the same view.
-        perceptual: Adds LPIPS.
 
     Returns:
         With a truth: `psnr_whole`, `ssim_whole`, `ssim_padded_whole`, `flip_whole`, and `lpips_whole` where asked for;

@@ -66,11 +66,7 @@ SCENES = {
 
 
 def published_name(method: str) -> str:
-    """The paper's name of a method whose folder is called `method`; that name itself where it is none of the paper's.
-
-    Args:
-        method: A folder's name, e.g. "gaussian_shader".
-    """
+    """The paper's name of a method by the name of its folder; that name itself where it is none of the paper's."""
     plain = "".join(letter for letter in method.lower() if letter.isalnum())
     return _NAMES.get(plain, method)
 

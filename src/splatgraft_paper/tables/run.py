@@ -87,12 +87,7 @@ def read_measured(scene: PaperScene, method: str, folder: Path, seconds: Mapping
 def pooled_distances(
     steps: Mapping[tuple[Kind, str, str], list[MeasurePictures]], features: Features
 ) -> dict[tuple[Kind, str, str], dict[str, float]]:
-    """FID and KID of a method's pictures of all its scenes against the truth's.
-
-    Args:
-        steps: (kind, pose, method) to the measurements whose pictures are taken together.
-        features: Of the published FID.
-    """
+    """FID and KID of a method's pictures of all its scenes against the truth's."""
     out: dict[tuple[Kind, str, str], dict[str, float]] = {}
     for key, group in steps.items():
         found, wanted = (_features(group, role, features) for role in ("pictures", "truth"))
@@ -143,13 +138,7 @@ class _Found:
 
 
 def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: Console) -> PaperResults:
-    """Measure and run what is missing.
-
-    Args:
-        run: Scenes, methods, settings.
-        not_measured: Metrics whose weights are missing, with the reason.
-        console: Takes progress and messages.
-    """
+    """Measure and run what is missing."""
     found = _Found("lpips" not in not_measured, console)
     for scene in run.scenes:
         composite = scene.folders.get("composite")

@@ -79,8 +79,6 @@ class FluxObjective:
 
         Args:
             folder: the base model's, with transformer/, vae/ and empty_prompt.safetensors.
-            options: of the training.
-            say: receives how many layers are adapted.
 
         Raises:
             ValueError: a folder is of another kind or broken.

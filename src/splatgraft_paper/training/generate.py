@@ -85,11 +85,8 @@ def generate(
     A sample whose object is too small, too large or not found is recorded in rejected/ and not tried again.
 
     Args:
-        out: folder of the samples.
         plans: candidates, in order.
-        lighting: how they are relit.
         total: number of samples to reach.
-        progress: called after each candidate.
 
     Returns:
         The number of samples in `out`.
@@ -210,10 +207,7 @@ class TextToImage:
         """Move a pipeline to a device.
 
         Args:
-            pipeline: a `FluxPipeline`.
             device: where it runs; its parts stay on the CPU in turn where GPU memory does not suffice.
-            size: width and height of the images, pixels.
-            say: receives a message where parts stay on the CPU.
         """
         self._pipeline, self._size = pipeline, size
         if device.type == "cuda" and torch.cuda.mem_get_info(device)[0] < _PIPELINE_BYTES:

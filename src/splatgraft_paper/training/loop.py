@@ -96,9 +96,6 @@ class LoopOptions:
     def check(self, processes: int) -> int:
         """Check the options.
 
-        Args:
-            processes: number of training processes.
-
         Returns:
             Pairs per process and pass.
 
@@ -196,11 +193,7 @@ def train(
     """Train to the last step, resuming from the folder's last state.
 
     Args:
-        task: what is trained.
-        options: of the loop.
         folder: receives states/, validation/ and log.jsonl.
-        say: receives messages.
-        progress: called after every step.
 
     Returns:
         The trained weights by name, or their moving average, on the CPU; empty in all but the first of several

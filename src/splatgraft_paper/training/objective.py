@@ -51,7 +51,6 @@ class Objective(Protocol):
 
         Args:
             network: `self.network`, or what calls it.
-            latents: of the batch, for all `roles`.
             seeds: of the noise, one per pair.
         """
         ...
@@ -88,10 +87,7 @@ class LatentCache:
         """Use the cache in `folder`.
 
         Args:
-            folder: the cache.
             encode: the autoencoder: images (b 3 h w), sRGB in [0, 1], to latents.
-            width: of the images, pixels.
-            height: of the images, pixels.
             autoencoder: identifies its weights; part of the cache key.
         """
         self._folder, self._encode = folder, encode
@@ -211,12 +207,8 @@ def train_objective(
     """Train an objective on pairs and write its model.
 
     Args:
-        objective: what is trained.
-        data: pairs.
         out: folder for the model, states, log, latents and validation pictures.
-        options: of the loop.
         base: folder with the autoencoder of the latents.
-        console: takes progress and messages.
 
     Returns:
         The folder of the model; None in all but the first of several processes.
@@ -252,8 +244,6 @@ def save_weights(model: Any, config: Mapping[str, Any], state: Mapping[str, Tens
     the network in training may be split over processes, and it holds the last weights, not their average.
 
     Args:
-        model: the diffusers class.
-        config: of the network.
         state: every weight of it, by name.
         folder: is replaced when all is written.
     """

@@ -226,10 +226,8 @@ def split_mixture(
     """Split folders into training and held-out pairs, by whole groups in the order of their names' hashes.
 
     Args:
-        folders: of pairs.
         weights: relative, one per folder; by the number of training pairs where empty.
         held_out: share of the groups of each folder, at least one group; 0 holds out none.
-        seed: of the drawing.
 
     Returns:
         The training mixture, and the held-out one or None where nothing is held out.
@@ -296,8 +294,6 @@ def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -
     """Open the folders and hold out scenes.
 
     Args:
-        options: the folders.
-        seed: of the drawing.
         recipe: its sources must all be given, and its weights hold where the options have none.
 
     Raises:

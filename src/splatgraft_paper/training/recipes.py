@@ -89,9 +89,6 @@ class Recipe:
     def weights(self, folders: dict[str, int]) -> tuple[float, ...]:
         """The weight of each folder, in the order of `folders`.
 
-        Args:
-            folders: number of folders by option.
-
         Raises:
             ValueError: a source of the recipe has no folder, or a folder belongs to no source of it.
         """
@@ -189,7 +186,6 @@ def parse_image_size(text: str, *, multiple_of: int = 1) -> tuple[int, int]:
     """Parse the value of --size.
 
     Args:
-        text: Such as `704x496`.
         multiple_of: Both sides must be multiples of this, pixels.
 
     Returns:

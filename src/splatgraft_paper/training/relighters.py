@@ -111,10 +111,6 @@ class DiffusionRenderer:
     def __init__(self, checkout: Path, python: Path) -> None:
         """Check an installation.
 
-        Args:
-            checkout: folder of its code.
-            python: interpreter that runs it.
-
         Raises:
             ValueError: a program is missing, or the interpreter does not start.
         """

@@ -61,7 +61,6 @@ class RemovalObjective:
 
         Args:
             base: folder or hub id with unet/, vae/ and empty_prompt.safetensors.
-            say: receives messages on downloads.
             checkpointing: recompute activations in the backward pass instead of keeping them.
 
         Raises:

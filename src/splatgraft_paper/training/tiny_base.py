@@ -62,9 +62,6 @@ def write_tiny_base(
     Args:
         folder: is replaced when all is written.
         pictures: (3 h w), sRGB in [0, 1], all of one size.
-        options: sizes and training.
-        say: receives the sizes and the autoencoder's error.
-        progress: called after every step.
     """
     torch.manual_seed(options.seed)
     autoencoder = _autoencoder(options.autoencoder_widths)

@@ -205,8 +205,6 @@ def compact_loss(
     """Compute the loss.
 
     Args:
-        view: the network's input.
-        output: its prediction.
         truth: the ground truth, linear light.
 
     Returns:

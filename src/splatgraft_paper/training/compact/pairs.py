@@ -57,8 +57,6 @@ class CompactPairs:
         Args:
             pairs: folder that `splatgraft paper synth pairs` rendered.
             priors: folders of `write_priors`, one per variant of the perturbed lights.
-            held_out: which pairs are held out.
-            progress: called after each scene.
 
         Raises:
             ValueError: the manifest or an image is missing or broken, or no pair has a prior.
@@ -216,7 +214,6 @@ def augment(
         view: a batch of one.
         target: the ground truth, linear light.
         size: height and width of the result, pixels.
-        seed: determines the augmentation.
 
     Returns:
         View and target at `size`; the crop contains the whole object.

@@ -86,12 +86,6 @@ def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Pro
 
     Files that exist are kept.
 
-    Args:
-        folders: rendered scenes.
-        out: folder for the files.
-        seed: of the perturbed lights.
-        progress: called after each folder.
-
     Raises:
         ValueError: a folder lacks a file.
     """
@@ -115,10 +109,7 @@ def light_transfer_priors(folder: Path, object_: str, lights: list[str], *, seed
     """Compute one prior per light of an object.
 
     Args:
-        folder: a rendered scene.
-        object_: name of the object.
         lights: names of the lights under which it was rendered alone.
-        seed: of the perturbed lights.
 
     Raises:
         ValueError: the folder lacks a file.
@@ -159,11 +150,6 @@ class SurfacePixels:
 def read_pixels(folder: Path, object_: str, cameras: Cameras) -> SurfacePixels:
     """Read the pixels of an object's take and lift them to points by their depth.
 
-    Args:
-        folder: of a rendered scene.
-        object_: name of the object.
-        cameras: of the scene.
-
     Raises:
         ValueError: a file is missing or broken.
     """
@@ -190,9 +176,7 @@ def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussian
     """Read points sampled on a surface as surfels, see `surfels`.
 
     Args:
-        folder: of a rendered scene.
         name: of the object, or `scene`.
-        color: of all surfels, sRGB.
 
     Raises:
         ValueError: the points are missing or broken.
