@@ -1,4 +1,4 @@
-"""The phase Open: what a path is, before anything is made of it, and the way back from a project."""
+"""The phase Open: what a path is before anything is made of it, and how scenes are viewed."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -9,9 +9,7 @@ import pytest
 from editor_pages import opened_page, sends
 from tiny_project import ball, photograph, plane
 
-from splatgraft.editor.page.page import Page
 from splatgraft.editor.project import RenderedViews
-from splatgraft.editor.state_files import read_state
 from splatgraft.folders.input_description import describe_input
 from splatgraft.formats import write_gaussians
 from splatgraft.project.toml_edit import with_keys
@@ -80,28 +78,6 @@ def test_a_project_is_started_only_of_two_usable_paths(inputs: Path, tmp_path: P
             phase._look((str(inputs / "ball.ply"), str(inputs / second)))
             assert phase._start.disabled != usable
         assert "80 Gaussians" in phase._found_source.content
-
-
-def test_there_is_a_way_back_from_a_project_and_back_to_it(page: Page) -> None:
-    context = page.context
-    session, folder = context.require_session(), context.project.file.parent
-    session.change(session.placed_state())
-    kept = {name: (folder / name).read_bytes() for name in ("project.toml", "placement.json")}
-    page.show_phase("Open")
-    phase = cast("Any", page.phases["Open"])
-    phase._ask_back()
-    assert phase._confirm.visible
-    phase._leave_project()
-    assert context.session is None
-    assert context.problem is None
-    # nothing of the old project is left for the next one, but its results
-    assert not (folder / "placement.json").is_file()
-    assert (folder / "target" / "scene" / "scene.ply").is_file()
-    assert phase._again.visible
-    phase._return_to_project()
-    assert {name: (folder / name).read_bytes() for name in kept} == kept
-    assert read_state(context.project.file).objects is not None
-    assert context.require_session().undo()
 
 
 def test_an_opened_project_shows_how_its_scenes_are_viewed(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Ses
         assert picture.std() > 1, kind
     assert session.relighting.is_relit(state)
     assert not session.relighting.is_relit(moved(state))
-    picture, other = (session.pictures.view(kind, state, camera).pixels for kind in ("Copy-paste", "Mask"))
+    picture, other = (session.pictures.view(kind, state, camera).pixels for kind in ("Copy-paste", "Target alone"))
     both = wipe_comparison(picture, other, 0.25)
     assert (both[:, :10] == picture[:, :10]).all()
     assert (both[:, 20:] == other[:, 20:]).all()

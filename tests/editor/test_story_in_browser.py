@@ -16,6 +16,7 @@ from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
 from splatgraft.project.toml_edit import with_keys
 
+DRAFT = "a draft of the light"
 RESULTS = ("object/object.ply", "composite/scene.ply", "relit/scene.ply", "result/scene.ply")
 
 
@@ -107,9 +108,12 @@ def place(window: Window, project: Path) -> None:
     window.page.keyboard.press("Control+z")
     window.until(lambda: len(state_of(project).objects or ()) == 1, what="one object again")
     window.until(lambda: "Light transfer" in window.caption(), what="a preview of the light transfer")
-    # a drag is saved while it lasts
-    window.drag_gizmo((0, -60), lambda: not torch.equal(object_at(project), found), what="a drag in placement.json")
-    window.page.mouse.up()
+
+    def drag_and_release() -> None:
+        window.drag_gizmo((0, -60), lambda: DRAFT in window.caption(), what="a draft of the light")
+        window.page.mouse.up()
+
+    window.act_until(drag_and_release, lambda: not torch.equal(object_at(project), found), what="a saved drag")
     moved = object_at(project)
     # along the object's own vertical, which is the ground's: a plane of noisy Gaussians, level to two degrees
     assert float(moved[2] - found[2]) > 0.01

@@ -1,17 +1,14 @@
-"""What the editor keeps in its own folder: the undo history, and copies of files that could not be read.
+"""The undo history on disk, in the editor's own folder.
 
 Each state is a file named by the hash of its content, and the history is a list of these names. Undo is therefore
 unbounded, needs little memory, and survives the end of the editor.
 """
 
-import contextlib
 import hashlib
 import json
 import os
-import shutil
 from collections import OrderedDict
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -29,9 +26,6 @@ from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
 from splatgraft.runtime.files import atomic_write
 
 _HISTORY_FILE, _STATES_FOLDER = "history.json", "states"
-_GOOD_FILE, _BROKEN_FOLDER, _ASIDE_FOLDER = "project.toml", "broken", "aside"
-_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, EOFError)
-"""What a damaged file may raise."""
 _IN_MEMORY = 20
 """Number of states held in memory; memos recognise such a state by the identity of its parts."""
 
@@ -50,10 +44,6 @@ class History:
     def pushed(self, name: str) -> "History":
         """The history after a new step; undone states are discarded."""
         return History(name, (*self.past, self.present))
-
-    def amended(self, name: str) -> "History":
-        """The history with another present state, without a new step."""
-        return replace(self, present=name)
 
     def undone(self) -> "History":
         """One step back; itself where there is none."""
@@ -90,45 +80,32 @@ class StateStore:
         """The state of that name.
 
         Raises:
-            ValueError: If its file is missing, or is not what was stored.
+            ValueError: If its file is not what was stored.
+            OSError: If its file is missing.
         """
         if name not in self._recent:
             path = self._path(name, ".json")
-            try:
-                content = path.read_bytes()
-                if _name(content) != name:
-                    raise ValueError("other bytes")
-                self._remember(name, self._from_json(json.loads(content)))
-            except _UNREADABLE as error:
-                raise ValueError(f"{path}: expected an earlier state, found {type(error).__name__}: {error}") from error
+            content = path.read_bytes()
+            if _name(content) != name:
+                raise ValueError(f"{path}: expected an earlier state, found other bytes")
+            self._remember(name, self._from_json(json.loads(content)))
         self._recent.move_to_end(name)
         return self._recent[name]
 
     def read_history(self) -> History | None:
-        """Read the history and delete states that are not in it; None where none is stored.
-
-        Raises:
-            ValueError: If the list is invalid.
-        """
-        path = self._folder / _HISTORY_FILE
+        """Read the history and delete states that are not in it; None where none is stored, or it is damaged."""
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-            history = History(str(found["present"]), tuple(map(str, found["past"])), tuple(map(str, found["future"])))
-        except FileNotFoundError:
+            found = json.loads((self._folder / _HISTORY_FILE).read_text(encoding="utf-8"))
+            history = History(found["present"], tuple(found["past"]), tuple(found["future"]))
+            self._remove_unused({history.present, *history.past, *history.future})
+        except (OSError, ValueError, KeyError, TypeError):
             return None
-        except _UNREADABLE as error:
-            raise ValueError(f"{path}: expected a history, found {type(error).__name__}: {error}") from error
-        self._remove_unused({history.present, *history.past, *history.future})
         return history
 
     def save_history(self, history: History) -> None:
         """Write the list of names."""
         with atomic_write(self._folder / _HISTORY_FILE) as stream:
             stream.write(json.dumps(asdict(history)).encode())
-
-    def paths(self) -> tuple[Path, ...]:
-        """The file of the history and the folder of the states."""
-        return self._folder / _HISTORY_FILE, self._folder / _STATES_FOLDER
 
     def _path(self, name: str, suffix: str) -> Path:
         return self._folder / _STATES_FOLDER / f"{name}{suffix}"
@@ -147,12 +124,10 @@ class StateStore:
 
     def _remove_unused(self, used: set[str]) -> None:
         """Delete all states but those in `used`, and all arrays that these do not refer to."""
-        arrays: set[str] = set()
+        arrays: set[str | None] = set()
         for path in (self._path(name, ".json") for name in used):
-            # a state that cannot be read is passed over by undo
-            with contextlib.suppress(*_UNREADABLE):
-                found = json.loads(path.read_text(encoding="utf-8"))
-                arrays |= {str(found["erased"]), str(found["corrections"])}
+            found = json.loads(path.read_text(encoding="utf-8"))
+            arrays |= {found["erased"], found["corrections"]}
         for path in (self._folder / _STATES_FOLDER).glob("*"):
             if path.stem not in used and path.stem not in arrays:
                 path.unlink()
@@ -228,80 +203,6 @@ class StateStore:
             array = torch.from_numpy(content["numbers"])
         self._arrays[id(array)] = (array, name)
         return array
-
-
-class ProjectBackup:
-    """The last project.toml with which the project opened, and files that were set aside."""
-
-    def __init__(self, project: Path) -> None:
-        """Name the project file; nothing is read or written."""
-        self._project, self._folder = project, project.parent / EDITOR_FOLDER
-        self._good, self._aside = self._folder / _GOOD_FILE, self._folder / _ASIDE_FOLDER
-
-    def keep(self) -> None:
-        """Keep the present project.toml as the last good one."""
-        content = self._project.read_bytes()
-        if not self._good.is_file() or self._good.read_bytes() != content:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            with atomic_write(self._good) as stream:
-                stream.write(content)
-
-    def has_good(self) -> bool:
-        """Whether a good project.toml was kept that differs from the present one."""
-        present = self._project.read_bytes() if self._project.is_file() else None
-        return self._good.is_file() and self._good.read_bytes() != present
-
-    def restore(self) -> None:
-        """Put the last good project.toml back; the present one is kept as a copy.
-
-        Raises:
-            ValueError: If none was kept.
-        """
-        if not self._good.is_file():
-            raise ValueError(
-                f"{self._good}: expected a copy of an earlier project.toml, found none; correct the file by hand"
-            )
-        self.copy_broken([self._project])
-        with atomic_write(self._project) as stream:
-            stream.write(self._good.read_bytes())
-
-    def copy_broken(self, files: Iterable[Path]) -> Path:
-        """Copy files into the folder of broken files, in place of earlier copies; returns the folder."""
-        folder = self._folder / _BROKEN_FOLDER
-        folder.mkdir(parents=True, exist_ok=True)
-        for file in files:
-            if file.is_file():
-                shutil.copy2(file, folder / file.name)
-        return folder
-
-    def move_aside(self, files: Iterable[Path]) -> None:
-        """Move the files and folders of the edits out of the project, in place of those moved earlier."""
-        shutil.rmtree(self._aside, ignore_errors=True)
-        for file in files:
-            if file.exists():
-                # the folder of the editor is inside that of the project
-                place = self._aside / file.relative_to(self._project.parent)
-                place.parent.mkdir(parents=True, exist_ok=True)
-                shutil.move(file, place)
-
-    def has_aside(self) -> bool:
-        """Whether a project was moved aside."""
-        return (self._aside / self._project.name).is_file()
-
-    def bring_back(self) -> None:
-        """Put what was moved aside back.
-
-        Raises:
-            ValueError: If there is nothing, or another project has been made meanwhile.
-        """
-        if not self.has_aside() or self._project.is_file():
-            found = "another project" if self._project.is_file() else "none"
-            raise ValueError(f"{self._project}: expected a project that was set aside, found {found}")
-        for file in sorted(path for path in self._aside.rglob("*") if path.is_file()):
-            place = self._project.parent / file.relative_to(self._aside)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.move(file, place)
-        shutil.rmtree(self._aside)
 
 
 def _name(content: bytes) -> str:

@@ -24,8 +24,6 @@ PictureKind = Literal[
     "Light transfer",
     "Result",
     "Target alone",
-    "Mask",
-    "Depth",
     "Shadow layer",
     "Photograph",
     "Source",
@@ -36,8 +34,6 @@ PICTURE_KINDS: tuple[PictureKind, ...] = (
     "Light transfer",
     "Result",
     "Target alone",
-    "Mask",
-    "Depth",
     "Shadow layer",
     "Photograph",
 )
@@ -87,9 +83,6 @@ class Pictures:
                 return Picture(self._photograph(camera))
             if kind == "Shadow layer":
                 return Picture(self._shadow(state, camera, draft=draft))
-            if kind in ("Mask", "Depth"):
-                gaussians, is_object = self._relighting.pasted(self._relighting.composite(state))
-                return Picture(_depth(gaussians, camera) if kind == "Depth" else _mask(gaussians, is_object, camera))
             scene = self._scene(kind, state, draft=draft)
             if budget is not None and scene.count > budget:
                 inputs = (scene, budget)
@@ -172,23 +165,6 @@ def with_badge(pixels: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarra
     patch[:] = patch // 3
     cv2.putText(out, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (235, 235, 235), 1, cv2.LINE_AA)
     return out
-
-
-def _mask(gaussians: Gaussians, is_object: Bool[Tensor, "n"], camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-    features = render(gaussians, camera, outputs=frozenset(), features=is_object[:, None].float()).features
-    return _bytes(features[0].expand(-1, -1, 3))
-
-
-def _depth(gaussians: Gaussians, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-    depth = render(gaussians, camera, outputs=frozenset({"depth"})).depth[0]
-    covered = depth[depth > 0]
-    if not len(covered):
-        return np.zeros((*depth.shape, 3), np.uint8)
-    # reciprocal depth between its 2nd and 98th percentile, so that floaters do not set the range
-    low, high = 1 / float(covered.quantile(0.98)), 1 / float(covered.quantile(0.02))
-    level = ((1 / depth.clamp_min(1e-6) - low) / max(high - low, 1e-9)).clamp(0, 1) * (depth > 0)
-    colored = cv2.applyColorMap((level * 255).byte().numpy(), cv2.COLORMAP_TURBO)
-    return np.ascontiguousarray(colored[..., ::-1])
 
 
 def _drawn(scene: Gaussians, camera: Cameras) -> Picture:

@@ -1,6 +1,5 @@
 """An open project: its edits with undo history, saved after every change, and its scenes, pictures and job."""
 
-import contextlib
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -13,7 +12,7 @@ from torch import Tensor
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.history import History, ProjectBackup, StateStore
+from splatgraft.editor.history import History, StateStore
 from splatgraft.editor.jobs import Jobs, JobState
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.placement import ObjectSize, PlaceableObject
@@ -21,12 +20,15 @@ from splatgraft.editor.project import PROBLEM, ExportPage, Project, ProjectFiles
 from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState, check_state
-from splatgraft.editor.state_files import as_written, find_state, state_files, write_state
+from splatgraft.editor.state_files import as_written, read_state, state_files, write_state
 from splatgraft.exports.export import Layer
 from splatgraft.formats.metric_scale import read_scale, write_scale
 from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.project.layout import EDITOR_FOLDER, Side
 from splatgraft.segmentation import Box, add_correction, apply_corrections
+
+Stamps = tuple[tuple[int, int] | None, ...]
+"""Time and size of each file of the edits; None where there is none."""
 
 
 class Session:
@@ -36,7 +38,7 @@ class Session:
         """Open the project with the edits and the undo history of the last session.
 
         Raises:
-            ValueError: If project.toml is missing or invalid. Other files may be: `notice` names them then.
+            ValueError: If project.toml is missing, or one of the files of the edits is invalid.
         """
         files = project.files()
         if files is None:
@@ -47,59 +49,42 @@ class Session:
         self.relighting = RelitPreview(self.scenes)
         self.pictures = Pictures(self.scenes, self.relighting)
         self.jobs = Jobs(files.root / EDITOR_FOLDER)
-        self.notice: str | None = None
-        """What the user should know of the files; None where all is well."""
         self._store = StateStore(files.root, project_folder=files.file.parent)
-        self._backup = ProjectBackup(files.file)
-        self._backup.keep()
-        found = find_state(files.file)
-        self.state: EditState = found.state
-        """The current edits; `change` replaces them."""
-        self._problems = dict(found.problems)
-        self._opening_is_step = False
-        self.history: History = self._read_history()
-        if self._problems:
-            self.notice = self._problems_text()
         self._stamps = self._read_stamps()
+        self.state: EditState = read_state(files.file)
+        """The current edits; `change` replaces them."""
+        saved, now = self._store.read_history(), self._store.save(self.state)
+        # a change of the files while no editor was open is one more step
+        self.history = History(now) if saved is None else saved if saved.present == now else saved.pushed(now)
+        self._store.save_history(self.history)
         self._composed: tuple[int, tuple[ObjectPlacement, ...]] = (0, ())
         self._lock = threading.RLock()
 
     def change(self, state: EditState) -> None:
-        """Save a new state as one undo step.
+        """Save a new state as one undo step; an unchanged one adds none.
 
         Raises:
             ValueError: If a value is out of its range, the files were changed outside the editor, which loads that
-                change, or cannot be written.
+                change where it can be read, or they cannot be written.
         """
-        # an unchanged state adds no undo step
-        self._save(state, lambda history, name: history if name == history.present else history.pushed(name))
-
-    def amend(self, state: EditState) -> None:
-        """Save a changed state as a part of the present undo step.
-
-        Raises:
-            ValueError: As `change`.
-        """
-        self._save(state, History.amended)
+        check_state(state)
+        with self._lock:
+            state = as_written(state, self.state)
+            name = self._store.save(state)
+            if name != self.history.present:
+                self._apply(self.history.pushed(name), state)
 
     def has_steps(self) -> bool:
         """Whether there is anything to undo or to redo."""
-        return bool(self.history.past or self.history.future or self._problems)
+        return bool(self.history.past or self.history.future)
 
     def undo(self) -> bool:
-        """Go back by one step; False where there is none. A file that could not be read is a step: it is written anew.
+        """Go back by one step; False where there is none.
 
         Raises:
             ValueError: As `change`.
         """
-        with self._lock:
-            # files may have been made unreadable since the last look
-            with contextlib.suppress(ValueError):
-                self.reload()
-            if self._problems and not self._opening_is_step:
-                self._restore_files()
-                return True
-            return self._step(History.undone)
+        return self._step(History.undone)
 
     def redo(self) -> bool:
         """Go forward by one step; False where there is none.
@@ -107,111 +92,42 @@ class Session:
         Raises:
             ValueError: As `change`.
         """
-        with self._lock:
-            return self._step(History.redone)
-
-    def set_aside(self) -> None:
-        """Move project.toml, all edits and their history aside; results stay. The session must not be used again.
-
-        Raises:
-            ValueError: If a job is running.
-        """
-        job = self.job()
-        if job is not None and job.live:
-            raise ValueError(f"{job.title}: expected no job at work, found this one; wait or cancel it")
-        self._backup.move_aside((*state_files(self.files.file), *self._store.paths()))
+        return self._step(History.redone)
 
     def reload(self) -> bool:
         """Load changes made outside the editor as one undo step; whether there were any.
 
         Raises:
-            ValueError: If a file is invalid; once for each change of the files.
+            ValueError: If a file is invalid; nothing is saved until it is corrected.
         """
         with self._lock:
             stamps = self._read_stamps()
             if stamps == self._stamps:
                 return False
-            self._stamps, self._opening_is_step = stamps, False
-            try:
-                found, files = find_state(self.files.file), self.project.files()
-            except ValueError as error:
-                self._problems = {PROBLEM: str(error)}
-                raise ValueError(self._problems_text()) from None
-            self._problems = dict(found.problems)
-            if self._problems:
-                raise ValueError(self._problems_text())
-            self._backup.keep()
-            self.state = found.state
-            name = self._store.save(found.state)
+            self.state, files = read_state(self.files.file), self.project.files()
+            self._stamps = stamps
+            name = self._store.save(self.state)
             if name != self.history.present:
                 self._save_history(self.history.pushed(name))
             self._use_files(files)
             return True
 
-    def _save(self, state: EditState, next_history: Callable[[History, str], History]) -> None:
-        check_state(state)
-        with self._lock:
-            state = as_written(state, self.state)
-            self._apply(next_history(self.history, self._store.save(state)), state)
-
     def _step(self, move: Callable[[History], History]) -> bool:
-        """Move in the history to the next state that can be read."""
-        history = self.history
-        while (moved := move(history)) is not history:
-            history = moved
-            try:
-                state = self._store.read(history.present)
-            except ValueError as error:
-                self.notice = f"{error}; that step is left out"
-                continue
-            self._apply(history, state)
+        with self._lock:
+            history = move(self.history)
+            if history is self.history:
+                return False
+            self._apply(history, self._store.read(history.present))
             return True
-        return False
 
     def _apply(self, history: History, state: EditState) -> None:
-        if history.present == self.history.present and not self._problems:
-            self._save_history(history)
-            return
         if self.reload():
             raise ValueError(
                 f"{self.files.file.name}: changed outside the editor; the change was loaded, please repeat your edit"
             )
-        if PROBLEM in self._problems:
-            raise ValueError(self._problems_text())
-        if self._problems:
-            self._backup.copy_broken(state_files(self.files.file))
-        write_state(self.files.file, None if self._problems else self.state, state)
-        self.state, self._problems, self._stamps = state, {}, self._read_stamps()
-        self._backup.keep()
+        write_state(self.files.file, self.state, state)
+        self.state, self._stamps = state, self._read_stamps()
         self._save_history(history)
-
-    def _restore_files(self) -> None:
-        """Write the present state over files that could not be read, of which copies are kept."""
-        folder = self._backup.copy_broken(state_files(self.files.file))
-        if PROBLEM in self._problems:
-            self._backup.restore()
-        write_state(self.files.file, None, self.state)
-        self.notice = (
-            f"written again as before: {', '.join(sorted(self._problems))}; the unreadable files are in {folder}"
-        )
-        self._problems, self._stamps = {}, self._read_stamps()
-        self._use_files(self.project.files())
-
-    def _problems_text(self) -> str:
-        found = "; ".join(dict.fromkeys(self._problems.values()))
-        return f"{found}. All else is open; Undo puts back what was there before"
-
-    def _read_history(self) -> History:
-        """The saved history, with one more step where the files were changed while no editor was open."""
-        try:
-            saved = self._store.read_history()
-        except ValueError as error:
-            self.notice, saved = f"{error}; the undo history is empty now", None
-        now = self._store.save(self.state)
-        self._opening_is_step = saved is not None and saved.present != now
-        history = History(now) if saved is None else saved.pushed(now) if self._opening_is_step else saved
-        self._store.save_history(history)
-        return history
 
     def _save_history(self, history: History) -> None:
         self.history = history
@@ -221,9 +137,8 @@ class Session:
         if files is not None and files != self.files:
             self.files = self.scenes.files = files
 
-    def _read_stamps(self) -> tuple[tuple[int, int] | None, ...]:
-        files = state_files(self.files.file)
-        return tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in files)
+    def _read_stamps(self) -> Stamps:
+        return stamps_of(self.files.file)
 
     def set_view(self, side: Side, views: RenderedViews) -> None:
         """Set how images of a scene without photographs are rendered; not an undo step.
@@ -236,7 +151,6 @@ class Session:
                 raise ValueError(f"{self.files.file.name}: changed outside the editor; please repeat your edit")
             self.project.set_view(side, views)
             self._stamps = self._read_stamps()
-            self._backup.keep()
             self._use_files(self.project.files())
 
     # the selection in the source
@@ -414,3 +328,9 @@ class Session:
         while reason is not None and (before := reason.removeprefix("waits for ")) in found and before != reason:
             name, reason = before, found[before]
         return None if reason is None else f"{name}: {reason}"
+
+
+def stamps_of(project: Path) -> Stamps:
+    """The present stamps of the edits' files."""
+    files = state_files(project)
+    return tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in files)

@@ -2,8 +2,8 @@
 light.json."""
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,76 +18,51 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.settings import MAX_TEXT_BYTES, read_toml
 
 _CORRECTIONS_FILE, _PROMPTS_FILE = "corrections.npy", "prompts.json"
-_FILES = {"objects": PLACEMENT_FILE, "corrections": _CORRECTIONS_FILE, "prompts": _PROMPTS_FILE, "light": LIGHT_FILE}
-"""Usual file of a field of the state; project.toml holds the others."""
-
-
-@dataclass(frozen=True)
-class FoundState:
-    """What project.toml and the files beside it hold."""
-
-    state: EditState
-    """The edits; what could not be read is as in a project without it."""
-    problems: Mapping[str, str]
-    """One line for each field of the state that could not be read."""
 
 
 def read_state(project: Path) -> EditState:
     """Read the state from project.toml and the files beside it.
 
     Raises:
-        ValueError: If one of these files is invalid.
-    """
-    found = find_state(project)
-    for problem in found.problems.values():
-        raise ValueError(problem)
-    return found.state
-
-
-def find_state(project: Path) -> FoundState:
-    """Read what can be read of the state.
-
-    Raises:
-        ValueError: If project.toml is no TOML, or one of its tables is none.
+        ValueError: If one of these files is invalid; one line that names the file.
     """
     content, folder = read_toml(project), project.parent
     segment, relight, harmonize = (_table(content, name, project) for name in ("segment", "relight", "harmonize"))
-    placement = folder / PLACEMENT_FILE
+    placement, file = folder / PLACEMENT_FILE, project
     given, corrections, prompts = relight.get("given_light"), segment.get("corrections"), segment.get("prompts")
-    readers: dict[str, Callable[[], dict[str, Any]]] = {
-        "objects": lambda: _placed(placement) if placement.is_file() else {},
-        "corrections": lambda: {} if corrections is None else {"corrections": read_corrections(folder / corrections)},
-        "mask_source": lambda: {"mask_source": segment.get("mask_source")},
-        "box": lambda: {} if "box" not in segment else {"box": _six(segment["box"], project)},
-        "keep": lambda: {"keep": segment.get("keep")},
-        "prompts": lambda: {} if prompts is None else {"prompts": read_prompts(folder / prompts)},
-        "light": lambda: {} if given is None else {"light": _light(folder / given)},
-        "weights": lambda: {"weights": _weights(relight, project)},
-        "harmonizer": lambda: {"harmonizer": harmonize.get("method")},
-    }
     values: dict[str, Any] = {}
-    problems: dict[str, str] = {}
-    for name, read in readers.items():
-        try:
-            part = read()
-            check_state(EditState(**part))
-        # a file may hold anything: numbers beyond float's range, a path of the wrong type, nesting without end
-        except (ValueError, OSError, TypeError, ArithmeticError, RecursionError, MemoryError) as error:
-            line = " ".join((str(error) or type(error).__name__).split())
-            problems[name] = line if str(folder) in line else f"{folder / _FILES.get(name, project.name)}: {line}"
-            continue
-        values |= part
-    return FoundState(EditState(**values), problems)
+    # a file may hold anything: numbers beyond float's range, a path of the wrong type, nesting without end
+    try:
+        values |= {key: segment[key] for key in ("mask_source", "keep") if key in segment}
+        values |= {"box": _six(segment["box"], project)} if "box" in segment else {}
+        values |= {"weights": _weights(relight, project), "harmonizer": harmonize.get("method")}
+        if corrections is not None:
+            values["corrections"] = read_corrections(folder / corrections)
+        if prompts is not None:
+            values["prompts"] = read_prompts(folder / prompts)
+        if given is not None:
+            values["light"] = _light(folder / given)
+        check_state(EditState(**values))
+        if placement.is_file():
+            file = placement
+            _check_size(placement)
+            found = read_placement(placement)
+            values |= {"objects": found.objects, "erased": found.erased}
+            check_state(EditState(objects=found.objects))
+    except (ValueError, OSError, TypeError, ArithmeticError, RecursionError, MemoryError) as error:
+        line = " ".join((str(error) or type(error).__name__).split())
+        raise ValueError(line if str(folder) in line else f"{file}: {line}") from error
+    return EditState(**values)
 
 
-def write_state(project: Path, before: EditState | None, after: EditState) -> None:
+def write_state(project: Path, before: EditState, after: EditState) -> None:
     """Update the files from state `before` to state `after`; what both agree on stays untouched.
 
     Files that project.toml refers to are written before it, so that it never refers to a missing file.
 
     Args:
         project: project.toml.
-        before: What the files hold; None where that is not known, and then all is written.
+        before: What the files hold.
         after: What they shall hold.
 
     Raises:
@@ -95,7 +70,7 @@ def write_state(project: Path, before: EditState | None, after: EditState) -> No
     """
 
     def is_new(name: str) -> bool:
-        return before is None or getattr(after, name) is not getattr(before, name)
+        return getattr(after, name) is not getattr(before, name)
 
     folder, old = project.parent, project.read_text(encoding="utf-8")
     text = old
@@ -129,21 +104,27 @@ def as_written(state: EditState, before: EditState) -> EditState:
 
 def state_files(project: Path) -> tuple[Path, ...]:
     """All files that hold the state."""
-    return (project, *(project.parent / name for name in (*_FILES.values(), ERASED_FILE)))
+    return (
+        project,
+        *(
+            project.parent / name
+            for name in (PLACEMENT_FILE, ERASED_FILE, _CORRECTIONS_FILE, _PROMPTS_FILE, LIGHT_FILE)
+        ),
+    )
 
 
-def _changed_keys(before: EditState | None, after: EditState) -> dict[str, dict[str, Any]]:
+def _changed_keys(before: EditState, after: EditState) -> dict[str, dict[str, Any]]:
     """What changes in each table of project.toml; None removes a key."""
-    new, old = _keys(after), {} if before is None else _keys(before)
+    new, old = _keys(after), _keys(before)
     # the file of what was changed may have another name, given by hand
     renewed = {
         key
         for key, field in (("corrections", "corrections"), ("prompts", "prompts"), ("given_light", "light"))
-        if before is not None and getattr(after, field) is not getattr(before, field)
+        if getattr(after, field) is not getattr(before, field)
     }
     changes: dict[str, dict[str, Any]] = {}
     for (table, key), value in new.items():
-        if (table, key) not in old or key in renewed or json.dumps(value) != json.dumps(old[table, key]):
+        if key in renewed or json.dumps(value) != json.dumps(old[table, key]):
             changes.setdefault(table, {})[key] = value
     return changes
 
@@ -170,12 +151,6 @@ def _table(content: Mapping[str, Any], name: str, project: Path) -> Mapping[str,
     if not isinstance(table, dict):
         raise ValueError(f"{project}: expected [{name}] to be a table, found {table!r:.60}")
     return table
-
-
-def _placed(path: Path) -> dict[str, Any]:
-    _check_size(path)
-    found = read_placement(path)
-    return {"objects": found.objects, "erased": found.erased}
 
 
 def _light(path: Path) -> Light:

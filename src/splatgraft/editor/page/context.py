@@ -16,7 +16,7 @@ from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.server import GuardedServer
 from splatgraft.editor.project import Project
 from splatgraft.editor.scene_sample import View, typical_distance
-from splatgraft.editor.session import Session
+from splatgraft.editor.session import Session, Stamps, stamps_of
 from splatgraft.runtime.files import atomic_write
 
 STATUS_ORDER, HISTORY_ORDER, VIEW_ORDER = 1e6, 2e6, 3e6
@@ -62,7 +62,7 @@ class PageContext:
         self.phase = "Open"
         self.session: Session | None = None
         self.problem: str | None = None
-        """Why project.toml could not be opened; None where it could, or where there is none."""
+        """Why the project could not be opened; None where it could, or where there is none."""
         self.refresh: Callable[[], None] = lambda: None
         """Updates the current phase, the preview, the header and the undo buttons."""
         self.reopened: Callable[[], None] = lambda: None
@@ -71,12 +71,12 @@ class PageContext:
         self.on_moved: list[Callable[[], None]] = []
         """Called when the view or the shape of the editing window has changed."""
         self.status = self.gui.add_html("", order=STATUS_ORDER)
-        self._seen: tuple[int, int] | None = None
+        self._seen: Stamps = ()
         self.open_session()
 
     def open_session(self) -> None:
         """Open the project where there is one; what prevents it is kept as `problem`."""
-        self.session, self.problem, self._seen = None, None, self._stamp()
+        self.session, self.problem, self._seen = None, None, stamps_of(self.project.file)
         try:
             if self.project.files() is not None:
                 self.session = Session(self.project)
@@ -90,8 +90,8 @@ class PageContext:
         self.reopened()
 
     def is_corrected(self) -> bool:
-        """Whether a project.toml that could not be opened has changed since."""
-        return self.problem is not None and self._stamp() != self._seen
+        """Whether the files of a project that could not be opened have changed since."""
+        return self.problem is not None and stamps_of(self.project.file) != self._seen
 
     def require_session(self) -> Session:
         """The open project.
@@ -267,7 +267,3 @@ class PageContext:
     def _scene_read(self) -> None:
         if self.is_open and self.session is not None:
             self.refresh()
-
-    def _stamp(self) -> tuple[int, int] | None:
-        file = self.project.file
-        return (file.stat().st_mtime_ns, file.stat().st_size) if file.is_file() else None

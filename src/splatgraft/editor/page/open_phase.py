@@ -7,7 +7,6 @@ from pathlib import Path
 import viser
 
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.editor.history import ProjectBackup
 from splatgraft.editor.page.context import PageContext, note, parse_path
 from splatgraft.editor.placement import Triple
 from splatgraft.editor.project import RenderedViews
@@ -43,7 +42,6 @@ class OpenPhase:
         """Build the controls."""
         self._context, gui = context, context.gui
         self._problem = gui.add_html("", visible=False)
-        self._restore = gui.add_button("Put the last good project.toml back", icon=viser.Icon.HISTORY, visible=False)
         self._help = gui.add_markdown(_HELP)
         self._source = gui.add_text("Object from", "", hint="The capture or scene with the object: a path")
         self._found_source = gui.add_html("")
@@ -61,18 +59,9 @@ class OpenPhase:
         self._looks = {side: gui.add_dropdown(f"Cameras: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}
         self._ups = {side: gui.add_dropdown(f"Up: {side}", tuple(_UPS), visible=False) for side, _ in _SIDES}
         self._other_ups: dict[Side, dict[str, Triple | None]] = {side: {} for side, _ in _SIDES}
-        self._back = gui.add_button("Back: choose other captures", icon=viser.Icon.ARROW_LEFT, color="gray")
-        self._confirm = gui.add_button("Yes, set this project aside", color="red", visible=False)
-        self._again = gui.add_button(
-            "Back to the project that was set aside", icon=viser.Icon.ARROW_LEFT, color="gray", visible=False
-        )
         self._build = gui.add_button("Reconstruct both scenes", icon=viser.Icon.PLAYER_PLAY)
         for field in (self._source, self._target):
             context.on(field, self._look_later)
-        context.on(self._restore, self._restore_project)
-        context.on(self._back, self._ask_back)
-        context.on(self._confirm, self._leave_project)
-        context.on(self._again, self._return_to_project)
         context.on(self._start, self._create)
         for side, _ in _SIDES:
             for control in (self._looks[side], self._ups[side]):
@@ -87,9 +76,8 @@ class OpenPhase:
 
     def refresh(self) -> None:
         """Show the fields of a new project, or the facts of the open one."""
-        session, problem, backup = self._context.session, self._context.problem, self._backup()
+        session, problem = self._context.session, self._context.problem
         self._problem.visible = problem is not None
-        self._restore.visible = problem is not None and backup.has_good()
         if problem is not None:
             self._problem.content = note(
                 f"<b>This project cannot be opened:</b><br>{html.escape(problem)}<br>"
@@ -102,9 +90,7 @@ class OpenPhase:
         for control in (self._help, *fields, self._upload, self._start):
             control.visible = is_new
         self._start.disabled = not all(self._is_usable)
-        self._again.visible = is_new and backup.has_aside()
-        self._confirm.visible = self._confirm.visible and session is not None
-        self._back.visible = self._facts.visible = self._build.visible = session is not None
+        self._facts.visible = self._build.visible = session is not None
         for index, (side, _) in enumerate(_SIDES):
             without_photos = session is not None and session.files.without_photos[index]
             self._looks[side].visible = self._ups[side].visible = without_photos
@@ -152,32 +138,6 @@ class OpenPhase:
         fields = (self._source, self._target, *(self._scenes if path.suffix.lower() in SCENE_SUFFIXES else ()))
         next((field for field in fields if not field.value), fields[-1]).value = str(path)
         self._look_later()
-
-    # another project, and back
-
-    def _backup(self) -> ProjectBackup:
-        return ProjectBackup(self._context.project.file)
-
-    def _restore_project(self) -> None:
-        self._backup().restore()
-        self._context.open_project()
-        if self._context.session is not None:
-            self._context.say("the last project.toml that opened is back; the other one is in .editor/broken")
-
-    def _ask_back(self) -> None:
-        self._confirm.visible = True
-        self._context.say(
-            "the project and its edits are set aside, and its results stay in the folder: nothing is deleted"
-        )
-
-    def _leave_project(self) -> None:
-        self._confirm.visible = False
-        self._context.require_session().set_aside()
-        self._context.open_project()
-
-    def _return_to_project(self) -> None:
-        self._backup().bring_back()
-        self._context.open_project()
 
     # the open project
 

@@ -24,17 +24,6 @@ from splatgraft.editor.sharing import served_file
 
 _POLL_SECONDS = 0.4
 _CURRENT_MARK = "\u25cf "
-_KEYS = (
-    ("1 to 5", "Open, Select, Place, Light, Run"),
-    ("Ctrl+Z, Ctrl+Shift+Z", "undo, redo"),
-    ("Left, Right", "previous and next camera of the scene"),
-    ("B", "Select: brush on or off"),
-    ("Shift and drag", "Select: a rectangle"),
-    ("G", "Place: drop the object to the surface"),
-    ("S", "Place: snap on or off"),
-    ("D, Delete", "Place: duplicate or delete the object"),
-    ("?", "this list"),
-)
 _CSS = """<style>
 div:has(> * > label[for="{steps}"]) {{ display: none; }}
 @media (max-width: 36em) {{
@@ -89,7 +78,6 @@ class Page:
         self._header = gui.add_html("")
         self._notices: dict[int, viser.GuiHtmlHandle] = {}
         self._views: dict[str, tuple[Any, ...]] = {}
-        self._list_of_keys: Any = None
         self._phase_buttons = gui.add_button_group("Step", ("Open", "Select", "Place", "Light", "Run"))
         gui.add_html(_CSS.format(steps=self._phase_buttons._impl.uuid))
         job = self._job = JobPanel(context)
@@ -113,8 +101,6 @@ class Page:
         self._history = gui.add_button_group("History", ("Undo", "Redo"), order=HISTORY_ORDER)
         undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
         redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
-        question: Any = "?"
-        context.on(gui.add_command("List of keys", hotkey=question, modifier="shift"), self._show_keys)
         context.on(self._phase_buttons, lambda: self.show_phase(self._phase_buttons.value.removeprefix(_CURRENT_MARK)))
         context.on(self._history, lambda: self._undo() if self._history.value == "Undo" else self._redo())
         context.on(undo, self._undo)
@@ -171,7 +157,7 @@ class Page:
             end()
 
     def _reopened(self) -> None:
-        """Show a project that has been opened, in the phase that comes next, and say what is wrong with it."""
+        """Show a project that has been opened in the phase that comes next, or say what is wrong with it."""
         session, context = self.context.session, self.context
         self.preview.reset()
         context.view.hide_splats("/")
@@ -180,13 +166,8 @@ class Page:
             self.show_phase("Open")
         else:
             self.show_phase("Place" if files.object.is_file() else "Select")
-        self._say_notice()
-
-    def _say_notice(self) -> None:
-        session = self.context.session
-        notice = self.context.problem if session is None else session.notice
-        if notice is not None:
-            self.context.say(notice, bad=True)
+        if context.problem is not None:
+            context.say(context.problem, bad=True)
 
     def _light_ready(self) -> None:
         """Update the light phase after the preview has estimated the light."""
@@ -194,7 +175,7 @@ class Page:
             if self.context.phase == "Light":
                 self.phases["Light"].refresh()
 
-    # undo and keys
+    # undo
 
     def _undo(self) -> None:
         self._step(Session.undo, "undone", "nothing to undo")
@@ -203,22 +184,7 @@ class Page:
         self._step(Session.redo, "redone", "nothing to redo")
 
     def _step(self, move: Callable[[Session], bool], done: str, nothing: str) -> None:
-        session = self.context.require_session()
-        session.notice = None
-        self.context.say(done if move(session) else nothing)
-        self._say_notice()
-
-    def _show_keys(self) -> None:
-        shown, self._list_of_keys = self._list_of_keys, None
-        if shown is not None:
-            shown.close()
-            return
-        gui = self.context.gui
-        self._list_of_keys = gui.add_modal("Keys")
-        with self._list_of_keys:
-            rows = "\n".join(f"| {key} | {meaning} |" for key, meaning in _KEYS)
-            gui.add_markdown(f"| key | what it does |\n| --- | --- |\n{rows}")
-            self.context.on(gui.add_button("Close"), self._show_keys)
+        self.context.say(done if move(self.context.require_session()) else nothing)
 
     # windows and their views
 
@@ -272,17 +238,17 @@ class Page:
     def _poll_loop(self) -> None:
         while self.context.is_open:
             time.sleep(_POLL_SECONDS)
-            with self.context.lock, self.context.reported():
+            with self.context.lock:
                 self.poll()
 
     def poll(self) -> None:
         """Load what was changed outside the editor, and show how far the job is."""
         context = self.context
-        if context.session is None:
+        with context.reported():
             if context.is_corrected():
                 context.open_project()
-            return
-        if context.session.reload():
-            context.say("the project's files were changed outside the editor and were loaded again")
-            self.refresh()
-        self._job.refresh()
+            if context.session is not None and context.session.reload():
+                context.say("the project's files were changed outside the editor and were loaded again")
+                self.refresh()
+        with context.reported():
+            self._job.refresh()

@@ -1,7 +1,6 @@
 """The phase `Place`: place objects in the target by gizmo, numbers and named operations; erase parts of the target."""
 
 import html
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -36,8 +35,6 @@ from splatgraft.segmentation import Box
 
 _NO_NAMES: tuple[str, ...] = ("1",)
 """Options of a dropdown while there is nothing to choose."""
-_SAVE_EVERY = 0.25
-"""Seconds between saves during a drag."""
 _SNAP_NEAR = 0.5
 """Distance from the surface, over the object's height, within which a drag ends on it."""
 _SCALES = ("its capture", "the place")
@@ -51,7 +48,7 @@ class PlacePhase:
     def __init__(self, context: PageContext, preview: PreviewPanel) -> None:
         """Build the controls."""
         self._context, self._preview, gui = context, preview, context.gui
-        self._chosen, self._dragging, self._saved = 0, False, 0.0
+        self._chosen, self._dragging = 0, False
         self._shown: Gizmo | None = None
         """What the fields of numbers show; as `SelectPhase._shown_box`."""
         self._note = gui.add_html("", visible=False)
@@ -272,29 +269,23 @@ class PlacePhase:
     # the gizmo
 
     def _dragged(self, placed: Similarity, ended: bool) -> None:
-        """Show and save a placement during a drag; a drag is one undo step and is saved repeatedly while it lasts."""
+        """Show a placement during a drag, and save it at its end, as one undo step."""
         session = self._context.session
         if session is None or self._chosen >= len(session.objects()):
             return
+        self._dragging = not ended
         with self._context.reported():
             if ended and self._snap.value:
                 placed = self._snapped_to_surface(session, placed)
-            item = session.objects()[self._chosen]
-            self._context.view.set_transform(f"/target/objects/{self._chosen}", placed)
-            edited = session.placed_state().with_object(self._chosen, replace(item, target_from_object=placed))
+            item = replace(session.objects()[self._chosen], target_from_object=placed)
+            edited = session.placed_state().with_object(self._chosen, item)
             check_state(edited)
-            now = time.monotonic()
-            if not self._dragging:
-                self._dragging, self._saved = True, now
-                self._context.callback(lambda _: session.change(edited))(None)
-            elif ended or now - self._saved > _SAVE_EVERY:
-                self._saved = now
-                session.amend(edited)
-            self._preview.set_dragged_state(None if ended else edited)
+            self._context.view.set_transform(f"/target/objects/{self._chosen}", placed)
+            if not ended:
+                self._preview.set_dragged_state(edited)
         if ended:
-            self._dragging = False
+            self._context.callback(lambda _: session.set_placement(self._chosen, placed))(None)
             self._preview.set_dragged_state(None)
-            self._context.refresh()
 
     def _snapped_to_surface(self, session: Session, placed: Similarity) -> Similarity:
         """The placement with its foot on the surface below or just above, where there is one near."""
