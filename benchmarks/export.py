@@ -1,13 +1,12 @@
 """Size, seconds and PSNR of every format that `splatgraft export` writes, against the .ply.
 
-`python benchmarks/export.py PROJECT [--chromium] [--copies]`. PROJECT is a project's folder, e.g. of `splatgraft demo`.
+`python benchmarks/export.py PROJECT [--chromium]`. PROJECT is a project's folder, e.g. of `splatgraft demo`.
 PSNR is the mean over eight of the target's views, drawn by our renderer from what our reader finds; of the .html it is
 the picture in Chromium (playwright) against ours, without a network. Sizes of an .html count both scenes and viewer.
-The last line is the scene with band 0 alone. With --copies, 18 jittered copies of the scene are written instead.
+The last line is the scene with band 0 alone.
 """
 
 import io
-import resource
 import shutil
 import sys
 import tempfile
@@ -18,11 +17,11 @@ import numpy as np
 import torch
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.exports.export import ExportOptions, export_scene
 from splatgraft.exports.export_source import ExportSource, first_view
 from splatgraft.folders.export_source import read_export_source
-from splatgraft.formats import read_gaussians, write_gaussians
+from splatgraft.formats import read_gaussians
 from splatgraft.rendering import render
 
 FORMATS = (".ply", ".compressed.ply", ".sog", ".spz", "3.spz", "2.spz", ".splat", ".glb", ".usdz", ".html")
@@ -62,9 +61,6 @@ def page_psnr(path: Path, source: ExportSource) -> tuple[float, float]:
 
 def main() -> None:
     source = read_export_source(Path(sys.argv[1]))
-    if "--copies" in sys.argv:
-        time_copies(source.scene)
-        return
     assert source.cameras is not None
     cameras = source.cameras.spread(VIEWS)
     cameras = cameras.resized(LONGEST_PX / float(cameras.sizes.max()))
@@ -94,28 +90,6 @@ def main() -> None:
             label = f".spz, version {version}" if name.endswith(".spz") else name
             print(f"| `{label}` | {size / 1e6:.2f} | {size / whole:.0%} | {seconds:.1f} | {quality} |", flush=True)
     print(f"band 0 alone: {mean_psnr(source.scene.with_sh_degree(0), truth, cameras):.1f} dB")
-
-
-def copies(scene: Gaussians, count: int) -> Gaussians:
-    """A scene of a size at which time and memory matter; its pictures do not."""
-    generator = torch.Generator().manual_seed(0)
-
-    def jittered(values: torch.Tensor) -> torch.Tensor:
-        return values + 0.02 * torch.randn(values.shape, generator=generator)
-
-    return concatenate([scene.map(jittered) for _ in range(count)])
-
-
-def time_copies(scene: Gaussians) -> None:
-    many = copies(scene, 18)
-    print(f"{many.count:,} Gaussians")
-    with tempfile.TemporaryDirectory() as folder:
-        for suffix in (".compressed.ply", ".sog", ".spz", ".glb"):
-            start, path = time.perf_counter(), Path(folder) / f"scene{suffix}"
-            write_gaussians(path, many)
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-            seconds = time.perf_counter() - start
-            print(f"{suffix}: {seconds:.1f} s, {path.stat().st_size / 1e6:.1f} MB, peak memory so far {peak:.1f} GB")
 
 
 if __name__ == "__main__":

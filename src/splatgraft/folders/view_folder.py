@@ -16,6 +16,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import read_mask, read_rgb, write_image
 from splatgraft.formats import read_cameras, write_cameras
+from splatgraft.formats.json_file import load, number
 from splatgraft.harmonization import HarmonizerInputs
 from splatgraft.project.layout import CAMERAS_FILE
 from splatgraft.runtime.files import atomic_write
@@ -76,8 +77,7 @@ class ViewFolder:
     def files(self) -> tuple[Path, ...]:
         """All files of the folder."""
         pictures = [self.path(name, i) for name in PICTURES for i in range(len(self))]
-        prior = self.folder / _PRIOR_FILE
-        return (self.folder / CAMERAS_FILE, *pictures, *((prior,) if prior.is_file() else ()))
+        return (self.folder / CAMERAS_FILE, *pictures, self.folder / _PRIOR_FILE)
 
     def write(self, index: int, view: HarmonizerInputs) -> None:
         """Write all pictures of one view."""
@@ -113,14 +113,9 @@ class ViewFolder:
         )
 
     def _prior_confidence(self) -> float:
-        """Confidence of the priors' light; 0 in folders of versions that did not write it."""
+        """Confidence of the priors' light."""
         path = self.folder / _PRIOR_FILE
-        if not path.is_file():
-            return 0.0
-        try:
-            return float(json.loads(path.read_text())["trust"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f'{path}: expected {{"trust": 0 to 1}}, found {path.read_text()[:80]!r}') from error
+        return number(path, load(path), "trust")
 
 
 def _normal_from_rgb(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
