@@ -132,6 +132,7 @@ def test_a_run_that_is_killed_ends_as_one_that_was_not(rendered, tmp_path):
         trained("cut", options=replace(QUICK, rate=1.0))
 
 
+@pytest.mark.long
 def test_it_learns_its_training_pairs(rendered, tmp_path):
     pairs = pairs_of(rendered)
     loop = replace(QUICK, steps=200, batch=4, rate=3e-3, ema=0.9, save_every=1000, validate_every=1000)
@@ -169,27 +170,32 @@ def test_the_command_makes_weights_that_the_harmoniser_loads(rendered, tmp_path,
     assert "4 pairs to train on, 4 held out" in capsys.readouterr().err
 
 
-def test_the_shipped_pairs_are_read_with_their_light(tmp_path):
-    shipped = Path(__file__).parents[2] / "data" / "pairs"
-    priors.write_priors([shipped / "kitchen_0001_00001"], tmp_path, seed=0)
-    pairs = CompactPairs(shipped, [tmp_path], NOTHING)
-    assert len(pairs.training) == 10
-    view, truth = pairs.read(0)
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory):
+    """Ten of the shipped pairs with their priors."""
+    folder, out = Path(__file__).parents[2] / "data" / "pairs", tmp_path_factory.mktemp("shipped")
+    priors.write_priors([folder / "kitchen_0001_00001"], out, seed=0)
+    return CompactPairs(folder, [out], NOTHING)
+
+
+@pytest.mark.long
+def test_the_shipped_pairs_are_read_with_their_light(shipped):
+    assert len(shipped.training) == 10
+    view, truth = shipped.read(0)
     # wherever the object is not and casts nothing, background and truth are one render but for its noise
     far = (view.mask == 0) & (view.log_ratio.abs().sum(1, keepdim=True) == 0)
     assert float((view.background - truth).abs().mean(1, keepdim=True)[far].median()) < 0.02
-    assert 0 < pairs.read(0)[0].prior_confidence < 1
+    assert 0 < view.prior_confidence < 1
 
 
-def test_the_shipped_weights_are_those_of_a_training(tmp_path):
+@pytest.mark.long
+def test_the_shipped_weights_are_those_of_a_training(shipped):
     # these pairs were trained on: this tells that the file is whole and fits its features, not how good it is
-    shipped = Path(__file__).parents[2] / "data" / "pairs"
-    priors.write_priors([shipped / "kitchen_0001_00001"], tmp_path, seed=0)
-    pairs, network = CompactPairs(shipped, [tmp_path], NOTHING), read_weights(SHIPPED)
+    network = read_weights(SHIPPED)
     assert SHIPPED.stat().st_size < 10e6
     before = after = 0.0
     for index in range(10):
-        view, truth = pairs.read(index)
+        view, truth = shipped.read(index)
         with torch.no_grad():
             made = apply_output(view, network(view.resized(160, 240).channels()))
         assert made.isfinite().all()
