@@ -9,10 +9,11 @@ import os
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = os.environ["NUMBA_NUM_THREADS"] = "1"
 
+import gc
 import shutil
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,13 @@ def finished_project(tmp_path_factory: pytest.TempPathFactory) -> Path:
             finish_project(root)
             done.touch()
     return root / "project"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _no_open_files() -> Iterator[None]:
+    """Collect garbage behind each module, so that a file left open fails there for certain and not later by chance."""
+    yield
+    gc.collect()
 
 
 @pytest.fixture
