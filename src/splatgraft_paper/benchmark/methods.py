@@ -54,7 +54,7 @@ class Method:
     harmonizer: str | None = None
     """The image model; without one, the prior is the result."""
     loss: Loss = "fourier"
-    """Of the consolidation; `paper` is the paper's: 10,000 steps of Adam on LPIPS and L1."""
+    """Loss of the consolidation; `paper` is the paper's: 10,000 steps of Adam on LPIPS and L1."""
     schedule: Schedule = "once"
     """Whether views are harmonised again from the consolidated scene (paper, Iterative Dataset Update)."""
     pictures: Path | None = None
@@ -103,7 +103,7 @@ class RelightForBenchmark:
     target: Path
     """The target scene, a .ply."""
     placement: Path
-    """Of the composite."""
+    """The composite's placement file."""
     cameras: Path
     """The target's."""
     surroundings: Path
@@ -155,7 +155,7 @@ class UpdateIteratively:
     """Folder for scene.ply."""
     harmonizer: str = "reinhard"
     loss: Loss = "fourier"
-    """Of the consolidation."""
+    """Loss of the consolidation."""
     schedule: Schedule = "linear"
     weights: Path | None = None
     """Folder of LPIPS's weights."""

@@ -47,7 +47,7 @@ class BenchmarkRun:
     scenes: tuple[GroundTruthScene, ...]
     methods: tuple[Method, ...]
     options: ReconstructOptions
-    """Of the reconstruction of every capture; its device serves all steps."""
+    """Options of the reconstruction of every capture; its device serves all steps."""
     weights: Path | None = None
     """Folder with the weights of LPIPS and Inception."""
     harmonizer_weights: str | None = None

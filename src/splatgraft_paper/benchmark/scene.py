@@ -72,7 +72,7 @@ class ComposedScene:
     from_capture: bool = True
     """Whether the object's own capture is known; without it, the light that the object had is not."""
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """Of the steps that all methods share."""
+    """Seconds of the steps that all methods share."""
 
     @property
     def cameras(self) -> Path:

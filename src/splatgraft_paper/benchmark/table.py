@@ -11,7 +11,7 @@ import numpy as np
 from splatgraft_paper.benchmark.measure import REGIONS
 
 _RESAMPLES = 10_000
-"""Of the bootstrap."""
+"""Resamples of the bootstrap."""
 _FORMATS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "flip": "{:.4f}", "lpips": "{:.4f}", "fid": "{:.1f}", "kid": "{:.4f}"}
 _METRICS = ("psnr", "ssim", "flip", "lpips", "fid", "kid")
 _LESS_IS_BETTER = (
@@ -50,12 +50,12 @@ class Benchmark:
 
     @property
     def methods(self) -> list[str]:
-        """In the order in which they appear."""
+        """Names in the order in which they appear."""
         return list(dict.fromkeys(row.method for row in self.rows))
 
     @property
     def scenes(self) -> list[str]:
-        """In the order in which they appear."""
+        """Names in the order in which they appear."""
         return list(dict.fromkeys(row.scene for row in self.rows))
 
 

@@ -25,7 +25,7 @@ from splatgraft.relighting.shading import apply_gain
 from splatgraft.runtime.note import Note
 
 _DEGREE = 2
-"""Of the expansions: the clamped cosine has no band 3, and little above (Ramamoorthi and Hanrahan 2001)."""
+"""Degree of the expansions: the clamped cosine has no band 3, and little above (Ramamoorthi and Hanrahan 2001)."""
 # limits of the ratio, set by hand; the publication's are not stated
 _FLOOR = 0.05
 """Share of the mean irradiance below which neither irradiance counts: expansions may be near 0 or negative."""

@@ -54,7 +54,7 @@ class Exam:
     work: Path | None = None
     """Folder of the reconstructions, to be shared by runs; OUT/work where not given."""
     iterations: int = 1000
-    """Of each reconstruction."""
+    """Steps of each reconstruction."""
     budget: int = 20_000
     """Gaussians of each reconstruction."""
     rows: tuple[str, ...] = tuple(ROWS)

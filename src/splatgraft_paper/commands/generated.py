@@ -43,7 +43,7 @@ class GeneratedPairs:
     size: str = "704x496"
     """Pixels, WIDTHxHEIGHT, multiples of 16."""
     seed: int = 0
-    """Of the prompts, the pictures and the lights."""
+    """Seed of the prompts, the pictures and the lights."""
     device: Device = "auto"
     """Where to compute."""
 
@@ -94,7 +94,7 @@ class OridaPairs:
     size: str = "704x496"
     """Pixels, WIDTHxHEIGHT; photographs of another shape are cropped to the centre."""
     seed: int = 0
-    """Of the choice and the lights."""
+    """Seed of the choice and the lights."""
 
     def execute(self, console: Console) -> int:
         """Make the missing samples."""

@@ -50,7 +50,7 @@ class SynthPairs:
     lights: int = 3
     """Environment maps per object."""
     seed: int = 0
-    """Of all random choices."""
+    """Seed of all random choices."""
     maps: Path | None = None
     """Folder with .hdr and .exr environment maps; those that come with Blender where not given."""
     models: Path | None = None
@@ -218,7 +218,7 @@ class SynthSpheres:
     size: str = "64x48"
     """Pixels, WIDTHxHEIGHT."""
     seed: int = 0
-    """Of places, colours and suns."""
+    """Seed of places, colours and suns."""
 
     def execute(self, console: Console) -> int:
         """Render the missing scenes."""

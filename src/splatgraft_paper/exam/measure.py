@@ -93,7 +93,7 @@ def _with_truth(row: str, scene: ExamScene) -> tuple[SourceScene, Light | None]:
 LIGHT_ROW = "transfer"
 """The row whose estimates of light and normals are measured."""
 METRICS = {"object": "psnr_object", "whole": "psnr_whole", "shadow": "shadow_ratio_rmse"}
-"""Of a row, and the names that `measure_view` gives them: PSNR in dB twice, and the error of the shadow's strength."""
+"""Values of a row, and their names in `measure_view`: PSNR in dB twice, and the error of the shadow's strength."""
 _PICTURED = ("paste", "transfer", "true-lights-and-normals")
 _OPAQUE = 0.3
 """Opacity above which the normal of a Gaussian is measured."""

@@ -38,7 +38,7 @@ from splatgraft_paper.synthesis.places import KINDS
 _CELLS = 80
 """Width of the image in whose cells surface points are compared; the object takes up half of it or less."""
 _BEHIND = 0.05
-"""Of the object's size: how far behind the nearest point a point is still seen."""
+"""Share of the object's size by which a point may lie behind the nearest one and still count as seen."""
 TRAINING_NUMBER = 0
 """Its scenes are for development; every other number is used for one exam only."""
 SIZE = BenchmarkSize(RenderSize(width=288, height=204, samples=8), views=18)

@@ -46,7 +46,7 @@ class BenchmarkScene:
     name: str
     kind: str
     seed: int
-    """Of the scene; differs from all seeds of training pairs."""
+    """Seed of the scene; differs from all seeds of training pairs."""
     object_seed: int
     pose_deg: float = 0.0
     """The object's rotation about the vertical between source and target."""

@@ -43,10 +43,10 @@ class SurfaceSampling:
 
 @dataclass(frozen=True)
 class Take:
-    """One set of pictures of a job, from all or some of its cameras."""
+    """One set of pictures of a job, from all its cameras; or a measurement."""
 
     name: str
-    """Of its folder."""
+    """Name of the take and of its folder."""
     scene: bool
     """Whether the scene is rendered; without it the background is transparent."""
     object: str = ""
@@ -56,10 +56,6 @@ class Take:
     """Takes of one group share one exposure, computed from the first of them."""
     world: World | None = None
     """Replaces the scene's world."""
-    cameras: tuple[int, ...] | None = None
-    """Indices of cameras; all where None."""
-    stops: float = 0.0
-    """Added to the group's exposure, photographic stops."""
     probe: Vector | None = None
     """Instead of pictures: the light at this point, `0000.npy` (64, 128, 3) and `suns.json`.
 
@@ -91,8 +87,7 @@ class Job:
     def files(self, out: Path) -> Iterator[Path]:
         """List the files that mark finished pictures, one per take and camera."""
         for take in self.takes:
-            all_cameras = range(len(self.cameras)) if take.is_pictures else (0,)
-            for i in all_cameras if take.cameras is None else take.cameras:
+            for i in range(len(self.cameras)) if take.is_pictures else (0,):
                 yield out / take.name / f"{i:04d}.done"
 
     def is_done(self, out: Path) -> bool:

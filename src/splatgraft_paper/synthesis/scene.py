@@ -30,7 +30,6 @@ Pattern = Literal[
     "painting",
     "grass",
     "metal",
-    "glass",
 ]
 Shape = Literal[
     "box", "cushion", "cylinder", "sphere", "turned", "extruded", "blob", "torus", "tuft", "foliage", "model"
@@ -74,7 +73,7 @@ class Part:
     bevel: Number = 0.0
     """Width of rounded edges, metres."""
     seed: int = 0
-    """Of shapes with random details."""
+    """Seed of shapes with random details."""
     path: str = ""
     """model: a .glb, .gltf, .obj or .blend file."""
 

@@ -33,7 +33,7 @@ class OurRun:
     out: Path
     """Folder of all results."""
     options: ReconstructOptions
-    """Of captures that are reconstructed."""
+    """Options of the reconstruction of captures."""
     methods: MethodSettings = field(default_factory=MethodSettings)
 
     @property

@@ -53,7 +53,7 @@ class SamplePlan:
     """One sample to be generated."""
 
     name: str
-    """Of the sample's folder."""
+    """Name of the sample's folder."""
     group: str
     """Samples of one group are held out together."""
     make: Callable[[], UnrelitSample]

@@ -9,9 +9,9 @@ from typing import Any
 
 _FOLDER = Path(__file__).with_name("recipe_files")
 _GPU_SECONDS_PER_PAIR = 48 * 3600 * 4 / (50_000 * 4)
-"""Of FLUX at 704x496 with all weights on an H100: the paper's two days on four for 50K steps of 4 pairs (Sec. 5.3)."""
+"""FLUX at 704x496 with all weights on an H100: the paper's two days on four for 50K steps of 4 pairs (Sec. 5.3)."""
 _REMOVAL_SECONDS_PER_PAIR = 0.08
-"""Of Stable Diffusion 2 at 704x496: 4 x 1.1 TFLOP at the 52 TFLOP/s that the paper's harmoniser reaches by the number
+"""Stable Diffusion 2 at 704x496: 4 x 1.1 TFLOP at the 52 TFLOP/s that the paper's harmoniser reaches by the number
 above. An estimate; the paper gives no time."""
 _PAPER_PIXELS = 704 * 496
 _LATENT_BYTES_PER_PIXEL = 16 / 64 * 2
@@ -23,9 +23,9 @@ class RecipeSource:
     """One source of pairs of a recipe."""
 
     option: str
-    """Of the command line, such as `pairs`."""
+    """Name of its option, such as `pairs`."""
     name: str
-    """In the paper's words."""
+    """The paper's name for it."""
     targets: int
     """Consistent pictures, in the paper."""
     composites: int
@@ -45,10 +45,10 @@ class Recipe:
     processes: int
     """GPUs that the paper used."""
     options: dict[str, Any]
-    """Of the command, by their names there."""
+    """Values of the command's options by name."""
     sources: tuple[RecipeSource, ...]
     licences: dict[str, str]
-    """Of weights and data, by name."""
+    """Licences of weights and data, by name."""
 
     @staticmethod
     def read(name: str) -> "Recipe":
@@ -128,7 +128,7 @@ class TrainingCost:
 
     @property
     def state_bytes(self) -> int:
-        """Of the two states that are kept and the one that is being written: weights, Adam's moments, the average."""
+        """Bytes of two kept states and one that is being written: weights, Adam's moments, the average."""
         return 3 * self.trained * (4 + 8 + 4 * self.ema)
 
 

@@ -34,7 +34,7 @@ class RelightingInput:
     name: str
     image: Float[Tensor, "h w 3"]
     mask: Float[Tensor, "h w"]
-    """Of the object."""
+    """Coverage by the object."""
 
 
 @runtime_checkable

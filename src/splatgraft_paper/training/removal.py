@@ -29,7 +29,7 @@ CONDITIONS = 2
 _SAMPLING_STEPS = 20
 """DDIM steps of a prediction, set by hand."""
 _PARAMETERS = 865_000_000
-"""Of Stable Diffusion 2's UNet."""
+"""Parameters of Stable Diffusion 2's UNet."""
 _MULTIPLE = 64
 """Pixels: 8 of the autoencoder times 8 of the UNet."""
 

@@ -37,10 +37,10 @@ class TinyBaseOptions:
     autoencoder_widths: tuple[int, ...] = (24, 48, 64)
     """Channels of its levels, multiples of 8; each but the first halves the picture."""
     autoencoder_steps: int = 4000
-    """Of parts of pictures, half as wide and half as high."""
+    """Steps on parts of pictures, half as wide and half as high."""
     batch: int = 8
     rate: float = 5e-4
-    """Of Adam, falling to zero along a cosine. With 2e-3 the autoencoder never learns colours."""
+    """Learning rate of Adam, falling to zero along a cosine. With 2e-3 the autoencoder never learns colours."""
     seed: int = 0
 
     @property

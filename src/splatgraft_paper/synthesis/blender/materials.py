@@ -177,7 +177,6 @@ _PATTERNS = {
     "grass": _grass,
     "plain": _plain,
     "metal": _plain,
-    "glass": _plain,
 }
 
 
@@ -193,8 +192,6 @@ def make(name, m):
     rough = tree.node("ShaderNodeMapRange", {"Value": gloss, "To Min": max(0.02, m["roughness"] * 0.85)})
     rough.inputs["To Max"].default_value = min(1.0, m["roughness"] * 1.15)
     tree.set(surface.inputs["Roughness"], rough.outputs["Result"])
-    if m["pattern"] == "glass":
-        surface.inputs["Transmission Weight"].default_value = 1.0
     if m["bump"] > 0:
         bump = tree.node("ShaderNodeBump", {"Strength": m["bump"], "Distance": 0.02, "Height": height})
         tree.set(surface.inputs["Normal"], bump.outputs["Normal"])

@@ -130,7 +130,7 @@ def main(path):
         folder = os.path.join(job["out"], take["name"])
         os.makedirs(folder, exist_ok=True)
         pictures = not (take.get("probe") or take.get("surface"))
-        chosen = take.get("cameras", range(len(cameras)) if pictures else [0])
+        chosen = range(len(cameras)) if pictures else [0]
         todo = [i for i in chosen if not os.path.exists(os.path.join(folder, f"{i:04d}.done"))]
         if not todo:
             continue
@@ -157,7 +157,7 @@ def main(path):
             _done(folder, 0, 0.0)
             continue
         matte = [thing.name for thing in objects.get(take["object"], [])]
-        exposure = _exposure(job, take, cameras) * 2.0 ** take.get("stops", 0.0)
+        exposure = _exposure(job, take, cameras)
         for i in todo:
             begin = time.time()
             arrays = passes.render(cameras[i], take["passes"], matte)

@@ -21,7 +21,7 @@ from splatgraft_paper.training.compact.pairs import CompactPairs, augment, batch
 from splatgraft_paper.training.loop import LoopOptions, Validation
 
 _BETAS = (0.9, 0.99)
-"""Of AdamW."""
+"""Decay of AdamW's moments."""
 _FINAL_RATE = 0.02
 """Learning rate at the last step over the largest."""
 _SHEET_ROWS = 12
