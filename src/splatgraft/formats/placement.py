@@ -70,15 +70,12 @@ def write_placement(path: Path, placement: Placement) -> None:
     """Write placement.json, and erased.npy beside it where anything is erased; both are read back exactly."""
     entries = []
     for item in placement.objects:
-        move, named = item.target_from_object, item.object_path is not None
-        entries.append(
-            ({"object": os.path.relpath(item.object_path, path.parent)} if named else {})
-            | {
-                "scale": move.scale,
-                "rotation": move.rotation.tolist(),
-                "translation": move.translation.tolist(),
-            }
-        )
+        entry: dict[str, Any] = {}
+        if item.object_path is not None:
+            entry["object"] = os.path.relpath(item.object_path, path.parent)
+        move = item.target_from_object
+        entry |= {"scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()}
+        entries.append(entry)
     content: dict[str, Any] = {"objects": entries}
     if placement.erased is not None:
         content["erased"] = _ERASED_FILE
