@@ -19,6 +19,7 @@ from test_state import LIGHT
 
 from splatgraft.editor.page.page import Page
 from splatgraft.editor.page.photo_clicks import PhotoView
+from splatgraft.editor.placement import rescale
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.formats import read_capture
@@ -101,6 +102,9 @@ def test_an_arrow_of_the_light_is_dragged_under_drafts(browser: Any, project: Pa
     # surroundings of one plane are too little to estimate a light from: one is given
     (project.parent / "light.json").write_text(light_to_json(LIGHT))
     project.write_text(with_keys(project.read_text(), "relight", {"given_light": "light.json"}))
+    # a small object has short arrows, which are in view
+    session = Session(Project(project))
+    session.set_placement(0, rescale(session.placeable_object(0), session.objects()[0].target_from_object, 0.15))
 
     def height_of_the_sun() -> float:
         light = state_of(project).light

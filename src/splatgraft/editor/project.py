@@ -19,7 +19,6 @@ from splatgraft.formats import is_scene
 from splatgraft.project.layout import (
     CAMERAS_FILE,
     EDITOR_FOLDER,
-    LIGHT_FILE,
     PLACEMENT_FILE,
     SCENE_FILE,
     SELECTION_FILE,
@@ -74,8 +73,6 @@ class ProjectFiles:
     """The composite's placement.json, which names its objects."""
     relit: Path
     """The composite with the light transfer."""
-    light: Path
-    """light.json as estimated, or as given."""
     result: Path
     """The consolidated scene."""
     report: Path
@@ -132,7 +129,6 @@ class Project:
             selection=layout.object / SELECTION_FILE,
             placement=layout.composite / PLACEMENT_FILE,
             relit=layout.relit / SCENE_FILE,
-            light=layout.relit / LIGHT_FILE,
             result=layout.result / SCENE_FILE,
             report=layout.report,
             without_photos=(_has_no_photos(flow, "source"), _has_no_photos(flow, "target")),

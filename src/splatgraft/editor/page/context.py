@@ -267,3 +267,17 @@ class PageContext:
     def _scene_read(self) -> None:
         if self.is_open and self.session is not None:
             self.refresh()
+
+
+class Phase:
+    """One phase of the editing workflow: its controls and its part of the 3D view."""
+
+    def enter(self) -> None:
+        """Begin what holds while the phase is shown."""
+
+    def leave(self) -> None:
+        """End it, and hide what belongs to the phase alone."""
+
+    def refresh(self) -> None:
+        """Update controls and 3D view to the current state."""
+        raise NotImplementedError

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.directions import tangents
-from splatgraft.editor.page.context import PageContext, note
+from splatgraft.editor.page.context import PageContext, Phase, note
 from splatgraft.editor.page.handles import add_handle
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.session import Session
@@ -33,7 +33,7 @@ _HANDLE_PX = 70.0
 _RING_SEGMENTS = 48
 
 
-class LightPhase:
+class LightPhase(Phase):
     """The controls of the phase, and the light sources in the 3D view."""
 
     def __init__(self, context: PageContext, preview: PreviewPanel) -> None:
@@ -57,9 +57,6 @@ class LightPhase:
         context.on(self._reset, self._reset_to_estimate)
         for slider in self._sliders.values():
             context.on(slider, self._set_weights)
-
-    def enter(self) -> None:
-        """Nothing is to be done once."""
 
     def leave(self) -> None:
         """Hide the light sources."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import viser
 
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.editor.page.context import PageContext, note, parse_path
+from splatgraft.editor.page.context import PageContext, Phase, note, parse_path
 from splatgraft.editor.placement import Triple
 from splatgraft.editor.project import RenderedViews
 from splatgraft.editor.session import Session
@@ -35,7 +35,7 @@ _LOOKS: dict[str, bool] = {"from around": False, "from within": True}
 _TRAINED_HINT = "A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
 
 
-class OpenPhase:
+class OpenPhase(Phase):
     """The controls of the phase."""
 
     def __init__(self, context: PageContext) -> None:
@@ -67,12 +67,6 @@ class OpenPhase:
             for control in (self._looks[side], self._ups[side]):
                 context.on(control, partial(self._set_view, side))
         context.on(self._build, lambda: context.run("reconstruct", "Reconstruct both scenes"))
-
-    def enter(self) -> None:
-        """Nothing is to be done once."""
-
-    def leave(self) -> None:
-        """Nothing of the phase alone is shown."""
 
     def refresh(self) -> None:
         """Show the fields of a new project, or the facts of the open one."""

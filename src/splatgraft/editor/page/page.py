@@ -4,11 +4,11 @@ import html
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import viser
 
-from splatgraft.editor.page.context import HISTORY_ORDER, PageContext, note
+from splatgraft.editor.page.context import HISTORY_ORDER, PageContext, Phase, note
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.light_phase import LightPhase
 from splatgraft.editor.page.open_phase import OpenPhase
@@ -37,22 +37,6 @@ takes the whole width, so that numbers are legible, and less than half of the he
 _WATCH_NOTE = (
     "<b>Read-only:</b> another window edits this project; close it to edit here. The controls below have no effect."
 )
-
-
-class Phase(Protocol):
-    """One phase of the editing workflow: its controls and its part of the 3D view."""
-
-    def enter(self) -> None:
-        """Begin what holds while the phase is shown."""
-        ...
-
-    def leave(self) -> None:
-        """End it, and hide what belongs to the phase alone."""
-        ...
-
-    def refresh(self) -> None:
-        """Update controls and 3D view to the current state."""
-        ...
 
 
 class Page:

@@ -10,7 +10,7 @@ import torch
 import viser
 
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.page.context import PageContext, note, parse_path
+from splatgraft.editor.page.context import PageContext, Phase, note, parse_path
 from splatgraft.editor.page.handles import SNAP_DEGREES, BoxHandles, ObjectGizmo
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.placement import (
@@ -42,7 +42,7 @@ _SAME = 0.002
 """Relative difference below which two sizes count as one."""
 
 
-class PlacePhase:
+class PlacePhase(Phase):
     """The controls of the phase, and the target with its objects in the 3D view."""
 
     def __init__(self, context: PageContext, preview: PreviewPanel) -> None:
@@ -89,9 +89,6 @@ class PlacePhase:
         self._add_key("Duplicate the object", "D", self._duplicate)
         self._add_key("Delete the object", "delete", self._delete)
         self._add_key("Snap on or off", "S", self._toggle_snap)
-
-    def enter(self) -> None:
-        """Nothing is to be done once."""
 
     def leave(self) -> None:
         """Hide the handles."""

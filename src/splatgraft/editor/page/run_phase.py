@@ -10,7 +10,7 @@ import viser
 
 from splatgraft.editor import sharing
 from splatgraft.editor.jobs import JobState
-from splatgraft.editor.page.context import PageContext, note
+from splatgraft.editor.page.context import PageContext, Phase, note
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.page.server import FILES_PREFIX
@@ -26,7 +26,7 @@ _SHOWN_SUFFIXES = (".html", ".png", ".jpg", ".webp", ".gif", ".mp4")
 _PICTURE = "view.png"
 
 
-class RunPhase:
+class RunPhase(Phase):
     """The controls of the phase."""
 
     def __init__(self, context: PageContext, preview: PreviewPanel, job: JobPanel) -> None:
@@ -58,9 +58,6 @@ class RunPhase:
         session = self._context.session
         if session is not None and session.files.result.is_file():
             self._preview.show("Copy-paste", "Result")
-
-    def leave(self) -> None:
-        """Nothing of the phase alone is shown."""
 
     def refresh(self) -> None:
         """Update the target, the table of steps and what can be shared."""

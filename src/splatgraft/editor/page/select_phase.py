@@ -9,7 +9,7 @@ from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.page.brush import Brush
-from splatgraft.editor.page.context import PageContext, note
+from splatgraft.editor.page.context import PageContext, Phase, note
 from splatgraft.editor.page.handles import BoxHandles
 from splatgraft.editor.page.photo_clicks import PhotoClicks
 from splatgraft.editor.page.scene_view import TINT, Color, camera_from_viser
@@ -30,7 +30,7 @@ _ADDS: Color = (0.2, 0.9, 0.3)
 _REMOVES: Color = (0.9, 0.1, 0.2)
 
 
-class SelectPhase:
+class SelectPhase(Phase):
     """The controls of the phase, and the source in the 3D view."""
 
     def __init__(self, context: PageContext) -> None:
