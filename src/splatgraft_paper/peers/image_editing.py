@@ -10,7 +10,7 @@ import os
 import urllib.error
 import urllib.request
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -80,35 +80,25 @@ class ImageEditing:
             ValueError: the service fails or returns no image.
         """
         mask = (view.mask > 0.5).float()[..., None].expand(-1, -1, 3)
-        parts: list[Any] = [{"text": PROMPT}]
-        for picture in (view.composite, mask):
-            parts.append({"inline_data": {"mime_type": "image/png", "data": _png(picture)}})
-        answer = self._request({"contents": [{"parts": parts}]})
-        try:
-            made = next(
-                find_part["inlineData"]["data"]
-                for candidate in answer["candidates"]
-                for find_part in candidate["content"]["parts"]
-                if "inlineData" in find_part
-            )
-            image = Image.open(io.BytesIO(base64.b64decode(made))).convert("RGB")
-        except (KeyError, TypeError, StopIteration, OSError, ValueError) as error:
-            found = " ".join(json.dumps(answer).split())[:160]
-            raise ValueError(f"{self.url}: expected a picture in the answer, found {found}") from error
-        height, width = view.mask.shape
-        return Harmonized(resize(torch.from_numpy(np.array(image)).float() / 255, width, height))
-
-    def _request(self, content: dict[str, Any]) -> Any:
+        pictures = [{"inline_data": {"mime_type": "image/png", "data": _png(one)}} for one in (view.composite, mask)]
+        content = json.dumps({"contents": [{"parts": [{"text": PROMPT}, *pictures]}]}).encode()
         headers = {"Content-Type": "application/json", "x-goog-api-key": self.key}
-        request = urllib.request.Request(self.url, json.dumps(content).encode(), headers)
+        answer = ""
         try:
+            request = urllib.request.Request(self.url, content, headers)
             with urllib.request.urlopen(request, timeout=_TIMEOUT_SECONDS) as response:
-                return json.load(response)
+                answer = response.read().decode()
+            parts = [part for one in json.loads(answer)["candidates"] for part in one["content"]["parts"]]
+            made = next(part["inlineData"]["data"] for part in parts if "inlineData" in part)
+            image = Image.open(io.BytesIO(base64.b64decode(made))).convert("RGB")
         except urllib.error.HTTPError as error:
             found = " ".join(error.read().decode(errors="replace").split())[:160]
             raise ValueError(f"{self.url}: expected an answer, found status {error.code}: {found}") from error
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{self.url}: expected an answer, found {error}") from error
+        except (OSError, ValueError, KeyError, TypeError, StopIteration) as error:
+            found = " ".join(answer.split())[:160] or str(error)
+            raise ValueError(f"{self.url}: expected a picture in the answer, found {found}") from error
+        height, width = view.mask.shape
+        return Harmonized(resize(torch.from_numpy(np.array(image)).float() / 255, width, height))
 
 
 def _png(picture: Float[Tensor, "h w 3"]) -> str:

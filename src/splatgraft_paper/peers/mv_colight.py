@@ -124,12 +124,12 @@ def network_input(view: HarmonizerInputs) -> Float[Tensor, "k 7 256 256"]:
 def _reduced(height: int, width: int) -> tuple[int, int]:
     """Rows and columns of the view whose shorter side is `SIDE`."""
     scale = SIDE / min(height, width)
-    return max(SIDE, round(height * scale)), max(SIDE, round(width * scale))
+    return round(height * scale), round(width * scale)
 
 
 def _starts(length: int) -> list[int]:
     """First pixels of evenly spaced squares that cover a side, neighbours overlapping where there are several."""
-    count = 1 if length == SIDE else -(-length // SIDE) if length % SIDE else length // SIDE + 1
+    count = 1 if length == SIDE else length // SIDE + 1
     return [round(i * (length - SIDE) / max(count - 1, 1)) for i in range(count)]
 
 
