@@ -216,7 +216,7 @@ def test_each_level_of_a_schedule_reaches_the_network_with_the_noise_that_belong
     assert isinstance(harmonizer, NoisyStartHarmonizer)
 
     def watched(transformer, latents, level, prompt):
-        seen.append((latents.clone(), float(level[0]), int(transformer.time_text_embed(level * 1000, None)[0])))
+        seen.append((latents.clone(), float(level[0]), int(transformer.time_text_embed(level * 1000, level[None])[0])))
         return velocity(transformer, latents, level, prompt)
 
     monkeypatch.setattr("splatgraft.harmonization.flux.harmonizer.velocity", watched)

@@ -131,6 +131,8 @@ def test_the_machine_does_not_make_a_result_stale(views):
 class Watched:
     """A harmoniser, as its own options, that works only while the next view is read and the last one is written."""
 
+    name = "watched"
+
     def __init__(self, read, written):
         self.read, self.written, self.done = read, written, 0
 

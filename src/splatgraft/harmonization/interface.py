@@ -41,6 +41,7 @@ class Harmonized:
     """Confidence in each pixel, in [0, 1]; None where the harmoniser does not estimate it."""
 
 
+@runtime_checkable
 class Harmonizer(Protocol):
     """An image model that harmonises one view at a time."""
 

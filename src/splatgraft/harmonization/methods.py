@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
 
 
+@runtime_checkable
 class HarmonizerOptions(Protocol):
     """Options of one method; heavy libraries are imported only when they make the harmoniser."""
 
