@@ -42,12 +42,12 @@ def test_a_group_lists_its_commands_and_refuses_others(capsys: pytest.CaptureFix
         assert main([group]) == 2
 
 
-@pytest.mark.parametrize("command", commands())
-def test_each_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as leaving:
-        main([*command.split(), "--help"])
-    assert leaving.value.code == 0
-    assert f"usage: splatgraft {command}" in capsys.readouterr().out
+def test_each_command_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in commands():
+        with pytest.raises(SystemExit) as leaving:
+            main([*command.split(), "--help"])
+        assert leaving.value.code == 0
+        assert f"usage: splatgraft {command}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
