@@ -1,6 +1,7 @@
 """The page without a browser: the real server and page, with the messages that a browser would send."""
 
 import asyncio
+import html
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -134,6 +135,9 @@ def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(page: Page) -> N
     assert {key: slider.value for key, slider in sliders.items()} == asdict(LayerWeights())
     relit = session.relighting.relit(session.placed_state())
     before = session.relighting.scene(session.placed_state())
+    # one plane tells little of the light: what is known of it is said
+    page.refresh()
+    assert (relit.report[0].text if relit.light is None else "Estimated: ") in html.unescape(light._text.content)
     for key, value in (("exposure", 1.0), ("tint", 0.5), ("shadow", 0.25)):
         sends(sliders[key], value)
     assert read_state(session.files.file).weights == LayerWeights(exposure=1.0, tint=0.5, shadow=0.25)

@@ -174,9 +174,8 @@ class Jobs:
     def _read(self) -> JobState | None:
         try:
             found = json.loads((self.folder / _STATE_FILE).read_text())
-            plan = tuple(PlannedStep(**step) for step in found.pop("plan"))
-            texts = {name: tuple(found.pop(name)) for name in ("command", "said")}
-            state = JobState(**found, **texts, plan=plan)
+            found["plan"] = tuple(PlannedStep(**step) for step in found["plan"])
+            state = JobState(**found | {name: tuple(found[name]) for name in ("command", "said")})
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None  # none yet, or of another version
         # a process is signalled by this number: 0 and below would be a group, or all processes

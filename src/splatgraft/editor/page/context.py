@@ -251,8 +251,9 @@ class PageContext:
             view.remove_coarse()
         elif not view.is_shown("/target/scene"):
             sample = scenes.sample(path)
-            is_cut = sample is not None and state.erased is not None
-            view.show_coarse(path, sample.without(state.erased.numpy()) if is_cut else sample)
+            if sample is not None and state.erased is not None:
+                sample = sample.without(state.erased.numpy())
+            view.show_coarse(path, sample)
         objects = state.objects or ()
         for index, item in enumerate(objects):
             file = scenes.object_path(item)

@@ -229,4 +229,4 @@ def _missing_reason(session: Session) -> str:
         return "No object is placed yet: see Place."
     if not session.relighting.is_relit(state):
         return "Estimating the light."
-    return " ".join(session.relighting.relit(state).report)
+    return " ".join(one.text for one in session.relighting.relit(state).report)
