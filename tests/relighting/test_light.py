@@ -272,7 +272,7 @@ def test_a_window_above_its_reflection_on_a_table_may_be_a_source():
     surfaces = receivers(torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) - 0.5)
     problem = radiance_problem(LightEvidence(surfaces, None, around, around, UP))
     (patch,) = problem.patches
-    members = problem.clipped[patch.members]
+    members = problem.clipped[patch]
     assert set(window.nonzero()[:, 0].tolist()) <= set(members.tolist())
     assert float(height[members].min()) > -8.1
 

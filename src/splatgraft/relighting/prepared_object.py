@@ -157,7 +157,7 @@ def prepare_object(
     samples = sample_light(light)
     maps = object_shadow_maps(gaussians, sphere, samples)
     lighting, notes = None, []
-    if source is not None and isinstance(source_light, NoLight):
+    if isinstance(source_light, NoLight):
         notes.append(Note(f"Where object {number} comes from: {source_light.reason}"))
     elif source is not None and source_light is not None:
         estimate = source_light if isinstance(source_light, EstimatedLight) else None

@@ -33,12 +33,12 @@ class ShadeSettings:
     tint_share: float = 0.25
     """Share, in [0, 1], of the mean's tint that is applied: where the old light's tint is found wrong, an object turns
     violet or blue. Chosen on 19 scenes that the light's numbers were not fitted to: 0 and 0.25 are alike, 1 worse."""
-    unknown_share: float = 0.5
-    """Share of the new light's variation that an object of unknown source light takes on; set by hand."""
 
 
+_UNKNOWN_SHARE = 0.5
+"""Share of the new light's variation that an object of unknown source light takes on; set by hand."""
 KNOWN_LIGHTS = ShadeSettings(level_share=1.0, tint_share=1.0)
-"""Where both lights were told: nothing is uncertain."""
+"""Where both lights were given: nothing is uncertain."""
 
 
 def soft_cosine(cosine: Float[Tensor, "n k"], softness: Float[Tensor, "k"]) -> Float[Tensor, "n k"]:
@@ -105,20 +105,15 @@ def light_scale(
     return ((settings.level_share - 1) * gray + (settings.tint_share - 1) * (mean - gray)).exp()
 
 
-def unknown_origin_ratio(
-    target: Float[Tensor, "n 3"],
-    opacities: Float[Tensor, "n"],
-    *,
-    settings: ShadeSettings = ShadeSettings(),
-) -> Float[Tensor, "n 3"]:
+def unknown_origin_ratio(target: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
     """The factor for an object of unknown source light: half of the new light's variation, a mean of 1.
 
     Args:
         target: Linear irradiance at the new place.
         opacities: Weights of the mean, in [0, 1].
-        settings: Limits.
     """
-    log_ratio = settings.unknown_share * _floored(target, opacities, settings).log()
+    settings = ShadeSettings()
+    log_ratio = _UNKNOWN_SHARE * _floored(target, opacities, settings).log()
     return _limited(log_ratio - _mean(log_ratio, opacities), opacities, settings)
 
 

@@ -23,6 +23,14 @@ _MIN_AMBIENT = 1e-3
 
 _MIN_DISTANCE = 1e-4
 """World units; minimum distance of a source in a light.json, whose numbers have four decimals."""
+_SOURCE_NUMBERS = {
+    "angular_radius_deg": (0.0, 90.0),
+    "uncertainty_deg": (0.0, 90.0),
+    "confidence": (0.0, 1.0),
+    "blockers_within": (0.0, math.inf),
+    "distance": (_MIN_DISTANCE, math.inf),
+}
+"""Fields of a source that are one number, and its bounds; a light.json leaves out what is infinite."""
 
 
 @dataclass(frozen=True)
@@ -125,18 +133,12 @@ def fit_ambient(radiance: Float[Tensor, "3"]) -> Float[Tensor, "9 3"]:
 
 def light_to_json(light: Light) -> str:
     """The text of a light.json, which can be changed by hand and read with `light_from_json`."""
-    sources = [
-        {
-            "name": s.name,
-            "direction": [round(float(v), 6) for v in s.direction],
-            "irradiance": [round(float(v), 6) for v in s.irradiance],
-            "angular_radius_deg": round(s.angular_radius_deg, 4),
-            "uncertainty_deg": round(s.uncertainty_deg, 4),
-            "confidence": round(s.confidence, 4),
-        }
-        | {k: round(v, 4) for k, v in _lengths(s).items() if math.isfinite(v)}
-        for s in light.sources
-    ]
+    sources = []
+    for source in light.sources:
+        record = {"name": source.name}
+        record |= {key: [round(float(v), 6) for v in getattr(source, key)] for key in ("direction", "irradiance")}
+        numbers = {key: round(getattr(source, key), 4) for key in _SOURCE_NUMBERS}
+        sources.append(record | {key: value for key, value in numbers.items() if math.isfinite(value)})
     record = {
         "format": FORMAT,
         "sources": sources,
@@ -187,16 +189,7 @@ def light_from_json(text: str, *, name: str = "light.json") -> Light:
 def _source(entry: object, where: str) -> LightSource:
     if not isinstance(entry, dict):
         raise ValueError(f"{where}: expected an object with direction and irradiance, found {entry!r:.60}")
-    known = {
-        "name",
-        "direction",
-        "irradiance",
-        "angular_radius_deg",
-        "uncertainty_deg",
-        "confidence",
-        "blockers_within",
-        "distance",
-    }
+    known = {"name", "direction", "irradiance", *_SOURCE_NUMBERS}
     unknown = sorted(set(entry) - known)
     if unknown:
         raise ValueError(f"{where}: expected only {', '.join(sorted(known))}, found {unknown[0]!r}")
@@ -208,25 +201,13 @@ def _source(entry: object, where: str) -> LightSource:
     name = entry.get("name", "light")
     if not isinstance(name, str):
         raise ValueError(f"{where}.name: expected a text, found {name!r:.60}")
-    return LightSource(
-        direction=(direction[0] / length, direction[1] / length, direction[2] / length),
-        irradiance=(r, g, b),
-        angular_radius_deg=_scalar(entry, "angular_radius_deg", 3.0, (0.0, 90.0), where),
-        uncertainty_deg=_scalar(entry, "uncertainty_deg", 0.0, (0.0, 90.0), where),
-        confidence=_scalar(entry, "confidence", 1.0, (0.0, 1.0), where),
-        name=name,
-        blockers_within=_scalar(entry, "blockers_within", math.inf, (0.0, math.inf), where),
-        distance=_scalar(entry, "distance", math.inf, (_MIN_DISTANCE, math.inf), where),
-    )
-
-
-def _lengths(source: LightSource) -> dict[str, float]:
-    """What a light.json leaves out where it is infinite."""
-    return {"blockers_within": source.blockers_within, "distance": source.distance}
-
-
-def _scalar(entry: dict, key: str, default: float, bounds: tuple[float, float], where: str) -> float:
-    return _numbers([entry[key]], 1, f"{where}.{key}", bounds)[0] if key in entry else default
+    numbers = {
+        key: _numbers([entry[key]], 1, f"{where}.{key}", bounds)[0]
+        for key, bounds in _SOURCE_NUMBERS.items()
+        if key in entry
+    }
+    x, y, z = (v / length for v in direction)
+    return LightSource((x, y, z), (r, g, b), name=name, **numbers)
 
 
 def _numbers(values: object, count: int, where: str, bounds: tuple[float, float]) -> list[float]:

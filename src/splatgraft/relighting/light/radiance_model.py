@@ -111,16 +111,6 @@ class LightEvidence:
 
 
 @dataclass(frozen=True)
-class Patch:
-    """A connected clipped part of the surroundings that may be a source."""
-
-    members: Int[Tensor, "p"]
-    """Positions in `RadianceProblem.clipped`."""
-    size: float
-    """Directions that it covers."""
-
-
-@dataclass(frozen=True)
 class ClippedPrior:
     """The normal density of the logarithms of the x clipped unknowns, given which patches are sources.
 
@@ -163,8 +153,8 @@ class RadianceProblem:
     """Log radiance expected of unseen directions."""
     connected: Bool[Tensor, "x x"]
     """Which clipped directions are of one patch."""
-    patches: tuple[Patch, ...]
-    """Clipped ones above the horizon, largest first."""
+    patches: tuple[Int[Tensor, "p"], ...]
+    """Positions in `clipped` of connected parts that may be sources: those above the horizon, largest first."""
 
     def split(self, x: Float[Tensor, "s"]) -> tuple[Tensor, Tensor, Tensor]:
         """Of a state: level of the unseen sky, the n log radiances, the g log albedos."""
@@ -209,7 +199,7 @@ class RadianceProblem:
         deviation = torch.full((count,), s.surface_sd, dtype=torch.float64)
         for patch, is_source in zip(self.patches, sources, strict=True):
             if is_source:
-                mean[patch.members], deviation[patch.members] = math.log(s.source), s.source_sd
+                mean[patch], deviation[patch] = math.log(s.source), s.source_sd
         if not count:
             return ClippedPrior(mean, torch.zeros(0, 0, dtype=torch.float64))
         covariance = (
@@ -288,15 +278,15 @@ def _patch_labels(clipped: Int[Tensor, "x"], up: Float[Tensor, "3"]) -> Int[Tens
 
 def _patches(
     far: Surroundings, clipped: Int[Tensor, "x"], label: Int[Tensor, "x"], up: Float[Tensor, "3"]
-) -> tuple[Patch, ...]:
+) -> tuple[Int[Tensor, "p"], ...]:
     found = []
     for value in label.unique():
         members = (label == value).nonzero()[:, 0]
         size = float(far.clipped[clipped[members]].sum())
         # members lie all above or all below
         if float(DIRECTIONS[clipped[members[0]]] @ up) > _LOWEST and size > _SMALLEST:
-            found.append(Patch(members, size))
-    return tuple(sorted(found, key=lambda patch: -patch.size))
+            found.append((size, members))
+    return tuple(members for _, members in sorted(found, key=lambda patch: -patch[0]))
 
 
 def start(problem: RadianceProblem, prior: ClippedPrior) -> Float[Tensor, "s"]:

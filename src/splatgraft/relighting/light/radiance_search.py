@@ -138,21 +138,10 @@ def _combinations(problem: RadianceProblem, dark: Float[Tensor, "s"]) -> list[Ma
     return sorted(found, key=lambda maximum: maximum.cost)
 
 
-@dataclass(frozen=True)
-class _LampCosts:
-    """Every unknown made a lamp of every strength: n x f."""
-
-    cost: Float[Tensor, "n f"]
-    """Change of the cost, up to a constant."""
-    radiance: Float[Tensor, "n f"]
-    """Logarithm."""
-    shift: Float[Tensor, "n f"]
-    """Of all log albedos."""
-
-
 def _lamp_costs(
     problem: RadianceProblem, prior: ClippedPrior, state: Float[Tensor, "s"], strengths: tuple[float, ...]
-) -> _LampCosts:
+) -> Float[Tensor, "3 n f"]:
+    """Each unknown made a lamp of each strength: change of the cost up to a constant, log radiance, albedos' shift."""
     p, s = problem, problem.settings
     level, radiances, albedo = p.split(state)
     u, now = len(p.unseen), radiances.exp()
@@ -178,15 +167,14 @@ def _lamp_costs(
             value += s.highlights * torch.log1p(-explained).double()
         value[p.shares < _MIN_SHARE] = math.inf
         columns.append(torch.stack([value, lamp.log(), shift.double()]))
-    found = torch.stack(columns, 2)
-    return _LampCosts(found[0], found[1], found[2])
+    return torch.stack(columns, 2)
 
 
 def _with_lamps(problem: RadianceProblem, base: Maximum, count: int) -> list[Maximum]:
     """The polished states with one more lamp, at the `count` best directions."""
     prior = problem.with_prior(base.sources)
-    costs = _lamp_costs(problem, prior, base.state, _STRENGTHS)
-    left, strength = costs.cost.min(1)
+    costs, radiances, shifts = _lamp_costs(problem, prior, base.state, _STRENGTHS)
+    left, strength = costs.min(1)
     towards = DIRECTIONS[torch.cat([problem.unseen, problem.clipped])]
     found = []
     for _ in range(min(count, len(left))):
@@ -195,8 +183,8 @@ def _with_lamps(problem: RadianceProblem, base: Maximum, count: int) -> list[Max
             break
         left = torch.where(towards @ towards[i] > math.cos(_APART), math.inf, left)
         state = base.state.clone()
-        state[1 + i] = costs.radiance[i, strength[i]]
-        state[1 + len(towards) :] += costs.shift[i, strength[i]]
+        state[1 + i] = radiances[i, strength[i]]
+        state[1 + len(towards) :] += shifts[i, strength[i]]
         found.append(_polished(problem, replace(base, state=state)))
     return found
 
@@ -231,7 +219,7 @@ def _hidden_radiance(problem: RadianceProblem, maximum: Maximum) -> Float[Tensor
         without = maximum.state.clone()
         without[1 + i] = level
         strengths = tuple((float(radiances[i] - level) + torch.linspace(-1, 1, 5)).exp().tolist())
-        value = _lamp_costs(problem, prior, without, strengths).cost[:count].min(1).values
+        value = _lamp_costs(problem, prior, without, strengths)[0, :count].min(1).values
         value = torch.where(towards @ towards[i] > math.cos(_SPREAD), value, math.inf)
         likely = (-(value - value.min()) / problem.settings.temperature).exp()
         energy = shares[i] * (radiances[i].exp() - level.exp())

@@ -73,17 +73,6 @@ class _FittedView:
 
 
 @dataclass(frozen=True)
-class _Scene:
-    """All n Gaussians of a scene, its r receivers first."""
-
-    gaussians: Gaussians
-    widths: Float[Tensor, "n"]
-    """Largest standard deviations, world units."""
-    values: Float[Tensor, "r"]
-    """Of the receivers, before the fit; the others have a value of 1."""
-
-
-@dataclass(frozen=True)
 class _Surfaces:
     """The surfaces that m receivers form."""
 
@@ -142,13 +131,13 @@ def fit_to_views(
         return ratio
     gaussians = concatenate([receivers.gaussians, others.with_sh_degree(receivers.gaussians.sh_degree)])
     values = grey.clamp_min(_DARKEST) ** (1 / _GAMMA)
-    scene = _Scene(gaussians, gaussians.log_scales.max(1).values.exp(), values)
+    widths = gaussians.log_scales.max(1).values.exp()
     surfaces = _Surfaces.of(receivers)
     views = []
     for camera in cameras:
         cut = _cut_to(camera, receivers.gaussians.means[shadowed])
         if cut is not None:
-            found = _view(scene, cut, surfaces, ratio_at=ratio_at)
+            found = _view(gaussians, widths, values, surfaces, cut, ratio_at=ratio_at)
             views += [found] if found is not None else []
     value, slope, known = _solved(values, views)
     wanted, before = value**_GAMMA, ratio.shadow.mean(1).clamp_min(1e-6)
@@ -212,19 +201,21 @@ def _projected(camera: Cameras, points: Float[Tensor, "n 3"]) -> tuple[Float[Ten
 
 
 def _view(
-    scene: _Scene,
-    camera: Cameras,
+    scene: Gaussians,
+    widths: Float[Tensor, "n"],
+    values: Float[Tensor, "r"],
     surfaces: _Surfaces,
+    camera: Cameras,
     *,
     ratio_at: RatioAt,
 ) -> _FittedView | None:
-    """What one camera shows: per pixel, the ratio where its ray meets the receivers' surface."""
-    which, drawn_px = gaussians_in_view(scene.gaussians.means, scene.widths, camera)
-    gaussians = scene.gaussians.select(which)
+    """What one camera shows of a scene, receivers first: per pixel the ratio where its ray meets their surface."""
+    which, drawn_px = gaussians_in_view(scene.means, widths, camera)
+    gaussians = scene.select(which)
     weights = view_operator(gaussians, camera)
     receivers = which[: int((which < len(surfaces.points)).sum())]
     features, first = torch.zeros(len(which), 5), slice(len(receivers))
-    features[:, 0], features[first, 0] = 1, scene.values[receivers]
+    features[:, 0], features[first, 0] = 1, values[receivers]
     features[first, 1:4], features[first, 4] = surfaces.points[receivers], 1
     blended = weights.blend(features)
     value, mass = blended[..., 0], blended[..., 4]
