@@ -90,9 +90,7 @@ _MAX_PER_ROUND = 4000
 
 
 def split_wide_around(
-    gaussians: Gaussians,
-    is_object: Bool[Tensor, "n"],
-    objects: Sequence[Gaussians],
+    gaussians: Gaussians, is_object: Bool[Tensor, "n"], objects: Sequence[Gaussians]
 ) -> tuple[Gaussians, Bool[Tensor, "m"]]:
     """Split the wide Gaussians of a composite's target that lie around its objects.
 

@@ -139,10 +139,7 @@ class Materials:
 
 
 def estimate_materials(
-    gaussians: Gaussians,
-    normals: Float[Tensor, "n 3"],
-    views: tuple[ObjectView, ...],
-    light: ReflectedLight,
+    gaussians: Gaussians, normals: Float[Tensor, "n 3"], views: tuple[ObjectView, ...], light: ReflectedLight
 ) -> Materials:
     """Fit the lobes of an object's materials.
 

@@ -44,11 +44,7 @@ class ObjectView:
     """Unit, from the camera to each Gaussian."""
 
 
-def object_views(
-    gaussians: Gaussians,
-    sphere: BoundingSphere,
-    cameras: Cameras,
-) -> tuple[ObjectView, ...]:
+def object_views(gaussians: Gaussians, sphere: BoundingSphere, cameras: Cameras) -> tuple[ObjectView, ...]:
     """Views of an object from some of the cameras that have its middle in their image.
 
     Args:
@@ -110,13 +106,7 @@ _NEIGHBOURS = 2.0
 surface more of them average more noise (5.0 degrees instead of 7.5), near edges they mislead."""
 
 
-def fuse_normals(
-    gaussians: Gaussians,
-    views: tuple[ObjectView, ...],
-    neighbours: Normals,
-    *,
-    radius: float,
-) -> Normals:
+def fuse_normals(gaussians: Gaussians, views: tuple[ObjectView, ...], neighbours: Normals, *, radius: float) -> Normals:
     """Normals from depth images and neighbours together.
 
     Args:

@@ -19,7 +19,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.light import Light, LightSource
 from splatgraft.relighting.light.panorama import NoLight
-from splatgraft.relighting.light.samples import ambient_pairs, sample_light, source_pairs
+from splatgraft.relighting.light.samples import sample_light
 from splatgraft.relighting.materials import Materials, estimate_materials, reflected_light
 from splatgraft.relighting.normals import Normals, estimate_normals
 from splatgraft.relighting.object_views import ObjectView, fuse_normals, object_views
@@ -99,7 +99,7 @@ class PreparedObject:
         center = self.sphere.center + (new.translation - old.translation).to(self.sphere.center)
         window = replace(self.maps.ambient_maps.window, center=center)
         samples = sample_light(light)
-        parts = [part for part in (source_pairs(samples)[0], ambient_pairs(samples)[0]) if len(part)]
+        parts = [part for part in (samples.of_sources, samples.of_ambient) if len(part)]
         occlusions = tuple(
             (part, replace(occlusion, center=center), bias)
             for part, (_, occlusion, bias) in zip(parts, self.maps.occlusions, strict=True)

@@ -4,10 +4,10 @@ Area lights and environment light as sets of directional lights, each of which o
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.directions import even_pairs, vogel_offsets
@@ -42,6 +42,19 @@ class LightSamples:
     def __len__(self) -> int:
         """Number of samples k."""
         return len(self.is_source)
+
+    @property
+    def of_sources(self) -> "LightSamples":
+        """The samples of sources."""
+        return self._part(slice(None, sum(self.is_source)))
+
+    @property
+    def of_ambient(self) -> "LightSamples":
+        """The ambient samples: the second half are the opposites of the first."""
+        return self._part(slice(sum(self.is_source), None))
+
+    def _part(self, rows: slice) -> "LightSamples":
+        return LightSamples(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
 def sample_light(light: Light) -> LightSamples:
@@ -90,31 +103,6 @@ def _sample_counts(light: Light) -> list[int]:
         counts.append(1 + taken if is_wide else 1)
         free -= counts[-1] - 1
     return counts
-
-
-def source_pairs(samples: LightSamples) -> tuple[LightSamples, Int[Tensor, "k"], Int[Tensor, "k"]]:
-    """The k samples of sources, and the positions of each one and of its opposite in `cat(directions, -directions)`."""
-    return _pairs(samples, source=True)
-
-
-def ambient_pairs(samples: LightSamples) -> tuple[LightSamples, Int[Tensor, "k"], Int[Tensor, "k"]]:
-    """The k ambient samples, and the positions of each one and of its opposite among them."""
-    return _pairs(samples, source=False)
-
-
-def _pairs(samples: LightSamples, *, source: bool) -> tuple[LightSamples, Int[Tensor, "k"], Int[Tensor, "k"]]:
-    which = torch.tensor([flag == source for flag in samples.is_source])
-    count = int(which.sum())
-    part = LightSamples(
-        directions=samples.directions[which],
-        irradiance=samples.irradiance[which],
-        softness=samples.softness[which],
-        is_source=(source,) * count,
-        blockers_within=tuple(samples.blockers_within[int(i)] for i in which.nonzero()[:, 0]),
-        distances=samples.distances[which],
-    )
-    front = torch.arange(count)
-    return part, front, front + count if source else (front + count // 2) % max(count, 1)
 
 
 def _cone_directions(source: LightSource, count: int) -> list[torch.Tensor]:

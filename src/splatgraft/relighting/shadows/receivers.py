@@ -78,10 +78,7 @@ class Receivers:
 
 
 def shade_receivers(
-    receivers: Receivers,
-    maps: ObjectShadowMaps,
-    *,
-    budget: int,
+    receivers: Receivers, maps: ObjectShadowMaps, *, budget: int
 ) -> tuple[Receivers, Int[Tensor, "j"], SceneRatio, Float[Tensor, "3 j 3"]]:
     """Split receivers at shadow edges and average the ratio over each.
 
@@ -259,10 +256,7 @@ def _with_center(beside: Float[Tensor, "f l s 3"], center: Float[Tensor, "f 3"])
 
 
 def _in_penumbra(
-    gaussians: Gaussians,
-    by_sources: Float[Tensor, "3 m 3"],
-    ratio: SceneRatio,
-    smallest: float,
+    gaussians: Gaussians, by_sources: Float[Tensor, "3 m 3"], ratio: SceneRatio, smallest: float
 ) -> Int[Tensor, "p"]:
     """Receivers in a penumbra that were too narrow to be averaged, yet are wide enough that their slope is visible."""
     without, with_object, _ = by_sources.mean(-1)

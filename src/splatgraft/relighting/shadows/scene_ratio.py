@@ -13,7 +13,7 @@ from torch import Tensor
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.directions import frames_along
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.relighting.light.samples import LightSamples, ambient_pairs, source_pairs
+from splatgraft.relighting.light.samples import LightSamples
 from splatgraft.relighting.normals import raised
 from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows.occlusion import Occlusion, occluded_irradiance, occlusion_from_maps
@@ -70,11 +70,7 @@ class ObjectShadowMaps:
     """For the sources, if there are any, and for the ambient light: samples, occlusion, and bias in world units."""
 
 
-def object_shadow_maps(
-    gaussians: Gaussians,
-    sphere: BoundingSphere,
-    samples: LightSamples,
-) -> ObjectShadowMaps:
+def object_shadow_maps(gaussians: Gaussians, sphere: BoundingSphere, samples: LightSamples) -> ObjectShadowMaps:
     """Depth maps of an object, in the target's frame, for every light sample, with its colours for the bounce.
 
     Args:
@@ -83,8 +79,7 @@ def object_shadow_maps(
         samples: Of the light at its place.
     """
     occluders = occluders_of(gaussians)
-    sources, front, back = source_pairs(samples)
-    ambient, ambient_front, ambient_back = ambient_pairs(samples)
+    sources, ambient = samples.of_sources, samples.of_ambient
     source_bias, ambient_bias = _OBJECT_BIAS
     occlusions = []
 
@@ -99,20 +94,20 @@ def object_shadow_maps(
         rim = sphere.radius / math.sqrt(1 - (float(nearness.max()) * sphere.radius) ** 2)
         window = Window(sphere.center, rim, frames_along(both), torch.cat([nearness, -nearness]))
         maps = splat_depth_maps(occluders, window, size=_SOURCE_SIZE, with_color=True)
-        occlusion = occlusion_from_maps(maps, front, back, brightest=unlit(sources))
+        front = torch.arange(len(sources))
+        occlusion = occlusion_from_maps(maps, front, front + len(front), brightest=unlit(sources))
         occlusions.append((sources, occlusion, source_bias * maps.texel))
     window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(ambient.directions))
     maps = splat_depth_maps(occluders, window, size=AMBIENT_SIZE, with_color=True)
-    occlusion = occlusion_from_maps(maps, ambient_front, ambient_back, brightest=unlit(ambient))
+    front = torch.arange(len(ambient))
+    back = (front + len(front) // 2) % len(front)
+    occlusion = occlusion_from_maps(maps, front, back, brightest=unlit(ambient))
     occlusions.append((ambient, occlusion, ambient_bias * maps.texel))
     return ObjectShadowMaps(maps, tuple(occlusions))
 
 
 def self_visibility(
-    maps: ObjectShadowMaps,
-    gaussians: Gaussians,
-    normals: Float[Tensor, "m 3"],
-    samples: LightSamples,
+    maps: ObjectShadowMaps, gaussians: Gaussians, normals: Float[Tensor, "m 3"], samples: LightSamples
 ) -> Float[Tensor, "m k"]:
     """Visibility of every light sample from an object's own Gaussians, past the object itself.
 
@@ -129,7 +124,7 @@ def self_visibility(
     points = raised(gaussians, normals)
     ambient = visibility(maps.ambient_maps, points, normals, bias=ambient_bias * maps.ambient_maps.texel)
     ambient = _SELF_AMBIENT + (1 - _SELF_AMBIENT) * ambient
-    sources, _, _ = source_pairs(samples)
+    sources = samples.of_sources
     if not len(sources):
         return ambient
     lit = Window(center=window.center, radius=window.radius, frames=frames_along(sources.directions))
@@ -149,17 +144,13 @@ class SceneShadowMaps:
     """One per ambient sample."""
 
 
-def scene_shadow_maps(
-    scene: Gaussians,
-    region: BoundingSphere,
-    samples: LightSamples,
-) -> SceneShadowMaps:
+def scene_shadow_maps(scene: Gaussians, region: BoundingSphere, samples: LightSamples) -> SceneShadowMaps:
     """Depth maps of `scene` for every light sample. Only Gaussians in or near `region` block light."""
     maps: list[DepthMaps | None] = []
     reach = _BLOCKERS_AROUND * region.radius + 3 * scene.scales.max(1).values
     blockers = scene.select((scene.means - region.center).norm(dim=1) < reach)
     sizes = (_SOURCE_SIZE, AMBIENT_SIZE)
-    for part, size in zip((source_pairs(samples)[0], ambient_pairs(samples)[0]), sizes, strict=True):
+    for part, size in zip((samples.of_sources, samples.of_ambient), sizes, strict=True):
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
         nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
         # Gaussians finer than a pixel of the map add no detail: a random part of them is enough
@@ -172,9 +163,7 @@ def scene_shadow_maps(
 
 
 def scene_visibility(
-    maps: SceneShadowMaps,
-    points: Float[Tensor, "m 3"],
-    normals: Float[Tensor, "m 3"],
+    maps: SceneShadowMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]
 ) -> Float[Tensor, "m k"]:
     """Visibility of every light sample from `points` past the scene, so that existing shadows are not darkened twice.
 

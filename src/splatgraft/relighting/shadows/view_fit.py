@@ -109,12 +109,7 @@ class _Surfaces:
 
 
 def fit_to_views(
-    receivers: Receivers,
-    ratio: SceneRatio,
-    others: Gaussians,
-    cameras: Cameras,
-    *,
-    ratio_at: RatioAt,
+    receivers: Receivers, ratio: SceneRatio, others: Gaussians, cameras: Cameras, *, ratio_at: RatioAt
 ) -> SceneRatio:
     """Fit the ratios of receivers to what some views show of them.
 
