@@ -74,15 +74,15 @@ def reflected_light(light: Light, samples: LightSamples, visibility: Float[Tenso
         samples: Of that light, k.
         visibility: Share of each sample that reaches each point, in [0, 1].
     """
-    which = torch.as_tensor(samples.is_source)
+    sources = samples.of_sources
     unsure = sum((torch.tensor(s.irradiance) * (1 - s.confidence) for s in light.sources), torch.zeros(3))
     ambient = light.ambient.clone()
     ambient[0] += unsure / (4 * math.pi * spherical_harmonics.C0)
     return ReflectedLight(
-        directions=samples.directions[which],
-        irradiance=samples.irradiance[which],
-        softness=samples.softness[which],
-        visibility=visibility[:, which],
+        directions=sources.directions,
+        irradiance=sources.irradiance,
+        softness=sources.softness,
+        visibility=visibility[:, : len(sources)],
         ambient=ambient,
     )
 
@@ -178,9 +178,11 @@ def estimate_materials(
         part = lobe_radiance(lobes, rows, light, record.mirrored(rows), record.cosine[rows])
         old[rows] = (record.weight[rows, :, None] * part).sum(1)
     left = torch.maximum(base - old, _MIN_MATT * base)
+    taken = torch.where(old > 1e-6, (1 - _MIN_MATT) * base / old.clamp_min(1e-6), torch.zeros(())).clamp(0, 1)
     return replace(
         lobes,
-        reflectance=lobes.reflectance * _taken(base, old),
+        # no more of the lobe is put in than is taken out
+        reflectance=lobes.reflectance * taken,
         matt=left,
         share=1 - left.sum(1) / base.sum(1).clamp_min(1e-6),
     )
@@ -220,12 +222,6 @@ def lobe_radiance(
 
 def _schlick(cosine: Float[Tensor, "m v"], facing: float) -> Float[Tensor, "m v"]:
     return facing + (1 - facing) * (1 - cosine.clamp(0, 1)) ** 5
-
-
-def _taken(base: Float[Tensor, "n 3"], old: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Share of the lobe that is taken out of the colours, so that no more is put in."""
-    most = (1 - _MIN_MATT) * base
-    return torch.where(old > 1e-6, most / old.clamp_min(1e-6), torch.zeros(())).clamp(0, 1)
 
 
 @dataclass(frozen=True)

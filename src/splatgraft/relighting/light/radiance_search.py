@@ -67,8 +67,6 @@ class RadianceEstimate:
     """Radiance of the parts of each direction that no camera saw."""
     clipped: Float[Tensor, "k"]
     """Radiance of the clipped parts beyond the camera's white."""
-    weights: tuple[float, ...]
-    """Probabilities of the local maxima, highest first."""
     residual: Float[Tensor, "m"]
     """Observed over explained brightness of the receivers, logarithm, at the best maximum."""
 
@@ -111,7 +109,6 @@ def search_radiance(problem: RadianceProblem) -> RadianceEstimate:
     return RadianceEstimate(
         unseen=hidden[0].float(),
         clipped=hidden[1].float(),
-        weights=tuple(weights.tolist()),
         residual=problem.residual(at_best, albedo).float(),
     )
 
