@@ -7,7 +7,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 
 _ROUNDS = 10
-"""Of reweighting; this and the others are set by hand."""
+"""Rounds of reweighting; this and the others are set by hand."""
 _ROLL_RAD = 0.05
 """Roll above which a camera counts less: hand-held cameras are level to about three degrees."""
 _MEAN_UP_WEIGHT = 0.01

@@ -15,7 +15,7 @@ from torch import Tensor
 from splatgraft.core.images import linear_from_srgb
 
 _PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
-"""Of the observer: 67.02, a 4K screen 0.7 m wide at a distance of 0.7 m (Sec. 5)."""
+"""The observer's resolution, 67.02: a 4K screen 0.7 m wide at a distance of 0.7 m (Sec. 5)."""
 _SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
 """Contrast sensitivity of the achromatic, red-green and blue-yellow channel, as sums of Gaussians (a, b):
 a sqrt(pi / b) exp(-pi^2 x^2 / b), x in degrees (Table 1)."""

@@ -39,16 +39,16 @@ class ExportOptions:
     """all: the whole scene; object: the relit object alone; scene: the place without object and shadow; shadow: black
     Gaussians that darken what lies behind them as the shadow does; object-with-shadow: both, for a compositor."""
     frame: Literal["auto", "capture", "world"] = "auto"
-    """Of a scene. capture: as in the project; world: upright and in metres, as far as they are known; auto: world for
-    .glb and .usdz, which ask for it, else capture."""
+    """Frame of a scene. capture: as in the project; world: upright and in metres, as far as they are known; auto: world
+    for .glb and .usdz, which ask for it, else capture."""
     spz_version: int = 4
-    """Of a .spz: 4, or 3 or 2 for programs that do not read it yet."""
+    """Version of a .spz: 4, or 3 or 2 for programs that do not read it yet."""
     sh_degree: int = 3
     """Highest SH degree that is written, 0 to 3: files of lower ones are smaller, and highlights move less."""
     width: int = 1280
-    """Of pictures and videos, pixels."""
+    """Width of pictures and videos, pixels."""
     frames: int = 120
-    """Of a turntable; 24 are a second."""
+    """Number of pictures of a turntable; 24 are a second."""
 
 
 def export_scene(

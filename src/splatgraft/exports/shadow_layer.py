@@ -26,14 +26,14 @@ _LONGEST_PX = 320
 _STEPS = 240
 """Steps of Adam, one view each."""
 _LEARNING_RATE = 0.15
-"""Of opacity logits; falls to a tenth."""
-_DARKEST_GROUND = 0.02
+"""Step size for opacity logits; it falls to a tenth."""
+_MIN_GROUND = 0.02
 """sRGB below which nothing is said about the share of light that is missing."""
 _MIN_SHARE = 0.01
 """Share of light that a Gaussian must miss to be part of the layer."""
 _MIN_WEIGHT_PX = 0.5
 """Pixels that a Gaussian must make up in all views together."""
-_FAINTEST = 1 / 255
+_MIN_OPACITY = 1 / 255
 """Opacity below which a Gaussian is left out at the end."""
 
 
@@ -87,8 +87,8 @@ def _view(camera: Cameras, ground: Gaussians, place: Gaussians) -> _View:
     """A view and the share of light, in sRGB, that the shadow takes."""
     shadowed, before = (render(scene, camera).color[0].clamp(0, 1) for scene in (ground, place))
     level = before.mean(-1)
-    darkness = (1 - shadowed.mean(-1) / level.clamp_min(_DARKEST_GROUND)).clamp(0, 1)
-    return _View(camera, before, shadowed, torch.where(level < _DARKEST_GROUND, 0.0, darkness))
+    darkness = (1 - shadowed.mean(-1) / level.clamp_min(_MIN_GROUND)).clamp(0, 1)
+    return _View(camera, before, shadowed, torch.where(level < _MIN_GROUND, 0.0, darkness))
 
 
 def _receivers(ground: Gaussians, views: list[_View]) -> Gaussians:
@@ -121,7 +121,7 @@ def _fitted(layer: Gaussians, views: list[_View], progress: Progress) -> Gaussia
         schedule.step()
         progress(step + 1, _STEPS, "fitting the shadow")
     done = replace(layer, opacity_logits=logits.detach())
-    return done.select(done.opacities > _FAINTEST)
+    return done.select(done.opacities > _MIN_OPACITY)
 
 
 def _psnr(layer: Gaussians, views: list[_View]) -> float:

@@ -18,7 +18,7 @@ _MAX_ISO = 65535
 _AUTO, _MANUAL = 0, 1
 """Values of the tag WhiteBalance."""
 _MAX_STOPS = 40.0
-"""Of any APEX value; cameras write some 100 stops where they know nothing."""
+"""Largest APEX value; cameras write some 100 stops where they know nothing."""
 
 
 def read_exposure(path: Path) -> Exposure:

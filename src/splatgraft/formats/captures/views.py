@@ -19,7 +19,8 @@ from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.formats.captures.masks import check_mask, masks_of
 
 MIN_SHARE = 0.5
-"""Of the images that a capture names and of its masks; with fewer, the folder is not the one that was meant."""
+"""Share of the images that a capture names, and of its masks, that must be usable; with fewer, the folder is not the
+one that was meant."""
 
 _RIGID_TOLERANCE = 1e-3
 """Largest entry of R^T R - I; allows matrices printed with four digits."""

@@ -37,7 +37,7 @@ _HEADER_BYTES = 28
 _RIGID = 1e-3
 """Largest deviation of a node's matrix from a uniformly scaled rotation, over its scale."""
 _MAX_DEPTH = 100
-"""Of nodes in nodes."""
+"""Deepest nesting of nodes."""
 _OPACITY_STEP = 0.25 / 65535
 """Opacities of 0 and 1 become finite logits, by a quarter step of 16 bits."""
 

@@ -46,9 +46,10 @@ _PALETTE_COLUMNS = 64
 """Entries in a row of the palette's picture."""
 _MIN_PALETTE, _MAX_PALETTE = 1 << 10, 1 << 16
 _GAUSSIANS_PER_ENTRY = 4
-"""Of the palette; by size and PSNR of the demo's scenes."""
+"""Gaussians that share an entry of the palette, chosen by size and PSNR of the demo's scenes."""
 _MAX_PIXELS_PER_BYTE = 100
-"""Of a picture: random bytes have 0.3, a scene of few different Gaussians 50; smaller pictures may have more."""
+"""Largest picture that its bytes can hold: random bytes have 0.3, a scene of few different Gaussians 50; smaller
+pictures may have more."""
 _FREE_PIXELS = 1 << 20
 _MAX_LOG_POSITION = 60.0
 _CODES = 256
@@ -57,7 +58,8 @@ _COARSE_GROUPS = 256
 _COARSE_SAMPLE = 1 << 15
 """Rows that the coarse groups are found from."""
 _ROUNDS = 5
-"""Of the coarse groups, and of the entries in each; more rounds changed the pictures of a demo by less than 0.1 dB."""
+"""Rounds of k-means for the coarse groups and for the entries in each; more rounds changed the pictures of a demo by
+less than 0.1 dB."""
 _ROWS_AT_ONCE = 1 << 14
 _DATE = (1980, 1, 1, 0, 0, 0)
 

@@ -37,7 +37,7 @@ _TABLE_ENTRY = struct.Struct("<QQ")
 _ANTIALIASED = 1
 _GZIP = 31
 _ZSTD_LEVEL = 12
-"""As the format's own library."""
+"""The level of the format's own library."""
 _MAX_EXPANSION = 100
 """Bytes of the arrays over compressed ones; files of trained scenes have about 2, a few repeated Gaussians 50."""
 _FREE_BYTES = 1 << 20
