@@ -1,4 +1,7 @@
-"""Images as tensors: reading and writing files, the sRGB transfer function, resampling."""
+"""Images as tensors: reading and writing files, the sRGB transfer function, resampling.
+
+Every reader raises ValueError where the file is no readable image.
+"""
 
 import math
 import warnings
@@ -72,11 +75,7 @@ def read_rgb(path: Path | str) -> Float[Tensor, "h w 3"]:
 
 
 def read_straight_rgb(path: Path) -> Float[Tensor, "h w 3"]:
-    """sRGB in [0, 1] as stored, transparency left aside: at soft edges the full colour (straight alpha), not a share.
-
-    Raises:
-        ValueError: The file is no readable image.
-    """
+    """sRGB in [0, 1] as stored, transparency left aside; at soft edges the full colour (straight alpha)."""
     image = _open(path)
     if not image.has_transparency_data:
         return _rgb(image)
@@ -109,10 +108,7 @@ def read_stored_rgb(
 
 
 def stored_size(path: Path, size: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Width and height of the grid that `read_stored_rgb` reads at full size, without decoding it.
-
-    Raises: ValueError where the file is no readable image.
-    """
+    """Width and height of the grid that `read_stored_rgb` reads at full size, without decoding it."""
     with opened(path) as image:
         width, height = image.size
         return (height, width) if size is not None and _is_sideways(image, size) else (width, height)
@@ -174,10 +170,7 @@ def shrink_on_decoding(image: Image.Image, longest_px: int) -> None:
 
 
 def mean_luminance(path: Path) -> float:
-    """Mean linear luminance (Rec. 709) of a picture in [0, 1]; a JPEG is read at a small size.
-
-    Raises: ValueError where the file is no readable image.
-    """
+    """Mean linear luminance (Rec. 709) of a picture in [0, 1]; a JPEG is read at a small size."""
     with opened(path) as image:
         image.draft(None, (_MEAN_PX, _MEAN_PX))
         image.load()
@@ -186,10 +179,7 @@ def mean_luminance(path: Path) -> float:
 
 
 def read_grey(path: Path, longest_px: int) -> UInt8[np.ndarray, "h w"]:
-    """Luma of a picture as a viewer shows it, at most `longest_px` long; a JPEG is decoded at a small size.
-
-    Raises: ValueError where the file is no readable image.
-    """
+    """Luma of a picture as a viewer shows it, at most `longest_px` long; a JPEG is decoded at a small size."""
     with opened(path) as image:
         image.draft(None, (longest_px, longest_px))
         image.load()
@@ -199,10 +189,7 @@ def read_grey(path: Path, longest_px: int) -> UInt8[np.ndarray, "h w"]:
 
 
 def read_upright(path: Path, longest_px: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
-    """A picture as a viewer shows it, at most `longest_px` long, and its full width and height upright.
-
-    Raises: ValueError where the file is no readable image.
-    """
+    """A picture as a viewer shows it, at most `longest_px` long, and its full width and height upright."""
     with opened(path) as image:
         width, height = image.size
         size = (height, width) if _exif_orientation(image) in _TURNED_SIDEWAYS else (width, height)
@@ -216,10 +203,7 @@ def read_upright(path: Path, longest_px: int) -> tuple[UInt8[np.ndarray, "h w 3"
 
 
 def read_exif(path: Path) -> dict[int, Any]:
-    """The camera's EXIF tags of an image file, with Pillow's values; empty where there are none or they are damaged.
-
-    Raises: ValueError where the file is no readable image.
-    """
+    """The camera's EXIF tags of an image file, with Pillow's values; empty where there are none or they are damaged."""
     with opened(path) as image:
         try:
             return dict(image.getexif().get_ifd(IFD.Exif))
@@ -228,19 +212,13 @@ def read_exif(path: Path) -> dict[int, Any]:
 
 
 def has_transparency(path: Path) -> bool:
-    """Whether the file has an alpha channel or a transparent colour, without decoding the pixels.
-
-    Raises: ValueError where the file is no readable image.
-    """
+    """Whether the file has an alpha channel or a transparent colour, without decoding the pixels."""
     with opened(path) as image:
         return image.has_transparency_data
 
 
 def read_alpha(path: Path, size: tuple[int, int] | None = None) -> Float[Tensor, "h w"]:
-    """The alpha channel in [0, 1] on the pixel grid of `read_stored_rgb`; ones where the file has none.
-
-    Raises: ValueError where the file is no readable image.
-    """
+    """The alpha channel in [0, 1] on the pixel grid of `read_stored_rgb`; ones where the file has none."""
     image = _open(path)
     if size is not None and _is_sideways(image, size):
         image = ImageOps.exif_transpose(image)
@@ -250,10 +228,7 @@ def read_alpha(path: Path, size: tuple[int, int] | None = None) -> Float[Tensor,
 
 
 def read_mask(path: Path) -> Float[Tensor, "h w"]:
-    """Coverage in [0, 1] on the stored pixel grid: the alpha channel where the file has one that varies, else luma.
-
-    Raises: ValueError where the file is no readable image.
-    """
+    """Coverage in [0, 1] on the stored pixel grid: the alpha channel where the file has one that varies, else luma."""
     image = _open(path)
     if image.has_transparency_data:
         alpha = np.array(image.convert("RGBA").getchannel("A"))
@@ -287,10 +262,7 @@ def _open(path: Path) -> Image.Image:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
-    """The opened image, not decoded yet; all of Pillow's errors about a broken file become one ValueError.
-
-    Raises: ValueError where the file is no readable image, also when it is decoded inside the context.
-    """
+    """The opened image, not decoded yet; all of Pillow's errors about a broken file become one ValueError."""
     if not path.is_file():
         raise ValueError(f"{path}: expected an image file, found none")
     formats = (*_FORMATS, "HEIF") if _with_heif(path) else _FORMATS
@@ -306,10 +278,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
 
 
 def _with_heif(path: Path) -> bool:
-    """Whether the file is HEIF by its suffix; Pillow's plugin is then loaded.
-
-    Raises: ValueError where the plugin is not installed.
-    """
+    """Whether the file is HEIF by its suffix; Pillow's plugin is then loaded."""
     if path.suffix.lower() not in _HEIF_SUFFIXES:
         return False
     if find_spec("pillow_heif") is None:

@@ -64,10 +64,7 @@ def _file(model: Path, stem: str) -> Path:
 
 
 def read_colmap(folder: Path) -> CaptureFile:
-    """The largest model, ordered by image name.
-
-    Raises: ValueError where no whole model is there, or its camera model is not supported.
-    """
+    """The largest model, ordered by image name."""
     models = [(path, _read_images(_file(path, "images"))) for path in _model_folders(folder)]
     if not models:
         raise ValueError(f"{folder}: expected a COLMAP model (cameras, images, points3D as .bin or .txt), found none")

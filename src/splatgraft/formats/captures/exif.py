@@ -28,9 +28,6 @@ def read_exposure(path: Path) -> Exposure:
 
     Args:
         path: An image file; JPEG, PNG, WebP and TIFF can have EXIF.
-
-    Raises:
-        ValueError: The file is no readable image.
     """
     tags = read_exif(path)
     balance = _number(tags.get(Base.WhiteBalance))

@@ -36,8 +36,6 @@ def find_photos(folder: Path) -> PhotoFiles:
 
     Masks are looked for beside the photos and beside their folder; a file NAME_mask is a mask and no photo where
     there is a photo NAME.
-
-    Raises: ValueError where there is no photo, or a folder of masks has none for any photo, or two for one.
     """
     photos = next(
         (place for place in (folder, *(folder / name for name in PHOTO_FOLDERS)) if place.is_dir() and _photos(place)),
@@ -65,10 +63,7 @@ def describe_masks(images: Sequence[Path], masks: Sequence[Path | None]) -> str:
 
 
 def check_mask(mask: Path, size: tuple[int, int]) -> None:
-    """Raise where a mask cannot be of an image with `size` (width, height).
-
-    Raises: ValueError where it has another shape or is no readable image.
-    """
+    """Raise where a mask cannot be of an image with `size` (width, height)."""
     found = stored_size(mask)
     if not same_shape(found, size):
         expected = f"{size[0]}x{size[1]} px, as its image has, or those scaled"

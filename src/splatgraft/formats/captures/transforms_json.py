@@ -36,10 +36,7 @@ _CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 
 
 def read_json(path: Path) -> CaptureFile:
-    """The capture that a transforms.json describes, or the cameras of a cameras.json, which is a list.
-
-    Raises: ValueError where the file is missing or broken as a whole.
-    """
+    """The capture that a transforms.json describes, or the cameras of a cameras.json, which is a list."""
     meta = load(path)
     if isinstance(meta, list):
         return _cameras_json(path, meta)

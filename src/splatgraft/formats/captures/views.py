@@ -64,10 +64,7 @@ class CaptureFile:
     """Reads sparse points, world units, and their colours, sRGB in [0, 1]."""
 
     def records(self) -> list[ViewRecord]:
-        """All views.
-
-        Raises: ValueError with the reason where one is left out.
-        """
+        """All views."""
         for view in self.views:
             if isinstance(view, LeftOut):
                 raise ValueError(view.reason)
@@ -75,10 +72,7 @@ class CaptureFile:
 
 
 def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
-    """The pose (4, 4) with its rotation made orthonormal in float64.
-
-    Raises: ValueError that starts with `where`, for a matrix that is not a rotation and a translation.
-    """
+    """The pose (4, 4) with its rotation made orthonormal in float64."""
     rotation = matrix[:3, :3]
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e30:
         raise ValueError(f"{where}: expected a pose of finite numbers, found nan, infinity or more than 1e30")
@@ -108,10 +102,7 @@ def existing_file(path: Path) -> Path | None:
 
 
 def posed_images(file: CaptureFile, *, with_points: bool = True) -> PosedImages:
-    """The capture without views whose image is missing or unreadable or does not fit its camera.
-
-    Raises: ValueError where fewer than half of the views or of their masks are left, or an image is named twice.
-    """
+    """The capture without views whose image is missing or unreadable or does not fit its camera."""
     checked = [view if isinstance(view, LeftOut) else _usable(view, file.source, file.folder) for view in file.views]
     left_out = [view for view in checked if isinstance(view, LeftOut)]
     kept = [view for view in checked if isinstance(view, ViewRecord)]
@@ -132,10 +123,7 @@ def posed_images(file: CaptureFile, *, with_points: bool = True) -> PosedImages:
 
 
 def cameras(file: CaptureFile) -> Cameras:
-    """The pinhole cameras of the undistorted views; images need not exist.
-
-    Raises: ValueError where a view is not usable.
-    """
+    """The pinhole cameras of the undistorted views; images need not exist."""
     return _cameras_of([fitted_to_file(view, file.source) for view in file.records()], file.source)[0]
 
 
@@ -195,8 +183,6 @@ def fitted_to_file(view: ViewRecord, source: Path) -> ViewRecord:
     """The view with intrinsics for its file's size, where that is smaller than the camera's and of the same shape.
 
     For a larger file of the same shape the camera's size stays: the image is resampled on reading.
-
-    Raises: ValueError where the shapes differ.
     """
     if view.image_path is None:
         return view
@@ -222,10 +208,7 @@ def fitted_to_file(view: ViewRecord, source: Path) -> ViewRecord:
 
 
 def _cameras_of(views: Sequence[ViewRecord], source: Path) -> tuple[Cameras, tuple[Distortion | None, ...]]:
-    """The pinhole cameras of the undistorted views, and the distortion of each file.
-
-    Raises: ValueError that names `source`, for invalid intrinsics.
-    """
+    """The pinhole cameras of the undistorted views, and the distortion of each file."""
     found = [_pinhole(view, source) for view in views]
     intrinsics = np.array([matrix for matrix, _ in found]).reshape(-1, 3, 3)
     cameras = Cameras(

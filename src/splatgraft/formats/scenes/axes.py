@@ -19,10 +19,7 @@ _DIRECTIONS = {"L": (-1, 0, 0), "R": (1, 0, 0), "U": (0, -1, 0), "D": (0, 1, 0),
 
 
 def require_axes(name: str) -> str:
-    """The name in capitals.
-
-    Raises: ValueError where it does not name three different axes.
-    """
+    """The name in capitals."""
     found = name.upper()
     if len(found) != 3 or any(sum(letter in pair for letter in found) != 1 for pair in ("LR", "UD", "BF")):
         raise ValueError(f"axes: expected directions of x, y and z such as RDF, RUB or LUF, found {name[:20]!r}")
@@ -58,10 +55,7 @@ def change_axes(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians
 
 
 def with_axes(scene: SceneFile, axes: str) -> SceneFile:
-    """The scene, with the file's axes taken to be `axes` instead of those that were found.
-
-    Raises: ValueError where `axes` are none.
-    """
+    """The scene, with the file's axes taken to be `axes` instead of those that were found."""
     name = require_axes(axes)
     if name == scene.axes:
         return scene

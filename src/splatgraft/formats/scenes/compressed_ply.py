@@ -40,10 +40,7 @@ def is_compressed(header: ply.PlyHeader) -> bool:
 
 
 def read_compressed_ply(header: ply.PlyHeader) -> Gaussians:
-    """The scene in a compressed .ply.
-
-    Raises: ValueError where chunks or f_rest are missing or do not fit each other.
-    """
+    """The scene in a compressed .ply."""
     vertex, chunk, sh = (header.element(name) for name in ("vertex", "chunk", "sh"))
     assert vertex is not None
     if chunk is None or chunk.count * _CHUNK < vertex.count:
@@ -94,10 +91,7 @@ def _bands(header: ply.PlyHeader, sh: ply.Element, count: int) -> Float[Tensor, 
 
 
 def write_compressed_ply(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
-    """Write positions and log scales in 11, 10 and 11 bits of each chunk's bounds, the rest in 8 to 10 bits.
-
-    Raises: ValueError where there are no Gaussians, or some are not finite.
-    """
+    """Write positions and log scales in 11, 10 and 11 bits of each chunk's bounds, the rest in 8 to 10 bits."""
     g = writable(path, gaussians, "compressed .ply")
     g = g.select(morton_order(g.means))
     log_scales = g.log_scales.clamp(-_LARGEST_LOG_SCALE, _LARGEST_LOG_SCALE)

@@ -43,10 +43,7 @@ _OPACITY_STEP = 0.25 / 65535
 
 
 def read_gaussian_glb(path: Path) -> SceneFile:
-    """The Gaussians of all primitives, placed by their nodes.
-
-    Raises: ValueError where the file has no Gaussians, or a node distorts them.
-    """
+    """The Gaussians of all primitives, placed by their nodes."""
     content, binary = _parts(path)
     notes: list[str] = []
     parts: list[Gaussians] = []

@@ -32,10 +32,7 @@ _MAX_NAMED = 6
 
 
 def read_gaussian_ply(path: Path) -> SceneFile:
-    """The scene in a 3DGS .ply, or SuperSplat's compressed form of one; other number types become float32.
-
-    Raises: ValueError where the file is no whole PLY with the properties of Gaussians.
-    """
+    """The scene in a 3DGS .ply, or SuperSplat's compressed form of one; other number types become float32."""
     header = ply.read_header(path)
     vertex = header.element("vertex")
     if vertex is None:

@@ -43,10 +43,7 @@ class _Section:
 
 
 def read_ksplat(path: Path) -> SceneFile:
-    """The scene in a .ksplat file.
-
-    Raises: ValueError where the file is of another version, or its sections do not fit it.
-    """
+    """The scene in a .ksplat file."""
     data = path.read_bytes()
     count, total = struct.unpack_from("<I", data, 4)[0], struct.unpack_from("<I", data, 16)[0]
     level = struct.unpack_from("<H", data, 20)[0]

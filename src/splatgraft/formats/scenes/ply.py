@@ -67,10 +67,7 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """The header, with counts checked against the length of the file.
-
-    Raises: ValueError where the file is no PLY, or shorter or longer than the header requires.
-    """
+    """The header, with counts checked against the length of the file."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a .ply file, found none")
     with path.open("rb") as stream:
@@ -141,10 +138,7 @@ def _check_size(header: PlyHeader) -> None:
 
 
 def read_into(header: PlyHeader, element: Element, columns: Sequence[tuple[str, np.ndarray]]) -> None:
-    """Fill arrays, one per named property, a few rows at a time: memory stays near what the caller keeps.
-
-    Raises: ValueError where the element or one before it has list properties, or its data is no number.
-    """
+    """Fill arrays, one per named property, a few rows at a time: memory stays near what the caller keeps."""
     before = header.elements[: header.elements.index(element)]
     if lists := [e.name for e in (*before, element) if e.has_lists]:
         raise ValueError(f"{header.path}: expected single values before and in '{element.name}', found lists {lists}")

@@ -49,8 +49,6 @@ def writable(path: Path, gaussians: Gaussians, kind: str) -> Gaussians:
         path: The file that is written, for the message.
         gaussians: The scene.
         kind: What the message calls the format.
-
-    Raises: ValueError where there are no Gaussians, or some are not finite.
     """
     if gaussians.count == 0:
         raise ValueError(f"{path}: expected at least one Gaussian for a {kind} file, found none")
@@ -58,10 +56,7 @@ def writable(path: Path, gaussians: Gaussians, kind: str) -> Gaussians:
 
 
 def finite(path: Path, gaussians: Gaussians) -> Gaussians:
-    """The Gaussians in float32 on the CPU, as quantised formats store neither nan nor infinity.
-
-    Raises: ValueError where a field of any Gaussian is not finite.
-    """
+    """The Gaussians in float32 on the CPU, as quantised formats store neither nan nor infinity."""
     fields = [gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh.flatten(1)]
     bad = ~torch.isfinite(torch.cat(fields, 1)).all(1) | gaussians.opacity_logits.isnan()
     if bool(bad.any()):

@@ -83,10 +83,7 @@ def sog_files(path: Path) -> tuple[Path, ...]:
 
 
 def read_sog(path: Path) -> SceneFile:
-    """The scene in a .sog, or in a folder with meta.json and pictures, or of that meta.json.
-
-    Raises: ValueError where the version is another, or values do not fit each other.
-    """
+    """The scene in a .sog, or in a folder with meta.json and pictures, or of that meta.json."""
     load = _loader(path)
     meta = json.loads(load(_META_FILE))
     n = meta["count"]
@@ -180,19 +177,13 @@ def _quaternions(pixels: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
 
 
 def write_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
-    """Write positions in 16 bits of their logarithm, scales and colours by tables, bands by a palette.
-
-    Raises: ValueError where there are no Gaussians, or some are not finite.
-    """
+    """Write positions in 16 bits of their logarithm, scales and colours by tables, bands by a palette."""
     with atomic_write(path) as stream:
         stream.write(encode_sog(path, gaussians, metadata))
 
 
 def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> bytes:
-    """The bytes of a .sog; `path` is for messages.
-
-    Raises: ValueError where there are no Gaussians, or some are not finite.
-    """
+    """The bytes of a .sog; `path` is for messages."""
     g = writable(path, gaussians, ".sog")
     g = g.select(morton_order(g.means))
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "splatgraft"}, "count": g.count, "antialias": False}

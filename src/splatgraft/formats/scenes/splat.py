@@ -19,10 +19,7 @@ _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4),
 
 
 def read_splat(path: Path) -> SceneFile:
-    """The scene in a .splat file, SH degree 0.
-
-    Raises: ValueError where the file is no whole number of records, or they hold no positions and scales.
-    """
+    """The scene in a .splat file, SH degree 0."""
     data = path.read_bytes()
     if not data or len(data) % _ROW.itemsize:
         raise ValueError(f"{path}: expected a multiple of {_ROW.itemsize} bytes above 0, found {len(data)}")
@@ -41,10 +38,7 @@ def read_splat(path: Path) -> SceneFile:
 
 
 def write_splat(path: Path, gaussians: Gaussians) -> None:
-    """Write positions and scales exactly, the rest in 8 bits; bands above 0 are lost, as the format has none.
-
-    Raises: ValueError where there are no Gaussians, or some are not finite.
-    """
+    """Write positions and scales exactly, the rest in 8 bits; bands above 0 are lost, as the format has none."""
     g = writable(path, gaussians, ".splat")
     rows = np.empty(g.count, _ROW)
     rows["position"] = g.means.numpy()

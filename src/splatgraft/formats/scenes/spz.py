@@ -47,10 +47,7 @@ _HALF_SQRT2 = 0.5**0.5
 
 
 def read_spz(path: Path) -> SceneFile:
-    """The scene in a .spz file.
-
-    Raises: ValueError where the file is of another version, or shorter than its header claims.
-    """
+    """The scene in a .spz file."""
     data = path.read_bytes()
     packed = data[:4] == struct.pack("<I", _MAGIC)
     inflate = zlib.decompressobj(_GZIP)
