@@ -2,6 +2,7 @@
 
 import math
 import random
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -155,6 +156,8 @@ def test_it_learns_its_training_pairs(rendered, tmp_path):
 def test_the_command_makes_weights_that_the_harmoniser_loads(rendered, tmp_path, capsys):
     words = ["paper", "train", "compact", str(tmp_path), "--pairs", str(rendered), "--device", "cpu", "--steps", "2"]
     words += ["--batch", "2", "--size", "32", "48", "--validation-pairs", "1", "--widths", "8", "8", "16", "16"]
+    for out in (tmp_path, tmp_path / "again"):
+        shutil.copytree(rendered / "priors", out / "priors" / "0")
     assert main([*words, "--blocks", "1", "1", "1", "1", "--heads", "2"]) == 0
     weights = tmp_path / "compact.safetensors"
     assert weights.is_file()
@@ -207,5 +210,5 @@ def test_the_shipped_weights_are_those_of_a_training(shipped):
 def test_a_missing_probe_is_named(tmp_path):
     write_ball_pairs(tmp_path / "ball_0")
     (tmp_path / "ball_0" / "place_probe" / "0000.npy").unlink()
-    with pytest.raises(ValueError, match=r"0000\.npy and suns\.json, found"):
+    with pytest.raises(ValueError, match=r"place_probe/0000\.npy, suns\.json: expected a measured light, found"):
         priors.write_priors([tmp_path / "ball_0"], tmp_path / "priors", seed=0)

@@ -288,7 +288,7 @@ def test_object_removal_learns_its_pair(tmp_path):
 
 def test_object_removal_is_trained_by_the_same_loop_and_resumes(tmp_path):
     base = removal_folder(tmp_path / "base")
-    loop = replace(QUICK, steps=3, save_every=2, validate_every=99)
+    loop = replace(QUICK, steps=3, batch=1, save_every=2, validate_every=99, validation_pairs=1)
     model = removal_run(tmp_path, "out", base, loop).train()
     with pytest.raises(KeyboardInterrupt):
         removal_run(tmp_path, "killed", base, loop, killed_at(3)).train()
