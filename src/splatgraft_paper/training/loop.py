@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TextIO, runtime_checkable
 
 import torch
-import torch.distributed.checkpoint as dcp
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.distributed.checkpoint.api import CheckpointException
@@ -39,6 +38,8 @@ from torch.distributed.checkpoint.state_dict import (
     set_model_state_dict,
     set_optimizer_state_dict,
 )
+from torch.distributed.checkpoint.state_dict_loader import load
+from torch.distributed.checkpoint.state_dict_saver import save
 
 from splatgraft.core.images import write_image
 from splatgraft.runtime.files import atomic_write
@@ -471,7 +472,7 @@ class _Loop:
             partial.mkdir(parents=True)
         self._processes.wait_for_everyone()
         with _quiet():
-            dcp.save(self._state(), checkpoint_id=partial, no_dist=self._processes.num_processes == 1)
+            save(self._state(), checkpoint_id=partial, no_dist=self._processes.num_processes == 1)
         if self.is_first:
             (partial / _JOB_FILE).write_text(json.dumps(self._job()))
             shutil.rmtree(path, ignore_errors=True)
@@ -494,7 +495,7 @@ class _Loop:
             state = self._state()
             try:
                 with _quiet():
-                    dcp.load(state, checkpoint_id=path, no_dist=self._processes.num_processes == 1)
+                    load(state, checkpoint_id=path, no_dist=self._processes.num_processes == 1)
             except _BROKEN_STATE as error:
                 found = (" ".join(str(error).split()) or type(error).__name__)[-200:]
                 say(f"{path}: expected a whole state, found {found}; the one before it is tried")

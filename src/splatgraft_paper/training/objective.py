@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from splatgraft.core.image_metrics import psnr, ssim
 from splatgraft.harmonization.flux.tensor_file import read_tensors, write_tensors
@@ -133,12 +133,12 @@ class ObjectiveTask:
 
     def __init__(self, objective: Objective, data: TrainingData, cache: LatentCache, options: LoopOptions) -> None:
         """Move the objective to the device of this process."""
-        self.network = objective.network
+        self.network: nn.Module = objective.network
         self.objective, self.data, self._cache, self._options = objective, data, cache, options
         self._device = join_processes(options).device
         objective.to(self._device)
         counts = zip(data.mixture.names, map(len, data.mixture.pairs), strict=True)
-        self.fingerprint = {"data": [list(entry) for entry in counts]}
+        self.fingerprint: Mapping[str, Any] = {"data": [list(entry) for entry in counts]}
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Adam without weight decay (paper, Sec. 5.3)."""

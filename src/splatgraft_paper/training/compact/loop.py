@@ -6,13 +6,13 @@ augmentation follow from the seed and the step alone.
 
 import math
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.harmonization.compact.features import CompactInput, CompactOutput, apply_output
@@ -65,12 +65,12 @@ class CompactTask:
         """Make the network; `begin` holds its initial weights, random where None."""
         torch.manual_seed(options.seed)
         self._pairs, self._options, self._device = pairs, options, device
-        self.network = CompactNetwork(options.network)
+        self.network: nn.Module = CompactNetwork(options.network)
         if begin is not None:
             self.network.load_state_dict(begin)
         settings: dict[str, Any] = {name: asdict(options)[name] for name in ("steps", "decay", "size", "network")}
         start = 0.0 if begin is None else sum(float(tensor.double().abs().sum()) for tensor in begin.values())
-        self.fingerprint = {**settings, "pairs": pairs.fingerprint(), "begin": start}
+        self.fingerprint: Mapping[str, Any] = {**settings, "pairs": pairs.fingerprint(), "begin": start}
 
     def optimizer(self) -> torch.optim.Optimizer:
         """AdamW; biases and scales do not decay."""
