@@ -266,7 +266,9 @@ def run_method(
     )
     seconds["render"] = perform_if_stale(render, console)
     harmonized = scene.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
-    seconds["harmonize"] = perform_if_stale(Harmonize(views, harmonized, options, device=settings.device), console)
+    # the step takes the methods of other projects too, which the command line does not offer
+    step = Harmonize(views, harmonized, options, device=settings.device)  # pyright: ignore[reportArgumentType]
+    seconds["harmonize"] = perform_if_stale(step, console)
     step = Consolidate(prior, views, harmonized, result, lpips_weights=settings.weights, device=settings.device)
     if method.loss == "paper":
         step = replace(step, loss="lpips-l1", method="adam", iterations=settings.iterations)
