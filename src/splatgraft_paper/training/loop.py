@@ -132,10 +132,15 @@ class Validation:
 class Task(Protocol):
     """What is trained: a network, its items and its loss."""
 
-    network: nn.Module
-    """Frozen parameters have requires_grad off."""
-    fingerprint: Mapping[str, Any]
-    """Data and settings besides `LoopOptions` that must be equal for a state to be resumed; JSON values."""
+    @property
+    def network(self) -> nn.Module:
+        """Frozen parameters have requires_grad off."""
+        ...
+
+    @property
+    def fingerprint(self) -> Mapping[str, Any]:
+        """Data and settings besides `LoopOptions` that must be equal for a state to be resumed; JSON values."""
+        ...
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Make the optimiser of the trained parameters."""
