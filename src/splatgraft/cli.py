@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
-        print(_help(_HEAD, {name: one.summary for name, one in commands().items()}) + _TAIL)
+        print(_help(_HEAD, _first_words()) + _TAIL)
         return 0
     if words[0] == "--version":
         from splatgraft import __version__
@@ -156,7 +156,7 @@ def _group(words: list[str]) -> int:
     first = words[:-1] if wants_help else words
     while first and not _below(first):
         first = first[:-1]
-    inner = _below(first) if first else {name: one.summary for name, one in commands().items()}
+    inner = _below(first) if first else _first_words()
     if wants_help and first == words[:-1]:
         group = " ".join(first)
         usage = f"usage: splatgraft {group} COMMAND [OPTIONS]; `splatgraft {group} COMMAND --help` says more"
@@ -169,6 +169,14 @@ def _group(words: list[str]) -> int:
 def _below(first: Sequence[str]) -> dict[str, str]:
     start = " ".join([*first, ""])
     return {name: one.summary for name, one in commands().items() if name.startswith(start)}
+
+
+def _first_words() -> dict[str, str]:
+    """The commands of one word, and a line for those that share their first word."""
+    table = commands()
+    groups = {name.split()[0] for name in table if " " in name}
+    lines = {f"{first} ...": f"the commands that `splatgraft {first} --help` lists" for first in sorted(groups)}
+    return {name: one.summary for name, one in table.items() if " " not in name} | lines
 
 
 _HEAD = "usage: splatgraft COMMAND [OPTIONS]; `splatgraft COMMAND --help` says more"
