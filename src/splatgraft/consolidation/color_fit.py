@@ -39,7 +39,7 @@ class _Rates:
     """Learning rates of Adam on the colours."""
 
     first: float
-    """Of band 0."""
+    """Step size of band 0."""
     rest_ratio: float
     """That of the higher bands over that of band 0."""
     final_ratio: float

@@ -34,7 +34,7 @@ as many show where the scene is level."""
 _MAX_TILT = 0.5
 """Largest sine of the angle between the plane and the surface at a Gaussian that the plane is fitted to."""
 _MIN_SHARE = 0.25
-"""Of the target's surface within reach that lies on the plane; less, as in a bush, is no contact layer."""
+"""Smallest share of the surface within reach that lies on the plane; less, as in a bush, is no contact layer."""
 _TOP = 2.0
 """Standard deviations of the heights from the layer's middle to its top."""
 _DEEPEST = 3.0
@@ -59,12 +59,12 @@ class _Layer:
     normal: Float[Tensor, "3"]
     """Unit, towards the object."""
     offset: float
-    """Of its middle along the normal, world units."""
+    """Position of its middle along the normal, world units."""
     deviation: float
     """Standard deviation of heights over the middle, with the Gaussians' own extent, world units."""
 
     def heights(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Of points over the middle, world units."""
+        """Heights of points over the middle, world units."""
         return points @ self.normal - self.offset
 
     def extents(self, gaussians: Gaussians) -> Float[Tensor, "n"]:

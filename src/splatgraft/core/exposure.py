@@ -48,7 +48,7 @@ class Exposure:
         return None
 
     def __str__(self) -> str:
-        """As photographers write it, such as '1/60 s f/1.8 ISO 100'."""
+        """The settings as photographers write them, such as '1/60 s f/1.8 ISO 100'."""
         if self.shutter_s is None or self.aperture is None or self.iso is None:
             return "unknown settings" if self.ev100 is None else f"EV {self.ev100:.1f}"
         short = self.shutter_s < 0.4

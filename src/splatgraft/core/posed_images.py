@@ -56,7 +56,7 @@ class PosedImages:
         return self._resampled(read_stored_rgb(self.image_paths[index], self._size(index)), index)
 
     def reduced_image(self, index: int) -> Float[Tensor, "h w 3"]:
-        """As `image`, faster for a file that is much larger than the camera's size: it is decoded at less."""
+        """The image, faster for a file that is much larger than the camera's size: it is decoded at less."""
         size = self._size(index)
         # the removal of distortion interpolates, which softens by less than a pixel of what it works on
         factor = 2 if self.distortions and self.distortions[index] is not None else 1

@@ -37,7 +37,7 @@ class Gizmo:
     """Pose and scale of the transform gizmo, which is shown at the object's pivot."""
 
     position: Triple
-    """Of the pivot, in the target."""
+    """Position of the pivot in the target, world units."""
     wxyz: tuple[float, float, float, float]
     """Rotation from the object's to the target's axes."""
     scale: float
@@ -81,9 +81,9 @@ class ObjectSize:
     scale: float
     """Size in the target over size in its own capture."""
     own: MetricScale | None
-    """Of its own capture; None where it is not known, or the object was added from a file."""
+    """Scale of the object's own capture; None where it is not known, or the object was added from a file."""
     place: MetricScale | None
-    """Of the target's capture; None where it is not known."""
+    """Scale of the target's capture; None where it is not known."""
 
     @property
     def here_cm(self) -> float | None:

@@ -85,7 +85,7 @@ class SceneCache:
         return self._read("sample", path, read_sample)
 
     def sampled_gaussians(self, path: Path, erased: Bool[Tensor, "n"] | None = None) -> Gaussians:
-        """As `sample`, with constant colours and without the erased Gaussians; the whole scene where there is none."""
+        """The sample with constant colours, without the erased Gaussians; the whole scene where there is none."""
         whole = self.sample(path)
         if whole is None:
             return self.gaussians(path)

@@ -15,7 +15,7 @@ class ShareKind:
     """One kind of file."""
 
     suffix: str
-    """Of the file, with the dot; it names the format."""
+    """Suffix of the file, with the dot; it names the format."""
     page: ExportPage = "viewer"
     """What an .html holds; the report has no parts."""
     module: str | None = None

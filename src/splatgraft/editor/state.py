@@ -18,7 +18,7 @@ from splatgraft.segmentation import Keep
 BoxNumbers = tuple[float, float, float, float, float, float]
 
 _SCALES = (1e-6, 1e6)
-"""Of an object: beyond, covariances leave the range of float32."""
+"""Range of an object's scale; beyond it covariances leave the range of float32."""
 _COORDINATES = (-1e6, 1e6)
 """World units: beyond, float32 resolves less than a tenth of a unit."""
 _HEIGHTS_CM = (1e-3, 1e7)

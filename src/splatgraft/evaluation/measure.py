@@ -195,7 +195,7 @@ def _means(rows: Sequence[dict]) -> dict[str, dict[str, float | None]]:
 
 
 def _mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float | None]:
-    """Of each metric over the views where it is defined; None where it is in none."""
+    """The mean of each metric over the views where it is defined; None where it is defined in none."""
     means: dict[str, float | None] = {}
     for name in rows[0] if rows else ():
         values = [row[name] for row in rows if math.isfinite(row[name])]

@@ -108,7 +108,7 @@ _NOISE_STOPS = 0.02
 _FULL_COLOR_STOPS = 1.0
 """Photographic stops at which the change map has its full colours; set by hand."""
 _EXPONENT = 0.7
-"""Of the colours of the change map; below 1, so that faint shadows stay visible beside strong ones."""
+"""Exponent of the colours of the change map; below 1, so that faint shadows stay visible beside strong ones."""
 
 
 def describe_change(

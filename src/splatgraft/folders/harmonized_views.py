@@ -43,7 +43,7 @@ class Part:
     number: int = 0
     of: int = 1
     device: str = "auto"
-    """As in `choose_device`: auto, cpu or cuda; or the device that was assigned to this part, such as cuda:1."""
+    """auto, cpu or cuda; or the device that was assigned to this part, such as cuda:1."""
 
     def missing(self, views: ViewFolder) -> list[int]:
         """Indices of the part's views that are not finished."""

@@ -66,7 +66,7 @@ class ProjectFile:
     path: Path
     """The file, for messages and as the base of relative paths."""
     content: Mapping[str, Any]
-    """As read, with renamed keys under their present names; tables are known, keys not yet checked."""
+    """The tables as read, renamed keys under their present names; tables are known, keys not yet checked."""
     renamed: tuple[str, ...] = ()
     """One line per key that was found under an earlier name."""
 

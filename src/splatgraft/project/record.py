@@ -29,7 +29,7 @@ class Job:
     options: Mapping[str, Any]
     """Plain JSON values that the result depends on."""
     defaults: Mapping[str, Any] = field(default_factory=dict)
-    """Of the options that have one: what an earlier version did, which did not have the option yet."""
+    """Defaults of the options that have one: what an earlier version did, which did not have the option yet."""
 
     @cached_property
     def entries(self) -> Mapping[str, tuple[Entry, ...]]:
@@ -76,7 +76,7 @@ class Record:
     step: str
     """The command."""
     version: str
-    """Of splatgraft."""
+    """Version of splatgraft."""
     options: Mapping[str, Any]
     """All options, resolved, as plain JSON."""
     inputs: Mapping[str, tuple[Entry, ...]]

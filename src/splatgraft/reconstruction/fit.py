@@ -118,9 +118,9 @@ class FitState:
     iteration: int
     """Steps done."""
     gaussians: Gaussians
-    """As fitted so far."""
+    """The scene as it is fitted so far."""
     moments: adam.Moments
-    """Of the fields that are fitted."""
+    """Adam's moments of the fields that are fitted."""
     view_colors: ViewColors
     """Colours of each view over the scene's."""
     memory: dict[str, Tensor] = field(default_factory=dict)

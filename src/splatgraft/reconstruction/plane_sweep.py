@@ -25,7 +25,7 @@ _PATCH_SPACING_PX = 1.5
 _MIN_ANGLE_DEG = 2.0
 """Between the directions of two views to what they look at; less tells nothing about depth."""
 _MIN_COSINE = 0.5
-"""Of the angle between the optical axes of two views that are compared."""
+"""Smallest cosine of the angle between the optical axes of two views that are compared."""
 NEAR, _FAR = 0.4, 8.0
 """Range of the distance from every camera, over the cameras' mean distance from what they look at."""
 _MIN_KNOWN = 100

@@ -35,7 +35,7 @@ class Shadows:
     receivers: Receivers
     """The Gaussians of the scene that some object reaches, wide ones split at shadow edges."""
     on_scene: SceneRatio
-    """Of the receivers, by all objects together."""
+    """Ratios of the receivers, by all objects together."""
     scene_visibility: tuple[Float[Tensor, "n k"], ...]
     """Per object the share of every light sample that reaches its Gaussians past the scene, in [0, 1]."""
     on_objects: tuple[SceneRatio, ...]

@@ -33,7 +33,7 @@ from splatgraft.runtime.note import Note
 _MAX_VIEW_CHANGE = 0.9
 """Share of the light in a shadow that a view direction takes away; set by hand."""
 _MIN_SLOPE = 1e-6
-"""Of a ratio over view directions; below it nothing is seen, and divisions would overflow."""
+"""Smallest slope of a ratio over view directions; below it nothing is seen, and divisions would overflow."""
 _MIN_CERTAIN = 0.5
 """Share of the light that was captured and whose direction is certain, below which most of it is a guess."""
 

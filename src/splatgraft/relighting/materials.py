@@ -92,13 +92,13 @@ _CHUNK = 8192
 _MAX_FITTED = 8192
 """Gaussians that lobes are fitted to, spread over the object; more add time and change nothing."""
 _ROUNDS = 15
-"""Of k-means."""
+"""Rounds of k-means."""
 
 # the model's few numbers; on twelve rendered scenes of given true light the result is flat around all of them
 _CLUSTERS = 6
 """Clusters of colour and place; 2 to 16 give the same PSNR within 0.02 dB."""
 _CONCENTRATIONS = (1.5, 3.0, 6.0, 12.0, 25.0)
-"""Of the lobes that are tried, from a satin to a polished surface; finer ones no bands of degree 3 can hold."""
+"""Concentrations of the lobes that are tried, from satin to polished; bands of degree 3 hold no finer ones."""
 _EVIDENCE = 0.05
 """Explained share of the change with the view at which a lobe is believed by half: shares of pure noise."""
 _LOWEST_COSINE = 0.1
@@ -118,13 +118,13 @@ class Materials:
     reflectance: Float[Tensor, "n 3"]
     """Linear rgb share of the light in the lobe that is reflected, at least 0; 0 where nothing tells of gloss."""
     concentration: Float[Tensor, "n"]
-    """Of the lobe."""
+    """Concentration of the lobe."""
     dielectric: Bool[Tensor, "n"]
     """Whether reflectance grows towards grazing views (Schlick 1994); otherwise it is even, as that of a metal."""
     matt: Float[Tensor, "n 3"]
     """Linear rgb under the old light, without the lobe."""
     share: Float[Tensor, "n"]
-    """Of the light seen under the old light, what the lobe gave, in [0, 1]."""
+    """Share of what was seen under the old light that the lobe gave, in [0, 1]."""
 
     @property
     def glossy(self) -> Bool[Tensor, "n"]:
@@ -231,7 +231,7 @@ class _Record:
     colors: Float[Tensor, "n v 3"]
     """Linear rgb, the mean of each picture over the pixels that the Gaussian covers."""
     weight: Float[Tensor, "n v"]
-    """Of each view, sums to 1 or 0."""
+    """Weight of each view; they sum to 1, or to 0 where no view counts."""
     pixels: Float[Tensor, "n"]
     """That the Gaussian covers in all views."""
     directions: Float[Tensor, "n v 3"]

@@ -30,7 +30,7 @@ _UNSEEN_CONFIDENCE = 0.5
 _RAISED = 1.5
 """Standard deviations along the normal from a Gaussian's centre to where its surface is visible."""
 _OWN_WEIGHT = 0.5
-"""Of a Gaussian's own covariance beside the mixture's, both scaled to trace 1."""
+"""Weight of a Gaussian's own covariance beside the mixture's, both scaled to trace 1."""
 _FLATNESS_GAIN = 2
 """1 - thickness / width, times this, is the confidence: a Gaussian twice as wide as thick is a surface."""
 

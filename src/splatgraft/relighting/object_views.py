@@ -39,7 +39,7 @@ class ObjectView:
     camera: Cameras
     """A single one, of the cut image."""
     operator: ViewOperator
-    """Of the object alone."""
+    """The view's linear map for the object alone."""
     directions: Float[Tensor, "n 3"]
     """Unit, from the camera to each Gaussian."""
 

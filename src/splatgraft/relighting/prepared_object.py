@@ -41,7 +41,7 @@ class SourceScene:
     gaussians: Gaussians
     """In the object's own frame."""
     cameras: Cameras
-    """Of the capture, in the same frame."""
+    """Cameras of the capture, in the same frame."""
     light: Light | None = None
     """At the object's place, in the same frame, where it is known; otherwise it is estimated."""
     normals: Float[Tensor, "n 3"] | None = None
@@ -67,17 +67,17 @@ class PreparedObject:
     """One placed object of n Gaussians, target's frame."""
 
     number: int
-    """Of the object among all placed ones, from 1."""
+    """Number of the object among all placed ones, from 1."""
     gaussians: Gaussians
     """Target's frame."""
     target_from_object: Similarity
     """The placement."""
     sphere: BoundingSphere
-    """Of the Gaussians."""
+    """Bounding sphere of the Gaussians."""
     normals: Normals
-    """Of the Gaussians."""
+    """Normals of the Gaussians."""
     light_sources: tuple[LightSource, ...]
-    """Of the light at the new place, for which the maps are."""
+    """Sources of the light at the new place, for which the maps are."""
     maps: ObjectShadowMaps
     """For the samples of the light at the new place."""
     self_visibility: Float[Tensor, "n k"]

@@ -57,9 +57,9 @@ _MIN_GAUSSIANS = 500
 _DARKEST = 0.01
 """sRGB; darker channels count as this."""
 _LIT_QUANTILE = 0.75
-"""Of apparent albedo in a group of one material: a Gaussian of this brightness is taken to be fully lit."""
+"""Quantile of apparent albedo in a group of one material: a Gaussian of this brightness is taken to be fully lit."""
 _RAMP_START, _RAMP_WIDTH = 0.2, 0.4
-"""Of the ramp from 0 to 1 over the measured visibility: little light counts as none."""
+"""Start and width of the ramp from 0 to 1 over the measured visibility: little light counts as none."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class SceneLight:
     scene: Gaussians
     """All Gaussians that are not erased."""
     cameras: Cameras
-    """Of the scene's capture."""
+    """Cameras of the scene's capture."""
     light: Light
     """At the objects' place."""
     estimate: EstimatedLight | None

@@ -135,7 +135,7 @@ class _TileLists:
         )
 
     def in_order(self, values: np.ndarray) -> np.ndarray:
-        """Of `values (n, c)` those of the splats, (m, c)."""
+        """The rows of `values (n, c)` that belong to the splats, (m, c)."""
         out = np.empty((len(self.order), values.shape[1]), np.float32)
         cpu_blend.gather(values, self.order, out)
         return out

@@ -128,7 +128,7 @@ def blend_and_transpose(splats, start, entries, rows, slots, values, pixel_weigh
 @kernel
 @no_type_check
 def _blend_one_and_keep(splats, entries, rows, values, x0, y0, work, weights):
-    """As `_blend_and_keep` for one channel: planes transmittance and value."""
+    """The same blending as `_blend_and_keep` for one channel: planes transmittance and value."""
     kept = 0
     for k in range(entries.shape[0]):
         s = entries[k]

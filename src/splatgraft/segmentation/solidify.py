@@ -167,7 +167,7 @@ class _Fit:
 
     @property
     def gaussians(self) -> Gaussians:
-        """As fitted so far."""
+        """The object as it is fitted so far."""
         leaves = {name: leaf.detach() for name, leaf in self._leaves.items()}
         return replace(self._start, **leaves, sh=torch.cat([self._base, self._higher], 1).detach())
 

@@ -39,13 +39,13 @@ class KeyTable:
     """One table of project.toml."""
 
     name: str
-    """As in the file, without brackets, e.g. `source.reconstruct`."""
+    """Name of the table in the file, without brackets, e.g. `source.reconstruct`."""
     meaning: str
     """What the step does, or what the table is for."""
     keys: tuple[Key, ...]
     """In the order in which the command's help lists them."""
     variants: tuple["KeyTable", ...] = ()
-    """Of a table with a choice, such as `method` in [harmonize]: the further keys that each choice takes, by name."""
+    """Tables of a choice, such as `method` in [harmonize]: the further keys that each choice takes, by name."""
 
 
 def describe_table(

@@ -34,7 +34,7 @@ _TYPICAL_SECONDS = {
 
 Another project differs by a factor, which its finished steps give."""
 _COMPILATION_SECONDS = 25.0
-"""Of the kernels of a first reconstruction, a part of its typical time."""
+"""Seconds that compiling the kernels takes in a first reconstruction, a part of its typical time."""
 
 
 def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, ...]:

@@ -168,7 +168,7 @@ def _read_normals(path: Path, thing: Gaussians, cameras: Cameras) -> Float[Tenso
 
 
 _RECONSTRUCTION = ReconstructOptions(iterations=1000, budget=20_000)
-"""As an exam's."""
+"""Reconstruction of a held-out scene."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class TrainingScene:
     name: str
     """EXAM-SCENE."""
     files: Path
-    """As `render_scene` leaves them."""
+    """Folder as `render_scene` leaves it."""
     work: Path
     """Its reconstructions, object and composite."""
 

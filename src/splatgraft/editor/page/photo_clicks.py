@@ -19,7 +19,7 @@ from splatgraft.editor.page.scene_view import Canvas
 
 _KINDS = ("on the object", "beside it")
 _LONGEST_PX = 1920
-"""Of a photo on the canvas; the browser enlarges it on a larger one."""
+"""Longest side of a photo on the canvas, pixels; on a larger canvas the browser enlarges it."""
 _TAKES_POINTS = (None, "auto", "grabcut", "sam2")
 """Values of `mask_source` of which the points count."""
 _OTHER_SHAPE = 0.01

@@ -22,7 +22,7 @@ from splatgraft.project.layout import EXPORTS_FOLDER, REPORT_FILE
 _LISTED = 6
 """Shared files that are listed, the newest ones."""
 _SHOWN_SUFFIXES = (".html", ".png", ".jpg", ".webp", ".gif", ".mp4")
-"""Of files that a browser shows."""
+"""Suffixes of files that a browser shows."""
 _PICTURE = "view.png"
 
 

@@ -20,7 +20,7 @@ from websockets.http11 import Request, Response
 from splatgraft.editor.access import allowed_query, check_access
 
 FILES_PREFIX = "files/"
-"""Of the addresses of files, below the page's own address."""
+"""First part of the addresses of files, below the page's own address."""
 _CAMERA_MESSAGES = (_messages.ViewerCameraMessage, _messages.GetRenderResponseMessage)
 _TYPES = {
     ".html": "text/html; charset=utf-8",

@@ -46,7 +46,7 @@ class CompactInput:
     """Linear light, without the object."""
     mask: Float[Tensor, "b 1 h w"]
     log_ratio: Float[Tensor, "b 3 h w"]
-    """Of the prior over the composite, see `log_light_ratio`; 0 where there is no prior."""
+    """Log ratio of the prior over the composite, see `log_light_ratio`; 0 where there is no prior."""
     depth: Float[Tensor, "b 1 h w"]
     """Log of depth over the object's median depth, clamped to [-2, 2]; 2 where nothing is hit."""
     normal: Float[Tensor, "b 3 h w"]
@@ -94,7 +94,7 @@ class CompactOutput:
     object_grid: Float[Tensor, "b 12 l p q"]
     """Bilateral grid (Chen et al. 2007) of affine colour maps, as a difference: 3 rows of 3 factors and an offset."""
     scene_prior_scale: Float[Tensor, "b 1 i j"]
-    """As `object_prior_scale`, off the object."""
+    """The same factor as `object_prior_scale`, off the object."""
     scene_gain: Float[Tensor, "b 3 i j"]
     """Log gain off the object: shadow and bounce."""
     scene_added: Float[Tensor, "b 3 i j"]

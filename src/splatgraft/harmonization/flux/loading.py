@@ -32,7 +32,7 @@ _PREFIX = "transformer."
 BASE = "black-forest-labs/FLUX.1-schnell"
 _AUTHORS = "nviolante/dot3d"
 _BYTES = {"bf16": 2.0, "fp8": 1.0, "offload": 0.1}
-"""Of a parameter on the device, best first; offload holds the two blocks in use."""
+"""Bytes of a parameter on the device, best precision first; offload holds the two blocks in use."""
 _RESERVED_BYTES = 1.2e9
 """For the autoencoder, the CUDA context, kernels and fragmentation. An estimate."""
 

@@ -60,7 +60,7 @@ class FluxNetwork:
     variant: Variant
     device: torch.device
     dtype: torch.dtype
-    """Of the transformer's arithmetic."""
+    """Number type of the transformer's arithmetic."""
     strengths: tuple[float, ...] = (1.0,)
     """Noise levels to start from that its modulations are precomputed for."""
 

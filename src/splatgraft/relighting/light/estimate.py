@@ -50,10 +50,10 @@ _FAR = 0.9
 _OVER_MEDIAN = 4.0
 """Luminance of a peak over the median of all directions."""
 _MIN_SHARE = 0.02
-"""Of all light, from one direction of a peak."""
+"""Smallest share of all light that comes from one direction of a peak."""
 _MAX_SOURCES = 4
 _NEIGHBOUR_COSINE = math.cos(math.radians(14))
-"""Of the angle to the brightest direction below which a direction belongs to its source: it is a neighbour."""
+"""Cosine of the largest angle to the brightest direction at which a direction belongs to its source."""
 _SUN = 0.03
 """Steradians; a smaller clipped patch is called sun, a larger one window."""
 _UNSEEN_RADIUS_DEG = 1.0
@@ -69,7 +69,7 @@ _SURFACE_ALPHA = 0.5
 _SOURCE_IMAGE = (32.0, 16)
 """Focal length and width, pixels, of the depth image."""
 _SOURCE_QUANTILE = 0.25
-"""Of the depths in that image: the distance to the source."""
+"""Quantile of the depths in that image that is the distance to the source."""
 _BLOCKERS_WITHIN = 0.7
 """Share of that distance within which occluders block the source."""
 

@@ -29,7 +29,7 @@ from splatgraft.relighting.normals import Normals, seen_from, spread_over
 from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occluders_of, splat_depth_maps, visibility
 
 _SEED = 0
-"""Of all random choices of Gaussians."""
+"""Seed of all random choices of Gaussians."""
 _DARKEST_CHROMA = 1e-3
 """Linear light; channels darker than this count as this in chromaticities."""
 
@@ -99,7 +99,7 @@ _SQUARINGS = 3
 """The lobe is cos^(2^squarings), cos^8: 24 degrees wide at half height, as narrow as harmonics of degree 3 can be, and
 wide enough for windows."""
 _ROUGHNESS = 0.707
-"""Of rough surfaces; its square is GGX's alpha, .5: of the order of stone, wood and grass."""
+"""Roughness of rough surfaces; its square is GGX's alpha, .5: of the order of stone, wood and grass."""
 _FACING = 0.04
 """Reflectance of dielectrics that face the camera."""
 _MAX_EXPLAINED = 0.98
@@ -174,7 +174,7 @@ class ShadingEvidence:
         return torch.cat(rows) if rows else self.visibility
 
     def _near_transport(self, part: Int[Tensor, "p"], lights: Float[Tensor, "k 3"]) -> Float[Tensor, "p k"]:
-        """Of some receivers, for lights at places in world units."""
+        """Transport to some receivers from lights at places in world units."""
         away = lights - self.points[part, None]
         apart = away.norm(dim=2, keepdim=True).clamp_min(1e-6)
         towards = away / apart
@@ -286,7 +286,7 @@ class HighlightEvidence:
     products: Float[Tensor, "g r k"]
     """Covariances of the lobes with the observed change of brightness."""
     variance: float
-    """Of that change."""
+    """Variance of that change."""
 
     def explained(self, light: Float[Tensor, "k"]) -> float:
         """Share of the change from view to view that such a light explains, in [0, 1]."""

@@ -222,7 +222,7 @@ def _numbers(values: object, count: int, where: str, bounds: tuple[float, float]
 
 
 _C0 = 0.28209479
-"""Of the harmonics' first band; rounded, and kept so: `core.spherical_harmonics.C0` would change written priors."""
+"""The harmonics' first band; rounded, and kept so: `core.spherical_harmonics.C0` would change written priors."""
 _UNCERTAIN_DEG = 20.0
 """Degrees of direction uncertainty at which a source counts exp(-1); set by hand."""
 

@@ -25,7 +25,7 @@ _MAX_ALBEDO = math.log(0.9)
 _ABOVE_MAX = 100.0
 """Precision of the prior that keeps albedo below 0.9."""
 _LARGEST_STEP = 1.5
-"""Of any logarithm in one step."""
+"""Largest change of any logarithm in one step."""
 _DARKEST = 1e-3
 """Radiance that the sky is taken to have where nothing at all was seen."""
 _PRESENT = 0.02
@@ -91,7 +91,7 @@ class LightEvidence:
     """What is known of the light at a place."""
 
     surfaces: ShadingEvidence
-    """Of a region around the place."""
+    """Surfaces of a region around the place."""
     highlights: HighlightEvidence | None
     """On the same surfaces; None without view-dependent colours."""
     far: Surroundings
@@ -144,7 +144,7 @@ class RadianceProblem:
     """Radiance of white surfaces under what was captured."""
     log_color: Float[Tensor, "m"]
     weights: Float[Tensor, "m"]
-    """Of the receivers; they sum to `effective`."""
+    """Weights of the receivers; they sum to `effective`."""
     is_white: Bool[Tensor, "m"]
     """Receivers that the camera clipped: they may be brighter than recorded."""
     material_weights: Float[Tensor, "g"]
@@ -157,7 +157,7 @@ class RadianceProblem:
     """Positions in `clipped` of connected parts that may be sources: those above the horizon, largest first."""
 
     def split(self, x: Float[Tensor, "s"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Of a state: level of the unseen sky, the n log radiances, the g log albedos."""
+        """The parts of a state: level of the unseen sky, the n log radiances, the g log albedos."""
         n = self.transport.shape[1]
         return x[0], x[1 : 1 + n], x[1 + n :]
 

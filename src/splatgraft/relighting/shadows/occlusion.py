@@ -44,7 +44,7 @@ class Occlusion:
     """An object's depth maps as k mip pyramids, one per light sample."""
 
     center: Float[Tensor, "3"]
-    """Of the maps' window, world units."""
+    """Centre of the maps' window, world units."""
     radius: float
     """Half the width of the maps, world units."""
     frames: Float[Tensor, "k 3 3"]

@@ -46,7 +46,7 @@ _SHOWS_BEHIND = 1.2
 lies behind its centre, seen from the camera; without this an edge appears too far from all cameras. Measured on
 planes: 1.0 for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
 _NARROWEST = 0.25
-"""Of the finest width that is split: narrower Gaussians get no slope; set by hand."""
+"""Share of the finest width that is split: narrower Gaussians get no slope; set by hand."""
 _EDGE = 0.02
 """Share of light by which rim and centre differ at an edge; a rim shows a twentieth of it; set by hand."""
 

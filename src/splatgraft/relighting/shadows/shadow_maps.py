@@ -34,7 +34,7 @@ _SPENT = np.float32(0.02)
 _HALF = np.float32(0.5)
 """Transmittance at which a texel's first depth is taken."""
 _MAX_ALPHA = np.float32(0.99)
-"""Of one splat in one pixel, as in 3DGS."""
+"""Largest alpha of one splat in one pixel, as in 3DGS."""
 _DILATION = np.float32(0.15)
 """Pixels squared, added to the variance of a splat's footprint against aliasing."""
 _LIFT = np.float32(1.5)

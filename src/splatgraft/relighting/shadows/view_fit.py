@@ -77,13 +77,13 @@ class _Surfaces:
     """The surfaces that m receivers form."""
 
     points: Float[Tensor, "m 3"]
-    """Of each one the point in the middle of the layer."""
+    """The point in the middle of the layer at each of them, world units."""
     normals: Float[Tensor, "m 3"]
     """Unit."""
     extents: Float[Tensor, "m"]
     """World units; how far from its point a receiver shows the surface."""
     tree: KDTree
-    """Of the points."""
+    """Search tree of the points."""
 
     @staticmethod
     def of(receivers: Receivers) -> "_Surfaces":
