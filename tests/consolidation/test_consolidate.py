@@ -136,7 +136,7 @@ import sys
 sys.path.insert(0, sys.argv[3])
 from dataclasses import replace
 import torch
-from conftest import ball, ring
+from ball_scenes import ball, ring
 from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import ball, basis_towards, ring, views_of
+from ball_scenes import ball, basis_towards, ring, views_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from conftest import ball, basis_towards, ring, views_of
+from ball_scenes import ball, basis_towards, ring, views_of
 
 from splatgraft.consolidation import normal_equations
 from splatgraft.consolidation.color_fit import drop_higher_bands

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import address_of
 from editor_driver import Window, state_of
+from editor_fixtures import address_of
 from editor_pages import opened_page
 from PIL import Image
 from test_state import LIGHT

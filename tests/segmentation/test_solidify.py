@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import BALL, splats
+from ball_views import BALL, splats
 
 from splatgraft.core.gaussians import concatenate
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
