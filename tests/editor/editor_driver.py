@@ -137,9 +137,19 @@ class Window:
 
     @staticmethod
     def opened(browser: Any, address: str) -> "Window":
-        """Open a new window on an editor."""
+        """Open a new window on an editor; one that stays empty is loaded again, as a user would.
+
+        Where connections failed shortly before, Chromium delays the next one, and viser gives it up after a second.
+        """
+        from playwright.sync_api import TimeoutError as PlaywrightTimeout
+
         page = browser.new_page()
         page.goto(address)
+        while not page.locator(".sg-header").count():
+            try:
+                page.wait_for_selector(".sg-header", timeout=30_000)
+            except PlaywrightTimeout:
+                page.goto(address)
         return Window(page)
 
     # waiting
