@@ -12,7 +12,10 @@
 Every name is loaded when it is first used: `import splatgraft` itself imports neither torch nor numba.
 """
 
+import ast
+from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -132,79 +135,23 @@ __all__ = [
     "true_views",
 ]
 
-_SOURCES = {
-    "Box": "segmentation.Box",
-    "Cameras": "core.cameras.Cameras",
-    "CompactOptions": "harmonization.CompactOptions",
-    "Composite": "core.composite.Composite",
-    "ConsolidateOptions": "consolidation.ConsolidateOptions",
-    "FluxOptions": "harmonization.FluxOptions",
-    "Gaussians": "core.gaussians.Gaussians",
-    "Harmonized": "harmonization.Harmonized",
-    "HarmonizedViews": "harmonization.HarmonizedViews",
-    "Harmonizer": "harmonization.Harmonizer",
-    "HarmonizerContext": "harmonization.HarmonizerContext",
-    "HarmonizerInputs": "harmonization.HarmonizerInputs",
-    "LayerWeights": "relighting.LayerWeights",
-    "LiftOptions": "segmentation.LiftOptions",
-    "Light": "relighting.Light",
-    "LightSource": "relighting.LightSource",
-    "PlaceOptions": "composition.PlaceOptions",
-    "Placed": "composition.Placed",
-    "PlacedObject": "core.composite.PlacedObject",
-    "PosedImages": "core.posed_images.PosedImages",
-    "ReconstructOptions": "reconstruction.ReconstructOptions",
-    "RelightOptions": "relighting.RelightOptions",
-    "Relit": "relighting.Relit",
-    "Render": "rendering.Render",
-    "RenderOptions": "rendering.RenderOptions",
-    "SceneMetadata": "formats.SceneMetadata",
-    "Segmentation": "segmentation.Segmentation",
-    "SelectOptions": "segmentation.SelectOptions",
-    "Similarity": "core.similarity.Similarity",
-    "SolidifyOptions": "segmentation.SolidifyOptions",
-    "SourceScene": "relighting.SourceScene",
-    "Truth": "evaluation.Truth",
-    "compose": "composition.compose",
-    "consolidate": "consolidation.consolidate",
-    "evaluate": "evaluation.evaluate",
-    "harmonize": "harmonization.harmonize",
-    "held_out": "core.posed_images.held_out",
-    "lift_masks": "segmentation.lift_masks",
-    "light_from_json": "relighting.light_from_json",
-    "light_to_json": "relighting.light_to_json",
-    "load": "formats.read_gaussians",
-    "load_image": "core.images.read_rgb",
-    "look_at": "core.cameras.look_at",
-    "make_harmonizer": "harmonization.make_harmonizer",
-    "pinhole": "core.cameras.pinhole",
-    "place_object": "composition.place_object",
-    "read_cameras": "formats.read_cameras",
-    "read_capture": "formats.read_capture",
-    "reconstruct": "reconstruction.reconstruct",
-    "relight": "relighting.relight",
-    "render": "rendering.render",
-    "render_views": "harmonization.render_views",
-    "run_project": "workflow.run.run_project",
-    "save": "formats.write_gaussians",
-    "save_image": "core.images.write_image",
-    "segment": "segmentation.segment",
-    "select_object": "segmentation.select_object",
-    "solidify_object": "segmentation.solidify_object",
-    "stale_steps": "workflow.run.stale_steps",
-    "true_views": "evaluation.true_views",
-}
-"""Where each name of `__all__` is defined, below splatgraft; the imports above are for type checkers."""
+
+@cache
+def _sources() -> dict[str, tuple[str, str]]:
+    """Module and name there of each public name: what the imports above, which never run, tell type checkers."""
+    block = next(node for node in ast.parse(Path(__file__).read_text("utf-8")).body if isinstance(node, ast.If))
+    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
+    return {alias.asname or alias.name: (str(one.module), alias.name) for one in imports for alias in one.names}
 
 
 if not TYPE_CHECKING:  # a type checker would take every unknown name for one of these
 
     def __getattr__(name: str) -> object:
         """Load a public name when it is first used (PEP 562)."""
-        if name not in _SOURCES:
+        if name not in __all__:
             raise AttributeError(f"module 'splatgraft' has no attribute {name!r}")
-        module, _, own = _SOURCES[name].rpartition(".")
-        return getattr(import_module(f"splatgraft.{module}"), own)
+        module, own = _sources()[name]
+        return getattr(import_module(module), own)
 
 
 def __dir__() -> list[str]:

@@ -41,11 +41,7 @@ class Edit:
         end_process(0)
 
     def serve(self, console: Console, stop: threading.Event) -> None:
-        """Serve until `stop` is set.
-
-        Raises:
-            ValueError: If another editor has the project open.
-        """
+        """Serve until `stop` is set; a ValueError where another editor has the project open."""
         from splatgraft.editor.page.opening import Opening
         from splatgraft.editor.page.server import GuardedServer
 

@@ -46,14 +46,7 @@ class Export:
         return 0
 
     def write(self, console: Console) -> tuple[str, ...]:
-        """Read and write, with a progress bar.
-
-        Returns:
-            Sentences for the user: what was assumed; size and seconds.
-
-        Raises:
-            ValueError: There is nothing to export, or the format cannot hold it.
-        """
+        """Read and write, with a progress bar; gives sentences: what was assumed, size and seconds."""
         began, said = time.monotonic(), ()
         if self.page == "report":
             write_report_file(self.to, self._report())

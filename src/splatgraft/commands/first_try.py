@@ -53,10 +53,7 @@ class Try:
         return 0
 
     def _write_project(self, folder: Path, console: Console) -> None:
-        """A project at draft quality; one that this command wrote earlier, and that may be refined, is kept.
-
-        Raises: ValueError where the folder holds a project of other captures, or a capture does not exist.
-        """
+        """A project at draft quality; one that this command wrote earlier, and that may be refined, is kept."""
         project = folder / PROJECT_FILE
         init = Init(folder, source=self.object, target=self.place)
         if project.is_file():
@@ -72,12 +69,7 @@ class Try:
 
 
 def refinements(flow: Flow, folder: Path) -> list[str]:
-    """What was unsure in a finished project, in the order of the steps, what helps most, and how to get finer results.
-
-    Args:
-        flow: The project.
-        folder: As the user names it.
-    """
+    """What was unsure in a finished project, step by step, what helps most, and how to get finer results."""
     shown = Path(shlex.quote(str(folder)))
     lines: list[str] = []
     helps: list[str] = []

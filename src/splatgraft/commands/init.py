@@ -42,10 +42,7 @@ class Init:
         return 0
 
     def text(self) -> str:
-        """The content of project.toml.
-
-        Raises: ValueError where a capture does not exist.
-        """
+        """The content of project.toml; a ValueError where a capture does not exist."""
         for capture in (self.source, self.target):
             if not capture.exists():
                 raise ValueError(f"{capture}: expected photos, a video, a posed capture or a scene, found nothing")

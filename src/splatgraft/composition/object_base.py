@@ -56,16 +56,7 @@ def object_base(
     up: Float[Tensor, "3"],
     surroundings: Gaussians | None = None,
 ) -> ObjectBase:
-    """Base of `object_`, on its own ground where that is found, otherwise at its lowest parts.
-
-    Args:
-        object_: The object in the frame of its capture.
-        up: Of any length but zero.
-        surroundings: The capture without the object; None where there is none.
-
-    Raises:
-        ValueError: Where the object is empty.
-    """
+    """Base of `object_`, on its own ground where `surroundings` show that, otherwise at its lowest parts."""
     if object_.count == 0:
         raise ValueError("placement: expected an object with Gaussians, found an empty one")
     up = torch.nn.functional.normalize(up.to(object_.means), dim=0)
@@ -123,16 +114,8 @@ def rest_on_surface(
 ) -> tuple[Similarity, Support]:
     """`target_from_object` that rests `base` on the surface below `point`, along its normal, and that surface.
 
-    Args:
-        target: The receiving scene.
-        base: The object's base, in its own capture.
-        point: On or above the surface, in the target.
-        up: Of the target, of any length but zero.
-        scale: Size in the target over size in the object's own capture.
-        yaw_deg: Rotation about the surface's normal, counterclockwise seen from above.
-
-    Raises:
-        ValueError: Where no surface lies below `point`.
+    `scale`: size in the target over size in the object's own capture. `yaw_deg`: about the surface's normal,
+    counterclockwise seen from above. A ValueError where no surface lies below.
     """
     support = support_below(target, point, up=up, radius=scale * base.radius)
     yaw = rotation_about(support.normal, math.radians(yaw_deg))

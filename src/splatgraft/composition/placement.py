@@ -159,15 +159,10 @@ def facing_yaw_deg(
     *,
     up: Float[Tensor, "3"],
 ) -> float:
-    """Rotation about `up` that turns photographed sides towards the target's cameras.
+    """Rotation about unit `up` that turns photographed sides towards the target's cameras, degrees in [-180, 180).
 
-    Args:
-        to_source_cameras: From the object to the cameras of its own capture, in the target's frame.
-        to_target_cameras: From the object to the target's cameras, in the target's frame.
-        up: Unit.
-
-    Returns:
-        Degrees in [-180, 180); the smallest of about equally good ones: 0 where the capture goes all round.
+    Both directions are from the object, in the target's frame. Of about equally good ones the smallest: 0 where the
+    capture goes all round.
     """
     yaw = torch.arange(-180, 180, _YAW_STEP_DEG, dtype=torch.float64)
     source, target = (_azimuth(x.double(), up.double()) for x in (to_source_cameras, to_target_cameras))
@@ -180,12 +175,7 @@ def facing_yaw_deg(
 
 
 def unseen_share(to_source_cameras: Float[Tensor, "s 3"], to_target_cameras: Float[Tensor, "t 3"]) -> float:
-    """Share of the target's cameras, in [0, 1], that see the object from where no photograph of it was taken.
-
-    Args:
-        to_source_cameras: From the object to the cameras of its own capture, in the target's frame.
-        to_target_cameras: From the object to the target's cameras, in the target's frame.
-    """
+    """Share of the target's cameras, in [0, 1], that see the object from where no photograph of it was taken."""
     source, target = (torch.nn.functional.normalize(x.double(), dim=1) for x in (to_source_cameras, to_target_cameras))
     nearest = (target @ source.T).amax(1)
     return float((nearest < math.cos(math.radians(_PHOTOGRAPHED_DEG))).double().mean())

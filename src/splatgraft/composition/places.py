@@ -74,20 +74,7 @@ def suggest_places(
 
     Captures have no common unit of length, so a scale that is not given is a guess from the size in the images; it is
     reduced where no level place is large enough. Where no place is level and in view, the nearest to it is given with
-    the reason.
-
-    Args:
-        target: The receiving scene.
-        base: The object's base and size.
-        cameras: Of the target.
-        up: Of any length but zero.
-        scale: Size in the target over size in the source; None guesses it.
-
-    Returns:
-        At least one, the best first, apart from each other by the object's radius.
-
-    Raises:
-        ValueError: Where the scene has no surface near that point.
+    the reason. At least one, apart from each other by the object's radius; a ValueError where there is no surface.
     """
     focus, reach, reasons = _search_area(target, cameras)
     up = torch.nn.functional.normalize(up.to(focus), dim=0)
@@ -185,15 +172,9 @@ def _visible_share(target: Gaussians, ground: HeightMap, *, cameras: Cameras) ->
 
 
 def hidden_fraction(target: Gaussians, placed: Gaussians, *, cameras: Cameras) -> float:
-    """Share of an object, by opacity, that the target's surfaces hide from all cameras, as inside a wall.
+    """Share of an object, by opacity, that the target's surfaces hide from all cameras, as inside a wall; in [0, 1].
 
-    Args:
-        target: Scene without the object.
-        placed: Object in the frame of the target.
-        cameras: Of the target; a part outside the images of all chosen ones counts as hidden.
-
-    Returns:
-        In [0, 1].
+    A part outside the images of all chosen cameras counts as hidden.
     """
     points = placed.means
     if placed.count == 0:

@@ -51,15 +51,9 @@ def height_map(
     top: float,
     size: int = 96,
 ) -> HeightMap:
-    """The height map of the square of half width `radius` around `center`.
+    """The s x s height map, s = `size`, of the square of half width `radius` around `center`.
 
-    Args:
-        scene: What is seen from above.
-        center: World units.
-        up: Of any length but zero.
-        radius: World units.
-        top: Gaussians centred more than this above `center` are left out, world units.
-        size: Width and height of the map, pixels.
+    Gaussians centred more than `top` above `center`, along `up`, are left out; all in world units.
     """
     center, up = center.to(scene.means), torch.nn.functional.normalize(up.to(scene.means), dim=0)
     distance = _CAMERA_DISTANCE * radius
@@ -175,20 +169,11 @@ def support_below(
     radius: float,
     clearance: float | None = None,
 ) -> Support:
-    """The surface that fills most of a horizontal disc below `point`, level as far as one is.
+    """The surface that fills most of a horizontal disc of `radius` below `point`, level as far as one is.
 
-    It may be poor, as on a heap of things or a steep slope: `flat_fraction` says how much of the disc lies on it.
-
-    Args:
-        scene: What is seen from above.
-        point: World units; may lie on the surface.
-        up: Of any length but zero.
-        radius: Of the disc, world units.
-        clearance: Height above `point` from which the search starts, world units; what is higher, such as a lamp, is
-            ignored. None takes a share of the radius, so that a point on a noisy surface finds it.
-
-    Raises:
-        ValueError: Where no surface lies below.
+    It may be poor, as on a heap of things or a steep slope: `flat_fraction` says how much of the disc lies on it. What
+    is higher than `clearance` above `point`, such as a lamp, is ignored; None takes a share of the radius, so that a
+    point on a noisy surface finds it. A ValueError where no surface lies below.
     """
     up = torch.nn.functional.normalize(up.to(scene.means), dim=0)
     point = point.to(scene.means)

@@ -77,15 +77,10 @@ class _Layer:
 
 
 def flatten_contact_layers(target: Gaussians, objects: Sequence[Gaussians]) -> Gaussians:
-    """Flatten the layers that objects stand on, so that they do not cover the objects' feet.
+    """Flatten the layers that the placed objects stand on, so that they do not cover the objects' feet.
 
-    Args:
-        target: n Gaussians of the scene.
-        objects: The placed objects, in the frame of `target`.
-
-    Returns:
-        The n Gaussians in their order. Those away from every foot, and all around an object that floats or that stands
-        on no surface, keep every bit; of the others centres and shapes change, not opacities and colours.
+    Gaussians away from every foot, and all around an object that floats or that stands on no surface, keep every bit;
+    of the others centres and shapes change, not opacities and colours.
     """
     on_cpu = flattened = target.to("cpu")
     for one in objects:

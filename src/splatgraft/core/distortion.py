@@ -56,14 +56,7 @@ class Distortion:
     def undistort(
         self, image: Float[Tensor, "h w *c"], pinhole: Float[Tensor, "3 3"], *, width: int, height: int
     ) -> Float[Tensor, "h w *c"]:
-        """`image`, at its own resolution, as a pinhole camera sees it.
-
-        Args:
-            image: Pixels of the file.
-            pinhole: Intrinsics of the pinhole camera, for an image of `width` x `height` pixels.
-            width: Pixels.
-            height: Pixels.
-        """
+        """`image`, at its own resolution, as a pinhole camera of `width` x `height` pixels sees it."""
         h, w = image.shape[:2]
         half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV has pixel centres at whole numbers
         to_file = np.diag([w / self.size[0], h / self.size[1], 1])
@@ -82,12 +75,7 @@ class Distortion:
         return torch.from_numpy(moved).reshape(image.shape)
 
     def undistort_points(self, points: Float[Tensor, "k 2"], pinhole: Float[Tensor, "3 3"]) -> Float[Tensor, "k 2"]:
-        """Where a pinhole camera sees what the distorted picture shows at `points`.
-
-        Args:
-            points: x and y, pixels of a picture of `size`.
-            pinhole: Intrinsics of the pinhole camera.
-        """
+        """Where a pinhole camera sees what the distorted picture, of `size`, shows at `points` (x, y), pixels."""
         if not len(points):
             return points
         found = cv2.undistortPoints(

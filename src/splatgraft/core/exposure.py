@@ -69,12 +69,7 @@ class LuminanceScale:
 def luminance_scale(exposures: Sequence[Exposure], means: Sequence[float]) -> LuminanceScale | None:
     """The luminance behind a capture's linear values; None where under half of the photos have exposure data.
 
-    Args:
-        exposures: Of v photos.
-        means: Mean linear luminance of each photo's pixels, in [0, 1].
-
-    Returns:
-        Medians over the photos that have data.
+    `means`: mean linear luminance of each photo's pixels, in [0, 1].
     """
     whites = [None if one.ev100 is None else _SATURATION_CD_M2 * 2**one.ev100 for one in exposures]
     known = [(white, mean) for white, mean in zip(whites, means, strict=True) if white is not None]
@@ -84,14 +79,7 @@ def luminance_scale(exposures: Sequence[Exposure], means: Sequence[float]) -> Lu
 
 
 def describe_inconsistency(exposures: Sequence[Exposure]) -> str | None:
-    """What differs between the settings of a capture's photos and what that leads to, in one line.
-
-    Args:
-        exposures: Of all photos of a capture; those without data count for nothing.
-
-    Returns:
-        The line; None where nothing differs, or nothing is known.
-    """
+    """What differs between the settings of photos and what that leads to, in one line; None where nothing does."""
     known = sorted((value, str(one)) for one in exposures if (value := one.ev100) is not None)
     stops = known[-1][0] - known[0][0] if known else 0.0
     found: list[str] = []

@@ -46,15 +46,7 @@ _OFFSET = torch.tensor([-16.0, 0, 0], dtype=torch.float64)
 
 
 def flip_map(image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-    """Compute the visible difference of each pixel.
-
-    Args:
-        image: sRGB in [0, 1].
-        reference: sRGB in [0, 1].
-
-    Returns:
-        Differences in [0, 1]. Symmetric in the two images.
-    """
+    """The visible difference of each pixel of two sRGB images in [0, 1]: in [0, 1], symmetric in the two."""
     both = [_opponent(linear_from_srgb(x.double().clamp(0, 1))) for x in (image, reference)]
     seen = [_hunt(_lab(_as_seen(x))) for x in both]
     color = _spread(_hyab(seen[0], seen[1]) ** _COLOR_EXPONENT)

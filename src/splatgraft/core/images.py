@@ -87,15 +87,8 @@ def read_stored_rgb(
 ) -> Float[Tensor, "h w 3"]:
     """sRGB in [0, 1] on the stored pixel grid, to which poses refer: COLMAP ignores EXIF rotation.
 
-    A file whose upright grid alone has the shape of the camera's image is turned: other programs heed EXIF rotation.
-
-    Args:
-        path: An image file.
-        size: Width and height of the camera's image; None takes the stored grid.
-        longest_px: A longer picture is reduced to this longest side; a JPEG is then decoded at less than its full size.
-
-    Raises:
-        ValueError: The file is no readable image.
+    A file whose upright grid alone has the shape of the camera's image, `size`, is turned: other programs heed EXIF
+    rotation. A picture longer than `longest_px` is reduced to it; a JPEG is then decoded at less than its full size.
     """
     with opened(path) as image:
         if longest_px is not None:
@@ -117,16 +110,7 @@ def stored_size(path: Path, size: tuple[int, int] | None = None) -> tuple[int, i
 def stored_points(
     path: Path, points: Float[Tensor, "n 2"], size: tuple[int, int] | None = None
 ) -> Float[Tensor, "n 2"]:
-    """Points of a picture as a viewer shows it, on the grid that `read_stored_rgb` reads.
-
-    Args:
-        path: An image file.
-        points: Pixels to the right and down, with EXIF rotation applied.
-        size: Width and height of the camera's image, as for `read_stored_rgb`.
-
-    Raises:
-        ValueError: The file is no readable image.
-    """
+    """Points of a picture as a viewer shows it, pixels, on the grid that `read_stored_rgb` reads for `size`."""
     with opened(path) as image:
         orientation = 1 if size is not None and _is_sideways(image, size) else _exif_orientation(image)
         width, height = image.size

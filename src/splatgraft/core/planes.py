@@ -64,13 +64,7 @@ def least_squares_normal(offsets: Float[Tensor, "m 3"]) -> Float[Tensor, "3"]:
 def dominant_level_plane(
     points: Float[Tensor, "m 3"], up: Float[Tensor, "3"], *, options: LevelPlaneOptions = LevelPlaneOptions()
 ) -> LevelPlane | None:
-    """The largest nearly level plane among `points`; None where no plane is level and large enough.
-
-    Args:
-        points: Sparse surface points, world units.
-        up: Unit.
-        options: What counts as clear.
-    """
+    """The largest nearly level plane among sparse surface points; None where no plane is level and large enough."""
     x, upward = points.double(), up.double()
     if len(x) < _MIN_POINTS:
         return None

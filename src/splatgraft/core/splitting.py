@@ -36,15 +36,7 @@ _TABLE = (
 
 
 def split_along(gaussians: Gaussians, axis: Int[Tensor, "n"]) -> tuple[Gaussians, Int[Tensor, "m"]]:
-    """Split each Gaussian into five along one of its own axes.
-
-    Args:
-        gaussians: n Gaussians.
-        axis: Own axis (0, 1 or 2) along which each is split.
-
-    Returns:
-        The m = 5 n pieces, and the index of the Gaussian that each piece is of.
-    """
+    """Split each Gaussian into five along an axis of its own (0, 1 or 2): the m = 5 n pieces, and the whole of each."""
     n = gaussians.count
     columns = _pieces_by_opacity(gaussians.opacities.clamp_max(0.99))
     opacities = columns[:, [2, 1, 0, 1, 2]].clamp(1e-6, 0.9999)
@@ -92,19 +84,11 @@ _MAX_PER_ROUND = 4000
 def split_wide_around(
     gaussians: Gaussians, is_object: Bool[Tensor, "n"], objects: Sequence[Gaussians]
 ) -> tuple[Gaussians, Bool[Tensor, "m"]]:
-    """Split the wide Gaussians of a composite's target that lie around its objects.
+    """Split the wide Gaussians of a composite's target that lie around its placed objects.
 
     Renderers blend Gaussians in the order of their centres. A plain table is reconstructed with Gaussians wider than
     the objects on it, and one of them whose centre is nearer to the camera than the object covers the object's foot,
     though it lies below. Gaussians of objects, and all that are not split, keep every bit and their order.
-
-    Args:
-        gaussians: n Gaussians of the composite: the target's, then the objects'.
-        is_object: Which of them belong to an object.
-        objects: The placed objects, in the frame of `gaussians`.
-
-    Returns:
-        The m Gaussians after splitting, pieces in the place of their whole, and which of them belong to an object.
     """
     for one in objects:
         if not one.count:

@@ -116,18 +116,10 @@ def compare(
     background: Float[Tensor, "h w 3"],
     perceptual: Perceptual | None = None,
 ) -> dict[str, float]:
-    """Compute all metrics of one image.
+    """All metrics of one image; nan where a region of the view has fewer than `SMALLEST_REGION` pixels.
 
-    Args:
-        image: sRGB in [0, 1].
-        truth: the ground truth.
-        regions: of the view, see `find_regions`.
-        background: render of the scene without the object, sRGB in [0, 1]; reconstruction errors that it shares with
-            `image` cancel in `shadow_ratio_rmse` and `rest_*_change`.
-        perceptual: adds "lpips".
-
-    Returns:
-        Metric to value; nan where a region of the view has fewer than `SMALLEST_REGION` pixels.
+    `background` is a render of the scene without the object: reconstruction errors that it shares with `image` cancel
+    in `shadow_ratio_rmse` and `rest_*_change`. `perceptual` adds "lpips".
     """
     similarity = ssim_map(image, truth.image).mean(-1)
     inner = (slice(_SSIM_BORDER, -_SSIM_BORDER), slice(_SSIM_BORDER, -_SSIM_BORDER))
@@ -153,16 +145,11 @@ def compare(
 
 
 def measure(views: Sequence[ComparedView], perceptual: Perceptual | None = None) -> dict:
-    """Compute the content of metrics.json; missing values are None.
+    """The content of metrics.json; missing values are None.
 
-    Args:
-        views: at least one.
-        perceptual: adds "lpips".
-
-    Returns:
-        `copy_paste` and `result`: means over held-out views, or over all where none is held out (`views` names which).
-        `all_views`: the same over every view. `per_view`: every value. `rest_max_change` is a maximum over views; the
-        other metrics are means over the views where they are defined.
+    `copy_paste` and `result`: means over held-out views, or over all where none is held out (`views` names which).
+    `all_views`: the same over every view. `per_view`: every value. `rest_max_change` is a maximum over views; the
+    other metrics are means over the views where they are defined.
     """
     rows = [_row(view, perceptual) for view in views]
     held_out = [row for row in rows if row["held_out"]]

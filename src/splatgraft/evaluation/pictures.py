@@ -30,17 +30,7 @@ def side_by_side(images: Sequence[Float[Tensor, "h _ 3"]], labels: Sequence[str]
 def write_animation(
     path: Path, frames: Sequence[Float[Tensor, "h w 3"]], *, fps: float = 20.0, max_bytes: int = 6_000_000
 ) -> None:
-    """Write a looping .gif (one palette of 256 colours, dithered) or .webp.
-
-    Args:
-        path: the file; its suffix selects the format.
-        frames: sRGB in [0, 1], all of one size.
-        fps: frames per second.
-        max_bytes: frames are scaled down until the file is no larger.
-
-    Raises:
-        ValueError: another suffix, or no frames.
-    """
+    """Write a looping .gif (one palette, dithered) or .webp, scaled down until it has at most `max_bytes`."""
     if path.suffix not in (".gif", ".webp") or not frames:
         raise ValueError(f"{path}: expected .gif or .webp and at least one frame, found {len(frames)} frames")
     encode = _gif if path.suffix == ".gif" else _webp
@@ -114,17 +104,10 @@ _EXPONENT = 0.7
 def describe_change(
     result: Float[Tensor, "h w 3"], composite: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> dict[str, float]:
-    """Describe how the luminance of `result` differs from copy-paste.
+    """Describe how the luminance of `result` differs from copy-paste, given the coverage by the object.
 
-    Args:
-        result: the view after light transfer, sRGB in [0, 1].
-        composite: the view before, sRGB in [0, 1].
-        mask: coverage by the object, in [0, 1].
-
-    Returns:
-        object_brightness: mean ratio of linear luminance on the object, 1 where the view shows no object.
-        darkened_fraction: share of the pixels outside the object that lost more than 5% of their light.
-        brightened_fraction: share of these pixels that gained as much.
+    object_brightness: mean ratio of linear luminance on the object, 1 where the view shows no object.
+    darkened_fraction, brightened_fraction: shares of the pixels outside it that lost or gained more than 5% of it.
     """
     ratio = luminance_ratio(result, composite)
     inside, outside = mask > 0.5, mask <= 0

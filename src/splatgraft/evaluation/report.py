@@ -148,17 +148,7 @@ def write_report(
     views: Iterable[ReportView],
     turntable: Sequence[Float[Tensor, "h w 3"]] = (),
 ) -> Path:
-    """Write index.html and its pictures, and metrics.json where there are metrics.
-
-    Args:
-        folder: of the report.
-        report: texts and metrics.
-        views: consumed one at a time, so that they need not all be in memory.
-        turntable: frames of the animation; none where empty.
-
-    Returns:
-        The path of index.html.
-    """
+    """Write index.html with its pictures, one view at a time, and metrics.json where there are metrics."""
     (folder / "views").mkdir(parents=True, exist_ok=True)
     files = []
     for number, view in enumerate(views):

@@ -36,16 +36,7 @@ def turntable_cameras(
     """Make a closed path of cameras around `center` that look at it.
 
     Distance and height at an azimuth are means of the captured ones, weighted by nearness in azimuth, so that the path
-    stays between captured viewpoints.
-
-    Args:
-        cameras: the captured ones.
-        center: point to look at, world units.
-        up: the vertical direction.
-        options: of the path.
-
-    Returns:
-        Cameras with the size of the first captured one and the median focal length times `options.zoom`.
+    stays between captured viewpoints. Pictures have the size of the first captured one.
     """
     up = torch.nn.functional.normalize(up.double(), dim=0)
     across, along = tangents(up)

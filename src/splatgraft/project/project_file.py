@@ -71,16 +71,9 @@ class ProjectFile:
     """One line per key that was found under an earlier name."""
 
     def step(self, kind: type[T], given: Mapping[str, Path] | None = None, *, out: Path, side: Side | None = None) -> T:
-        """Build the step `kind` from its table.
+        """Build the step `kind` from its table, which has the class's name in lower case.
 
-        Args:
-            kind: Dataclass of the step; its table has the class's name in lower case.
-            given: Default paths, by field; a path in the table replaces them.
-            out: Folder of the result.
-            side: Capture whose own table takes precedence.
-
-        Raises:
-            ValueError: A key is unknown or missing, or a value is not as expected.
+        Paths in the table replace the default ones in `given`, by field; the table of `side` takes precedence.
         """
         name = kind.__name__.lower()
         values, where = dict(self.content.get(name, {})), f"{self.path} [{name}]"
@@ -106,15 +99,7 @@ class ProjectFile:
 
 
 def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
-    """Read project.toml.
-
-    Args:
-        path: The file.
-        tables: Names of the tables that are allowed beside [source] and [target].
-
-    Raises:
-        ValueError: The file is missing or no TOML, or a table is unknown.
-    """
+    """Read project.toml, in which `tables` are allowed beside [source] and [target]."""
     content, renamed = _present_names(path, read_toml(path))
     known = ("source", "target", *tables)
     for name, table in content.items():

@@ -33,20 +33,12 @@ class Job:
 
     @cached_property
     def entries(self) -> Mapping[str, tuple[Entry, ...]]:
-        """The input files at the first access, by role.
-
-        Raises:
-            ValueError: An input file is missing.
-        """
+        """The input files at the first access, by role; a ValueError where one is missing."""
         return {role: input_entries(files, ()) for role, files in self.inputs.items()}
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the step's name, its options and the content of its inputs.
-
-        Raises:
-            ValueError: An input file is missing.
-        """
+        """SHA-256 of the step's name, its options and the content of its inputs."""
         content = {role: [(e[0], e[3]) for e in entries] for role, entries in self.entries.items()}
         text = json.dumps([self.step, content, self.options], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
@@ -92,11 +84,7 @@ class Record:
 
 
 def read_record(folder: Path) -> Record | None:
-    """Read the record of a finished result; None where there is none.
-
-    Raises:
-        ValueError: step.json is damaged.
-    """
+    """Read the record of a finished result; None where there is none, a ValueError where step.json is damaged."""
     path = folder / STEP_FILE
     if not path.is_file():
         return None
@@ -110,11 +98,7 @@ def read_record(folder: Path) -> Record | None:
 
 
 def why_stale(job: Job) -> str | None:
-    """Say in a few words why the folder's content is not what `job` would make; None where it is.
-
-    Raises:
-        ValueError: An input file is missing or step.json is damaged.
-    """
+    """Say in a few words why the folder's content is not what `job` would make; None where it is."""
     record = read_record(job.folder)
     if record is None:
         return "not made yet"

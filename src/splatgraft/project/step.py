@@ -187,11 +187,7 @@ def plain_options(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def locked(folder: Path) -> Generator[None]:
-    """Lock `folder` for this process.
-
-    Raises:
-        ValueError: Another process holds the lock.
-    """
+    """Lock `folder` for this process; a ValueError where another process holds the lock."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     lock = filelock.FileLock(folder.with_name(f".{folder.name}.lock"))
     try:
@@ -208,14 +204,8 @@ def locked(folder: Path) -> Generator[None]:
 def replacing(job: Job, warned: Sequence[Note] = ()) -> Generator[Path]:
     """Give a new folder to write the result into; at the end it replaces the earlier one and gets its step.json.
 
-    A run that is killed or fails at any point leaves the earlier result complete.
-
-    Args:
-        job: What is made.
-        warned: The warnings for step.json; read at the end.
-
-    Raises:
-        ValueError: The folder holds files that no step wrote, or an input is missing.
+    A run that is killed or fails at any point leaves the earlier result complete. `warned` is read at the end. A
+    ValueError where the folder holds files that no step wrote, or an input is missing.
     """
     inputs = job.entries
     if job.folder.exists() and not job.folder.is_dir():
@@ -250,11 +240,7 @@ def _recorded(note: Note, job: Job, new: Path) -> Note:
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Remove the temporary folders that killed runs left beside a result that is up to date.
-
-    Raises:
-        ValueError: Another process works on the folder.
-    """
+    """Remove the temporary folders that killed runs left beside a result that is up to date."""
     with locked(folder):
         for kind in ("new", "old", "checkpoint"):
             shutil.rmtree(folder.with_name(f".{folder.name}.{kind}"), ignore_errors=True)

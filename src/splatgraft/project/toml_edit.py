@@ -8,11 +8,7 @@ from typing import Any
 
 
 def with_keys(text: str, table: str, values: Mapping[str, Any]) -> str:
-    """Set keys of one top-level table; a value of None removes the key.
-
-    Raises:
-        ValueError: If the text's layout does not allow it line by line.
-    """
+    """Set keys of one top-level table, None removes one; a ValueError where the layout forbids it line by line."""
     wanted = tomllib.loads(text)
     inside = dict(wanted.get(table, {}))
     for key, value in values.items():

@@ -46,11 +46,7 @@ def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
 
 
 def require_memory(capture: PosedImages, options: ReconstructOptions) -> None:
-    """Check the predicted memory against the available memory.
-
-    Raises:
-        ValueError: Where too little is available; names the options to lower.
-    """
+    """Raise a ValueError that names the options to lower where less memory is available than predicted."""
     needed, free = predict_memory(capture, options), available_memory(options.device)
     if free is not None and needed > free:
         raise ValueError(
@@ -75,12 +71,7 @@ def available_memory(device: str) -> int | None:
 
 
 def predict_cpu_seconds(cameras: Cameras, options: ReconstructOptions) -> float:
-    """CPU seconds of `reconstruct`, within about a factor of 2: scenes differ in how many Gaussians a pixel sees.
-
-    Args:
-        cameras: Of the capture that is given to `reconstruct`.
-        options: Likewise.
-    """
+    """CPU seconds of `reconstruct`, within about a factor of 2: scenes differ in how many Gaussians a pixel sees."""
     served = cameras.resized(options.served_size(cameras))
     sizes = served.sizes.prod(1).double()
     size = float(sizes.mean()) if len(sizes) else 0.0

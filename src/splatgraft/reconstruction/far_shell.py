@@ -35,13 +35,7 @@ _PLAIN_TOLERANCE = 2.5 / 255
 
 
 def shell_radius(points: Float[Tensor, "m 3"], focus: Float[Tensor, "3"], reach: float) -> float:
-    """Distance of the shell from `focus`, world units.
-
-    Args:
-        points: Known points of the scene.
-        focus: Where the cameras look.
-        reach: Their mean distance from it.
-    """
+    """Distance of the shell from `focus`, world units; `reach` is the cameras' mean distance from it."""
     if not len(points):
         return MIN_RADIUS * reach
     distances = (points.double() - focus.to(points.device)).norm(dim=1)
@@ -64,19 +58,10 @@ def shell_points(
     count: int,
     margin_deg: float = 15.0,
 ) -> SeedPoints:
-    """Points on a sphere that some camera sees, evenly distributed, in the mean colour of all photographs there.
+    """About `count` points on a sphere that some camera sees, even, in the mean colour of all photographs there.
 
-    Args:
-        cameras: One batch of 1 per image.
-        images: sRGB.
-        center: Of the sphere, world units.
-        radius: Of the sphere, world units.
-        count: About how many points there are.
-        margin_deg: How far from a seen point, as an angle at the centre, there are points that no camera sees, so that
-            walls do not end at the edge of a photograph; they have the colours of the nearest that are seen.
-
-    Returns:
-        No points where no camera sees the sphere.
+    Points that no camera sees lie up to `margin_deg` from a seen one, so that walls do not end at the edge of a
+    photograph; they have the colours of the nearest that are seen.
     """
     center = center.float()
     trial = _directions(max(count, _MIN_DIRECTIONS))

@@ -161,19 +161,10 @@ def fit(  # noqa: PLR0913 - with progress and checkpoint
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
-    """Fit the fields of `gaussians` whose learning rate is above 0 to the images of `views`.
+    """Fit the fields of `gaussians` whose learning rate is above 0 to the images of `views`, at least one.
 
-    Args:
-        gaussians: Start of the fit; stays unchanged.
-        views: Cameras and target images, at least one.
-        options: Length, seed and background.
-        rates: Of the fields that are fitted, and of the views' colours.
-        control: Called after every step, as for density control.
-        progress: Called every ten steps.
-        checkpoint: Where the state is saved every 30 seconds and on Ctrl-C, and from which a run is resumed.
-
-    Raises:
-        ValueError: Where loss or gradients are not finite.
+    The state is saved every 30 seconds and on Ctrl-C, and a run goes on from it. A ValueError where loss or gradients
+    are not finite.
     """
     names = rates.active()
     saved = checkpoint.load()

@@ -41,16 +41,9 @@ _MAX_COST = 0.12
 def sweep(
     cameras: Sequence[Cameras], images: Sequence[Float[Tensor, "_ _ 3"]], *, known: Float[Tensor, "p 3"], reach: float
 ) -> SeedPoints:
-    """Points on the rays through grid cells in which no known point lies.
+    """Points on the rays through grid cells without a known point, as wide as neighbouring rays are apart at most.
 
-    Args:
-        cameras: One batch of 1 per view, at the size of its image.
-        images: sRGB, small.
-        known: World points that are there already.
-        reach: The cameras' mean distance from what they look at, world units.
-
-    Returns:
-        Points of all views, as wide as the distance of neighbouring rays at most.
+    `images`: small. `reach`: the cameras' mean distance from what they look at, world units.
     """
     nearest = NEAR * reach
     if len(known) >= _MIN_KNOWN:

@@ -139,25 +139,15 @@ def view_operator(
 ) -> ViewOperator:
     """The map from Gaussian values to the pixels of one camera, with depth order and tile lists computed once.
 
-    Args:
-        gaussians: n Gaussians.
-        camera: A batch of one.
-        options: Low-pass filter and near plane.
-        min_row_weight: The weights of a Gaussian in 16 neighbouring pixels of a row that add up to no more than this
-            count as 0 where they are its first or last in a tile of 16 rows; behind opaque surfaces most rows are so.
-            0 is exact. On CUDA nothing is left out.
+    The weights of a Gaussian in 16 neighbouring pixels of a row that add up to no more than `min_row_weight` count as 0
+    where they are its first or last in a tile of 16 rows; behind opaque surfaces most rows are so. 0 is exact. On CUDA
+    nothing is left out.
     """
     return _implementation(gaussians).FrozenView(gaussians, camera, options, min_row_weight)
 
 
 def surface_points(scene: Gaussians, camera: Cameras, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
-    """The points of the scene's surface that a picture shows at `pixels`; those that show nothing are left out.
-
-    Args:
-        scene: What is seen.
-        camera: One camera.
-        pixels: x and y, pixels of the camera's picture.
-    """
+    """The points of the scene's surface that a picture shows at pixels x, y; those that show nothing are left out."""
     drawn = render(scene, camera, outputs=frozenset({"depth"}))
     pixels = pixels.to(drawn.depth)
     size = camera.sizes[0].to(pixels)
@@ -185,16 +175,7 @@ def assemble_render(
     has_features: bool,
     options: RenderOptions,
 ) -> Render:
-    """Split blended channels into the outputs of a `Render`.
-
-    Args:
-        image: Blended channels over black, in the order of `CHANNEL_COUNTS`, then features.
-        alpha: Accumulated opacity.
-        visible: Gaussians in each view.
-        outputs: Which of `CHANNEL_COUNTS` are in `image`.
-        has_features: Whether features follow.
-        options: Of which the background is added to the colour.
-    """
+    """Split channels, blended over black in the order of `CHANNEL_COUNTS` and then features, into a `Render`."""
     planes, at = {}, 0
     for name, width in CHANNEL_COUNTS.items():
         if name in outputs:

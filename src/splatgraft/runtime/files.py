@@ -82,14 +82,7 @@ def _flush(folder: Path) -> None:
 
 @contextmanager
 def room_on_disk(folder: Path) -> Generator[None]:
-    """Turn errors of a block that found no room on the disk into one line.
-
-    Args:
-        folder: What the block writes.
-
-    Raises:
-        ValueError: There was no room.
-    """
+    """Turn errors of a block that writes `folder` and found no room on the disk into a ValueError of one line."""
     try:
         yield
     except Exception as error:

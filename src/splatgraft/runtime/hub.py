@@ -13,18 +13,10 @@ _OTHER_FORMS = ("*.bin", "*.ckpt", "*.msgpack", "*.fp16.*")
 
 
 def hub_folder(repository: str, patterns: Sequence[str], say: Say) -> Path:
-    """Fetch the files of a repository that match any of the patterns.
+    """Fetch the files of a repository, OWNER/NAME, that match any of the patterns; gives its folder in the cache.
 
-    Args:
-        repository: OWNER/NAME.
-        patterns: Of paths in the repository, as in `fnmatch`.
-        say: Takes where the licence is, before anything is fetched.
-
-    Returns:
-        The repository's folder in the cache.
-
-    Raises:
-        ValueError: There is no such repository, it is gated, or there is no network and nothing in the cache.
+    `say` takes where the licence is, before anything is fetched. A ValueError where there is no such repository, it is
+    gated, or there is no network and nothing in the cache.
     """
     with _one_line(repository):
         from huggingface_hub import snapshot_download
@@ -35,11 +27,7 @@ def hub_folder(repository: str, patterns: Sequence[str], say: Say) -> Path:
 
 
 def hub_file(repository: str, name: str) -> Path:
-    """Fetch one file of a repository.
-
-    Raises:
-        ValueError: As `hub_folder`.
-    """
+    """Fetch one file of a repository; errors as of `hub_folder`."""
     with _one_line(repository):
         from huggingface_hub import hf_hub_download
 

@@ -28,21 +28,11 @@ def run_logged(
     stdin: str | None = "",
     on_line: Callable[[str], None] | None = None,
 ) -> int:
-    """Run `command` and wait for it; an exception in the meantime, an interrupt included, kills the process.
+    """Run a program and wait for it; an exception in the meantime, an interrupt included, kills the process.
 
-    Args:
-        command: Program and arguments; no shell is involved.
-        log: File to which standard error is appended, and standard output where `on_line` is None.
-        folder: Working directory of the process; this process's where None.
-        stdin: Text for the standard input. With None it stays open as long as this process lives, so that a program
-            that reads it to the end notices when this process is killed.
-        on_line: Called with each line of the standard output, without its end, as soon as it is written.
-
-    Returns:
-        The exit code; negative where a signal ended the process.
-
-    Raises:
-        ValueError: Where the program cannot be started.
+    Standard error is appended to `log`, and standard output where `on_line` does not take its lines as they come.
+    `stdin` is the text for the standard input; with None it stays open as long as this process lives, so that a program
+    that reads it to the end notices when this process is killed. Gives the exit code, negative for a signal.
     """
     with log.open("ab") as stream, tempfile.TemporaryFile() as given:
         given.write((stdin or "").encode())
@@ -72,15 +62,10 @@ def last_line(log: Path) -> str:
 
 @contextmanager
 def interruption_held(*, terminate: bool = False) -> Generator[Callable[[], bool]]:
-    """Hold back the first Ctrl-C within the block; the second one acts at once.
+    """Hold back the first Ctrl-C within the block, and with `terminate` a SIGTERM that nothing handles.
 
+    Yields whether there was one; the block then saves its state and raises KeyboardInterrupt. The second acts at once.
     Signals whose handler is not Python's own are left alone, and so are blocks in other threads than the main one.
-
-    Args:
-        terminate: Hold SIGTERM too where nothing handles it, as schedulers of clusters send it.
-
-    Yields:
-        Whether there was one; the block then saves its state and raises KeyboardInterrupt.
     """
     requested = False
 

@@ -32,11 +32,7 @@ class Table:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises:
-        ValueError: There is no such file, or it is not TOML.
-    """
+    """Read a TOML file; a ValueError where there is none, or it is not TOML."""
     if path.is_file() and path.stat().st_size > MAX_TEXT_BYTES:
         size = path.stat().st_size >> 20
         raise ValueError(f"{path}: expected at most {MAX_TEXT_BYTES >> 20} MiB of TOML, found {size} MiB")

@@ -33,22 +33,11 @@ def run_tasks(
     progress: Progress = silent,
     gpus_each: int = 0,
 ) -> list[str]:
-    """Run all tasks; a task that fails with a ValueError does not stop the others.
+    """Run all tasks, `at_once` in threads, or through Ray; one that fails with a ValueError does not stop the others.
 
-    Args:
-        tasks: What to run; for Ray, all machines must see the same files under the same names.
-        at_once: Threads, where Ray is not used.
-        ray_address: Address of a Ray cluster (`auto`, `host:port`, `ray://host:port`), or `local` for a cluster of
-            this machine's cores that ends with the call; None runs the tasks in threads.
-        progress: Called after each task.
-        gpus_each: GPUs that Ray reserves for a task.
-
-    Returns:
-        One line per failed task, in the order of the tasks.
-
-    Raises:
-        Exception: Any error but a ValueError that a task raises.
-        ModuleNotFoundError: Where Ray is asked for and not installed.
+    `ray_address`: of a cluster (`auto`, `host:port`, `ray://host:port`) whose machines all see the same files under the
+    same names, or `local` for one of this machine's cores that ends with the call; `gpus_each` it reserves for a task.
+    Gives one line per failed task, in the order of the tasks; any other error of a task is raised.
     """
     if ray_address is not None:
         return _through_ray(tasks, ray_address, progress, gpus_each)

@@ -56,22 +56,14 @@ class Flow:
         return [other for other, step in self if any(path.is_relative_to(step.out) for path in paths)]
 
     def named(self, name: str) -> set[str]:
-        """The steps of that name: reconstruct is both source/reconstruct and target/reconstruct.
-
-        Raises:
-            ValueError: There is no such step.
-        """
+        """The steps of that name: reconstruct is both source/reconstruct and target/reconstruct."""
         found = {step for step in self.steps if name in (step, step.split("/")[-1])}
         if not found:
             raise ValueError(f"--to, --force: expected a step among {', '.join(self.steps)}; found {name}")
         return found
 
     def up_to(self, name: str | None) -> dict[str, Step]:
-        """The steps that `name` depends on, and itself last; all steps where it is None.
-
-        Raises:
-            ValueError: There is no such step.
-        """
+        """The steps that `name` depends on, and itself last; all steps where it is None."""
         wanted = set(self.steps) if name is None else self.named(name)
         for other in reversed(list(self.steps)):
             wanted |= set(self.before(other)) if other in wanted else set()
@@ -86,14 +78,9 @@ class Flow:
 
 
 def read_flow(project: Path, out: Path | None = None) -> Flow:
-    """Read the steps of a project.
+    """Read the steps of a project, its file or folder; `out` is the root of the results where that is not its folder.
 
-    Args:
-        project: The project file, or its folder.
-        out: Root of the results; the folder of the project file where None.
-
-    Raises:
-        ValueError: The file is missing, or one of its keys or values is not as expected.
+    A ValueError where the file is missing, or one of its keys or values is not as expected.
     """
     path = project / PROJECT_FILE if project.is_dir() else project
     file = read_project_file(path, tables=tuple(kind.__name__.lower() for kind in STEPS))
@@ -176,13 +163,7 @@ def default_paths(layout: Layout) -> dict[type[Any], dict[str, Path]]:
 def reasons(flow: Flow, wanted: Collection[str] | None = None) -> dict[str, str | None]:
     """The reason why each step is stale, or None; a step after a stale step waits for that step.
 
-    Args:
-        flow: The steps of a project.
-        wanted: Names of the steps to examine, with all steps that they read from; all steps where None. Inputs of
-            other steps may be missing.
-
-    Raises:
-        ValueError: An input of an examined step is missing.
+    `wanted`: names of the steps to examine, with all steps that they read from; inputs of others may be missing.
     """
     found: dict[str, str | None] = {}
     for name, step in flow:

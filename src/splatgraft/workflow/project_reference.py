@@ -51,13 +51,9 @@ class KeyTable:
 def describe_table(
     name: str, kind: type, *, given: Mapping[str, Path] | None = None, omitted: frozenset[str] = frozenset({"out"})
 ) -> KeyTable:
-    """Describe the table whose keys are the fields of a step.
+    """Describe the table whose keys are the fields of a step, without those `omitted`; nested fields are keys too.
 
-    Args:
-        name: Name of the table.
-        kind: Dataclass of the step; the fields of nested dataclasses are keys of the same table.
-        given: Default paths that a project supplies, by field, relative to the project's folder.
-        omitted: Fields that are no keys.
+    `given`: default paths that a project supplies, by field, relative to the project's folder.
     """
     keys = tuple(key for key in _keys(kind, None, given or {}) if key.name not in omitted)
     variants = tuple(
@@ -185,9 +181,7 @@ _WIDTH = 118
 def full_project_text(*, source: str, target: str) -> str:
     """Write a commented project.toml with every key of every table.
 
-    Args:
-        source: The line that names the capture or scene with the object, e.g. `capture = "photos"`.
-        target: The same for the capture or scene that receives it.
+    `source` and `target` are the lines that name the captures or scenes, e.g. `capture = "photos"`.
     """
     named = {"source": source, "target": target}
     lines = [_HEAD]

@@ -19,19 +19,10 @@ def run_steps(
     force: tuple[str, ...] = (),
     accept_doubtful: bool = False,
 ) -> None:
-    """Perform the stale steps up to the step `to`, and print the paths of the results.
+    """Perform the stale steps up to `to`, and those `force` names, and print the paths of the results.
 
-    Args:
-        project: The project file, or its folder.
-        console: Takes the progress and, on standard output, the paths.
-        out: Root of the results; the project's folder where None.
-        to: Last step, e.g. "reconstruct" (both captures) or "source/reconstruct"; all where None.
-        force: Steps that are performed even where they are up to date.
-        accept_doubtful: Whether to go on after a capture whose poses are not plausible.
-
-    Raises:
-        ValueError: The project file or an input is bad, another run works on the project, or the poses of a capture are
-            not plausible and this was not accepted.
+    Raises: ValueError where the project file or an input is bad, another run works on the project, or the poses of a
+    capture are not plausible and this was not accepted.
     """
     flow = read_flow(project, out)
     for line in flow.renamed_keys:

@@ -38,14 +38,9 @@ _COMPILATION_SECONDS = 25.0
 
 
 def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, ...]:
-    """Estimate the seconds of each step.
+    """Estimate the seconds of each stale step; `is_measured` is false where they are a guess.
 
-    Args:
-        flow: All steps of the project; finished ones give the factor to the typical times.
-        stale: Names of the steps that will run.
-
-    Returns:
-        One entry per stale step; `is_measured` is false where the seconds are a guess.
+    The finished steps of the project give the factor to the typical times.
     """
     measured = {name: found.seconds for name, step in flow if (found := read_record(step.out)) is not None}
     typical = {name: _typical_seconds(step, flow) for name, step in flow}

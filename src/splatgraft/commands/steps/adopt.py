@@ -58,12 +58,7 @@ class Adopt:
 
 
 def misfit_of(scene: SceneFile, points: Float[Tensor, "m 3"]) -> str | None:
-    """One sentence where `scene` does not lie at `points`, with the axes in which it would; None where it does.
-
-    Args:
-        scene: As read.
-        points: Points of its capture, in the same frame if they belong together.
-    """
+    """One sentence where `scene` does not lie at the points of its capture, with axes in which it would; else None."""
     means = scene.gaussians.means
     means = means[means.isfinite().all(1)]
     points = points[:: max(1, len(points) // _MAX_POINTS)]

@@ -159,11 +159,7 @@ class Capture:
 
 
 def doubt_about(step: Capture) -> str | None:
-    """Why the result of `step` should not be built upon and what to do, in one line; None where it may be.
-
-    Raises:
-        ValueError: Where its pose_report.json is damaged.
-    """
+    """Why the result of `step` should not be built upon and what to do, in one line; None where it may be."""
     doubts = read_doubts(step.out)
     if not doubts or step.accept_doubtful:
         return None

@@ -76,11 +76,7 @@ class Harmonize:
 
 
 def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
-    """Arguments in the present form: `--method NAME`, the form of version 0.1.0, becomes the sub-command NAME.
-
-    Raises:
-        ValueError: There is no method of that name.
-    """
+    """`--method NAME`, the form of version 0.1.0, becomes the sub-command NAME."""
     words = [part for word in words for part in (word.split("=", 1) if word.startswith("--method=") else [word])]
     if "--method" not in words[:-1]:
         return words

@@ -88,11 +88,7 @@ class Reconstruct:
 
 
 def far_worse(psnr_by_view: dict[str, float]) -> dict[str, str]:
-    """One sentence per held-out view that is far worse than the rest, the worst first.
-
-    Args:
-        psnr_by_view: PSNR of each held-out view in dB, by the name of its photo.
-    """
+    """One sentence per held-out view far worse than the rest, the worst first, by photo; `psnr_by_view` is in dB."""
     values = np.array(list(psnr_by_view.values()))
     middle = float(np.median(values))
     spread = 1.4826 * float(np.median(np.abs(values - middle)))

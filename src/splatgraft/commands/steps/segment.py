@@ -217,13 +217,7 @@ def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tenso
 
 
 def _agreement_notes(agreement: Agreement, sheet: Path, picture: Path) -> list[Note]:
-    """How well the masks agree, and what is wrong with that.
-
-    Args:
-        agreement: How well masks and selection agree.
-        sheet: Where the picture will lie.
-        picture: Where it lies while the step runs.
-    """
+    """How well the masks agree, and what is wrong with that; the `picture` will lie at `sheet`."""
     mean, names = agreement.mean, [Path(agreement.names[index]).name for index in agreement.doubtful]
     notes = [Note(f"the masks agree with the object by {mean:.2f} (mean IoU over the images; 1 is perfect): {sheet}")]
     if mean < MIN_AGREEMENT:
