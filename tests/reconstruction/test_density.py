@@ -1,6 +1,7 @@
 """Density control: the children of a split Gaussian, and which Gaussian is split."""
 
 import torch
+from shapes import random_scene
 
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
@@ -11,14 +12,7 @@ from splatgraft.rendering import RenderOptions
 
 
 def test_children_lie_on_the_long_axis_and_keep_its_variance():
-    generator = torch.Generator().manual_seed(0)
-    parents = Gaussians(
-        means=torch.randn(50, 3, generator=generator),
-        log_scales=torch.randn(50, 3, generator=generator),
-        quaternions=torch.randn(50, 4, generator=generator),
-        opacity_logits=torch.randn(50, generator=generator),
-        sh=torch.randn(50, 4, 3, generator=generator),
-    )
+    parents = random_scene(50, 1, seed=0)
     children = split(parents)
     assert children.count == 100
     one, other = (children.select(torch.arange(50) + k) for k in (0, 50))

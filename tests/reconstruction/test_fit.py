@@ -105,6 +105,18 @@ def test_colours_that_differ_between_views_do_not_enter_the_scene():
     assert errors[1] < 0.7 * errors[0]
 
 
+def test_a_random_background_leaves_no_holes_before_what_is_dark():
+    dark, cameras = replace(blobs(60, 4), sh=torch.full((60, 4, 3), -0.5)), ring(6)
+    views = as_views(cameras, [torch.zeros(32, 32, 3)] * 6)
+    alphas = []
+    for random in (False, True):
+        options, rates = ReconstructOptions(iterations=60), LearningRates(opacity_logits=0.05)
+        fitted = fit(dark, views, options=options, rates=rates, random_background=random)
+        alphas.append(float(render(fitted, cameras).alpha.mean()))
+    # what comes through from a random background, half bright in the mean, is an error of as much
+    assert alphas[1] > 1.1 * alphas[0]
+
+
 def test_the_mean_of_the_views_colours_stays_the_identity():
     colors = ViewColors.identity(5, torch.device("cpu"))
     generator = torch.Generator().manual_seed(0)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from shapes import random_scene
 
 from splatgraft.core import cameras as camera_values
 from splatgraft.core.gaussians import Gaussians
@@ -18,14 +19,7 @@ WIDTH, HEIGHT = 101, 83
 
 
 def scene() -> Gaussians:
-    generator = torch.Generator().manual_seed(1)
-    return Gaussians(
-        means=0.7 * torch.randn(80, 3, generator=generator),
-        log_scales=-2 + 0.3 * torch.randn(80, 3, generator=generator),
-        quaternions=torch.randn(80, 4, generator=generator),
-        opacity_logits=torch.randn(80, generator=generator),
-        sh=torch.randn(80, 4, 3, generator=generator),
-    )
+    return random_scene(80, 1, seed=1)
 
 
 @pytest.fixture

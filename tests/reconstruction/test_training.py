@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from memory_checkpoint import KilledError, MemoryCheckpoint
+from shapes import random_scene
 
 from splatgraft.core import cameras as camera_values
 from splatgraft.core.gaussians import Gaussians, concatenate
@@ -20,24 +21,18 @@ from splatgraft.reconstruction import (
     reconstruct,
 )
 from splatgraft.reconstruction.initialization import SeedPoints, from_points
-from splatgraft.reconstruction.options import Quality
 from splatgraft.rendering import render
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+SURROUNDINGS = "splatgraft.reconstruction.training.shows_surroundings"
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> PosedImages:
     """Sixteen 48x40 views of 150 blobs, with noisy points for them."""
     folder: Path = tmp_path_factory.mktemp("capture")
-    generator = torch.Generator().manual_seed(0)
-    truth = Gaussians(
-        means=0.6 * torch.randn(150, 3, generator=generator),
-        log_scales=-1.8 + 0.2 * torch.randn(150, 3, generator=generator),
-        quaternions=torch.randn(150, 4, generator=generator),
-        opacity_logits=2 + torch.randn(150, generator=generator),
-        sh=torch.randn(150, 1, 3, generator=generator),
-    )
+    truth = random_scene(150, 0, seed=0)
+    truth = replace(truth, means=0.6 * truth.means, log_scales=truth.log_scales / 3 - 1, sh=2.5 * truth.sh)
     angle = torch.arange(16) * (2 * torch.pi / 16)
     eye = torch.stack([4 * angle.cos(), 4 * angle.sin(), 1 + (3 * angle).sin()], 1)
     poses = camera_values.look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
@@ -46,12 +41,12 @@ def capture(tmp_path_factory) -> PosedImages:
     with torch.no_grad():
         for path, image in zip(paths, render(truth, cameras).color, strict=True):
             write_image(path, image)
-    points = truth.means + 0.05 * torch.randn(150, 3, generator=generator)
+    points = truth.means + 0.05 * torch.randn(150, 3, generator=torch.Generator().manual_seed(0))
     return PosedImages(paths, cameras, points, torch.full((150, 3), 0.5))
 
 
-def held_out_psnr(scene: Gaussians, capture: PosedImages, every: int) -> float:
-    tested = torch.nonzero(held_out(len(capture), every)).flatten().tolist()
+def held_out_psnr(scene: Gaussians, capture: PosedImages) -> float:
+    tested = torch.nonzero(held_out(len(capture))).flatten().tolist()
     with torch.no_grad():
         values = [psnr(render(scene, capture.cameras[i]).color[0].clamp(0, 1), capture.image(i)) for i in tested]
     return float(torch.stack(values).mean())
@@ -64,21 +59,14 @@ def test_held_out_views_are_found_again(capture):
     assert scene.sh_degree == 1
     # black images score about 12 dB here; views between known ones of a scene that Gaussians can express exactly
     # must come far above it, though 48x40 pixels leave the geometry between views open
-    assert held_out_psnr(scene, capture, 8) > 20
+    assert held_out_psnr(scene, capture) > 20
 
 
 @pytest.mark.parametrize("more", [False, True], ids=["draft", "with all that standard adds"])
 def test_a_killed_reconstruction_resumes_bit_for_bit(capture, monkeypatch, more):
     monkeypatch.setattr("splatgraft.reconstruction.fit._CHECKPOINT_SECONDS", -1.0)
-    options = ReconstructOptions(
-        iterations=60,
-        budget=220,
-        sh_degree=1,
-        seed=5,
-        quality="standard" if more else "draft",
-        random_background=more,
-        far_shell=more,
-    )
+    monkeypatch.setattr(SURROUNDINGS, lambda images, background: True)
+    options = ReconstructOptions("standard" if more else "draft", iterations=60, budget=220, sh_degree=1, seed=5)
     whole = reconstruct(capture, options)
     checkpoint = MemoryCheckpoint()
 
@@ -88,7 +76,6 @@ def test_a_killed_reconstruction_resumes_bit_for_bit(capture, monkeypatch, more)
 
     with pytest.raises(KilledError):
         reconstruct(capture, options, progress=die, checkpoint=checkpoint)
-    assert checkpoint.state is not None
     assert 0 < checkpoint.state["iteration"] < 60
     resumed = reconstruct(capture, options, checkpoint=checkpoint)
     for name in FIELDS:
@@ -116,11 +103,8 @@ def watched_counts(capture: PosedImages, budget: int) -> list[float]:
     return [*counts, scene.count]
 
 
-def test_the_budget_holds_at_every_moment(capture):
+def test_the_budget_holds_at_every_moment_and_many_points_leave_room_for_the_density_control(capture):
     assert max(watched_counts(capture, 100)) <= 100
-
-
-def test_many_sparse_points_leave_room_for_the_density_control(capture):
     points = capture.points.repeat(10, 1) + 0.02 * torch.randn(1500, 3, generator=torch.Generator().manual_seed(1))
     counts = watched_counts(replace(capture, points=points, point_colors=torch.full((1500, 3), 0.5)), 1500)
     # at step 10 of 60 a start of 0.6 of the budget has grown by about a tenth of the budget
@@ -134,10 +118,8 @@ def before_walls(capture, tmp_path) -> PosedImages:
     truth = reconstruct(capture, ReconstructOptions(iterations=1, budget=150, sh_degree=0, quality="draft"))
     direction = torch.nn.functional.normalize(torch.randn(3000, 3, generator=torch.Generator().manual_seed(3)), dim=1)
     shade = (0.05 + 0.6 * (direction[:, :1] > 0)).expand(-1, 3)
-    walls = replace(
-        from_points(SeedPoints(30 * direction, shade, torch.full((3000,), torch.inf))),
-        opacity_logits=torch.full((3000,), 6.0),
-    )
+    walls = from_points(SeedPoints(30 * direction, shade, torch.full((3000,), torch.inf)))
+    walls = replace(walls, opacity_logits=torch.full((3000,), 6.0))
     paths = tuple(tmp_path / f"{i}.png" for i in range(16))
     with torch.no_grad():
         for path, image in zip(paths, render(concatenate([truth, walls]), capture.cameras).color, strict=True):
@@ -145,38 +127,16 @@ def before_walls(capture, tmp_path) -> PosedImages:
     return replace(capture, image_paths=paths)
 
 
-def holes(scene: Gaussians, capture: PosedImages) -> float:
-    """Share of the light from behind the scene."""
-    with torch.no_grad():
-        return float(1 - render(scene, capture.cameras).alpha.mean())
-
-
-def test_a_random_background_leaves_no_holes_before_dark_walls(before_walls):
-    options = ReconstructOptions(
-        iterations=200, budget=1500, sh_degree=0, random_background=False, far_shell=True, quality="draft"
-    )
-    fixed = reconstruct(before_walls, options)
-    random = reconstruct(before_walls, replace(options, random_background=True))
-    # what comes through dark walls from a random background, half bright in the mean, is an error of as much
-    assert holes(random, before_walls) < 0.5 * holes(fixed, before_walls)
-
-
-def test_a_far_shell_shows_held_out_views_what_is_behind_the_points(before_walls):
-    options = ReconstructOptions(iterations=200, budget=1500, sh_degree=0, eval_every=8, quality="draft")
-    without = held_out_psnr(reconstruct(before_walls, options), before_walls, 8)
+def test_walls_behind_the_points_are_shown_to_held_out_views_and_dark_ones_have_no_holes(before_walls, monkeypatch):
+    options = ReconstructOptions(iterations=200, budget=1500, sh_degree=0, eval_every=8)
+    found = reconstruct(before_walls, options)
+    monkeypatch.setattr(SURROUNDINGS, lambda images, background: False)
+    without = reconstruct(before_walls, options)
     # a decibel is a fifth of the squared error: walls fill most of these pictures
-    assert held_out_psnr(reconstruct(before_walls, replace(options, far_shell=True)), before_walls, 8) > without + 1
-
-
-def test_draft_has_nothing_of_what_standard_adds_and_an_object_alone_no_surroundings():
-    def choices(quality: Quality, surroundings: bool) -> tuple[bool | None, ...]:
-        options = ReconstructOptions(quality=quality).decided(surroundings)
-        return options.random_background, options.far_shell, options.splits_by_error
-
-    assert choices("draft", True) == (False, False, False)
-    assert choices("standard", True) == choices("high", True) == choices("full", True) == (True, True, True)
-    assert choices("standard", False) == (False, False, True)
-    assert ReconstructOptions(quality="draft", far_shell=True).decided(False).far_shell
+    assert held_out_psnr(found, before_walls) > held_out_psnr(without, before_walls) + 1
+    with torch.no_grad():
+        holes = [float(1 - render(scene, before_walls.cameras).alpha.mean()) for scene in (found, without)]
+    assert holes[0] < 0.5 * holes[1]
 
 
 def test_without_points_it_says_so_and_goes_on(capture):
@@ -186,17 +146,14 @@ def test_without_points_it_says_so_and_goes_on(capture):
     scene = reconstruct(bare, options, progress=lambda done, total, message: said.append(message))
     assert any("no sparse points" in message for message in said)
     # better than the black image (about 12 dB), from nothing but pictures
-    assert held_out_psnr(scene, capture, 8) > 15
+    assert held_out_psnr(scene, capture) > 15
 
 
 def test_images_of_several_sizes_are_fitted_together(capture):
     cameras = capture.cameras
-    small = cameras.resized(0.75)
-    mixed = replace(
-        cameras,
-        sizes=torch.where(torch.arange(16)[:, None] % 2 == 0, cameras.sizes, small.sizes),
-        intrinsics=torch.where(torch.arange(16)[:, None, None] % 2 == 0, cameras.intrinsics, small.intrinsics),
-    )
+    small, even = cameras.resized(0.75), torch.arange(16)[:, None] % 2 == 0
+    sizes = torch.where(even, cameras.sizes, small.sizes)
+    mixed = replace(cameras, sizes=sizes, intrinsics=torch.where(even[..., None], cameras.intrinsics, small.intrinsics))
     scene = reconstruct(replace(capture, cameras=mixed), ReconstructOptions(iterations=20, budget=200, sh_degree=0))
     assert torch.isfinite(scene.means).all()
 
@@ -204,38 +161,35 @@ def test_images_of_several_sizes_are_fitted_together(capture):
 def test_memory_is_asked_for_before_the_start(capture, monkeypatch):
     options = ReconstructOptions(iterations=10, budget=1_000_000)
     assert predict_memory(capture, options) > predict_memory(capture, replace(options, budget=1000))
-    monkeypatch.setattr("splatgraft.reconstruction.cost.available_memory", lambda device: 10**8)
+    monkeypatch.setattr("splatgraft.reconstruction.options.available_memory", lambda device: 10**8)
     with pytest.raises(ValueError, match=r"lower --resolution or --budget \(1000000\)"):
         reconstruct(capture, options)
 
 
-def test_quality_chooses_what_is_not_given():
-    assert ReconstructOptions(quality="draft").all_iterations == 1000
-    assert ReconstructOptions(quality="full", iterations=7).all_iterations == 7
-    assert ReconstructOptions(quality="full").max_gaussians > ReconstructOptions().max_gaussians
-
-
-def test_pixels_are_left_out_only_where_there_are_more_than_gaussians(capture):
-    options = ReconstructOptions(quality="draft")
-    large = replace(capture, cameras=capture.cameras.resized(12.0))
-    assert max(part.stride for part in options.sampling(large.cameras)) == 2
-    assert max(part.stride for part in options.sampling(capture.cameras)) == 1
-    assert max(part.stride for part in replace(options, budget=100_000).sampling(large.cameras)) == 1
-
-
-def test_more_time_is_predicted_for_more_work(capture):
-    durations = [
-        predict_cpu_seconds(capture.cameras, ReconstructOptions(quality=q)) for q in ("draft", "standard", "high")
-    ]
+def test_quality_chooses_what_is_not_given(capture):
+    draft, full = ReconstructOptions("draft"), ReconstructOptions("full")
+    assert draft.all_iterations == 1000
+    assert replace(full, iterations=7).all_iterations == 7
+    assert full.max_gaussians > ReconstructOptions().max_gaussians
+    assert (draft.beyond_draft, ReconstructOptions().beyond_draft, full.beyond_draft) == (False, True, True)
+    durations = [predict_cpu_seconds(capture.cameras, ReconstructOptions(q)) for q in ("draft", "standard", "high")]
     assert durations == sorted(durations)
     assert describe_duration(312.0) == "5 minutes"
 
 
-def test_large_photographs_are_served_smaller_unless_told(capture):
+def test_large_photographs_are_served_smaller_and_pixels_left_out_where_there_are_more_than_gaussians(capture):
+    options = ReconstructOptions(quality="draft")
+    large = replace(capture, cameras=capture.cameras.resized(12.0))
+    for one, cameras, stride in (
+        (options, large.cameras, 2),
+        (options, capture.cameras, 1),
+        (replace(options, budget=100_000), large.cameras, 1),
+    ):
+        assert max(part.stride for part in one.sampling(cameras)) == stride
     large = replace(capture, cameras=capture.cameras.resized(40.0))
-    assert ReconstructOptions(quality="draft").served(large).cameras.width == 640
-    assert ReconstructOptions(quality="draft", resolution=1.0).served(large).cameras.width == 1920
-    assert ReconstructOptions(quality="draft").served(capture).cameras.width == 48
+    assert options.served(large).cameras.width == 640
+    assert replace(options, resolution=1.0).served(large).cameras.width == 1920
+    assert options.served(capture).cameras.width == 48
 
 
 def test_too_few_views_and_odd_options_are_named(capture):

@@ -9,7 +9,8 @@ import reference
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import camera, random_scene
+from shapes import camera_inside as camera
+from shapes import random_scene
 
 from splatgraft import rendering
 from splatgraft.core import spherical_harmonics

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scenes import camera, random_scene
+from shapes import camera_inside as camera
+from shapes import random_scene
 
 from splatgraft import rendering
 from splatgraft.core import spherical_harmonics

@@ -17,7 +17,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import adam, l1_dssim
-from splatgraft.reconstruction.image_pyramid import Pyramid, View
+from splatgraft.reconstruction.image_pyramid import Pyramid
 from splatgraft.reconstruction.options import ReconstructOptions
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.process import interruption_held
@@ -157,6 +157,7 @@ def fit(  # noqa: PLR0913 - with progress and checkpoint
     *,
     options: ReconstructOptions,
     rates: LearningRates,
+    random_background: bool = False,
     control: Control | None = None,
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
@@ -172,7 +173,7 @@ def fit(  # noqa: PLR0913 - with progress and checkpoint
     last_save, recent = time.monotonic(), 0.0
     with interruption_held() as interrupted:
         while state.iteration < options.all_iterations:
-            state, value, step = _stepped(state, views, rates, options)
+            state, value, step = _stepped(state, views, rates, options, random_background)
             if control is not None:
                 state = control(state, step)
             recent = value if recent == 0 else 0.95 * recent + 0.05 * value
@@ -189,7 +190,7 @@ def fit(  # noqa: PLR0913 - with progress and checkpoint
 
 
 def _stepped(
-    state: FitState, views: Pyramid, rates: LearningRates, options: ReconstructOptions
+    state: FitState, views: Pyramid, rates: LearningRates, options: ReconstructOptions, random_background: bool
 ) -> tuple[FitState, float, Step]:
     """The state after one step on one view, the loss, and what the control sees."""
     names, done = rates.active(), state.iteration / options.all_iterations
@@ -197,7 +198,13 @@ def _stepped(
     # each pass visits all views in an order that depends on seed and pass only
     index = int(torch.randperm(len(views), generator=_generator(options.seed, visit))[place])
     view = views.at(index, visit=visit, done=done)
-    rendering = _rendering_of(view, state.iteration, options)
+    rendering = RenderOptions(background=options.background)
+    if view.low_pass_px2 is not None:
+        rendering = replace(rendering, low_pass_px2=view.low_pass_px2)
+    if random_background:
+        # uniform in sRGB; depends on seed and iteration only
+        red, green, blue = torch.rand(3, generator=_generator(options.seed, state.iteration, plus=1)).tolist()
+        rendering = replace(rendering, background=(red, green, blue))
     leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
     drawn = render(replace(state.gaussians, **leaves), view.camera, options=rendering)
     fits_colors = rates.view_colors > 0
@@ -229,18 +236,6 @@ def _diverged(state: FitState, found: str) -> ValueError:
 
 def _generator(seed: int, number: int, plus: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed((seed * 1_000_003 + number) % 2**62 + plus)
-
-
-def _rendering_of(view: View, iteration: int, options: ReconstructOptions) -> RenderOptions:
-    """How the view is drawn in an iteration."""
-    rendering = RenderOptions(background=options.background)
-    if view.low_pass_px2 is not None:
-        rendering = replace(rendering, low_pass_px2=view.low_pass_px2)
-    if options.random_background:
-        # uniform in sRGB; depends on seed and iteration only
-        red, green, blue = torch.rand(3, generator=_generator(options.seed, iteration, plus=1)).tolist()
-        rendering = replace(rendering, background=(red, green, blue))
-    return rendering
 
 
 def _start(gaussians: Gaussians, names: tuple[str, ...], views: int) -> FitState:

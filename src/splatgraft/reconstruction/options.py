@@ -1,11 +1,14 @@
-"""Options of a reconstruction, and the presets of each quality."""
+"""Options of a reconstruction, the presets of each quality, and the memory and the time that they lead to."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
+
+import torch
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.core.spherical_harmonics import MAX_DEGREE
+from splatgraft.core.spherical_harmonics import MAX_DEGREE, coefficient_count
 
 Quality = Literal["draft", "standard", "high", "full"]
 
@@ -36,8 +39,7 @@ class _Preset:
     longest_side_px: int
     sampling: tuple[Sampling, ...] = SPARSE
     beyond_draft: bool = False
-    """Whether backgrounds are drawn by chance, the start has a far shell, and splits look at covered errors: `draft`
-    has none of them, since the numbers of the light estimate were fitted on draft scenes."""
+    """Not at `draft`: the numbers of the light estimate were fitted on draft scenes."""
 
 
 _PRESETS: dict[str, _Preset] = {
@@ -68,11 +70,6 @@ class ReconstructOptions:
     photo_colors: bool | None = None
     """Whether each photo has its own exposure and white balance, which then stay out of the scene; None: where its EXIF
     says that they differ."""
-    random_background: bool | None = None
-    """Whether each step draws the scene over another colour, so that dark surfaces are not fitted by holes before
-    `background`; None: unless at `draft`, or the photos show an object alone before `background`."""
-    far_shell: bool | None = None
-    """Whether the start has Gaussians behind everything, in the colours around; None: likewise."""
     eval_every: int = 0
     """Every how many views one is held out, from the first (3DGS: 8); 0 holds out none."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -108,22 +105,10 @@ class ReconstructOptions:
         return _PRESETS[self.quality].budget if self.budget is None else self.budget
 
     @property
-    def splits_by_error(self) -> bool:
-        """Whether Gaussians are split by gradient and covered error, not by the gradient alone."""
+    def beyond_draft(self) -> bool:
+        """Whether splits look at covered errors, and, where the photos show what is around, the start has Gaussians
+        behind everything and each step draws the scene over another colour, so that dark surfaces have no holes."""
         return _PRESETS[self.quality].beyond_draft
-
-    def decided(self, surroundings: bool) -> "ReconstructOptions":
-        """The same options with the choices made that the quality and the photos decide.
-
-        Args:
-            surroundings: Whether the photos show what is around, and not an object alone before `background`.
-        """
-        usual = _PRESETS[self.quality].beyond_draft and surroundings
-        return replace(
-            self,
-            random_background=usual if self.random_background is None else self.random_background,
-            far_shell=usual if self.far_shell is None else self.far_shell,
-        )
 
     def sampling(self, served: Cameras) -> tuple[Sampling, ...]:
         """Which pixels of the served views the steps see, from the first to the last.
@@ -146,3 +131,88 @@ class ReconstructOptions:
             return self.resolution
         longest = int(cameras.sizes.max()) if len(cameras) else 1
         return min(1.0, _PRESETS[self.quality].longest_side_px / longest)
+
+
+_BASE_BYTES = 450 * 2**20
+"""Python, torch and compiled kernels, resident."""
+_COPIES = 6
+"""Copies of every field: value, gradient, two moments, and two while Gaussians are rearranged."""
+_BYTES_PER_PIXEL = 160
+"""For the largest view while it is rendered and compared: colour, transmittance, loss and their gradients."""
+_BYTES_PER_GAUSSIAN = 1500
+"""Projections, tile lists and their gradients."""
+
+# CPU seconds of one step; fitted to runs of 1000 to 4000 steps on an AMD EPYC at 3 GHz (docs/results.md)
+_STEP_SECONDS = 6e-3
+_SECONDS_PER_GAUSSIAN = 1.0e-6
+"""Projection, colours, Adam."""
+_SECONDS_PER_PIXEL = 0.3e-6
+"""Blending and loss."""
+_ERROR_SHARE = 0.1
+"""Share of all this that measuring the covered error adds."""
+
+
+def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
+    """Upper estimate of the peak memory of the process that calls `reconstruct`, bytes.
+
+    Measured on the CPU with bands up to degree 3: 20k Gaussians at 352x248 took 492 MiB (534 predicted), 200k 974
+    (1035), 40k at 640x426 568 (626).
+    """
+    served = options.served(capture)
+    pixels = served.cameras.sizes.prod(1).double().tolist()
+    pyramid = 3 * sum(pixels) * sum(part.factor**2 for part in options.sampling(served.cameras))
+    largest = max(pixels, default=0.0)
+    largest_file = max(capture.cameras.sizes.prod(1).tolist(), default=0)
+    numbers = 11 + 3 * coefficient_count(options.sh_degree)
+    gaussians = options.max_gaussians * (4 * numbers * _COPIES + _BYTES_PER_GAUSSIAN)
+    decoding = 24 * max(largest_file, largest)
+    return int(_BASE_BYTES + pyramid + max(decoding, largest * _BYTES_PER_PIXEL) + gaussians)
+
+
+def require_memory(capture: PosedImages, options: ReconstructOptions) -> None:
+    """Raise a ValueError that names the options to lower where less memory is available than predicted."""
+    needed, free = predict_memory(capture, options), available_memory(options.device)
+    if free is not None and needed > free:
+        raise ValueError(
+            f"reconstruct: expected {needed / 2**30:.1f} GiB of free memory, found {free / 2**30:.1f} GiB; "
+            f"lower --resolution or --budget ({options.max_gaussians})"
+        )
+
+
+def available_memory(device: str) -> int | None:
+    """Bytes available on `device` without swapping; None where the system does not report them (Linux and CUDA do)."""
+    if device.startswith("cuda"):
+        return torch.cuda.mem_get_info(torch.device(device))[0]
+    found = []
+    if (table := Path("/proc/meminfo")).exists():
+        rows = dict(line.split(":", 1) for line in table.read_text().splitlines())
+        found.append(int(rows["MemAvailable"].split()[0]) * 1024)
+    # a container's limit (cgroup v2)
+    limit, used = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
+    if limit.exists() and limit.read_text().strip() != "max":
+        found.append(max(int(limit.read_text()) - int(used.read_text()), 0))
+    return min(found, default=None)
+
+
+def predict_cpu_seconds(cameras: Cameras, options: ReconstructOptions) -> float:
+    """CPU seconds of `reconstruct`, within about a factor of 2: scenes differ in how many Gaussians a pixel sees."""
+    served = cameras.resized(options.served_size(cameras))
+    sizes = served.sizes.prod(1).double()
+    size = float(sizes.mean()) if len(sizes) else 0.0
+    pixels, begin = 0.0, 0.0
+    for part in options.sampling(served):
+        pixels += (part.until - begin) * size * (part.factor / part.stride) ** 2
+        begin = part.until
+    # about a sixth fewer than the budget on average, as it is reached late
+    gaussians = options.max_gaussians * 5 / 6
+    step = _STEP_SECONDS + _SECONDS_PER_GAUSSIAN * gaussians + _SECONDS_PER_PIXEL * pixels
+    return options.all_iterations * step * (1 + _ERROR_SHARE * options.beyond_draft)
+
+
+def describe_duration(seconds: float) -> str:
+    """Rounded as what it is, an estimate: '40 s', '6 minutes' or '1.5 hours'."""
+    if seconds < 90:
+        return f"{max(1, round(seconds / 10)) * 10} s"
+    if seconds < 5400:
+        return f"{round(seconds / 60)} minutes"
+    return f"{seconds / 3600:.1f} hours"

@@ -9,17 +9,26 @@ rates other than the centres' eight times 28.1 (a bunch of bananas, 16 photograp
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.reconstruction.cost import require_memory
 from splatgraft.reconstruction.density import DensityControl
-from splatgraft.reconstruction.far_shell import shell_points, shell_radius, shows_surroundings
 from splatgraft.reconstruction.fit import FitState, LearningRates, Step, fit
-from splatgraft.reconstruction.image_pyramid import Pyramid, read_pyramid
-from splatgraft.reconstruction.initialization import SeedPoints, from_points, looked_at, random_seeds, scene_extent
-from splatgraft.reconstruction.options import ReconstructOptions
+from splatgraft.reconstruction.image_pyramid import read_pyramid
+from splatgraft.reconstruction.initialization import (
+    SeedPoints,
+    from_points,
+    looked_at,
+    random_seeds,
+    scene_extent,
+    shell_points,
+    shell_radius,
+    shows_surroundings,
+)
+from splatgraft.reconstruction.options import ReconstructOptions, require_memory
 from splatgraft.reconstruction.plane_sweep import sweep
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
@@ -81,8 +90,9 @@ def reconstruct(
         raise ValueError(f"reconstruct: expected at least 2 views to fit, found {len(capture)}")
     capture = options.served(capture)
     views = read_pyramid(capture, options.sampling(capture.cameras), device=options.device, progress=progress)
-    options = options.decided(shows_surroundings(views.reduced(_SMALL_SIDE_PX)[1], options.background))
-    start = _start(capture, views, options, progress=progress).to(options.device)
+    small = views.reduced(_SMALL_SIDE_PX)
+    surroundings = options.beyond_draft and shows_surroundings(small[1], options.background)
+    start = _start(capture, small, options, far_shell=surroundings, progress=progress).to(options.device)
     density = DensityControl(
         budget=options.max_gaussians,
         first_count=start.count,
@@ -90,7 +100,7 @@ def reconstruct(
         full_at=int(_FULL_AT * options.all_iterations),
         stop=int(_STOP_AT * options.all_iterations),
         camera_centers=capture.cameras.centers.to(options.device),
-        error_every=_ERROR_EVERY if options.splits_by_error else 0,
+        error_every=_ERROR_EVERY if options.beyond_draft else 0,
     )
     band_every = max(1, options.all_iterations // _BAND_SHARE)
 
@@ -104,13 +114,28 @@ def reconstruct(
         return replace(state, gaussians=wider, moments=state.moments.padded("sh", wider.sh.shape[1]))
 
     rates = _rates(capture.cameras, options)
-    fitted = fit(start, views, options=options, rates=rates, control=control, progress=progress, checkpoint=checkpoint)
+    fitted = fit(
+        start,
+        views,
+        options=options,
+        rates=rates,
+        random_background=surroundings,
+        control=control,
+        progress=progress,
+        checkpoint=checkpoint,
+    )
     return fitted.with_sh_degree(options.sh_degree)
 
 
-def _start(capture: PosedImages, views: Pyramid, options: ReconstructOptions, *, progress: Progress) -> Gaussians:
+def _start(
+    capture: PosedImages,
+    small: tuple[list[Cameras], list[Float[Tensor, "_ _ 3"]]],
+    options: ReconstructOptions,
+    *,
+    far_shell: bool,
+    progress: Progress,
+) -> Gaussians:
     """Gaussians at sparse points; of few, also at points of a plane sweep; else at random; and the far shell."""
-    small = views.reduced(_SMALL_SIDE_PX)
     focus, reach = looked_at(capture.cameras)
     budget = options.max_gaussians
     seeds = SeedPoints(
@@ -127,7 +152,7 @@ def _start(capture: PosedImages, views: Pyramid, options: ReconstructOptions, *,
             found = f"{found}: {len(swept)} found by comparing views"
         progress(0, options.all_iterations, found)
     shell = SeedPoints.none()
-    if options.far_shell:
+    if far_shell:
         radius = shell_radius(capture.points, focus, reach)
         shell = shell_points(*small, center=focus, radius=radius, count=max(1, int(_SHELL_SHARE * budget)))
     most = max(1, int(_START_SHARE * budget))
