@@ -17,10 +17,11 @@ def clear():
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
-def _mesh(name, fill):
+def _mesh(name, part):
     data = bpy.data.meshes.new(name)
     built = bmesh.new()
-    fill(built)
+    _SHAPES[part["shape"]](built, part)
+    bmesh.ops.scale(built, vec=part["size"], verts=built.verts)
     bmesh.ops.recalc_face_normals(built, faces=built.faces)
     built.to_mesh(data)
     built.free()
@@ -29,158 +30,111 @@ def _mesh(name, fill):
     return thing
 
 
-def _scaled(built, size):
-    bmesh.ops.scale(built, vec=size, verts=built.verts)
+# each shape fills a box of size 1
 
 
-def _box(part):
-    def fill(built):
-        bmesh.ops.create_cube(built, size=1.0)
-        _scaled(built, part["size"])
-
-    return fill
+def _box(built, part):
+    bmesh.ops.create_cube(built, size=1.0)
 
 
-def _cushion(part):
+def _cushion(built, part):
     """A box with bulging faces and a little seeded noise."""
-
-    def fill(built):
-        bmesh.ops.create_cube(built, size=1.0)
-        bmesh.ops.subdivide_edges(built, edges=built.edges[:], cuts=7, use_grid_fill=True)
-        for v in built.verts:
-            x, y, z = (2 * c for c in v.co)
-            swell = (1 - x * x) * (1 - y * y)
-            v.co.z *= 0.75 + 0.45 * swell
-            pinch = 1 - 0.08 * (x * x + y * y) * abs(z)
-            v.co.x, v.co.y = v.co.x * pinch, v.co.y * pinch
-            v.co += 0.02 * noise.noise_vector(v.co * 3.0 + Vector((part["seed"] % 97, 0, 0)))
-        _scaled(built, part["size"])
-
-    return fill
+    bmesh.ops.create_cube(built, size=1.0)
+    bmesh.ops.subdivide_edges(built, edges=built.edges[:], cuts=7, use_grid_fill=True)
+    for v in built.verts:
+        x, y, z = (2 * c for c in v.co)
+        swell = (1 - x * x) * (1 - y * y)
+        v.co.z *= 0.75 + 0.45 * swell
+        pinch = 1 - 0.08 * (x * x + y * y) * abs(z)
+        v.co.x, v.co.y = v.co.x * pinch, v.co.y * pinch
+        v.co += 0.02 * noise.noise_vector(v.co * 3.0 + Vector((part["seed"] % 97, 0, 0)))
 
 
-def _round(part):
-    def fill(built):
-        if part["shape"] == "sphere":
-            bmesh.ops.create_uvsphere(built, u_segments=40, v_segments=24, radius=0.5)
-        else:
-            bmesh.ops.create_cone(built, cap_ends=True, segments=48, radius1=0.5, radius2=0.5, depth=1.0)
-        _scaled(built, part["size"])
-
-    return fill
+def _sphere(built, part):
+    bmesh.ops.create_uvsphere(built, u_segments=40, v_segments=24, radius=0.5)
 
 
-def _turned(part):
+def _cylinder(built, part):
+    bmesh.ops.create_cone(built, cap_ends=True, segments=48, radius1=0.5, radius2=0.5, depth=1.0)
+
+
+def _turned(built, part):
     """A surface of revolution about z; the profile's radii are in units of half the width, heights of the height."""
-
-    def fill(built):
-        points = [Vector((r * 0.5, 0, h - 0.5)) for r, h in part["profile"]]
-        verts = [built.verts.new(p) for p in points]
-        edges = [built.edges.new(pair) for pair in pairwise(verts)]
-        bmesh.ops.spin(built, geom=verts + edges, angle=2 * math.pi, steps=56, axis=(0, 0, 1), cent=(0, 0, 0))
-        bmesh.ops.remove_doubles(built, verts=built.verts, dist=1e-5)
-        _scaled(built, part["size"])
-
-    return fill
+    points = [Vector((r * 0.5, 0, h - 0.5)) for r, h in part["profile"]]
+    verts = [built.verts.new(p) for p in points]
+    edges = [built.edges.new(pair) for pair in pairwise(verts)]
+    bmesh.ops.spin(built, geom=verts + edges, angle=2 * math.pi, steps=56, axis=(0, 0, 1), cent=(0, 0, 0))
+    bmesh.ops.remove_doubles(built, verts=built.verts, dist=1e-5)
 
 
-def _extruded(part):
-    def fill(built):
-        low = [built.verts.new((x, y, -0.5)) for x, y in part["profile"]]
-        face = built.faces.new(low)
-        made = bmesh.ops.extrude_face_region(built, geom=[face])
-        bmesh.ops.translate(built, vec=(0, 0, 1), verts=[g for g in made["geom"] if isinstance(g, bmesh.types.BMVert)])
-        _scaled(built, part["size"])
-
-    return fill
+def _extruded(built, part):
+    face = built.faces.new([built.verts.new((x, y, -0.5)) for x, y in part["profile"]])
+    made = bmesh.ops.extrude_face_region(built, geom=[face])
+    bmesh.ops.translate(built, vec=(0, 0, 1), verts=[g for g in made["geom"] if isinstance(g, bmesh.types.BMVert)])
 
 
-def _blob(part):
+def _blob(built, part):
     """A sphere displaced by seeded noise."""
-
-    def fill(built):
-        bmesh.ops.create_icosphere(built, subdivisions=4, radius=0.5)
-        offset = Vector((part["seed"] % 89, part["seed"] % 53, 0))
-        for v in built.verts:
-            d = v.co.normalized()
-            v.co = d * (0.42 + 0.16 * noise.noise(d * 1.6 + offset) + 0.05 * noise.noise(d * 5.0 + offset))
-        _scaled(built, part["size"])
-
-    return fill
+    bmesh.ops.create_icosphere(built, subdivisions=4, radius=0.5)
+    offset = Vector((part["seed"] % 89, part["seed"] % 53, 0))
+    for v in built.verts:
+        d = v.co.normalized()
+        v.co = d * (0.42 + 0.16 * noise.noise(d * 1.6 + offset) + 0.05 * noise.noise(d * 5.0 + offset))
 
 
-def _torus(part):
-    def fill(built):
-        ring = 1 - part["bevel"]
-        rows = []
-        for i in range(40):
-            a = 2 * math.pi * i / 40
-            row = []
-            for j in range(16):
-                b = 2 * math.pi * j / 16
-                r = 0.5 * (ring + part["bevel"] * math.cos(b))
-                row.append(built.verts.new((r * math.cos(a), r * math.sin(a), 0.5 * math.sin(b))))
-            rows.append(row)
-        for i in range(40):
-            for j in range(16):
-                k, n = (i + 1) % 40, (j + 1) % 16
-                built.faces.new((rows[i][j], rows[k][j], rows[k][n], rows[i][n]))
-        _scaled(built, part["size"])
-
-    return fill
+def _torus(built, part):
+    """40 x 16 points; `bevel` is the radius of the tube, where the outer radius is 1."""
+    rows = []
+    for a in (2 * math.pi * i / 40 for i in range(40)):
+        circle = (2 * math.pi * j / 16 for j in range(16))
+        radii = [(0.5 * (1 - part["bevel"] + part["bevel"] * math.cos(b)), 0.5 * math.sin(b)) for b in circle]
+        rows.append([built.verts.new((r * math.cos(a), r * math.sin(a), z)) for r, z in radii])
+    for row, following in zip(rows, [*rows[1:], rows[0]], strict=True):
+        for j in range(16):
+            n = (j + 1) % 16
+            built.faces.new((row[j], following[j], following[n], row[n]))
 
 
-def _tuft(part):
+def _tuft(built, part):
     """Many bent blades that rise from the bottom centre."""
     rng = random.Random(part["seed"])
-
-    def fill(built):
-        for _ in range(90):
-            turn, lean, length = rng.uniform(0, 2 * math.pi), rng.uniform(0.1, 1.25), rng.uniform(0.5, 1.0)
-            width = rng.uniform(0.03, 0.07)
-            out = Vector((math.cos(turn), math.sin(turn), 0))
-            side = Vector((-out.y, out.x, 0))
-            previous = None
-            for step in range(6):
-                t = step / 5
-                bend = lean * (0.4 + 0.9 * t)
-                centre = Vector((0, 0, -0.5)) + length * t * (
-                    out * math.sin(bend) * 0.55 + Vector((0, 0, math.cos(bend)))
-                )
-                half = side * width * math.sin(math.pi * min(0.98, 0.15 + 0.85 * t))
-                pair = (built.verts.new(centre - half), built.verts.new(centre + half))
-                if previous:
-                    built.faces.new((previous[0], previous[1], pair[1], pair[0]))
-                previous = pair
-        _scaled(built, part["size"])
-
-    return fill
+    for _ in range(90):
+        turn, lean, length = rng.uniform(0, 2 * math.pi), rng.uniform(0.1, 1.25), rng.uniform(0.5, 1.0)
+        width = rng.uniform(0.03, 0.07)
+        out = Vector((math.cos(turn), math.sin(turn), 0))
+        side = Vector((-out.y, out.x, 0))
+        previous = None
+        for step in range(6):
+            t = step / 5
+            bend = lean * (0.4 + 0.9 * t)
+            along = out * math.sin(bend) * 0.55 + Vector((0, 0, math.cos(bend)))
+            centre = Vector((0, 0, -0.5)) + length * t * along
+            half = side * width * math.sin(math.pi * min(0.98, 0.15 + 0.85 * t))
+            pair = (built.verts.new(centre - half), built.verts.new(centre + half))
+            if previous:
+                built.faces.new((previous[0], previous[1], pair[1], pair[0]))
+            previous = pair
 
 
-def _foliage(part):
+def _foliage(built, part):
     """Many small leaves, most of them near the surface of an uneven ellipsoid."""
     rng = random.Random(part["seed"])
-
-    def fill(built):
-        leaf = 0.055 / max(part["size"])
-        offset = Vector((part["seed"] % 83, part["seed"] % 47, 0))
-        for _ in range(1500):
-            towards = Vector((rng.gauss(0, 1), rng.gauss(0, 1), rng.gauss(0, 1))).normalized()
-            reach = 0.5 * rng.uniform(0.35, 1.0) ** 0.4 * (0.8 + 0.35 * noise.noise(towards * 2.2 + offset))
-            turn = Euler((rng.uniform(0, 6.3), rng.uniform(0, 6.3), rng.uniform(0, 6.3))).to_matrix()
-            half = leaf * rng.uniform(0.7, 1.5)
-            corners = ((-half, 0), (0, -half * 0.55), (half, 0), (0, half * 0.55))
-            built.faces.new([built.verts.new(towards * reach + turn @ Vector((x, y, 0))) for x, y in corners])
-        _scaled(built, part["size"])
-
-    return fill
+    leaf = 0.055 / max(part["size"])
+    offset = Vector((part["seed"] % 83, part["seed"] % 47, 0))
+    for _ in range(1500):
+        towards = Vector((rng.gauss(0, 1), rng.gauss(0, 1), rng.gauss(0, 1))).normalized()
+        reach = 0.5 * rng.uniform(0.35, 1.0) ** 0.4 * (0.8 + 0.35 * noise.noise(towards * 2.2 + offset))
+        turn = Euler((rng.uniform(0, 6.3), rng.uniform(0, 6.3), rng.uniform(0, 6.3))).to_matrix()
+        half = leaf * rng.uniform(0.7, 1.5)
+        corners = ((-half, 0), (0, -half * 0.55), (half, 0), (0, half * 0.55))
+        built.faces.new([built.verts.new(towards * reach + turn @ Vector((x, y, 0))) for x, y in corners])
 
 
 _SHAPES = {
     "box": _box,
     "cushion": _cushion,
-    "cylinder": _round,
-    "sphere": _round,
+    "cylinder": _cylinder,
+    "sphere": _sphere,
     "turned": _turned,
     "extruded": _extruded,
     "blob": _blob,
@@ -240,7 +194,7 @@ def add_part(part, name, meshes):
         thing = bpy.data.objects.new(name, meshes[key])
         bpy.context.scene.collection.objects.link(thing)
     else:
-        thing = _mesh(name, _SHAPES[part["shape"]](part))
+        thing = _mesh(name, part)
         meshes[key] = thing.data
         _smooth(thing, part)
         thing.data.materials.append(_material(part["material"], name, meshes))
