@@ -36,39 +36,33 @@ class Palette:
         self.second_hue = (self.accent_hue + rng.choice([0.08, 0.33, 0.5, 0.6])) % 1.0
         self.wood_value = rng.uniform(0.28, 0.82)
 
+    def _tone(self, hues: list[float], saturation: tuple[float, float], value: tuple[float, float]) -> Color:
+        """A tone near one of several hues."""
+        return tone(self._rng, self._rng.choice(hues), saturation, value)
+
     def wall(self) -> Material:
         """Painted plaster, mostly pale."""
-        rng = self._rng
-        if rng.random() < 0.25:
-            color = tone(rng, self.accent_hue, (0.12, 0.4), (0.45, 0.75))
+        if self._rng.random() < 0.25:
+            color = tone(self._rng, self.accent_hue, (0.12, 0.4), (0.45, 0.75))
         else:
-            color = tone(rng, rng.choice([0.08, 0.12, 0.55, self.second_hue]), (0.02, 0.14), (0.72, 0.9))
-        darker: Color = (color[0] * 0.8, color[1] * 0.8, color[2] * 0.78)
-        return Material(pattern="plaster", color=color, second=darker, roughness=0.85, bump=0.05)
+            color = self._tone([0.08, 0.12, 0.55, self.second_hue], (0.02, 0.14), (0.72, 0.9))
+        return Material("plaster", color, (color[0] * 0.8, color[1] * 0.8, color[2] * 0.78), 0.85, bump=0.05)
 
     def ceiling(self) -> Material:
         """Nearly white paint."""
-        return Material(pattern="plaster", color=(0.78, 0.77, 0.74), second=(0.6, 0.6, 0.6), roughness=0.9)
+        return Material("plaster", (0.78, 0.77, 0.74), (0.6, 0.6, 0.6), 0.9)
 
     def floor(self, kind: str) -> Material:
         """Planks, tiles or stone, by the kind of room."""
         rng = self._rng
-        choice = rng.choice(
-            ["tiles", "marble", "tiles"] if kind in ("bathroom", "kitchen") else ["planks"] * 3 + ["tiles"]
-        )
-        if choice == "planks":
+        wet: list[Pattern] = ["tiles", "marble", "tiles"]
+        dry: list[Pattern] = ["planks", "planks", "planks", "tiles"]
+        pattern = rng.choice(wet if kind in ("bathroom", "kitchen") else dry)
+        if pattern == "planks":
             return self.wood("planks", scale=rng.uniform(0.9, 1.6))
-        pale = tone(rng, rng.choice([0.07, 0.1, 0.58]), (0.03, 0.25), (0.4, 0.85))
+        pale = self._tone([0.07, 0.1, 0.58], (0.03, 0.25), (0.4, 0.85))
         joint = tone(rng, 0.1, (0.02, 0.1), (0.25, 0.7))
-        pattern: Pattern = "tiles" if choice == "tiles" else "marble"
-        return Material(
-            pattern=pattern,
-            color=pale,
-            second=joint,
-            roughness=rng.uniform(0.08, 0.5),
-            scale=rng.uniform(1.6, 3.5),
-            bump=0.15,
-        )
+        return Material(pattern, pale, joint, rng.uniform(0.08, 0.5), scale=rng.uniform(1.6, 3.5), bump=0.15)
 
     def wood(self, pattern: Pattern = "wood", scale: Number = 1.0) -> Material:
         """Oak to walnut, varnished or oiled."""
@@ -76,24 +70,15 @@ class Palette:
         value = min(0.9, max(0.18, self.wood_value + rng.gauss(0, 0.06)))
         color = tone(rng, 0.075, (0.4, 0.62), (value, value))
         dark: Color = (color[0] * 0.5, color[1] * 0.45, color[2] * 0.4)
-        return Material(
-            pattern=pattern,
-            color=color,
-            second=dark,
-            roughness=rng.uniform(0.22, 0.6),
-            scale=scale,
-            bump=0.12,
-            coat=rng.choice([0.0, 0.0, 0.4]),
-        )
+        roughness = rng.uniform(0.22, 0.6)
+        return Material(pattern, color, dark, roughness, scale=scale, bump=0.12, coat=rng.choice([0.0, 0.0, 0.4]))
 
     def cloth(self, pattern: Pattern | None = None) -> Material:
         """Upholstery, curtains, bedding."""
-        rng = self._rng
-        hue = rng.choice([self.accent_hue, self.second_hue, 0.09])
-        color = tone(rng, hue, (0.08, 0.6), (0.25, 0.85))
-        second = tone(rng, self.second_hue, (0.05, 0.4), (0.4, 0.9))
-        chosen: Pattern = pattern or rng.choice(["fabric", "fabric", "fabric", "stripes", "checker"])
-        return Material(pattern=chosen, color=color, second=second, roughness=0.9, bump=0.35)
+        color = self._tone([self.accent_hue, self.second_hue, 0.09], (0.08, 0.6), (0.25, 0.85))
+        second = tone(self._rng, self.second_hue, (0.05, 0.4), (0.4, 0.9))
+        patterns: list[Pattern] = ["fabric", "fabric", "fabric", "stripes", "checker"]
+        return Material(pattern or self._rng.choice(patterns), color, second, 0.9, bump=0.35)
 
     def rug(self) -> Material:
         """A rug with a visible pattern."""
@@ -101,40 +86,31 @@ class Palette:
         color = tone(rng, self.accent_hue, (0.2, 0.65), (0.3, 0.7))
         second = tone(rng, self.second_hue, (0.1, 0.5), (0.5, 0.9))
         pattern: Pattern = rng.choice(["rug", "rug", "stripes", "speckle"])
-        return Material(
-            pattern=pattern, color=color, second=second, roughness=0.95, bump=0.5, scale=rng.uniform(0.7, 1.6)
-        )
+        return Material(pattern, color, second, 0.95, bump=0.5, scale=rng.uniform(0.7, 1.6))
 
     def paint(self) -> Material:
         """Lacquer on furniture."""
-        rng = self._rng
-        hue = rng.choice([self.accent_hue, self.second_hue, 0.1])
-        color = tone(rng, hue, (0.02, 0.55), (0.25, 0.95))
-        return Material(
-            pattern="plain", color=color, second=color, roughness=rng.uniform(0.15, 0.5), coat=rng.choice([0.0, 0.6])
-        )
+        color = self._tone([self.accent_hue, self.second_hue, 0.1], (0.02, 0.55), (0.25, 0.95))
+        return Material("plain", color, color, self._rng.uniform(0.15, 0.5), coat=self._rng.choice([0.0, 0.6]))
 
     def metal(self) -> Material:
         """Steel, brass, blackened iron."""
         rng = self._rng
         color = rng.choice([(0.62, 0.62, 0.64), (0.75, 0.53, 0.25), (0.06, 0.06, 0.065), (0.7, 0.38, 0.25)])
-        return Material(pattern="metal", color=color, second=color, roughness=rng.uniform(0.12, 0.45), metallic=1.0)
+        return Material("metal", color, color, rng.uniform(0.12, 0.45), metallic=1.0)
 
     def stone(self) -> Material:
         """Counters, basins, paving."""
         rng = self._rng
-        color = tone(rng, rng.choice([0.08, 0.6]), (0.02, 0.12), (0.35, 0.9))
+        color = self._tone([0.08, 0.6], (0.02, 0.12), (0.35, 0.9))
         vein = tone(rng, 0.08, (0.05, 0.2), (0.15, 0.6))
         pattern: Pattern = rng.choice(["marble", "speckle", "plaster"])
-        return Material(
-            pattern=pattern, color=color, second=vein, roughness=rng.uniform(0.1, 0.6), scale=rng.uniform(0.6, 1.6)
-        )
+        return Material(pattern, color, vein, rng.uniform(0.1, 0.6), scale=rng.uniform(0.6, 1.6))
 
     def ceramic(self) -> Material:
         """Glazed crockery and sanitary ware."""
-        rng = self._rng
-        color = tone(rng, rng.choice([self.accent_hue, 0.1]), (0.0, 0.35), (0.6, 0.95))
-        return Material(pattern="plain", color=color, second=color, roughness=0.18, coat=0.7)
+        color = self._tone([self.accent_hue, 0.1], (0.0, 0.35), (0.6, 0.95))
+        return Material("plain", color, color, 0.18, coat=0.7)
 
     def anything(self) -> Material:
         """Any material of a small object."""
@@ -146,14 +122,12 @@ Parts = tuple[Part, ...]
 
 def placed(parts: Parts, location: Vector, yaw: Number) -> Parts:
     """Rotate parts about z by `yaw` radians, then move them."""
-    return tuple(
-        replace(
-            part,
-            location=add(rotate_z(part.location, yaw), location),
-            rotation=(part.rotation[0], part.rotation[1], part.rotation[2] + yaw),
-        )
-        for part in parts
-    )
+
+    def moved(part: Part) -> Part:
+        x, y, z = part.rotation
+        return replace(part, location=add(rotate_z(part.location, yaw), location), rotation=(x, y, z + yaw))
+
+    return tuple(map(moved, parts))
 
 
 def box(size: Vector, location: Vector, material: Material, bevel: Number = 0.004) -> Part:
@@ -181,10 +155,9 @@ def table(rng: random.Random, palette: Palette, width: Number, depth: Number, he
             Part("cylinder", (0.07, 0.07, height - thick), (0, 0, (height - thick) / 2), foot),
             Part("cylinder", (side * 0.5, side * 0.5, 0.02), (0, 0, 0.01), foot, bevel=0.005),
         )
-    table_legs = legs(
-        width - 0.06, depth - 0.06, height - thick, rng.uniform(0.035, 0.07), rng.choice([top, palette.wood()])
-    )
-    return (box((width, depth, thick), (0, 0, height - thick / 2), top, 0.008), *table_legs)
+    leg = rng.uniform(0.035, 0.07)
+    four = legs(width - 0.06, depth - 0.06, height - thick, leg, rng.choice([top, palette.wood()]))
+    return (box((width, depth, thick), (0, 0, height - thick / 2), top, 0.008), *four)
 
 
 def sofa(rng: random.Random, palette: Palette, width: Number = 1.9) -> Parts:
@@ -203,10 +176,8 @@ def sofa(rng: random.Random, palette: Palette, width: Number = 1.9) -> Parts:
         x = (i - (count - 1) / 2) * each
         parts.append(Part("cushion", (each * 0.98, depth - 0.24, 0.17), (x, -0.08, seat - 0.03), cloth, seed=i))
         if rng.random() < 0.75:
-            tilt = (math.radians(68), 0.0, rng.uniform(-0.25, 0.25))
-            parts.append(
-                Part("cushion", (0.42, 0.42, 0.14), (x * 0.9, 0.14, seat + 0.22), palette.cloth(), tilt, seed=i + 7)
-            )
+            tilt, place = (math.radians(68), 0.0, rng.uniform(-0.25, 0.25)), (x * 0.9, 0.14, seat + 0.22)
+            parts.append(Part("cushion", (0.42, 0.42, 0.14), place, palette.cloth(), tilt, seed=i + 7))
     return tuple(parts)
 
 
@@ -236,14 +207,13 @@ def shelf(rng: random.Random, palette: Palette, width: Number = 0.9, height: Num
         while x < width / 2 - 0.1:
             if rng.random() < 0.12:
                 size = rng.uniform(0.08, 0.14)
-                parts.append(
-                    Part("sphere", (size, size, size), (x + size / 2, 0, z + thick / 2 + size / 2), palette.anything())
-                )
+                place = (x + size / 2, 0, z + thick / 2 + size / 2)
+                parts.append(Part("sphere", (size, size, size), place, palette.anything()))
                 x += size + 0.04
                 continue
             book_w, book_h = rng.uniform(0.018, 0.05), rng.uniform(0.17, 0.27)
             color = tone(rng, rng.random(), (0.1, 0.75), (0.2, 0.85))
-            cover = Material(pattern="plain", color=color, second=color, roughness=rng.uniform(0.3, 0.8))
+            cover = Material("plain", color, color, rng.uniform(0.3, 0.8))
             place = (x + book_w / 2, -0.02, z + thick / 2 + book_h / 2)
             parts.append(box((book_w * 0.94, rng.uniform(0.14, 0.2), book_h), place, cover, 0.002))
             x += book_w + (rng.uniform(0.05, 0.2) if rng.random() < 0.1 else 0.0)
@@ -291,9 +261,8 @@ def bed(rng: random.Random, palette: Palette) -> Parts:
         Part("cushion", (1.56, 1.3, 0.2), (0, -0.34, 0.53), blanket, seed=3),
     ]
     for s in (-1, 1):
-        parts.append(
-            Part("cushion", (0.62, 0.42, 0.2), (s * 0.36, 0.76, 0.64), palette.cloth("fabric"), (0.25, 0, 0), seed=5)
-        )
+        pillow = palette.cloth("fabric")
+        parts.append(Part("cushion", (0.62, 0.42, 0.2), (s * 0.36, 0.76, 0.64), pillow, (0.25, 0, 0), seed=5))
     return tuple(parts)
 
 
@@ -327,14 +296,9 @@ def plant(rng: random.Random, palette: Palette, height: Number) -> Parts:
     soil = Material("plaster", (0.03, 0.02, 0.012), (0.01, 0.01, 0.01), 0.95, bump=0.5)
     pot = height * 0.3
     profile = ((0.0, 0.0), (0.68, 0.0), (0.9, 0.8), (1.0, 1.0), (0.86, 1.0), (0.0, 0.9))
+    glaze = rng.choice([palette.ceramic, palette.stone])()
     return (
-        Part(
-            "turned",
-            (pot * 1.1, pot * 1.1, pot),
-            (0, 0, pot / 2),
-            rng.choice([palette.ceramic, palette.stone])(),
-            profile=profile,
-        ),
+        Part("turned", (pot * 1.1, pot * 1.1, pot), (0, 0, pot / 2), glaze, profile=profile),
         Part("cylinder", (pot * 0.85, pot * 0.85, 0.01), (0, 0, pot * 0.93), soil),
         Part("tuft", (height, height, height * 0.75), (0, 0, pot + height * 0.33), leaf, seed=rng.randrange(10**6)),
     )
@@ -379,9 +343,8 @@ def tabletop(rng: random.Random, palette: Palette, top: Part) -> Parts:
         kind = rng.choice(["bowl", "cup", "book", "ball"])
         if kind == "book":
             size = (rng.uniform(0.12, 0.2), rng.uniform(0.16, 0.26), rng.uniform(0.015, 0.05))
-            parts.append(
-                replace(box(size, (x, y, size[2] / 2), palette.paint(), 0.002), rotation=(0, 0, rng.uniform(0, 3)))
-            )
+            book = box(size, (x, y, size[2] / 2), palette.paint(), 0.002)
+            parts.append(replace(book, rotation=(0, 0, rng.uniform(0, 3))))
         elif kind == "ball":
             size = rng.uniform(0.06, 0.1)
             parts.append(Part("sphere", (size, size, size), (x, y, size / 2), palette.anything()))

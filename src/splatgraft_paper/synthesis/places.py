@@ -78,16 +78,11 @@ def _walls(rng: random.Random, palette: Palette, shell: _Shell, kind: str) -> Pa
     ]
     frame_color = ((0.8, 0.8, 0.78), (0.2, 0.13, 0.08), (0.03, 0.03, 0.03))[rng.randrange(3)]
     frame = Material("plain", frame_color, frame_color, 0.35)
-    middle = shell.sill + shell.window_height / 2
-    bars = [
-        box((0.05, 0.06, shell.window_height), (shell.window_center + s * shell.window_width / 2, y, middle), frame)
-        for s in (-1, 0, 1)
-    ]
-    bars += [
-        box((shell.window_width, 0.06, 0.05), (shell.window_center, y, middle + s * shell.window_height / 2), frame)
-        for s in (-1, 1)
-    ]
-    ledge = box((shell.window_width + 0.1, 0.24, 0.03), (shell.window_center, d / 2 - 0.03, shell.sill), frame)
+    center, wide, high = shell.window_center, shell.window_width, shell.window_height
+    middle = shell.sill + high / 2
+    bars = [box((0.05, 0.06, high), (center + s * wide / 2, y, middle), frame) for s in (-1, 0, 1)]
+    bars += [box((wide, 0.06, 0.05), (center, y, middle + s * high / 2), frame) for s in (-1, 1)]
+    ledge = box((wide + 0.1, 0.24, 0.03), (center, d / 2 - 0.03, shell.sill), frame)
     skirting = palette.paint()
     return (
         box((w + 2 * t, d + 2 * t, 0.1), (0, 0, -0.05), palette.floor(kind), 0),
@@ -166,7 +161,7 @@ def _against_walls(rng: random.Random, palette: Palette, kind: Interior, shell: 
     return tuple(parts)
 
 
-def _daylight(rng: random.Random, shell: _Shell, notes: dict[str, str]) -> tuple[tuple[Lamp, ...], World]:
+def _daylight(rng: random.Random, shell: _Shell, notes: dict[str, str]) -> tuple[list[Lamp], World]:
     """Sky and possibly sun through the window with an area light in front of it; in the evening only a dark sky."""
     middle = (shell.window_center, shell.depth / 2 + 0.25, shell.sill + shell.window_height / 2)
     mood = rng.choice(["sun", "sun", "sun", "overcast", "evening"])
@@ -179,100 +174,67 @@ def _daylight(rng: random.Random, shell: _Shell, notes: dict[str, str]) -> tuple
         sky = (0.9 - 0.5 * blue, 0.95 - 0.2 * blue, 1.0)
         strength = rng.uniform(60, 130)
         world = World("color", color=sky, strength=2.2)
-        lamps.append(
-            Lamp("area", sky, strength * area, middle, (0, -1, -0.15), shell.window_width, shell.window_height)
-        )
+        size = (shell.window_width, shell.window_height)
+        lamps.append(Lamp("area", sky, strength * area, middle, (0, -1, -0.15), *size))
     if mood == "sun":
         elevation, turn = rng.uniform(0.35, 0.85), rng.uniform(-0.7, 0.7)
-        towards = direction(math.pi / 2 + turn, elevation)
-        warm = rng.uniform(0.6, 0.95)
-        power = rng.uniform(6, 16)
-        lamps.append(
-            Lamp(
-                "sun",
-                (1.0, warm**0.5, warm),
-                power,
-                (0, 0, 5),
-                (-towards[0], -towards[1], -towards[2]),
-                size=rng.uniform(0.009, 0.03),
-            )
-        )
+        x, y, z = towards = direction(math.pi / 2 + turn, elevation)
+        warm, power, size = rng.uniform(0.6, 0.95), rng.uniform(6, 16), rng.uniform(0.009, 0.03)
+        lamps.append(Lamp("sun", (1.0, warm**0.5, warm), power, (0, 0, 5), (-x, -y, -z), size))
         notes["sun_direction"] = " ".join(f"{c:.5f}" for c in towards)
         notes["sun_power"] = f"{power:.3f}"
     notes["mood"] = mood
-    return tuple(lamps), world
+    return lamps, world
 
 
 def interior(seed: int, kind: Interior) -> Scene:
     """Make a furnished room; the same seed and kind give the same room."""
     rng = random.Random(f"{kind}-{seed}")
     palette = Palette(rng)
-    wide, deep = (
-        (rng.uniform(2.6, 3.2), rng.uniform(2.8, 3.4))
-        if kind == "bathroom"
-        else (rng.uniform(3.8, 5.4), rng.uniform(4.0, 5.6))
-    )
+    widths, depths = ((2.6, 3.2), (2.8, 3.4)) if kind == "bathroom" else ((3.8, 5.4), (4.0, 5.6))
+    wide, deep = rng.uniform(*widths), rng.uniform(*depths)
     window = rng.uniform(1.1, min(2.4, wide - 1.2))
-    height = rng.uniform(2.4, 2.9)
-    sill = rng.uniform(0.4, 0.95)
-    shell = _Shell(
-        width=wide,
-        depth=deep,
-        height=height,
-        window_center=rng.uniform(-0.5, 0.5) * (wide - window - 0.4),
-        window_width=window,
-        sill=sill,
-        window_height=rng.uniform(1.0, height - sill - 0.25),
-    )
+    height, sill = rng.uniform(2.4, 2.9), rng.uniform(0.4, 0.95)
+    center = rng.uniform(-0.5, 0.5) * (wide - window - 0.4)
+    shell = _Shell(wide, deep, height, center, window, sill, rng.uniform(1.0, height - sill - 0.25))
     notes: dict[str, str] = {}
     floor = _FloorPlan(shell)
     centre_parts, place, footprint = _centre(rng, palette, kind)
     yaw = rng.choice([0.0, math.pi / 2]) + rng.gauss(0, 0.08)
     offset = (rng.uniform(-0.3, 0.3), rng.uniform(-0.4, 0.4), 0.0)
-    reach = max(footprint)
-    floor.occupy(offset[0], offset[1], reach, reach)
+    floor.occupy(offset[0], offset[1], max(footprint), max(footprint))
     parts = [*_walls(rng, palette, shell, kind), *placed(centre_parts, offset, yaw)]
     if kind in ("living_room", "bedroom") and rng.random() < 0.7 and place.location[2] > 0.1:
         size = (rng.uniform(1.6, 2.4), rng.uniform(1.3, 1.9), 0.014)
         parts.append(Part("box", size, (offset[0], offset[1], 0.007), palette.rug(), (0, 0, yaw), bevel=0.004))
     parts += _against_walls(rng, palette, kind, shell, floor)
     lamps, world = _daylight(rng, shell, notes)
-    all_lamps = list(lamps)
     if notes["mood"] == "evening" or rng.random() < 0.35:
         made, lamp = furniture.floor_lamp(rng, palette)
         corner = (rng.choice([-1, 1]) * (shell.width / 2 - 0.4), -shell.depth / 2 + 0.45, 0.0)
         if floor.occupy(corner[0], corner[1], 0.4, 0.4):
             parts += placed(made, corner, 0)
-            all_lamps.append(replace(lamp, location=add(lamp.location, corner)))
+            lamps.append(replace(lamp, location=add(lamp.location, corner)))
     if notes["mood"] == "evening":
-        spot = (rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8), shell.height - 0.06)
-        warm = (1.0, 0.82, 0.62)
+        x, y, warm = rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8), (1.0, 0.82, 0.62)
         shade = Material("plain", warm, warm, 0.6, emission=4.0)
-        parts.append(Part("cylinder", (0.34, 0.34, 0.06), (spot[0], spot[1], shell.height - 0.03), shade))
-        all_lamps.append(
-            Lamp("area", warm, rng.uniform(45, 90), (spot[0], spot[1], shell.height - 0.08), (0, 0, -1), 0.32, 0.32)
-        )
-        notes["lamp_location"] = " ".join(f"{c:.3f}" for c in spot)
+        parts.append(Part("cylinder", (0.34, 0.34, 0.06), (x, y, height - 0.03), shade))
+        lamps.append(Lamp("area", warm, rng.uniform(45, 90), (x, y, height - 0.08), (0, 0, -1), 0.32, 0.32))
+        notes["lamp_location"] = " ".join(f"{c:.3f}" for c in (x, y, height - 0.06))
     for _ in range(rng.randint(1, 4)):
-        side = rng.choice([-1, 1])
-        place_y = rng.uniform(-0.35, 0.35) * shell.depth
-        parts += placed(
-            furniture.picture(rng, palette),
-            (side * (shell.width / 2 - 0.02), place_y, rng.uniform(1.45, 1.75)),
-            -side * math.pi / 2,
-        )
+        side, y = rng.choice([-1, 1]), rng.uniform(-0.35, 0.35) * deep
+        made = furniture.picture(rng, palette)
+        parts += placed(made, (side * (wide / 2 - 0.02), y, rng.uniform(1.45, 1.75)), -side * math.pi / 2)
     location = add(place.location, offset)
+    x, y = wide / 2 - 0.25, deep / 2 - 0.25
     return Scene(
         name=f"{kind}_{seed:04d}",
         kind=kind,
         parts=tuple(parts),
-        lamps=tuple(all_lamps),
+        lamps=tuple(lamps),
         world=world,
         places=(replace(place, location=location),),
-        bounds=(
-            (-shell.width / 2 + 0.25, -shell.depth / 2 + 0.25, 0.35),
-            (shell.width / 2 - 0.25, shell.depth / 2 - 0.25, shell.height - 0.3),
-        ),
+        bounds=((-x, -y, 0.35), (x, y, height - 0.3)),
         obstacles=floor.boxes(location[2] + 0.06, 2.0),
         notes=notes,
     )
@@ -280,15 +242,8 @@ def interior(seed: int, kind: Interior) -> Scene:
 
 Outdoor = Literal["terrace", "garden", "square"]
 OUTDOORS: tuple[Outdoor, ...] = ("terrace", "garden", "square")
-SUPPLIED_MAPS = (
-    "city.exr",
-    "courtyard.exr",
-    "forest.exr",
-    "sunrise.exr",
-    "sunset.exr",
-    "studio.exr",
-    "interior.exr",
-    "night.exr",
+SUPPLIED_MAPS = tuple(
+    f"{name}.exr" for name in ("city", "courtyard", "forest", "sunrise", "sunset", "studio", "interior", "night")
 )
 """Environment maps that come with Blender."""
 
@@ -313,12 +268,8 @@ def _hedge(rng: random.Random) -> Parts:
     height = rng.uniform(0.9, 1.8)
     sizes = [rng.uniform(0.9, 1.3) for _ in range(5)]
     seeds = [rng.randrange(10**6) for _ in range(2)]
-    return tuple(
-        Part(
-            "foliage", (1.3, 0.9, height), (0.75 * (i - 2), 0.1 * (size - 1.1), 0.46 * height), leaf, seed=seeds[i % 2]
-        )
-        for i, size in enumerate(sizes)
-    )
+    places = [(0.75 * (i - 2), 0.1 * (size - 1.1), 0.46 * height) for i, size in enumerate(sizes)]
+    return tuple(Part("foliage", (1.3, 0.9, height), at, leaf, seed=seeds[i % 2]) for i, at in enumerate(places))
 
 
 def _meadow(rng: random.Random, lawn: Color) -> Parts:
@@ -338,9 +289,8 @@ def _meadow(rng: random.Random, lawn: Color) -> Parts:
 
 def _house(rng: random.Random, palette: Palette) -> Parts:
     width, height = rng.uniform(4, 9), rng.uniform(3, 7)
-    wall = rng.choice(
-        [palette.wall(), Material("brick", linear(0.6, 0.34, 0.26), linear(0.75, 0.7, 0.65), 0.85, scale=3.2, bump=0.4)]
-    )
+    brick = Material("brick", linear(0.6, 0.34, 0.26), linear(0.75, 0.7, 0.65), 0.85, scale=3.2, bump=0.4)
+    wall = rng.choice([palette.wall(), brick])
     glass = Material("plain", linear(0.12, 0.14, 0.17), linear(0.1, 0.1, 0.1), 0.05, coat=0.5)
     frame = palette.paint()
     parts = [box((width, 2.0, height), (0, 1.0, height / 2), wall, 0.01)]
@@ -355,14 +305,12 @@ def _house(rng: random.Random, palette: Palette) -> Parts:
 def _support(rng: random.Random, palette: Palette) -> tuple[Parts, Place]:
     choice = rng.choice(["table", "ground", "block", "ground"])
     if choice == "table":
-        size = rng.uniform(0.8, 1.3)
-        height = rng.uniform(0.5, 0.75)
+        size, height = rng.uniform(0.8, 1.3), rng.uniform(0.5, 0.75)
         return furniture.table(rng, palette, size, size * 0.8, height), Place((0, 0, height), size * 0.27, 1.5)
     if choice == "block":
         side, height = rng.uniform(0.7, 1.1), rng.uniform(0.3, 0.6)
-        return (box((side, side, height), (0, 0, height / 2), palette.stone(), 0.02),), Place(
-            (0, 0, height), side * 0.3, 1.5
-        )
+        block = box((side, side, height), (0, 0, height / 2), palette.stone(), 0.02)
+        return (block,), Place((0, 0, height), side * 0.3, 1.5)
     return (), Place((0, 0, 0.0), 0.6, 2.0)
 
 
@@ -370,14 +318,8 @@ def outdoor(seed: int, kind: Outdoor) -> Scene:
     """Make an outdoor place; the same seed and kind give the same place."""
     rng = random.Random(f"{kind}-{seed}")
     palette = Palette(rng)
-    paving = Material(
-        "tiles",
-        tone(rng, 0.08, (0.03, 0.25), (0.4, 0.75)),
-        tone(rng, 0.08, (0.05, 0.2), (0.2, 0.5)),
-        0.75,
-        scale=rng.uniform(1.2, 2.4),
-        bump=0.3,
-    )
+    stone, joint = tone(rng, 0.08, (0.03, 0.25), (0.4, 0.75)), tone(rng, 0.08, (0.05, 0.2), (0.2, 0.5))
+    paving = Material("tiles", stone, joint, 0.75, scale=rng.uniform(1.2, 2.4), bump=0.3)
     green = tone(rng, 0.26, (0.45, 0.75), (0.25, 0.5))
     lawn = Material("grass", green, tone(rng, 0.2, (0.3, 0.6), (0.3, 0.5)), 0.9, bump=0.9)
     ground = {"terrace": palette.wood("planks", 1.2), "garden": lawn, "square": paving}[kind]
@@ -405,16 +347,8 @@ def outdoor(seed: int, kind: Outdoor) -> Scene:
         elif what == "hedge":
             parts += placed(_hedge(rng), (where[0] * 0.75, where[1] * 0.75, 0), facing)
         elif what == "wall":
-            parts.append(
-                Part(
-                    "box",
-                    (4, 0.25, rng.uniform(1, 2.2)),
-                    (where[0], where[1], 0.6),
-                    palette.wall(),
-                    (0, 0, facing),
-                    bevel=0.02,
-                )
-            )
+            size, place_of_wall = (4, 0.25, rng.uniform(1, 2.2)), (where[0], where[1], 0.6)
+            parts.append(Part("box", size, place_of_wall, palette.wall(), (0, 0, facing), bevel=0.02))
         else:
             thing = rng.choice([
                 furniture.plant(rng, palette, rng.uniform(0.7, 1.4)),
@@ -425,14 +359,8 @@ def outdoor(seed: int, kind: Outdoor) -> Scene:
     notes: dict[str, str] = {}
     if rng.random() < 0.7:
         elevation, azimuth = rng.uniform(0.3, 1.1), rng.uniform(0, 2 * math.pi)
-        world = World(
-            "sky",
-            strength=0.12,
-            sun_elevation=elevation,
-            sun_azimuth=azimuth,
-            sun_size=rng.uniform(0.0095, 0.03),
-            haze=rng.uniform(0.3, 3.0),
-        )
+        size, haze = rng.uniform(0.0095, 0.03), rng.uniform(0.3, 3.0)
+        world = World("sky", (0.0, 0.0, 0.0), 0.12, elevation, azimuth, size, haze)
         notes["sun_direction"] = " ".join(f"{c:.5f}" for c in direction(azimuth, elevation))
         notes["mood"] = "sun"
     else:
