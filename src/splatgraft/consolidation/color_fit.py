@@ -199,9 +199,6 @@ def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
         seed: Of the order of views.
         progress: Called after each iteration.
         checkpoint: Where the state is saved every 500 iterations.
-
-    Raises:
-        ValueError: Where a gradient is not finite, which a loss that divides can cause.
     """
     views, start = targets.views, 0
     sh = sh.clone().contiguous()

@@ -180,17 +180,11 @@ class Views:
         return others if behind is None else behind + others
 
     def target(self, index: int) -> Float[Tensor, "h w 3"]:
-        """The harmonised image of a view.
-
-        Raises: ValueError where its size is not the camera's, or numbers are not finite.
-        """
+        """The harmonised image of a view."""
         return self._sized(self.images[index], index, "image")
 
     def weight(self, index: int) -> Float[Tensor, "h w"] | None:
-        """The confidence in each pixel of a view in [0, 1], None where all count fully.
-
-        Raises: ValueError where its size is not the camera's, or numbers are not finite.
-        """
+        """The confidence in each pixel of a view in [0, 1], None where all count fully."""
         return None if self.weights is None else self._sized(self.weights[index], index, "weight")
 
     def _sized(self, image: Tensor, index: int, kind: str) -> Tensor:

@@ -78,8 +78,6 @@ def lpips_and_l1(folder: Path | None = None) -> ImageLoss:
     """LPIPS plus L1, of equal weight: LPIPS alone leaves a constant error of brightness nearly free.
 
     The paper's text names the perceptual loss only, and no weight of a second term.
-
-    Raises: ValueError where a file of LPIPS's weights is missing or holds something else.
     """
     perceptual = lpips_vgg(folder)
     return lambda image, target: perceptual(image, target) + l1(image, target)
@@ -89,8 +87,6 @@ def lpips_vgg(folder: Path | None = None) -> ImageLoss:
     """LPIPS (Zhang 2018, version 0.1, VGG-16, linear heads) with weights from `folder`, by default torch hub's cache.
 
     vgg16-397923af.pth is torchvision's; vgg.pth holds the heads and is lpips/weights/v0.1/vgg.pth of the lpips package.
-
-    Raises: ValueError where a file is missing or holds something else, and later where an image is below 16x16 pixels.
     """
     folder = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
     vgg, heads = _load(folder / VGG_FILE), _load(folder / HEADS_FILE)

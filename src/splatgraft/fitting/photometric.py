@@ -26,10 +26,7 @@ _FAST = {"contract", "nsz", "arcp", "reassoc"}
 def l1_dssim(
     image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"], *, dssim_weight: float = 0.2
 ) -> Float[Tensor, ""]:
-    """(1 - w) |image - reference| + w (1 - SSIM), means over pixels (3DGS, Eq. 7); differentiable in `image`.
-
-    Raises: ValueError where the image is smaller than the 11x11 window.
-    """
+    """(1 - w) |image - reference| + w (1 - SSIM), means over pixels (3DGS, Eq. 7); differentiable in `image`."""
     if min(image.shape[:2]) < 11:
         raise ValueError(f"l1_dssim: expected images of at least 11x11 pixels, found {image.shape[1]}x{image.shape[0]}")
     if image.device.type == "cpu" and image.dtype == torch.float32:

@@ -15,11 +15,7 @@ class HarmonizerOptions(Protocol):
     """The method's name."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
-        """Make the harmoniser.
-
-        Raises:
-            ValueError: An option is out of range, or weights or packages are missing.
-        """
+        """Make the harmoniser."""
         ...
 
 

@@ -25,9 +25,6 @@ def inception_features(folder: Path | None) -> Features:
 
     Args:
         folder: holds the weights; torch hub's cache where None.
-
-    Raises:
-        ValueError: the weights or the library are missing.
     """
     path = (Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder) / INCEPTION_FILE
     if not path.is_file():

@@ -104,11 +104,7 @@ class MeasureMethod:
 
 
 def true_view(truth: PosedImages, photographs: PosedImages, index: int) -> Truth:
-    """The true picture of a view, its picture without the object, and the object's mask.
-
-    Raises:
-        ValueError: The view has no mask.
-    """
+    """The true picture of a view, its picture without the object, and the object's mask."""
     mask = truth.mask(index)
     if mask is None:
         raise ValueError(f"{truth.image_paths[index]}: expected a mask of the object in masks/, found none")

@@ -62,11 +62,7 @@ class Method:
 
     @staticmethod
     def parse(text: str) -> "Method":
-        """Parse a name such as `transfer+compact/l1-dssim@linear` or `lbm=results/lbm`.
-
-        Raises:
-            ValueError: The text names no method.
-        """
+        """Parse a name such as `transfer+compact/l1-dssim@linear` or `lbm=results/lbm`."""
         if "=" in text:
             name, folder = text.split("=", 1)
             if not name or not Path(folder).is_dir():
@@ -229,9 +225,6 @@ def run_method(
 
     Returns:
         The resulting scene, a .ply, and the seconds of each of the method's own steps.
-
-    Raises:
-        ValueError: The method cannot run here, with the reason.
     """
     seconds: dict[str, float] = {}
     prior = scene.composite / SCENE_FILE

@@ -45,11 +45,7 @@ class GroundTruthScene:
 
     @staticmethod
     def from_folder(folder: Path) -> "GroundTruthScene":
-        """Find the files of a scene that `synth benchmark` rendered.
-
-        Raises:
-            ValueError: A part is missing.
-        """
+        """Find the files of a scene that `synth benchmark` rendered."""
         parts = {name: folder / name for name in ("source", "target", "ground_truth", PLACEMENT_FILE)}
         if missing := [str(path) for path in parts.values() if not path.exists()]:
             raise ValueError(f"{folder}: expected {', '.join(parts)}; found no {Path(missing[0]).name}")
@@ -121,9 +117,6 @@ def compose_scene(
 
     Args:
         device: Where to segment.
-
-    Raises:
-        ValueError: A part of the scene is missing or damaged.
     """
     seconds: dict[str, float] = {}
     for side, path in (("source", ground_truth.source), ("target", ground_truth.target)):

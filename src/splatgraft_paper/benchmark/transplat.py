@@ -44,9 +44,6 @@ def relight_by_irradiance_ratio(
     Returns:
         The composite and a note on each object. An object stays as it was captured where its source is not known or
         there is no light at one of its places, and a warning gives the reason.
-
-    Raises:
-        ValueError: There is not one source (or None) per object.
     """
     if len(sources) != len(composite.objects):
         raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")

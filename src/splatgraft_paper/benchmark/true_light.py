@@ -230,11 +230,7 @@ def _triple(values: list[float]) -> tuple[float, float, float]:
 
 
 def read_probe(panorama: Path, suns: Path) -> Light:
-    """Read the light that was measured at a place: a panorama without the suns (.npy), and a list of suns (.json).
-
-    Raises:
-        ValueError: A file is missing or damaged.
-    """
+    """Read the light that was measured at a place: a panorama without the suns (.npy), and a list of suns (.json)."""
     try:
         radiance = torch.from_numpy(np.load(panorama, allow_pickle=False)).float()
         return light_from_probe(radiance, json.loads(suns.read_text()))
@@ -243,21 +239,13 @@ def read_probe(panorama: Path, suns: Path) -> Light:
 
 
 def write_true_light(scene: Path) -> None:
-    """Write true_light.json from probe.npy and suns.json of a gathered scene.
-
-    Raises:
-        ValueError: One of the two is missing or damaged.
-    """
+    """Write true_light.json from probe.npy and suns.json of a gathered scene."""
     light = read_probe(scene / "probe.npy", scene / "suns.json")
     (scene / TRUE_LIGHT_FILE).write_text(light_to_json(light))
 
 
 def read_true_light(path: Path) -> Light:
-    """Read true_light.json.
-
-    Raises:
-        ValueError: There is no such file.
-    """
+    """Read true_light.json."""
     if not path.is_file():
         raise ValueError(f"{path}: expected the scene's true light, found none")
     return light_from_json(path.read_text(), name=str(path))

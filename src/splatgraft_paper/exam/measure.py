@@ -41,9 +41,6 @@ def make_row(row: str, scene: ExamScene) -> tuple[Gaussians, Relit | None]:
 
     Returns:
         The scene to draw, and the transfer in layers where the row is one.
-
-    Raises:
-        ValueError: The row is unknown, or tells what is not known of this scene.
     """
     if row == "paste":
         return scene.composite.bake()[0], None

@@ -66,9 +66,6 @@ def render_scene(which: BenchmarkScene, out: Path, blender_python: Path, *, jobs
 
     Returns:
         The scene's folder, as `synth benchmark` lays it out.
-
-    Raises:
-        ValueError: Blender fails, or a picture is black, clipped or without the object.
     """
     folder = out / "scenes" / which.name
     if not (folder / TRUE_LIGHT_FILE).is_file():  # it is written last
@@ -126,9 +123,6 @@ def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: C
     Args:
         folder: As `render_scene` leaves it; without surface.npy no normals are known.
         work: Receives both reconstructions, the object and the composite.
-
-    Raises:
-        ValueError: A file is missing or damaged.
     """
     files = GroundTruthScene.from_folder(folder)
     composed = compose_scene(files, work, options, device="cpu", console=console)
@@ -183,11 +177,7 @@ class TrainingScene:
     """Its reconstructions, object and composite."""
 
     def read(self) -> ExamScene:
-        """The scene; it is reconstructed where that is not done yet.
-
-        Raises:
-            ValueError: A file is missing or damaged.
-        """
+        """The scene; it is reconstructed where that is not done yet."""
         return read_scene(self.files, self.work, _RECONSTRUCTION, Console())
 
 

@@ -49,11 +49,7 @@ class ImageEditingOptions:
     """US dollars that may be spent at most."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
-        """Say what it costs; the key stays in the environment, since options are recorded in step.json.
-
-        Raises:
-            ValueError: The key is missing, or the expected cost exceeds `max_cost`.
-        """
+        """Say what it costs; the key stays in the environment, since options are recorded in step.json."""
         url = self.weights
         if not url.startswith(("https://", "http://127.0.0.1", "http://localhost")):
             raise ValueError(f"harmonizer image-editing: expected --weights https://..., found {url}")

@@ -85,11 +85,7 @@ class LbmOptions:
     """Folder or hub id of the weights."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
-        """Load the network.
-
-        Raises:
-            ValueError: The package is missing.
-        """
+        """Load the network."""
         if find_spec("lbm") is None:
             raise ValueError(
                 "harmonizer lbm: expected the package lbm (pip install git+https://github.com/gojasper/LBM, licence "
@@ -127,9 +123,6 @@ def method_options(name: str, *, weights: str | None = None) -> HarmonizerOption
     Args:
         name: A key of `HARMONIZERS` or of `PEERS`.
         weights: Replaces the default weights; ignored by methods without weights.
-
-    Raises:
-        ValueError: There is no method of that name.
     """
     known = {**HARMONIZERS, **PEERS}
     if name not in known:

@@ -58,11 +58,7 @@ class MVCoLightOptions:
     """Folder of its code; must be given."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
-        """Find the folders.
-
-        Raises:
-            ValueError: One is missing.
-        """
+        """Find the folders."""
         if self.checkout is None or not (self.checkout / "registry.py").is_file():
             raise ValueError(
                 "harmonizer mv-colight: expected --checkout with the code of github.com/InternRobotics/MV-CoLight, "

@@ -79,11 +79,7 @@ class BenchmarkSize:
 
     @staticmethod
     def named(name: str) -> "BenchmarkSize":
-        """Look up a size: `small` (352x248, 40 views) or `paper` (704x496, 200 views).
-
-        Raises:
-            ValueError: the name is neither.
-        """
+        """Look up a size: `small` (352x248, 40 views) or `paper` (704x496, 200 views)."""
         if name == "small":
             return BenchmarkSize(RenderSize.small(), 40)
         if name == "paper":
@@ -120,11 +116,7 @@ def pedestal_scene(seed: int, place: Place) -> Scene:
 
 
 def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
-    """Plan the job in the target scene (target, ground truth, light) and that on the pedestal (source, light, surface).
-
-    Raises:
-        ValueError: the scene leaves no room for the cameras.
-    """
+    """Plan the job in the target scene (target, truth, light) and that on the pedestal (source, light, surface)."""
     scene = make_scene(which.kind, which.seed)
     place = scene.places[0]
     parts = objects.make(which.object_seed, place)

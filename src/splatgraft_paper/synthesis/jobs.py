@@ -109,9 +109,6 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
 
     Args:
         out: receives the pictures, job.json and render.log.
-
-    Raises:
-        ValueError: Blender fails; the message has its last error line.
     """
     if job.is_done(out):
         return
@@ -129,11 +126,7 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
 
 
 def check_blender(blender_python: Path) -> str:
-    """Return Blender's version in that interpreter.
-
-    Raises:
-        ValueError: it has no bpy.
-    """
+    """Return Blender's version in that interpreter."""
     command = [str(blender_python), "-c", "import bpy; print('version', bpy.app.version_string)"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -165,11 +158,7 @@ class RenderWorkers:
     """Address of a Ray cluster whose machines all see the folder; `local` for one of this machine's cores."""
 
     def python(self, console: Console) -> Path:
-        """The interpreter, after a trial import of bpy.
-
-        Raises:
-            ValueError: It has no bpy.
-        """
+        """The interpreter, after a trial import of bpy."""
         found = self.blender_python or Path(sys.executable)
         console.say(f"blender: {check_blender(found)} in {found}")
         return found
@@ -181,11 +170,7 @@ class RenderWorkers:
 
 
 def read_render_size(text: str, samples: int) -> RenderSize:
-    """Parse WIDTHxHEIGHT.
-
-    Raises:
-        ValueError: It is not of this form, a side is below 16 pixels, or `samples` is below 1.
-    """
+    """Parse WIDTHxHEIGHT."""
     parts = text.split("x")
     if len(parts) != 2 or not all(part.isdigit() and int(part) >= 16 for part in parts) or samples < 1:
         raise ValueError(

@@ -58,11 +58,7 @@ class PairPlan:
 
 
 def plan(options: PairPlan, number: int) -> Job:
-    """Plan the job of scene `number`, determined by it and the seed.
-
-    Raises:
-        ValueError: the scene leaves no room for an arc of cameras.
-    """
+    """Plan the job of scene `number`, determined by it and the seed."""
     rng = random.Random(f"pairs-{options.seed}-{number}")
     kind = options.kinds[number % len(options.kinds)]
     scene = make_scene(kind, options.seed * 100_003 + number)
@@ -150,11 +146,7 @@ def composite(
 
 
 def samples_in(folder: Path) -> list[PairSample]:
-    """List all pairs of a rendered folder by its job.json.
-
-    Raises:
-        ValueError: job.json is missing or broken.
-    """
+    """List all pairs of a rendered folder by its job.json."""
     path = folder / "job.json"
     try:
         job = json.loads(path.read_text())
@@ -222,11 +214,7 @@ def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
 
 
 def read_manifest(out: Path) -> list[PairSample]:
-    """Read the sound pairs of a folder.
-
-    Raises:
-        ValueError: the manifest is missing or a line is broken.
-    """
+    """Read the sound pairs of a folder."""
     path = out / "manifest.jsonl"
     if not path.is_file():
         raise ValueError(
@@ -249,9 +237,6 @@ def check_pairs(out: Path, failures: list[str], console: Console) -> int:
 
     Returns:
         0 where nothing failed and no pair is faulty, otherwise 1.
-
-    Raises:
-        ValueError: There are neither scenes nor failures.
     """
     folders = sorted(path.parent for path in out.glob("*/job.json"))
     if not folders and not failures:

@@ -384,11 +384,7 @@ KINDS: tuple[str, ...] = (*INTERIORS, *OUTDOORS)
 
 
 def make_scene(kind: str, seed: int) -> Scene:
-    """Make the scene of a kind and a seed.
-
-    Raises:
-        ValueError: the kind is unknown.
-    """
+    """Make the scene of a kind and a seed."""
     if kind in INTERIORS:
         return interior(seed, kind)
     if kind in OUTDOORS:

@@ -211,9 +211,6 @@ def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> 
 
     Args:
         object_height: metres.
-
-    Raises:
-        ValueError: no free arc is found.
     """
     rng = random.Random(f"arc-{scene.name}-{seed}")
     # outdoors, a camera that looks steeply down sees only the ground
@@ -238,9 +235,6 @@ def capture_cameras(scene: Scene, place: Place, object_height: Number, count: in
 
     Args:
         object_height: metres.
-
-    Raises:
-        ValueError: too little of the surroundings is free.
     """
     rng = random.Random(f"capture-{scene.name}-{seed}")
     target = (place.location[0], place.location[1], place.location[2] + 0.4 * object_height)

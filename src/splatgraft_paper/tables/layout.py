@@ -57,11 +57,7 @@ class PaperScene:
 
 
 def download(folder: Path) -> None:
-    """Download the data set from Hugging Face into `folder`; existing files are kept.
-
-    Raises:
-        ValueError: The data set cannot be reached.
-    """
+    """Download the data set from Hugging Face into `folder`; existing files are kept."""
     import huggingface_hub
 
     # the card draws the folders in dot3d_data/, the file list may have them at the top
@@ -78,11 +74,7 @@ def download(folder: Path) -> None:
 
 
 def find_scenes(folder: Path) -> tuple[PaperScene, ...]:
-    """List the scenes of the data set in `folder`, or in dot3d_data/ there.
-
-    Raises:
-        ValueError: No folder of the data set is there.
-    """
+    """List the scenes of the data set in `folder`, or in dot3d_data/ there."""
     root = next(
         (root for root in (folder, folder / "dot3d_data") if any((root / p).is_dir() for p in _PARTS[:2])), None
     )
@@ -115,11 +107,7 @@ def _scene(root: Path, kind: Kind, name: str, folder: Path, results: Path, pose:
 
 
 def pictures(folder: Path) -> dict[str, Path]:
-    """Pictures directly in `folder` by the stem of their name, numbers in their order.
-
-    Raises:
-        ValueError: There is no such folder, or it has no pictures.
-    """
+    """Pictures directly in `folder` by the stem of their name, numbers in their order."""
     names = [path.name for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES] if folder.is_dir() else []
     if not names:
         raise ValueError(f"{folder}: expected pictures, found {'none' if folder.is_dir() else 'no such folder'}")

@@ -143,11 +143,7 @@ class MeasurePictures:
         (folder / METRICS_FILE).write_text(json.dumps(record, indent=1, allow_nan=False))
 
     def views(self) -> "ChosenViews":
-        """The views to measure and their files by role.
-
-        Raises:
-            ValueError: No picture of the method belongs to a view that is to be measured.
-        """
+        """The views to measure and their files by role."""
         reference = self.truth or self.composite
         found = pictures(self.pictures)
         wanted = list(found if reference is None else pictures(reference))

@@ -76,9 +76,6 @@ def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Consol
 
     Returns:
         The folder with its pictures of the held-out views, and seconds by step.
-
-    Raises:
-        ValueError: The scene lacks what is needed, or the method cannot run here, with the reason.
     """
     work = run.out / "scenes" / scene.name
     cameras_from = _cameras_path(scene)

@@ -79,9 +79,6 @@ class FluxObjective:
 
         Args:
             folder: the base model's, with transformer/, vae/ and empty_prompt.safetensors.
-
-        Raises:
-            ValueError: a folder is of another kind or broken.
         """
         checked = FluxFolder.open(folder)
         self._folder, self._options = folder, options
@@ -203,9 +200,6 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
 
     Returns:
         The folder of the model; None in all but the first of several processes, and where only the plan is printed.
-
-    Raises:
-        ValueError: Weights, pairs or options are not as expected.
     """
     recipe = Recipe.read(options.recipe) if options.recipe else None
     processes = join_processes(options.loop)

@@ -90,9 +90,6 @@ def generate(
 
     Returns:
         The number of samples in `out`.
-
-    Raises:
-        ValueError: a model fails; finished samples are kept.
     """
     (out / _REJECTED).mkdir(parents=True, exist_ok=True)
     done = 0
@@ -164,11 +161,7 @@ class RelightingOptions:
     """The Python that runs it; the current one where not given."""
 
     def open(self, seed: int) -> Lighting:
-        """Prepare the relighter and list the maps; `seed` determines the choice of maps.
-
-        Raises:
-            ValueError: the relighter or the maps are missing.
-        """
+        """Prepare the relighter and list the maps; `seed` determines the choice of maps."""
         maps = sorted(self.lights.glob("*.hdr")) if self.lights.is_dir() else []
         if not maps:
             raise ValueError(f"{self.lights}: expected a folder with .hdr environment maps (--lights), found none")
@@ -189,11 +182,7 @@ _PIPELINE_BYTES = 36 << 30
 
 
 def text_to_image_pipeline(base: str) -> Any:
-    """Load the stock FLUX pipeline with its text encoders in bfloat16; needs transformers too.
-
-    Raises:
-        ValueError: `base` is no such pipeline.
-    """
+    """Load the stock FLUX pipeline with its text encoders in bfloat16; needs transformers too."""
     try:
         return diffusers_library().FluxPipeline.from_pretrained(base, torch_dtype=torch.bfloat16)
     except OSError as error:
@@ -253,11 +242,7 @@ class Photograph:
 
 
 def read_orida(root: Path) -> list[Photograph]:
-    """List all photographs of an index.csv with the columns image, mask, background (files), object and scene.
-
-    Raises:
-        ValueError: the file is missing or empty, a row is broken, or a picture is missing.
-    """
+    """List all photographs of an index.csv with the columns image, mask, background (files), object and scene."""
     path, found = root / INDEX_FILE, []
     if not path.is_file():
         raise ValueError(f"{path}: expected a table with the columns {', '.join(COLUMNS)}, found no file")

@@ -99,9 +99,6 @@ class LoopOptions:
 
         Returns:
             Pairs per process and pass.
-
-        Raises:
-            ValueError: an option is out of range, or the batch cannot be divided evenly.
         """
         for name in ("steps", "batch", "accumulate", "save_every", "validate_every", "readers"):
             if getattr(self, name) < 1:
@@ -151,11 +148,7 @@ class Task(Protocol):
         ...
 
     def read(self, position: int) -> Any:
-        """Read the item at a position of the infinite sequence, in a thread.
-
-        Raises:
-            ValueError: a file is missing or broken.
-        """
+        """Read the item at a position of the infinite sequence, in a thread."""
         ...
 
     def loss(self, network: Callable[..., Any], items: Sequence[Any]) -> Float[Tensor, ""]:
@@ -167,11 +160,7 @@ class Task(Protocol):
         ...
 
     def validate(self, network: Callable[..., Any]) -> Validation | None:
-        """Measure the network on pairs for validation.
-
-        Raises:
-            ValueError: a file is missing or broken.
-        """
+        """Measure the network on pairs for validation."""
         ...
 
 
@@ -180,9 +169,6 @@ def join_processes(options: LoopOptions) -> Any:
 
     Returns:
         accelerate's Accelerator.
-
-    Raises:
-        ValueError: accelerate's settings ask for another way to split the weights.
     """
     from accelerate import Accelerator
 
@@ -204,11 +190,6 @@ def train(
     Returns:
         The trained weights by name, or their moving average, on the CPU; empty in all but the first of several
         processes.
-
-    Raises:
-        ValueError: the loss is not finite, an item cannot be read, memory does not suffice, or the folder's state is of
-            another training. The last state is kept.
-        KeyboardInterrupt: Ctrl-C, or SIGTERM as cluster schedulers send it; the state of the finished steps is saved.
     """
     with interruption_held(terminate=True) as interrupted:
         loop = _Loop(task, options, folder)
@@ -244,11 +225,7 @@ def train(
 
 
 def read_losses(path: Path) -> list[float]:
-    """Read the loss of each step, in order.
-
-    Raises:
-        ValueError: the log is missing or broken.
-    """
+    """Read the loss of each step, in order."""
     try:
         entries = [json.loads(line) for line in path.read_text().splitlines()]
     except (OSError, ValueError) as error:

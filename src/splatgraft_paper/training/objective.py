@@ -94,11 +94,7 @@ class LatentCache:
         self._size, self._key_prefix = (width, height), f"{autoencoder}|{width}x{height}"
 
     def load(self, pair: PairFiles, roles: Sequence[Role], seed: int = 0) -> LoadedPair:
-        """Read a pair's cached latents, and the images whose latents are missing.
-
-        Raises:
-            ValueError: a file is missing or broken.
-        """
+        """Read a pair's cached latents, and the images whose latents are missing."""
         paths = {role: self._path(pair.key(role)) for role in roles}
         latents = {role: read_tensors(path)["latents"] for role, path in paths.items() if path.is_file()}
         missing = [role for role in roles if role not in latents]
@@ -212,9 +208,6 @@ def train_objective(
 
     Returns:
         The folder of the model; None in all but the first of several processes.
-
-    Raises:
-        ValueError: see `train`.
     """
     processes = join_processes(options)
     first = processes.is_main_process

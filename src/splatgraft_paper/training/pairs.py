@@ -82,11 +82,7 @@ class PairFiles:
         return self.relit if role == "composite" else getattr(self, role)
 
     def key(self, role: Role) -> str:
-        """Identify the image of a role by the path, size and time of its file.
-
-        Raises:
-            ValueError: the file is missing.
-        """
+        """Identify the image of a role by the path, size and time of its file."""
         path = self.file(role)
         try:
             status = path.stat()
@@ -95,11 +91,7 @@ class PairFiles:
         return f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}|{role}"
 
     def read(self) -> TrainingPair:
-        """Read the pair; its composite has the relit object at the exposure of the object in the scene (paper, Eq. 2).
-
-        Raises:
-            ValueError: a file is missing or broken, or has another size than the target.
-        """
+        """Read the pair; its composite has the relit object at the exposure of that in the scene (paper, Eq. 2)."""
         target, background = read_rgb(self.target), read_rgb(self.background)
         mask, relit = read_mask(self.mask), read_straight_rgb(self.relit)
         for path, picture in ((self.background, background), (self.mask, mask), (self.relit, relit)):
@@ -121,11 +113,7 @@ class PairFolder:
 
 
 def open_rendered(folder: Path) -> PairFolder:
-    """List the pairs that `paper synth pairs` rendered.
-
-    Raises:
-        ValueError: the manifest is missing or broken.
-    """
+    """List the pairs that `paper synth pairs` rendered."""
     pairs = [
         PairFiles(
             sample.folder.name,
@@ -140,11 +128,7 @@ def open_rendered(folder: Path) -> PairFolder:
 
 
 def open_relit(folder: Path) -> PairFolder:
-    """List the pairs of a folder of relit samples, one for each sample and light.
-
-    Raises:
-        ValueError: the manifest is missing or broken.
-    """
+    """List the pairs of a folder of relit samples, one for each sample and light."""
     path = folder / MANIFEST_FILE
     if not path.is_file():
         raise ValueError(
@@ -231,9 +215,6 @@ def split_mixture(
 
     Returns:
         The training mixture, and the held-out one or None where nothing is held out.
-
-    Raises:
-        ValueError: a folder has no pair, or the weights do not fit.
     """
     if not folders or not all(folder.pairs for folder in folders):
         empty = next((folder.name for folder in folders if not folder.pairs), "no source")
@@ -295,9 +276,6 @@ def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -
 
     Args:
         recipe: its sources must all be given, and its weights hold where the options have none.
-
-    Raises:
-        ValueError: a folder is broken, no or not the recipe's sources are given, or the weights do not fit.
     """
     width, height = parse_image_size(options.size, multiple_of=16)
     given = {"pairs": options.pairs, "generated": options.generated, "orida": options.orida}

@@ -52,11 +52,7 @@ class Recipe:
 
     @staticmethod
     def read(name: str) -> "Recipe":
-        """Read a shipped recipe, or a file of your own that ends in .toml.
-
-        Raises:
-            ValueError: there is none of that name, or the file is broken.
-        """
+        """Read a shipped recipe, or a file of your own that ends in .toml."""
         path = Path(name) if name.endswith(".toml") else _FOLDER / f"{name}.toml"
         if not path.is_file():
             known = ", ".join(sorted(path.stem for path in _FOLDER.glob("*.toml")))
@@ -87,11 +83,7 @@ class Recipe:
         return words
 
     def weights(self, folders: dict[str, int]) -> tuple[float, ...]:
-        """The weight of each folder, in the order of `folders`.
-
-        Raises:
-            ValueError: a source of the recipe has no folder, or a folder belongs to no source of it.
-        """
+        """The weight of each folder, in the order of `folders`."""
         by_option = {source.option: source for source in self.sources}
         if missing := [option for option in by_option if not folders.get(option)]:
             wanted = ", ".join(f"--{option}" for option in by_option)
@@ -158,11 +150,7 @@ def plan(recipe: Recipe | None, cost: TrainingCost, rate: float) -> list[str]:
 
 
 def arguments_with_recipe(command: str, words: list[str]) -> list[str]:
-    """The words of a command, preceded by those of its recipe, so that the user's own replace them.
-
-    Raises:
-        ValueError: the recipe is unknown or belongs to another command.
-    """
+    """The words of a command, preceded by those of its recipe, so that the user's own replace them."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--recipe")
     name = parser.parse_known_args(words)[0].recipe
@@ -190,9 +178,6 @@ def parse_image_size(text: str, *, multiple_of: int = 1) -> tuple[int, int]:
 
     Returns:
         Width and height, pixels.
-
-    Raises:
-        ValueError: The text is not of this form.
     """
     parts = text.split("x")
     if len(parts) != 2 or not all(part.isdigit() and int(part) and int(part) % multiple_of == 0 for part in parts):

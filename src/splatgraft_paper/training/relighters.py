@@ -46,11 +46,7 @@ class Relighter(Protocol):
     licence: str
 
     def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
-        """Relight the image by each environment map.
-
-        Raises:
-            ValueError: the relighter fails.
-        """
+        """Relight the image by each environment map."""
         ...
 
 
@@ -109,11 +105,7 @@ class DiffusionRenderer:
     name = "DiffusionRenderer"
 
     def __init__(self, checkout: Path, python: Path) -> None:
-        """Check an installation.
-
-        Raises:
-            ValueError: a program is missing, or the interpreter does not start.
-        """
+        """Check an installation."""
         self._checkout = checkout.resolve()
         for program in (_INVERSE, _FORWARD):
             if not (checkout / program).is_file():
@@ -128,11 +120,7 @@ class DiffusionRenderer:
         self._worker = _Worker(python, self._checkout)
 
     def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
-        """Relight the image by each environment map; results have its size.
-
-        Raises:
-            ValueError: a program fails or writes no image.
-        """
+        """Relight the image by each environment map; results have its size."""
         height, width = draft.mask.shape
         size = (max(_MULTIPLE, height // _MULTIPLE * _MULTIPLE), max(_MULTIPLE, width // _MULTIPLE * _MULTIPLE))
         maps = [light.resolve() for light in lights]
@@ -166,11 +154,7 @@ class _Worker:
         self._log = Path(folder) / "log"
 
     def run(self, program: str, arguments: Sequence[str]) -> None:
-        """Run one program to its end.
-
-        Raises:
-            ValueError: it fails.
-        """
+        """Run one program to its end."""
         process = self._process if self._process is not None and self._process.poll() is None else self._start()
         job = {"program": program, "arguments": list(arguments)}
         assert process.stdin is not None

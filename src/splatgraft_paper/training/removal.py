@@ -62,9 +62,6 @@ class RemovalObjective:
         Args:
             base: folder or hub id with unet/, vae/ and empty_prompt.safetensors.
             checkpointing: recompute activations in the backward pass instead of keeping them.
-
-        Raises:
-            ValueError: a folder is of another kind or broken.
         """
         self.folder = folder = local_folder(base, say, parts=("unet",))
         config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
@@ -154,11 +151,7 @@ class ObjectRemover:
     """A loaded removal network."""
 
     def __init__(self, weights: Path, device: torch.device, say: Callable[[str], None], *, seed: int = 0) -> None:
-        """Load the folder that `train removal` wrote; `seed` is that of the initial noise.
-
-        Raises:
-            ValueError: the folder holds no removal network.
-        """
+        """Load the folder that `train removal` wrote; `seed` is that of the initial noise."""
         self._objective = RemovalObjective(str(weights), say, checkpointing=False)
         self._objective.network.to(device).eval().requires_grad_(False)
         self._objective.to(device)
@@ -188,9 +181,6 @@ def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) 
 
     Returns:
         The folder of the model; None in all but the first of several processes, and where only the plan is printed.
-
-    Raises:
-        ValueError: Weights, pairs or options are not as expected.
     """
     loop, recipe = options.loop, Recipe.read(options.recipe) if options.recipe else None
     if options.plan or recipe:

@@ -48,12 +48,7 @@ class CompactSize:
 
     @staticmethod
     def from_text(text: dict[str, str]) -> "CompactSize":
-        """Parse what `to_text` wrote.
-
-        Raises:
-            KeyError: a field is missing.
-            ValueError: a field is not of numbers.
-        """
+        """Parse what `to_text` wrote."""
         a, b, c, d = map(int, text["widths"].split())
         e, f, g, h = map(int, text["blocks"].split())
         return CompactSize((a, b, c, d), (e, f, g, h), int(text["heads"]))
@@ -180,11 +175,7 @@ def write_weights(path: Path, size: CompactSize, state: dict[str, Tensor], notes
 
 
 def read_weights(path: Path) -> CompactNetwork:
-    """Read a network in evaluation mode, with gradients off.
-
-    Raises:
-        ValueError: the file is missing, broken or holds something else.
-    """
+    """Read a network in evaluation mode, with gradients off."""
     try:
         with safe_open(str(path), "pt") as file:
             header = file.metadata() or {}

@@ -32,10 +32,6 @@ class FluxHarmonizer:
 
         z_t = (1 - t) z_prior + t eps with t = `strength`, then the steps from t to 0 (SDEdit, Meng et al. 2022, in
         rectified flow). The condition is the composite at every level (paper, Iterative Dataset Update).
-
-        Raises:
-            ValueError: The network was not loaded for this level, memory does not suffice, or the network's output is
-                not finite.
         """
         if not any(math.isclose(strength, prepared, abs_tol=1e-6) for prepared in self.network.strengths):
             prepared = ", ".join(f"{level:g}" for level in self.network.strengths)

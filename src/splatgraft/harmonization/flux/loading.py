@@ -52,9 +52,6 @@ def local_folder(weights: str, say: Say, *, parts: Sequence[str] = ("transformer
         weights: A folder, or a hub id OWNER/NAME or OWNER/NAME/FOLDER.
         say: Takes the repository and where its licence is.
         parts: Folders of the model that are needed; vae/ is taken too.
-
-    Raises:
-        ValueError: It is neither, or the download fails.
     """
     folder = Path(weights)
     if folder.is_dir():
@@ -85,11 +82,7 @@ class FluxFolder:
 
     @staticmethod
     def open(folder: Path) -> "FluxFolder":
-        """Read the transformer's config.
-
-        Raises:
-            ValueError: It is missing, or of another model.
-        """
+        """Read the transformer's config."""
         below = folder / "transformer"
         transformer = below if (below / "config.json").is_file() else folder
         config = read_config(transformer / "config.json", "FluxTransformer2DModel")
@@ -114,11 +107,7 @@ class FluxFolder:
         return self.config.get("num_attention_heads", 24) * self.config.get("attention_head_dim", 128)
 
     def variant(self, requested: str) -> Variant:
-        """Determine the variant: `requested`, or for `auto` that of harmonizer.json or of the folder's name.
-
-        Raises:
-            ValueError: It cannot be determined, contradicts `requested`, or the folder is FLUX itself.
-        """
+        """Determine the variant: `requested`, or for `auto` that of harmonizer.json or of the folder's name."""
         if not self.is_harmonizer:
             raise ValueError(
                 f"{self.transformer}: expected a harmoniser, found FLUX itself; train one by `splatgraft paper train "
@@ -132,11 +121,7 @@ class FluxFolder:
 
 
 def declared_variant(folder: Path) -> str | None:
-    """Read the variant from harmonizer.json in `folder`; None where there is no such file.
-
-    Raises:
-        ValueError: The file is broken.
-    """
+    """Read the variant from harmonizer.json in `folder`; None where there is no such file."""
     path = folder / DESCRIPTION_FILE
     if not path.is_file():
         return None
@@ -156,11 +141,7 @@ def _known(variant: str | None, place: Path) -> Variant:
 
 
 def read_config(path: Path, kind: str) -> dict[str, Any]:
-    """Read the diffusers config of a model of class `kind`.
-
-    Raises:
-        ValueError: It is missing, broken or of another class.
-    """
+    """Read the diffusers config of a model of class `kind`."""
     try:
         config = json.loads(path.read_text())
         found = config["_class_name"]
@@ -172,20 +153,12 @@ def read_config(path: Path, kind: str) -> dict[str, Any]:
 
 
 def load_transformer(checked: FluxFolder, *, dtype: torch.dtype) -> Any:
-    """Load the transformer on the CPU.
-
-    Raises:
-        ValueError: The weights are missing, damaged, or do not fit the config.
-    """
+    """Load the transformer on the CPU."""
     return _load(diffusers_library().FluxTransformer2DModel, checked.transformer, dtype)
 
 
 def load_autoencoder(folder: Path) -> Autoencoder:
-    """Load the autoencoder in float32 on the CPU.
-
-    Raises:
-        ValueError: The folder has none.
-    """
+    """Load the autoencoder in float32 on the CPU."""
     return Autoencoder(_load(diffusers_library().AutoencoderKL, folder, torch.float32))
 
 
@@ -219,9 +192,6 @@ def merge_lora(transformer: Any, path: Path) -> int:
 
     Returns:
         The number of layers changed by low-rank products.
-
-    Raises:
-        ValueError: The file is broken, or belongs to another network.
     """
     diffusers_library()
     from diffusers.loaders.lora_pipeline import FluxLoraLoaderMixin  # pyright: ignore
@@ -249,11 +219,7 @@ def merge_lora(transformer: Any, path: Path) -> int:
 
 
 def load_flux(options: FluxOptions, context: HarmonizerContext) -> FluxNetwork:
-    """Load the network, with precomputed modulations.
-
-    Raises:
-        ValueError: A folder is of another kind, a file is broken, or memory does not suffice.
-    """
+    """Load the network, with precomputed modulations."""
     say, device = context.say, context.device
     folder = local_folder(str(options.weights), say)
     checked = FluxFolder.open(folder)
@@ -330,9 +296,6 @@ def choose_precision(*, parameters: int, working: int, free: int) -> tuple[str, 
 
     Returns:
         The precision, and why it was chosen.
-
-    Raises:
-        ValueError: Not even fetching blocks from the CPU fits.
     """
     need = 0.0
     for precision, each in _BYTES.items():

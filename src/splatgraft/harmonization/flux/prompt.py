@@ -50,9 +50,6 @@ def read_prompt(path: Path, *, tokens_width: int, pooled_width: int) -> PromptEm
         path: File of `write_prompt`.
         tokens_width: Width of T5's hidden states that the network takes.
         pooled_width: Width of CLIP's pooled output that the network takes.
-
-    Raises:
-        ValueError: The file is missing, broken or made by other text encoders.
     """
     if not path.is_file():
         raise ValueError(

@@ -16,9 +16,6 @@ def schnell_levels(steps: int = 4, *, start: float = 1.0) -> tuple[float, ...]:
 
     The number of steps does not depend on `start`: the paper's updates take the same time with both its schedules
     (Table Iterative Dataset Update), though their levels differ.
-
-    Raises:
-        ValueError: `steps` is below 1, or `start` is outside (0, 1].
     """
     if steps < 1:
         raise ValueError(f"--sampling-steps: expected at least 1, found {steps}")

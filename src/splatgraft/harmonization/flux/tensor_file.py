@@ -12,11 +12,7 @@ from splatgraft.runtime.files import atomic_write
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Read all tensors of a .safetensors file.
-
-    Raises:
-        ValueError: The file is missing, truncated or of another format.
-    """
+    """Read all tensors of a .safetensors file."""
     try:
         return load_file(path)
     except (OSError, SafetensorError) as error:

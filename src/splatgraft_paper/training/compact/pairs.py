@@ -57,9 +57,6 @@ class CompactPairs:
         Args:
             pairs: folder that `splatgraft paper synth pairs` rendered.
             priors: folders of `write_priors`, one per variant of the perturbed lights.
-
-        Raises:
-            ValueError: the manifest or an image is missing or broken, or no pair has a prior.
         """
         self._arrays: dict[tuple[str, str, int], np.ndarray] = {}
         self._prior_confidence: dict[tuple[str, str], float] = {}

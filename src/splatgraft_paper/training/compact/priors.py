@@ -85,9 +85,6 @@ def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Pro
     """Compute the priors of all objects and lights of rendered folders, one .npz file per folder.
 
     Files that exist are kept.
-
-    Raises:
-        ValueError: a folder lacks a file.
     """
     out.mkdir(parents=True, exist_ok=True)
     for number, folder in enumerate(folders):
@@ -110,9 +107,6 @@ def light_transfer_priors(folder: Path, object_: str, lights: list[str], *, seed
 
     Args:
         lights: names of the lights under which it was rendered alone.
-
-    Raises:
-        ValueError: the folder lacks a file.
     """
     count = len(json.loads((folder / "cameras.json").read_text())["poses"])
     cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(count)))
@@ -148,11 +142,7 @@ class SurfacePixels:
 
 
 def read_pixels(folder: Path, object_: str, cameras: Cameras) -> SurfacePixels:
-    """Read the pixels of an object's take and lift them to points by their depth.
-
-    Raises:
-        ValueError: a file is missing or broken.
-    """
+    """Read the pixels of an object's take and lift them to points by their depth."""
     take, points, normals, masks = folder / object_, [], [], []
     for i in range(len(cameras)):
         path = take / f"{i:04d}_depth.npy"
@@ -177,9 +167,6 @@ def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussian
 
     Args:
         name: of the object, or `scene`.
-
-    Raises:
-        ValueError: the points are missing or broken.
     """
     path = folder / f"{name}_surface" / "0000.npy"
     try:
