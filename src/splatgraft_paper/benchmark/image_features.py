@@ -21,11 +21,7 @@ _KID_SUBSETS, _KID_SIZE = 100, 50
 
 
 def inception_features(folder: Path | None) -> Features:
-    """Load the network that computes the 2048 features of the published FID.
-
-    Args:
-        folder: holds the weights; torch hub's cache where None.
-    """
+    """The 2048 features of the published FID; weights are read from `folder`, or from torch hub's cache where None."""
     path = (Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder) / INCEPTION_FILE
     if not path.is_file():
         raise ValueError(f"{path}: expected Inception weights of torch-fidelity, found no such file")

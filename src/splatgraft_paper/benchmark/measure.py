@@ -161,15 +161,10 @@ def measure_view(
     background: Float[Tensor, "h w 3"],
     perceptual: Perceptual | None = None,
 ) -> dict[str, float]:
-    """Compute PSNR, SSIM, FLIP and LPIPS of every region, and the error of the shadow's strength.
+    """PSNR, SSIM, FLIP and, with `perceptual`, LPIPS of every region, and the error of the shadow's strength.
 
-    Args:
-        image: the method's result, sRGB in [0, 1].
-        background: the method's render without the object, sRGB in [0, 1].
-        perceptual: adds LPIPS. That of a region compares the truth with a copy that has the region's pixels of `image`.
-
-    Returns:
-        Keys such as `psnr_whole`, `lpips_shadow` to values; nan where a region is too small.
+    Images are sRGB in [0, 1]; `background` is the method's render without the object. LPIPS of a region compares the
+    truth with a copy that has the region's pixels of `image`. Values are nan where a region is too small.
     """
     regions = find_regions(truth)
     plain = compare(image, truth, regions=regions, background=background)
@@ -201,14 +196,9 @@ def warp(
     cameras: Cameras,
     into_depth: Float[Tensor, "h w"],
 ) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """Warp the second camera's image into the first camera's view.
+    """The second camera's image in the first camera's view, and the pixels where both cameras see the same point.
 
-    Args:
-        depth: of the second camera, along the optical axis; 0 where nothing is hit.
-        into_depth: depth of the first camera.
-
-    Returns:
-        The warped image, and the pixels where both cameras see the same point.
+    Depths are along the optical axis, 0 where nothing is hit.
     """
     first, second = cameras[0], cameras[1]
     h, w = into_depth.shape
@@ -239,14 +229,8 @@ def disagreement(
 ) -> float | None:
     """RMSE in sRGB between consecutive views, near the object, after warping by the true depth.
 
-    True gloss differs between views too, so compare with the value of the ground truth.
-
-    Args:
-        images: of a method, by index of the view.
-        masks: coverage by the object of all views; pixels within an eighth of the image's width of it are compared.
-
-    Returns:
-        None where no consecutive views have images.
+    Pixels within an eighth of the image's width of the object's masks are compared. None where no consecutive views
+    have images. True gloss differs between views too, so compare with the value of the ground truth.
     """
     squares, count = 0.0, 0
     for i in sorted(images):

@@ -221,11 +221,7 @@ def run_method(
     settings: MethodSettings,
     console: Console,
 ) -> tuple[Path, dict[str, float]]:
-    """Run the stale steps of a method on a scene.
-
-    Returns:
-        The resulting scene, a .ply, and the seconds of each of the method's own steps.
-    """
+    """Run the stale steps of a method; gives its scene, a .ply, and the seconds of each of its own steps."""
     seconds: dict[str, float] = {}
     prior = scene.composite / SCENE_FILE
     if method.prior != "off":

@@ -113,11 +113,7 @@ def perform_if_stale(step: Step, console: Console) -> float:
 def compose_scene(
     ground_truth: GroundTruthScene, work: Path, options: ReconstructOptions, *, device: Device, console: Console
 ) -> ComposedScene:
-    """Reconstruct both captures without the held-out views, segment the object and place it at its true pose.
-
-    Args:
-        device: Where to segment.
-    """
+    """Reconstruct both captures without the held-out views, segment the object and place it at its true pose."""
     seconds: dict[str, float] = {}
     for side, path in (("source", ground_truth.source), ("target", ground_truth.target)):
         capture = read_capture(path)

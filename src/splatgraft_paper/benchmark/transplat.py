@@ -38,12 +38,7 @@ def relight_by_irradiance_ratio(
 ) -> tuple[Composite, tuple[Note, ...]]:
     """Multiply the linear colours of every object by irradiance at its new place over that at its old one.
 
-    Args:
-        sources: Per object the scene that it was taken from; None where that is not known.
-
-    Returns:
-        The composite and a note on each object. An object stays as it was captured where its source is not known or
-        there is no light at one of its places, and a warning gives the reason.
+    An object whose source is None, or at one of whose places is no light, stays as it was captured; its note says so.
     """
     if len(sources) != len(composite.objects):
         raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")

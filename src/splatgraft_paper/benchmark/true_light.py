@@ -55,12 +55,10 @@ _MAX_PEAKS = 6
 
 
 def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Light:
-    """A light from a rendered panorama and a list of suns.
+    """A light from an equirectangular panorama of linear radiance and the entries of suns.json.
 
-    Args:
-        panorama: Equirectangular linear radiance; row 0 is up (+z), the middle column +x, to the right -y.
-        suns: Entries of suns.json: direction (unit, towards the sun), irradiance (linear rgb) and angular_radius
-            (radians).
+    Row 0 is up (+z), the middle column +x, to the right -y. A sun has a direction (unit, towards it), irradiance
+    (linear rgb) and angular_radius (radians).
     """
     panorama, peaks = _without_peaks(panorama)
     directions, solid_angles = cube_directions(_FACE)

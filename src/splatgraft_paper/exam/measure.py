@@ -37,11 +37,7 @@ ROWS: Mapping[str, str] = {
 
 
 def make_row(row: str, scene: ExamScene) -> tuple[Gaussians, Relit | None]:
-    """The scene that a row gives.
-
-    Returns:
-        The scene to draw, and the transfer in layers where the row is one.
-    """
+    """The scene that a row gives, and the transfer in layers where the row is one."""
     if row == "paste":
         return scene.composite.bake()[0], None
     if row == "gain":
@@ -127,12 +123,7 @@ class SceneResult:
 
 
 def evaluate_scene(scene: ExamScene, rows: Sequence[str], picture: Path) -> SceneResult:
-    """Make and measure the rows of a scene.
-
-    Args:
-        picture: A .png to write: held-out views one above the other; pasted, the transfer, the one with all ground
-            truth, the truth side by side.
-    """
+    """Make and measure the rows of a scene, and write a .png of its held-out views, one above the other."""
     values, columns, notes = {}, [], []
     light, normals_deg = {}, None
     for row in rows:

@@ -59,14 +59,7 @@ def draw_scenes(number: int, count: int) -> tuple[BenchmarkScene, ...]:
 
 
 def render_scene(which: BenchmarkScene, out: Path, blender_python: Path, *, jobs: int) -> Path:
-    """Render what is missing of a scene.
-
-    Args:
-        out: Folder of the exam; receives renders/ and scenes/.
-
-    Returns:
-        The scene's folder, as `synth benchmark` lays it out.
-    """
+    """Render what is missing of a scene into renders/ and scenes/ of `out`; gives its folder."""
     folder = out / "scenes" / which.name
     if not (folder / TRUE_LIGHT_FILE).is_file():  # it is written last
         sides = [out / "renders" / f"{which.name}_{side}" for side in ("target", "source")]
@@ -118,12 +111,7 @@ class ExamScene:
 
 
 def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: Console) -> ExamScene:
-    """Reconstruct and compose a rendered scene where that is not done yet, and read it.
-
-    Args:
-        folder: As `render_scene` leaves it; without surface.npy no normals are known.
-        work: Receives both reconstructions, the object and the composite.
-    """
+    """Reconstruct and compose a rendered scene in `work` where that is not done yet, and read it."""
     files = GroundTruthScene.from_folder(folder)
     composed = compose_scene(files, work, options, device="cpu", console=console)
     composite = read_composite(composed.target, composed.composite / PLACEMENT_FILE)
@@ -205,13 +193,10 @@ def estimated_lights(scene: ExamScene) -> dict[str, EstimatedLight | NoLight]:
 
 
 def seen_surface(surface: Float[Tensor, "m 6"], cameras: Cameras) -> Float[Tensor, "s 6"]:
-    """The surface points that some camera sees: not what lies inside of the object or under it.
+    """The surface points (position, unit normal) that some camera sees: not what lies inside of the object or under it.
 
-    A point is seen where it faces the camera and no point in its cell of an image is nearer by more than a share
-    of the object's size.
-
-    Args:
-        surface: Positions and unit normals of m points, ten or more per cell.
+    A point is seen where it faces the camera and no point in its cell of an image, of ten or more, is nearer by more
+    than a share of the object's size.
     """
     points, normals = surface[:, :3], surface[:, 3:]
     middle, size = points.mean(0), float((points - points.mean(0)).norm(dim=1).max())

@@ -70,11 +70,7 @@ class ImageEditing:
     key: str
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """Send composite and mask to the service and resize the returned image to the view's size.
-
-        Raises:
-            ValueError: the service fails or returns no image.
-        """
+        """Send composite and mask to the service and resize the returned image to the view's size."""
         mask = (view.mask > 0.5).float()[..., None].expand(-1, -1, 3)
         pictures = [{"inline_data": {"mime_type": "image/png", "data": _png(one)}} for one in (view.composite, mask)]
         content = json.dumps({"contents": [{"parts": [{"text": PROMPT}, *pictures]}]}).encode()

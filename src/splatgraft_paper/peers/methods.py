@@ -118,12 +118,7 @@ PEERS = {kind.name: kind for kind in (ReinhardOptions, LbmOptions, MVCoLightOpti
 
 
 def method_options(name: str, *, weights: str | None = None) -> HarmonizerOptions:
-    """Give the default options of a method, ours or another project's.
-
-    Args:
-        name: A key of `HARMONIZERS` or of `PEERS`.
-        weights: Replaces the default weights; ignored by methods without weights.
-    """
+    """The default options of a method of `HARMONIZERS` or `PEERS`, with other weights where it takes any."""
     known = {**HARMONIZERS, **PEERS}
     if name not in known:
         raise ValueError(f"harmonizer: expected one of {', '.join(sorted(known))}, found {name!r}")

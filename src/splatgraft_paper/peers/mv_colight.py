@@ -84,11 +84,7 @@ class MVCoLight:
     """The interpreter that runs it."""
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """Apply the network's change, as a ratio at its own size, to the composite.
-
-        Raises:
-            ValueError: the external program fails.
-        """
+        """Apply the network's change, as a ratio at its own size, to the composite."""
         height, width = view.mask.shape
         small = network_input(view)
         with tempfile.TemporaryDirectory() as name:

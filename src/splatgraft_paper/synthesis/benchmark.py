@@ -186,15 +186,10 @@ def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
 def sparse_points(
     folder: Path, cameras: Cameras, *, count: int = 20_000, noise: float = 0.002, seed: int = 0
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Sample noisy surface points, as structure from motion would reconstruct, by lifting random pixels by their depth.
+    """Noisy surface points, as structure from motion would reconstruct: random pixels lifted by their depth.
 
-    Args:
-        folder: a rendered take with depth.
-        count: number of points over all cameras, at most.
-        noise: standard deviation of the depth, as a share of it.
-
-    Returns:
-        Positions in metres and sRGB colours; the sky has no points.
+    `count` over all cameras, at most; `noise` is the deviation of the depth as a share of it. Gives positions in metres
+    and sRGB colours; the sky has no points.
     """
     generator = np.random.default_rng(seed)
     points, colors = [], []
@@ -215,13 +210,7 @@ def sparse_points(
 
 
 def gather_capture(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
-    """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply.
-
-    Args:
-        take: Its name, with color, and depth where `points` is set.
-        passes: Names of folders: images, masks, depth.
-        points: Whether sparse points are made of the depths.
-    """
+    """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply by its depths."""
     count = len(json.loads((rendered / "cameras.json").read_text())["poses"])
     stems = tuple(f"{i:04d}" for i in range(count))
     for folder, suffix, ending in _PASS_FILES:

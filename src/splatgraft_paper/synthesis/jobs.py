@@ -105,11 +105,7 @@ def _description(job: Job, out: Path) -> str:
 
 
 def render_job(job: Job, out: Path, blender_python: Path) -> None:
-    """Render what is missing in `out`; can be interrupted and repeated.
-
-    Args:
-        out: receives the pictures, job.json and render.log.
-    """
+    """Render what is missing in `out`, beside job.json and render.log; can be interrupted and repeated."""
     if job.is_done(out):
         return
     out.mkdir(parents=True, exist_ok=True)

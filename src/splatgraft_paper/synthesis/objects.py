@@ -78,10 +78,7 @@ def _handle(rng: random.Random, palette: Palette, width: Number, height: Number)
 
 
 def make(seed: int, place: Place) -> tuple[Part, ...]:
-    """Make an object of one to three stacked pieces, possibly with a handle, standing at the origin.
-
-    Its size fits `place`. The same seed and place give the same object.
-    """
+    """Make an object of one to three stacked pieces, possibly with a handle; it stands at the origin and fits `place`."""
     rng = random.Random(f"object-{seed}")
     palette = Palette(rng)
     total = min(place.height * 0.6, rng.uniform(0.16, 0.55))

@@ -118,11 +118,7 @@ class PairSample:
 def match_statistics(
     relit: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """Shift and scale the relit object to the mean and deviation per channel of the object in the scene (Sec. 5.2).
-
-    Args:
-        mask: weights of the statistics, in [0, 1].
-    """
+    """Shift and scale the relit object to the mean and deviation per channel of the object in the scene (Sec. 5.2)."""
     weight = mask[..., None] / mask.sum().clamp_min(1e-6)
 
     def moments(image: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
@@ -136,12 +132,7 @@ def match_statistics(
 def composite(
     relit: Float[Tensor, "h w 3"], background: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """M * relit + (1 - M) * background (paper, Eq. 2).
-
-    Args:
-        relit: colours of the object, not multiplied by its coverage.
-        mask: M, coverage in [0, 1].
-    """
+    """M * relit + (1 - M) * background (paper, Eq. 2); `relit` is not multiplied by its coverage M in [0, 1]."""
     return mask[..., None] * relit + (1 - mask[..., None]) * background
 
 
@@ -192,11 +183,7 @@ def find_defect(sample: PairSample) -> str | None:
 
 
 def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
-    """Check every pair and write manifest.jsonl.
-
-    Returns:
-        The number of sound pairs, and the defects of the others.
-    """
+    """Check every pair and write manifest.jsonl; gives the number of sound pairs and the defects of the others."""
     defects, lines = [], []
     for folder in folders:
         provenance = json.loads((folder / "job.json").read_text()).get("provenance", {})
@@ -233,11 +220,7 @@ def read_manifest(out: Path) -> list[PairSample]:
 
 
 def check_pairs(out: Path, failures: list[str], console: Console) -> int:
-    """Check all rendered scenes in `out`; write the manifest of their pairs and the list of failures.
-
-    Returns:
-        0 where nothing failed and no pair is faulty, otherwise 1.
-    """
+    """Check all rendered scenes in `out`, write the manifest and the failures; 1 where there are any, otherwise 0."""
     folders = sorted(path.parent for path in out.glob("*/job.json"))
     if not folders and not failures:
         raise ValueError(f"{out}: expected rendered pairs or benchmark scenes, found none")

@@ -207,11 +207,7 @@ def _eye(target: Vector, azimuth: Number, elevation: Number, distance: Number) -
 
 
 def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> tuple[Camera, ...]:
-    """Place five cameras on a random short arc that look at the object's place (paper, Sec. 5.2).
-
-    Args:
-        object_height: metres.
-    """
+    """Place five cameras on a random short arc that look at the object's place (paper, Sec. 5.2)."""
     rng = random.Random(f"arc-{scene.name}-{seed}")
     # outdoors, a camera that looks steeply down sees only the ground
     highest = 0.45 if scene.world.kind != "color" else 0.8
@@ -231,11 +227,7 @@ def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> 
 
 
 def capture_cameras(scene: Scene, place: Place, object_height: Number, count: int, seed: int) -> tuple[Camera, ...]:
-    """Place cameras all around the object in three rings of different heights, ordered by ring and azimuth.
-
-    Args:
-        object_height: metres.
-    """
+    """Place cameras all around the object in three rings of different heights, ordered by ring and azimuth."""
     rng = random.Random(f"capture-{scene.name}-{seed}")
     target = (place.location[0], place.location[1], place.location[2] + 0.4 * object_height)
     cameras: list[Camera] = []

@@ -40,12 +40,7 @@ class SpherePictures:
 
 
 def render_spheres(seed: int, *, width: int, height: int, lights: int) -> SpherePictures:
-    """Render the scene of a seed.
-
-    Args:
-        seed: of places, colours and suns.
-        lights: suns besides that of the scene.
-    """
+    """Render the scene of a seed, and its view under so many other suns."""
     rng = np.random.default_rng(seed)
     floor, sky = rng.uniform(0.2, 0.6, 3), rng.uniform(0.2, 0.8, 3)
     albedos = [rng.uniform(0.3, 0.7, 1).repeat(3), rng.uniform(0.15, 0.8, 3)]

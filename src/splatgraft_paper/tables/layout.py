@@ -121,14 +121,10 @@ def held_out_stems(stems: Sequence[str]) -> list[str]:
 
 
 def match_views(wanted: Sequence[str], found: dict[str, Path]) -> tuple[dict[str, Path], str]:
-    """Which picture of a method shows which view.
+    """The views that a method has pictures of, and how they were matched.
 
-    Args:
-        found: The method's pictures by stem, in their order.
-
-    Returns:
-        The views that the method has pictures of, and how they were matched: by name; or, as 3DGS's render.py numbers
-        its pictures, by order where there are as many as views or as held-out views. Empty where neither fits.
+    By name; or, as 3DGS's render.py numbers its pictures, by order where there are as many as views or as held-out
+    views. Empty where neither fits.
     """
     if same := {stem: found[stem] for stem in wanted if stem in found}:
         return same, f"{len(same)} of {len(wanted)} views by name"

@@ -43,15 +43,9 @@ class KnownView:
 def measure_picture(
     image: Float[Tensor, "h w 3"], known: KnownView, perceptual: Perceptual | None = None
 ) -> dict[str, float]:
-    """Compute every metric that what is known allows.
+    """Every metric that what is known allows; nan where a region is too small.
 
-    Args:
-        image: A method's picture of the view, sRGB in [0, 1].
-
-    Returns:
-        With a truth: `psnr_whole`, `ssim_whole`, `ssim_padded_whole`, `flip_whole`, and `lpips_whole` where asked for;
-        with a mask also those of the object; with a background too, those of the shadow and of the rest. nan where a
-        region is too small.
+    With a truth those of the whole, with a mask also those of the object, with a background all of `measure_view`.
     """
     out: dict[str, float] = {}
     if known.truth is not None and known.mask is not None and known.background is not None:

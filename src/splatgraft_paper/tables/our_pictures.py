@@ -72,11 +72,7 @@ class RenderPictures:
 
 
 def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Console) -> tuple[Path, dict[str, float]]:
-    """Run a method on a scene as far as it is stale.
-
-    Returns:
-        The folder with its pictures of the held-out views, and seconds by step.
-    """
+    """Run a method on a scene as far as it is stale; gives the folder of its held-out views, and seconds by step."""
     work = run.out / "scenes" / scene.name
     cameras_from = _cameras_path(scene)
     composed = _composed(scene, work, run, console)

@@ -75,11 +75,7 @@ class FluxObjective:
     output_role: Role = "target"
 
     def __init__(self, folder: Path, options: FluxTrainingOptions, say: Callable[[str], None]) -> None:
-        """Load the base model and widen its first layer where needed.
-
-        Args:
-            folder: the base model's, with transformer/, vae/ and empty_prompt.safetensors.
-        """
+        """Load the base model (transformer/, vae/, empty_prompt.safetensors) and widen its first layer where needed."""
         checked = FluxFolder.open(folder)
         self._folder, self._options = folder, options
         config = checked.config
@@ -162,12 +158,9 @@ class FluxObjective:
 
 
 def add_lora(network: Any, rank: int, *, seed: int) -> int:
-    """Freeze `network` and add trainable low-rank matrices to its linear layers, in place, by PEFT.
+    """Freeze `network` and add trainable low-rank matrices to its linear layers, in place, by PEFT; gives their number.
 
     All weights of the first layer stay trainable, since it is new where it was widened.
-
-    Returns:
-        The number of adapted layers.
     """
     from peft import LoraConfig
 
@@ -196,11 +189,7 @@ def _level(times: Times, generator: torch.Generator) -> Float[Tensor, ""]:
 
 
 def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Path | None:
-    """Train a harmoniser.
-
-    Returns:
-        The folder of the model; None in all but the first of several processes, and where only the plan is printed.
-    """
+    """Train a harmoniser; gives its folder in the first process, None in others and where only the plan is printed."""
     recipe = Recipe.read(options.recipe) if options.recipe else None
     processes = join_processes(options.loop)
     if options.plan or recipe:

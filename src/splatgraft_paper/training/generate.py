@@ -80,16 +80,9 @@ class Lighting:
 def generate(
     out: Path, plans: Iterable[SamplePlan], lighting: Lighting, *, total: int, progress: Progress = silent
 ) -> int:
-    """Generate missing samples, then write the manifest and a contact sheet.
+    """Generate samples up to `total`, then write the manifest and a contact sheet; gives the number of samples.
 
     A sample whose object is too small, too large or not found is recorded in rejected/ and not tried again.
-
-    Args:
-        plans: candidates, in order.
-        total: number of samples to reach.
-
-    Returns:
-        The number of samples in `out`.
     """
     (out / _REJECTED).mkdir(parents=True, exist_ok=True)
     done = 0

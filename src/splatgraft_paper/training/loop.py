@@ -95,11 +95,7 @@ class LoopOptions:
     """Train on the CPU even if a GPU is available."""
 
     def check(self, processes: int) -> int:
-        """Check the options.
-
-        Returns:
-            Pairs per process and pass.
-        """
+        """Check the options; gives pairs per process and pass."""
         for name in ("steps", "batch", "accumulate", "save_every", "validate_every", "readers"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')}: expected at least 1, found {getattr(self, name)}")
@@ -165,11 +161,7 @@ class Task(Protocol):
 
 
 def join_processes(options: LoopOptions) -> Any:
-    """Meet the other processes that the launcher (torchrun, or srun with the same variables) started.
-
-    Returns:
-        accelerate's Accelerator.
-    """
+    """accelerate's Accelerator of this process and the others that the launcher (torchrun or srun) started."""
     from accelerate import Accelerator
 
     accelerator = Accelerator(cpu=options.cpu, gradient_accumulation_steps=options.accumulate)
@@ -182,14 +174,10 @@ def join_processes(options: LoopOptions) -> Any:
 def train(
     task: Task, options: LoopOptions, folder: Path, *, say: Callable[[str], None], progress: Progress
 ) -> dict[str, Tensor]:
-    """Train to the last step, resuming from the folder's last state.
+    """Train to the last step, resuming from the folder's last state; it receives states/, validation/ and log.jsonl.
 
-    Args:
-        folder: receives states/, validation/ and log.jsonl.
-
-    Returns:
-        The trained weights by name, or their moving average, on the CPU; empty in all but the first of several
-        processes.
+    Gives the trained weights by name, or their moving average, on the CPU; nothing in all but the first process.
+    Ctrl-C, SIGTERM as cluster schedulers send it, and errors leave the state of the finished steps.
     """
     with interruption_held(terminate=True) as interrupted:
         loop = _Loop(task, options, folder)

@@ -200,15 +200,7 @@ class ObjectiveTask:
 def train_objective(
     objective: Objective, data: TrainingData, out: Path, options: LoopOptions, *, base: Path, console: Console
 ) -> Path | None:
-    """Train an objective on pairs and write its model.
-
-    Args:
-        out: folder for the model, states, log, latents and validation pictures.
-        base: folder with the autoencoder of the latents.
-
-    Returns:
-        The folder of the model; None in all but the first of several processes.
-    """
+    """Train an objective on pairs and write its model, with `base`'s autoencoder; the first process gives its folder."""
     processes = join_processes(options)
     first = processes.is_main_process
     say = console.say if first else lambda sentence: None
@@ -235,10 +227,6 @@ def save_weights(model: Any, config: Mapping[str, Any], state: Mapping[str, Tens
 
     It writes what a model holds and takes no other weights. So an empty model of the same config receives them first:
     the network in training may be split over processes, and it holds the last weights, not their average.
-
-    Args:
-        state: every weight of it, by name.
-        folder: is replaced when all is written.
     """
     with torch.device("meta"):
         empty = model.from_config(config)

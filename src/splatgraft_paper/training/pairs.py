@@ -209,12 +209,8 @@ def split_mixture(
 ) -> tuple[Mixture, Mixture | None]:
     """Split folders into training and held-out pairs, by whole groups in the order of their names' hashes.
 
-    Args:
-        weights: relative, one per folder; by the number of training pairs where empty.
-        held_out: share of the groups of each folder, at least one group; 0 holds out none.
-
-    Returns:
-        The training mixture, and the held-out one or None where nothing is held out.
+    `weights` are relative, one per folder, by the number of training pairs where empty; `held_out` is the share of the
+    groups of each folder, at least one group, or 0. The second mixture is None where nothing is held out.
     """
     if not folders or not all(folder.pairs for folder in folders):
         empty = next((folder.name for folder in folders if not folder.pairs), "no source")
@@ -272,11 +268,7 @@ class TrainingData:
 
 
 def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -> TrainingData:
-    """Open the folders and hold out scenes.
-
-    Args:
-        recipe: its sources must all be given, and its weights hold where the options have none.
-    """
+    """Open the folders and hold out scenes; a recipe's sources must all be given, and its weights are the default."""
     width, height = parse_image_size(options.size, multiple_of=16)
     given = {"pairs": options.pairs, "generated": options.generated, "orida": options.orida}
     weights = options.weights

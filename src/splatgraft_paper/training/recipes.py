@@ -171,14 +171,7 @@ def _size(count: int) -> str:
 
 
 def parse_image_size(text: str, *, multiple_of: int = 1) -> tuple[int, int]:
-    """Parse the value of --size.
-
-    Args:
-        multiple_of: Both sides must be multiples of this, pixels.
-
-    Returns:
-        Width and height, pixels.
-    """
+    """Parse --size WIDTHxHEIGHT; both must be multiples of `multiple_of` pixels."""
     parts = text.split("x")
     if len(parts) != 2 or not all(part.isdigit() and int(part) and int(part) % multiple_of == 0 for part in parts):
         wanted = "WIDTHxHEIGHT" if multiple_of == 1 else f"WIDTHxHEIGHT in multiples of {multiple_of}"

@@ -57,12 +57,7 @@ class RemovalObjective:
     output_role: Role = "background"
 
     def __init__(self, base: str, say: Callable[[str], None], *, checkpointing: bool = True) -> None:
-        """Load Stable Diffusion 2, or a removal network to continue from.
-
-        Args:
-            base: folder or hub id with unet/, vae/ and empty_prompt.safetensors.
-            checkpointing: recompute activations in the backward pass instead of keeping them.
-        """
+        """Load Stable Diffusion 2, or a removal network to continue from: unet/, vae/ and empty_prompt.safetensors."""
         self.folder = folder = local_folder(base, say, parts=("unet",))
         config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
         self._prompt_path = find_prompt(base, folder)
@@ -177,11 +172,7 @@ class ObjectRemover:
 
 
 def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) -> Path | None:
-    """Train the object removal.
-
-    Returns:
-        The folder of the model; None in all but the first of several processes, and where only the plan is printed.
-    """
+    """Train the object removal; the first process gives its folder, others None, as where only the plan is printed."""
     loop, recipe = options.loop, Recipe.read(options.recipe) if options.recipe else None
     if options.plan or recipe:
         processes = join_processes(loop)

@@ -57,12 +57,7 @@ def write_tiny_base(
     say: Callable[[str], None],
     progress: Progress,
 ) -> None:
-    """Train the autoencoder on pictures and write the base model's folder.
-
-    Args:
-        folder: is replaced when all is written.
-        pictures: (3 h w), sRGB in [0, 1], all of one size.
-    """
+    """Train the autoencoder on pictures (3 h w), sRGB in [0, 1], all of one size, and write the base model's folder."""
     torch.manual_seed(options.seed)
     autoencoder = _autoencoder(options.autoencoder_widths)
     stacked = torch.stack(list(pictures)) * 2 - 1

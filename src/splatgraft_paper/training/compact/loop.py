@@ -202,14 +202,7 @@ def region_errors(image: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w
 def compact_loss(
     view: CompactInput, output: CompactOutput, truth: Float[Tensor, "b 3 h w"]
 ) -> tuple[Tensor, Errors, Errors]:
-    """Compute the loss.
-
-    Args:
-        truth: the ground truth, linear light.
-
-    Returns:
-        The loss, the errors of the harmonised view, and the errors of the prior.
-    """
+    """The loss against the truth in linear light, the errors of the harmonised view, and those of the prior."""
     image = apply_output(view, output)
     errors, prior_errors = region_errors(image, truth, view), region_errors(view.prior(), truth, view)
     loss = WEIGHTS.object_and_shadow * (errors.object + errors.shadow) + WEIGHTS.rest * errors.rest

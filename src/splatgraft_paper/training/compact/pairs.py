@@ -205,16 +205,7 @@ SETTINGS = Augmentation()
 def augment(
     view: CompactInput, target: Float[Tensor, "1 3 h w"], size: tuple[int, int], seed: str
 ) -> tuple[CompactInput, Float[Tensor, "1 3 i j"]]:
-    """Augment a training view.
-
-    Args:
-        view: a batch of one.
-        target: the ground truth, linear light.
-        size: height and width of the result, pixels.
-
-    Returns:
-        View and target at `size`; the crop contains the whole object.
-    """
+    """A view (a batch of one) and its truth, augmented to `size` (height, width); the crop has the whole object."""
     rng = random.Random(seed)
     top, left, height, width = _random_crop(view.mask[0, 0], size, rng)
 

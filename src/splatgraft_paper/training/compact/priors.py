@@ -82,10 +82,7 @@ class PairPrior:
 
 
 def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Progress = silent) -> None:
-    """Compute the priors of all objects and lights of rendered folders, one .npz file per folder.
-
-    Files that exist are kept.
-    """
+    """Compute the priors of all objects and lights of rendered folders, one .npz per folder; existing files are kept."""
     out.mkdir(parents=True, exist_ok=True)
     for number, folder in enumerate(folders):
         path = out / f"{folder.name}.npz"
@@ -103,11 +100,7 @@ def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Pro
 
 
 def light_transfer_priors(folder: Path, object_: str, lights: list[str], *, seed: int) -> list[PairPrior]:
-    """Compute one prior per light of an object.
-
-    Args:
-        lights: names of the lights under which it was rendered alone.
-    """
+    """Compute one prior for each light under which an object was rendered alone."""
     count = len(json.loads((folder / "cameras.json").read_text())["poses"])
     cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(count)))
     pixels = read_pixels(folder, object_, cameras)
@@ -163,11 +156,7 @@ def read_pixels(folder: Path, object_: str, cameras: Cameras) -> SurfacePixels:
 
 
 def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussians:
-    """Read points sampled on a surface as surfels, see `surfels`.
-
-    Args:
-        name: of the object, or `scene`.
-    """
+    """Read points sampled on the surface of an object or of the `scene` as surfels."""
     path = folder / f"{name}_surface" / "0000.npy"
     try:
         found = torch.from_numpy(np.load(path, allow_pickle=False).astype(np.float32))
