@@ -133,10 +133,7 @@ def _check_counts(cameras: Cameras, images: ImageSequence, weights: ImageSequenc
 def restrict_to_changes(views: Views, unchanged_below: float) -> Views:
     """The views cropped to what the harmoniser changed, with the Gaussians that no changed pixel sees fixed.
 
-    Args:
-        views: Of all Gaussians, whole.
-        unchanged_below: Difference from the composite's render, in sRGB, below which a pixel is unchanged; 0 or less
-            returns `views`.
+    A difference from the composite's render, in sRGB, below `unchanged_below` is no change; 0 or less gives `views`.
     """
     if unchanged_below <= 0:
         return views
@@ -188,18 +185,7 @@ def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Float[Tensor, "m k 3"]:
-    """Colours after `iterations` steps of Adam over views in shuffled order; only visible Gaussians change.
-
-    Args:
-        sh: Initial coefficients of the active Gaussians.
-        targets: Views and their corrected images.
-        learning_rates: Of the bands, over the iterations.
-        iterations: Steps, one view each.
-        loss: Distance from the render to the target.
-        seed: Of the order of views.
-        progress: Called after each iteration.
-        checkpoint: Where the state is saved every 500 iterations.
-    """
+    """Colours after `iterations` steps of Adam over views in shuffled order; only visible Gaussians change."""
     views, start = targets.views, 0
     sh = sh.clone().contiguous()
     moments = adam.no_moments({"sh": sh}, len(sh))

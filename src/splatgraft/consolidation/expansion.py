@@ -61,16 +61,9 @@ class Expansion:
         moments: adam.Moments,
         rates: Float[Tensor, "3*k"],
     ) -> bool:
-        """One step of `adam.step` on the coefficients that are shown, along the transpose of `colors` at a gradient.
+        """One step of `adam.step` on the coefficients that are shown, along the transpose of the gradient by their colours.
 
-        Args:
-            sh: Changed in place, with `moments` of the field "sh".
-            colors: The loss's gradient by the colours.
-            moments: Adam's, of the coefficients.
-            rates: Learning rate of each coefficient, flattened.
-
-        Returns:
-            False where a gradient was not finite; the rows with such gradients stay unchanged.
+        Changes `sh` and the moments of the field "sh" in place. False where a gradient was not finite; such rows stay.
         """
         if self._on_cpu:
             flat = tuple(x.view(len(x), -1).numpy() for x in (sh, moments.first["sh"], moments.second["sh"]))

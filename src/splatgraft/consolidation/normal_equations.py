@@ -67,13 +67,7 @@ class _Equations:
 def solve(
     prior: Float[Tensor, "m k 3"], targets: CorrectedTargets, *, progress: Progress = silent
 ) -> Float[Tensor, "m k 3"]:
-    """The colours with the least squared error over all views, with a ridge towards `prior`.
-
-    Args:
-        prior: Coefficients of the active Gaussians, from which the solution starts.
-        targets: Views and their corrected images, refined between rounds.
-        progress: Called after each round.
-    """
+    """The colours with the least squared error over all views, with a ridge towards `prior`; targets are refined."""
     trials = len(_BAND_RIDGES) if len(targets.views) >= 2 * _HOLD_OUT_EVERY else 0
     total = _ROUNDS + trials + 1
     progress(0, total, "setting up the equations")

@@ -80,17 +80,9 @@ def step(
     rates: dict[str, Float[Tensor, "c"]],
     visible: Bool[Tensor, "n"],
 ) -> bool:
-    """Update `values` and `moments` in place where `visible`.
+    """Update `values` (n, ..) and `moments` in place where `visible`; a rate for each column, flattened.
 
-    Args:
-        values: Fields by name, (n, ..).
-        gradients: Of the loss, shaped as `values`.
-        moments: Of the same fields.
-        rates: Learning rate of each column of each field, flattened over the axes after the first.
-        visible: Gaussians to update.
-
-    Returns:
-        False where a gradient was not finite; the rows with such gradients stay unchanged.
+    False where a gradient was not finite; the rows with such gradients stay unchanged.
     """
     moments.steps[visible] += 1
     update = _step_numba if visible.device.type == "cpu" else _step_torch

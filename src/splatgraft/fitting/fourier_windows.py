@@ -33,10 +33,7 @@ def spectral_distance(
 ) -> Float[Tensor, ""]:
     """Mean absolute difference of the Fourier magnitudes ("ortho") of windows that overlap by half.
 
-    Args:
-        image: Padded to whole windows, float32 on the CPU; the gradient flows to it alone.
-        target: Likewise.
-        window: Factors on the pixels of a window.
+    Images are padded to whole windows, float32 on the CPU; the gradient flows to the first alone.
     """
     return _Distance.apply(image, target, window)
 

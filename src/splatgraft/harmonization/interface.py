@@ -55,12 +55,7 @@ class NoisyStartHarmonizer(Protocol):
     """A harmoniser that can start from a partly noisy image, which later iterative updates use (paper, ablations)."""
 
     def harmonize_from(self, view: HarmonizerInputs, strength: float) -> Harmonized:
-        """Harmonise `view`, conditioned on its composite, starting from its noisy prior.
-
-        Args:
-            view: In `prior`, a render of the scene to start from.
-            strength: Noise level to start from, in (0, 1]; 1 is noise alone.
-        """
+        """Harmonise `view`, conditioned on its composite, starting from its prior at a noise level in (0, 1]."""
         ...
 
 

@@ -200,7 +200,7 @@ class ObjectiveTask:
 def train_objective(
     objective: Objective, data: TrainingData, out: Path, options: LoopOptions, *, base: Path, console: Console
 ) -> Path | None:
-    """Train an objective on pairs and write its model, with `base`'s autoencoder; the first process gives its folder."""
+    """Train an objective with `base`'s autoencoder on pairs and write its model; the first process gives its folder."""
     processes = join_processes(options)
     first = processes.is_main_process
     say = console.say if first else lambda sentence: None

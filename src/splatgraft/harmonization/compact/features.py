@@ -114,15 +114,7 @@ def log_light_ratio(prior: Float[Tensor, "*n"], composite: Float[Tensor, "*n"]) 
 
 
 def apply_output(view: CompactInput, output: CompactOutput) -> Float[Tensor, "b 3 h w"]:
-    """Apply the network's output to a view.
-
-    Args:
-        view: inputs at any size.
-        output: the network's prediction; zeros give the prior.
-
-    Returns:
-        Linear light at the size of `view`, at least 0.
-    """
+    """The view, of any size, with the output applied: linear light of at least 0. An output of zeros gives the prior."""
     size = view.mask.shape[-2:]
 
     def up(x: Tensor) -> Tensor:

@@ -161,14 +161,7 @@ class _SelfAttention(nn.Module):
 
 
 def write_weights(path: Path, size: CompactSize, state: dict[str, Tensor], notes: dict[str, str]) -> None:
-    """Write a network.
-
-    Args:
-        path: the .safetensors file.
-        size: the network's widths and depths.
-        state: the network's state_dict; stored as float16.
-        notes: how it was trained, for the header.
-    """
+    """Write a network's state_dict as float16; `notes` on its training go into the header."""
     halves = {name: tensor.detach().cpu().to(torch.float16).contiguous() for name, tensor in state.items()}
     with atomic_write(path) as stream:
         stream.write(save(halves, {"format": _FORMAT, **size.to_text(), **notes}))

@@ -35,12 +35,9 @@ class BakedModulation(nn.Module):
     table: Tensor
 
     def __init__(self, norm: nn.Module, table: Float[Tensor, "s d"], parts: int) -> None:
-        """Keep `norm` and `table`.
+        """Keep `norm` and `table`: the linear layer's outputs, a row per noise level, each of so many `parts`.
 
-        Args:
-            norm: The normalisation without modulation.
-            table: Output of the linear layer, one row per noise level.
-            parts: Outputs per row: 6 for AdaLayerNormZero, 3 for AdaLayerNormZeroSingle, 2 for AdaLayerNormContinuous.
+        AdaLayerNormZero has 6 parts, AdaLayerNormZeroSingle 3, AdaLayerNormContinuous 2.
         """
         super().__init__()
         self.norm, self.parts = norm, parts
@@ -58,15 +55,9 @@ class BakedModulation(nn.Module):
 
 @torch.no_grad()
 def bake(transformer: Any, prompt: PromptEmbedding, levels: tuple[float, ...]) -> int:
-    """Replace the modulation layers of a `FluxTransformer2DModel` in place.
+    """Replace the modulation layers of a `FluxTransformer2DModel` in place; gives the number of parameters removed.
 
-    Args:
-        transformer: The network.
-        prompt: The only prompt that will be used.
-        levels: All noise levels that will be used, in [0, 1].
-
-    Returns:
-        The number of parameters removed.
+    No other prompt and no noise levels but these, in [0, 1], can be used then.
     """
     before = sum(p.numel() for p in transformer.parameters())
     weight = transformer.x_embedder.weight

@@ -19,11 +19,7 @@ class FluxHarmonizer:
         self.network, self._seed, self._steps = network, seed, steps
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """Harmonise one view.
-
-        Raises:
-            ValueError: Memory does not suffice, or the network's output is not finite.
-        """
+        """Harmonise one view."""
         return self.harmonize_from(view, 1.0)
 
     @torch.no_grad()

@@ -46,13 +46,7 @@ def diffusers_library() -> Any:
 
 
 def local_folder(weights: str, say: Say, *, parts: Sequence[str] = ("transformer",)) -> Path:
-    """Resolve `weights` to a local folder; what is needed of a hub id is fetched once.
-
-    Args:
-        weights: A folder, or a hub id OWNER/NAME or OWNER/NAME/FOLDER.
-        say: Takes the repository and where its licence is.
-        parts: Folders of the model that are needed; vae/ is taken too.
-    """
+    """Resolve a folder or a hub id OWNER/NAME[/FOLDER] to a local folder; its `parts` and vae/ are fetched once."""
     folder = Path(weights)
     if folder.is_dir():
         return folder
@@ -183,15 +177,9 @@ def widen_transformer(transformer: Any, init: FirstLayer = "repeat") -> None:
 
 
 def merge_lora(transformer: Any, path: Path) -> int:
-    """Add a low-rank adaptation to the weights in place, as diffusers and PEFT load it.
+    """Add a low-rank adaptation to the weights in place, as diffusers and PEFT load it; gives the layers that it changes.
 
-    Args:
-        transformer: The network.
-        path: File of `train flux --lora`, or another in a form that diffusers reads. Parameters that it holds whole,
-            such as those of the widened first layer, replace the network's.
-
-    Returns:
-        The number of layers changed by low-rank products.
+    Parameters that the file holds whole, such as those of the widened first layer, replace the network's.
     """
     diffusers_library()
     from diffusers.loaders.lora_pipeline import FluxLoraLoaderMixin  # pyright: ignore
@@ -276,27 +264,13 @@ def _best_precision(checked: FluxFolder, context: HarmonizerContext) -> tuple[st
 
 
 def working_bytes(*, pixels: int, width: int) -> int:
-    """Estimate the largest activations of one pass.
-
-    Args:
-        pixels: Of a view; a token covers 256 of them, and text adds 512 tokens.
-        width: Channels of a token.
-    """
+    """Estimate the largest activations of one pass: a token covers 256 pixels of a view, and text adds 512 tokens."""
     tokens = (pixels // 256 + 512) * width * 2 * 40  # about 40 bf16 copies of the transformer's tokens
     return max(tokens, pixels * 256 * 2 * 3)  # the decoder has three copies of 256 channels at full size
 
 
 def choose_precision(*, parameters: int, working: int, free: int) -> tuple[str, str]:
-    """Choose the best precision that fits.
-
-    Args:
-        parameters: Of the transformer.
-        working: Bytes of activations, see `working_bytes`.
-        free: Bytes of the device.
-
-    Returns:
-        The precision, and why it was chosen.
-    """
+    """The best precision of the transformer that fits with `working` bytes of activations into `free` ones, and why."""
     need = 0.0
     for precision, each in _BYTES.items():
         need = parameters * each + working + _RESERVED_BYTES

@@ -71,13 +71,9 @@ def velocity(
     level: Float[Tensor, " b"],
     prompt: PromptEmbedding,
 ) -> Float[Tensor, "b c h w"]:
-    """Predict the velocity eps - z_0.
+    """Predict the velocity eps - z_0 with a `FluxTransformer2DModel` at noise levels in [0, 1].
 
-    Args:
-        transformer: A `FluxTransformer2DModel`.
-        latents: Noisy latent, composite and condition, concatenated along channels (paper, Sec. 5); k = 3 c.
-        level: Noise levels in [0, 1].
-        prompt: Text embeddings, the same for all samples.
+    `latents` are the noisy latent, composite and condition, concatenated along channels (paper, Sec. 5); k = 3 c.
     """
     b, _, h, w = latents.shape
     text = prompt.tokens
@@ -134,11 +130,8 @@ def _reflected_indices(size: int, length: int) -> Tensor:
 def widen_layer(layer: Layer, times: int, init: FirstLayer = "repeat") -> Layer:
     """Make a layer for `times` as many input channels, with the same bias and the same weights for the first input.
 
-    Args:
-        layer: The first layer.
-        times: Number of inputs, each with as many channels as `layer` takes.
-        init: Weights of the further inputs: `repeat` copies them (the paper, after DEGS), `zero` sets them to 0, so
-            that the widened network ignores its conditions at first (diffusers' control training).
+    For the further inputs `repeat` copies the weights (the paper, after DEGS); `zero` sets them to 0, so that the
+    widened network ignores its conditions at first (diffusers' control training).
     """
     weight = layer.weight.detach()
     further = weight if init == "repeat" else torch.zeros_like(weight)

@@ -44,13 +44,7 @@ def write_prompt(path: Path, prompt: PromptEmbedding, source: str) -> None:
 
 
 def read_prompt(path: Path, *, tokens_width: int, pooled_width: int) -> PromptEmbedding:
-    """Read the embeddings and check their widths.
-
-    Args:
-        path: File of `write_prompt`.
-        tokens_width: Width of T5's hidden states that the network takes.
-        pooled_width: Width of CLIP's pooled output that the network takes.
-    """
+    """Read the embeddings and check the widths of T5's hidden states and CLIP's pooled output."""
     if not path.is_file():
         raise ValueError(
             f"{path}: expected the empty prompt's embeddings, found none; `splatgraft paper train embed` makes them"

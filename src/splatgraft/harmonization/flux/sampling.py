@@ -39,16 +39,7 @@ def noisy(
 
 @torch.no_grad()
 def sample(velocity: Velocity, start: Float[Tensor, "b c h w"], levels: tuple[float, ...]) -> Float[Tensor, "b c h w"]:
-    """Integrate the velocity d z / d t = eps - z_0 by Euler steps in float32.
-
-    Args:
-        velocity: the network.
-        start: latents at `levels[0]`.
-        levels: decreasing noise levels in [0, 1].
-
-    Returns:
-        Latents at `levels[-1]`.
-    """
+    """Integrate the velocity d z / d t = eps - z_0 from `levels[0]` to `levels[-1]` by Euler steps in float32."""
     latents = start.float()
     for level, following in pairwise(levels):
         latents = latents + (following - level) * velocity(latents, level).float()

@@ -82,7 +82,7 @@ class PairPrior:
 
 
 def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Progress = silent) -> None:
-    """Compute the priors of all objects and lights of rendered folders, one .npz per folder; existing files are kept."""
+    """Compute the priors of all objects and lights of rendered folders, one .npz each; files that exist are kept."""
     out.mkdir(parents=True, exist_ok=True)
     for number, folder in enumerate(folders):
         path = out / f"{folder.name}.npz"
