@@ -61,7 +61,7 @@ class Expansion:
         moments: adam.Moments,
         rates: Float[Tensor, "3*k"],
     ) -> bool:
-        """One step of `adam.step` on the coefficients that are shown, along the transpose of the gradient by their colours.
+        """One step of `adam.step` on the coefficients that are shown, along the transpose of the gradient by colours.
 
         Changes `sh` and the moments of the field "sh" in place. False where a gradient was not finite; such rows stay.
         """

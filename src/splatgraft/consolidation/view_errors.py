@@ -56,14 +56,7 @@ def refine(
     render: Float[Tensor, "h w 3"],
     weight: Float[Tensor, "h w"] | None,
 ) -> ViewError:
-    """The view's error after one Gauss-Newton step on the tint, then one on the flow.
-
-    Args:
-        view_error: Estimate so far.
-        image: The view's harmonised image, sRGB.
-        render: The current scene from the same camera, sRGB.
-        weight: Confidence of each pixel in [0, 1]; None: all are 1.
-    """
+    """The view's error after one Gauss-Newton step on the tint, then one on the flow; images are sRGB."""
     h, w = image.shape[:2]
     confidence = image.new_ones(h, w) if weight is None else weight
     warped = _warp(image, _upsample(view_error.flow, h, w))

@@ -210,7 +210,7 @@ def sparse_points(
 
 
 def gather_capture(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
-    """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply of its depths."""
+    """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply."""
     count = len(json.loads((rendered / "cameras.json").read_text())["poses"])
     stems = tuple(f"{i:04d}" for i in range(count))
     for folder, suffix, ending in _PASS_FILES:

@@ -114,7 +114,7 @@ def log_light_ratio(prior: Float[Tensor, "*n"], composite: Float[Tensor, "*n"]) 
 
 
 def apply_output(view: CompactInput, output: CompactOutput) -> Float[Tensor, "b 3 h w"]:
-    """The view, of any size, with the output applied: linear light of at least 0. An output of zeros gives the prior."""
+    """The view, of any size, with the output applied: linear light, at least 0. An output of zeros gives the prior."""
     size = view.mask.shape[-2:]
 
     def up(x: Tensor) -> Tensor:
