@@ -78,7 +78,7 @@ def _handle(rng: random.Random, palette: Palette, width: Number, height: Number)
 
 
 def make(seed: int, place: Place) -> tuple[Part, ...]:
-    """Make an object of one to three stacked pieces, possibly with a handle, that stands at the origin and fits `place`."""
+    """Make an object of one to three stacked pieces, possibly with a handle, that stands at the origin."""
     rng = random.Random(f"object-{seed}")
     palette = Palette(rng)
     total = min(place.height * 0.6, rng.uniform(0.16, 0.55))

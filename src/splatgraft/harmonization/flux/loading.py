@@ -177,7 +177,7 @@ def widen_transformer(transformer: Any, init: FirstLayer = "repeat") -> None:
 
 
 def merge_lora(transformer: Any, path: Path) -> int:
-    """Add a low-rank adaptation to the weights in place, as diffusers and PEFT load it; gives the changed layers' number.
+    """Add a low-rank adaptation to the weights in place, as diffusers and PEFT load it; gives the number of layers.
 
     Parameters that the file holds whole, such as those of the widened first layer, replace the network's.
     """
