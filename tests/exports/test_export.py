@@ -175,8 +175,8 @@ def test_the_frame_may_be_chosen(project, tmp_path):
     for frame, suffix in (("world", ".ply"), ("capture", ".glb")):
         out = tmp_path / f"{frame}{suffix}"
         assert main(["export", str(project), "--to", str(out), "--layer", "scene", "--frame", frame]) == 0
-    assert read_scene(tmp_path / "world.ply").up == pytest.approx((0, -1, 0))
-    assert read_scene(tmp_path / "world.ply").metres_per_unit == 1
+    assert read_scene(tmp_path / "world.ply").metadata.up == pytest.approx((0, -1, 0))
+    assert read_scene(tmp_path / "world.ply").metadata.metres_per_unit == 1
     assert read_gaussians(tmp_path / "world.ply").means[:, 1].std() < 1e-3  # the plane is level
     captured = read_gaussians(tmp_path / "capture.glb")
     torch.testing.assert_close(captured.means, parts()["place"].means, atol=1e-5, rtol=0)

@@ -134,8 +134,8 @@ def test_up_and_size_are_read_back(tmp_path, suffix):
     metadata = formats.SceneMetadata(up=(0.0, -0.6, 0.8), metres_per_unit=0.21)
     formats.write_gaussians(tmp_path / f"a{suffix}", random_gaussians(20), metadata=metadata)
     found = formats.read_scene(tmp_path / f"a{suffix}")
-    assert found.up == pytest.approx((0, -0.6, 0.8))
-    assert found.metres_per_unit == pytest.approx(0.21)
+    assert found.metadata.up == pytest.approx((0, -0.6, 0.8))
+    assert found.metadata.metres_per_unit == pytest.approx(0.21)
     assert any("one unit is 0.21 m" in sentence for sentence in found.said())
 
 
@@ -150,8 +150,8 @@ def test_comments_that_state_nothing(tmp_path, comment):
     data = (tmp_path / "a.ply").read_bytes().replace(b"element vertex", f"comment {comment}\nelement vertex".encode())
     (tmp_path / "a.ply").write_bytes(data)
     found = formats.read_scene(tmp_path / "a.ply")
-    assert found.up is None
-    assert found.metres_per_unit is None
+    assert found.metadata.up is None
+    assert found.metadata.metres_per_unit is None
 
 
 @pytest.mark.parametrize("suffix", [".compressed.ply", ".glb", ".sog", ".splat"])

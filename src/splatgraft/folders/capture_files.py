@@ -7,11 +7,10 @@ from splatgraft.core.exposure import LuminanceScale, describe_inconsistency, lum
 from splatgraft.core.images import list_images, mean_luminance
 from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.formats import list_capture_images
-from splatgraft.formats.captures.colmap import is_colmap
+from splatgraft.formats.captures import find_poses
 from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.runtime.note import Note
 
-_TRANSFORMS = ("transforms.json", "transforms_train.json")
 _NAMED = 8
 """Most images that a message names."""
 _FEW = 4
@@ -20,7 +19,7 @@ _FEW = 4
 
 def has_poses(path: Path) -> bool:
     """Whether `path` has camera poses, and is not only photos or a video."""
-    return path.suffix == ".json" or any((path / name).is_file() for name in _TRANSFORMS) or is_colmap(path)
+    return find_poses(path) is not None
 
 
 def description_files(path: Path) -> tuple[Path, ...]:
@@ -62,12 +61,12 @@ def camera_files(path: Path) -> tuple[Path, ...]:
     """
     if not path.is_dir():
         return (path,)
-    described = next((path / name for name in _TRANSFORMS if (path / name).is_file()), None)
-    if described is not None:
-        return (described,)
-    if is_colmap(path):
-        return tuple(file for file in description_files(path) if file.stem in ("cameras", "images"))
-    raise ValueError(f"{path}: expected transforms.json, or a COLMAP model in sparse/0, found neither")
+    found = find_poses(path)
+    if found is None:
+        raise ValueError(f"{path}: expected transforms.json, or a COLMAP model in sparse/0, found neither")
+    if found.is_file():
+        return (found,)
+    return tuple(file for file in description_files(path) if file.stem in ("cameras", "images"))
 
 
 def left_out_notes(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[Note]:

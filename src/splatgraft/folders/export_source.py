@@ -71,7 +71,7 @@ def _of_scene(path: Path, capture: Path | None) -> ExportSource:
     scene = read_scene(path)
     cameras = None if capture is None else read_cameras(capture)
     metres = None if capture is None else read_scale(capture)
-    up = scene.up if cameras is None else _up(cameras)
+    up = scene.metadata.up if cameras is None else _up(cameras)
     known = SceneMetadata(up, None if metres is None else metres.metres_per_unit)
     return ExportSource(scene=scene.gaussians, title=_title(path), cameras=cameras, metadata=known)
 

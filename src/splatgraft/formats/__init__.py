@@ -7,9 +7,9 @@ from pathlib import Path
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures.colmap import is_colmap, read_colmap
-from splatgraft.formats.captures.transforms_json import read_json, write_cameras, write_capture
-from splatgraft.formats.captures.views import CaptureFile, ViewRecord, cameras, posed_images
+from splatgraft.formats.captures import read_capture_file
+from splatgraft.formats.captures.transforms_json import write_cameras, write_capture
+from splatgraft.formats.captures.views import ViewRecord, cameras, posed_images
 from splatgraft.formats.scenes.axes import with_axes
 from splatgraft.formats.scenes.compressed_ply import COMPRESSED_PLY, write_compressed_ply
 from splatgraft.formats.scenes.gaussian_glb import read_gaussian_glb, write_gaussian_glb
@@ -61,8 +61,6 @@ _WRITERS = {
     ".glb": write_gaussian_glb,
     ".usdz": write_gaussian_usdz,
 }
-_WITHOUT_METADATA = (".spz", ".splat")
-"""Formats that have no room for it."""
 
 SCENE_SUFFIXES = tuple(_READERS)
 """Suffixes of trained scenes that can be read; a folder of SOG pictures has none."""
@@ -143,13 +141,7 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, *, metadata: SceneMe
     Raises:
         ValueError: The suffix is another, or the format cannot hold the scene.
     """
-    path = Path(path)
-    suffix = scene_suffix(path)
-    write = _by_suffix(path, _WRITERS)
-    if suffix in _WITHOUT_METADATA:
-        write(path, gaussians)
-    else:
-        write(path, gaussians, metadata)
+    _by_suffix(Path(path), _WRITERS)(Path(path), gaussians, metadata)
 
 
 def scene_suffix(path: Path) -> str:
@@ -179,16 +171,13 @@ def read_capture(path: Path | str) -> PosedImages:
         ValueError: There is none of these at `path`, or a file is broken.
     """
     with _readable(Path(path)):
-        return posed_images(_capture_file(Path(path)))
+        return posed_images(read_capture_file(Path(path)))
 
 
 def read_images(path: Path) -> PosedImages:
-    """Posed photographs without points, as of a ground truth; a points file need not exist.
-
-    Raises: ValueError where no capture exists, or a file is broken.
-    """
+    """Posed photographs without points, as of a ground truth; a points file need not exist."""
     with _readable(path):
-        return posed_images(_capture_file(path), with_points=False)
+        return posed_images(read_capture_file(path), with_points=False)
 
 
 def read_cameras(path: Path | str) -> Cameras:
@@ -204,20 +193,13 @@ def read_cameras(path: Path | str) -> Cameras:
         ValueError: There is none of these at `path`, or a file is broken.
     """
     with _readable(Path(path)):
-        return cameras(_capture_file(Path(path)))
+        return cameras(read_capture_file(Path(path)))
 
 
 def list_capture_images(path: Path) -> list[Path]:
-    """The image files of a capture that exist; none for a cameras.json.
-
-    Args:
-        path: As for `read_cameras`.
-
-    Raises:
-        ValueError: There is no capture at `path`, or a file is broken.
-    """
+    """The image files of a capture that exist; none for a cameras.json."""
     with _readable(path):
-        views = _capture_file(path).views
+        views = read_capture_file(path).views
     return [view.image_path for view in views if isinstance(view, ViewRecord) and view.image_path]
 
 
@@ -228,19 +210,3 @@ def _readable(path: Path) -> Generator[None]:
         yield
     except OSError as error:
         raise ValueError(f"{error.filename or path}: expected a readable file, found {error.strerror}") from error
-
-
-def _capture_file(path: Path) -> CaptureFile:
-    if path.suffix.lower() == ".json" or path.is_file():
-        return read_json(path)
-    if not path.is_dir():
-        raise ValueError(f"{path}: expected a capture folder or a transforms.json, found nothing there")
-    for name in ("transforms.json", "transforms_train.json"):
-        if (path / name).is_file():
-            return read_json(path / name)
-    if is_colmap(path):
-        return read_colmap(path)
-    raise ValueError(
-        f"{path}: expected transforms.json, or a COLMAP model in sparse/0, "
-        f"found {sorted(entry.name for entry in path.iterdir())[:6]}"
-    )

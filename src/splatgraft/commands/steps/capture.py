@@ -128,7 +128,7 @@ class Capture:
         """Pictures of a scene that came without photographs."""
         read = read_scene(self.capture, axes=self.axes)
         scene = read.gaussians
-        found = place_virtual_cameras(scene, self.look, stated_up=read.up, progress=context.progress)
+        found = place_virtual_cameras(scene, self.look, stated_up=read.metadata.up, progress=context.progress)
         for sentence in (*read.said(), *found.report):
             context.console.say(f"{self.capture}: {sentence}")
         (folder / "images").mkdir()

@@ -4,16 +4,18 @@ Of several models the one with the most registered images is read.
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.formats.captures.views import MAX_SIDE, CaptureFile, ViewRecord, existing_file, rigid
 
 _MODELS = (
@@ -25,21 +27,20 @@ _PARAMETER_COUNTS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RAD
 _MODEL_FOLDERS = ("sparse/*", "sparse", ".", "colmap/sparse/*", "colmap/sparse")
 
 
-@dataclass(frozen=True)
-class _Camera:
+class _Camera(NamedTuple):
+    """Fields of a `ViewRecord`."""
+
     size: tuple[int, int]
     focal: tuple[float, float]
     center: tuple[float, float]
     distortion: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class _Image:
+class _Image(NamedTuple):
     name: str
     camera_id: int
-    quaternion: tuple[float, ...]
-    """wxyz, camera from world."""
-    translation: tuple[float, ...]
+    pose: Sequence[float]
+    """Quaternion wxyz and translation, camera from world."""
 
 
 def is_colmap(folder: Path) -> bool:
@@ -76,41 +77,24 @@ def read_colmap(folder: Path) -> CaptureFile:
     root = next((root for root in roots if root.is_dir()), folder)
     views = []
     for image in sorted(images, key=lambda image: image.name):
-        camera = cameras.get(image.camera_id)
-        if camera is None:
+        if image.camera_id not in cameras:
             raise ValueError(f"{source}: expected camera {image.camera_id} of {image.name} in cameras, found none")
-        views.append(
-            ViewRecord(
-                name=image.name,
-                image_path=existing_file(root / image.name),
-                world_from_camera=_pose(image, source),
-                focal=camera.focal,
-                center=camera.center,
-                size=camera.size,
-                distortion=camera.distortion,
-            )
-        )
+        pose, file = _pose(image, source), existing_file(root / image.name)
+        views.append(ViewRecord(image.name, file, pose, **cameras[image.camera_id]._asdict()))
     return CaptureFile(source, folder, views, lambda: _read_points(_file(model, "points3D")))
 
 
 def _pose(image: _Image, source: Path) -> np.ndarray:
-    quaternion = np.array(image.quaternion)
-    if not np.abs([*image.quaternion, *image.translation]).max() < 1e30:  # nan fails too
+    if not np.abs(image.pose).max() < 1e30:  # nan fails too
         raise ValueError(f"{source}: expected a pose of finite numbers for {image.name}, found nan or infinity")
-    norm = float(np.linalg.norm(quaternion))
+    norm = float(np.linalg.norm(image.pose[:4]))
     if not 0.5 < norm < 2:
         raise ValueError(f"{source}: expected a unit quaternion for {image.name}, found length {norm:.4g}")
-    w, x, y, z = quaternion / norm
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    quaternion = torch.tensor([image.pose[:4]], dtype=torch.float64)
+    world_from_camera = rotation_from_quaternion(quaternion)[0].numpy().T
     pose = np.eye(4)
-    pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ np.array(image.translation)
+    pose[:3, :3] = world_from_camera
+    pose[:3, 3] = -world_from_camera @ np.array(image.pose[4:])
     return rigid(pose, f"{source}: {image.name}")
 
 
@@ -132,9 +116,14 @@ def _camera(path: Path, model: str, size: tuple[int, int], numbers: tuple[float,
 
 
 def _read_cameras(path: Path) -> dict[int, _Camera]:
-    if path.suffix == ".txt":
-        return dict(_text_camera(path, line) for line in _lines(path) if line and not line.startswith("#"))
     cameras = {}
+    if path.suffix == ".txt":
+        for line in _lines(path):
+            with _fields(path, "ID MODEL WIDTH HEIGHT PARAMETERS", line):
+                camera_id, model, width, height, *numbers = line.split()
+                values = int(camera_id), (int(width), int(height)), tuple(map(float, numbers))
+            cameras[values[0]] = _camera(path, model, *values[1:])
+        return cameras
     with _records(path) as records:
         for _ in range(records.take("<Q")[0]):
             camera_id, number, width, height = records.take("<IiQQ")
@@ -144,86 +133,67 @@ def _read_cameras(path: Path) -> dict[int, _Camera]:
     return cameras
 
 
-def _text_camera(path: Path, line: str) -> tuple[int, _Camera]:
-    try:
-        camera_id, model, width, height, *numbers = line.split()
-        values = int(camera_id), (int(width), int(height)), tuple(map(float, numbers))
-    except ValueError:
-        raise ValueError(f"{path}: expected 'ID MODEL WIDTH HEIGHT PARAMETERS', found {line[:60]!r}") from None
-    return values[0], _camera(path, model, values[1], values[2])
-
-
 def _read_images(path: Path) -> list[_Image]:
-    if path.suffix == ".txt":
-        return list(_text_images(path))
     images = []
+    if path.suffix == ".txt":
+        lines = iter(_lines(path, every=True))
+        for line in lines:
+            if not line or line.startswith("#"):
+                continue
+            with _fields(path, "ID QW QX QY QZ TX TY TZ CAMERA NAME", line):
+                _, qw, qx, qy, qz, tx, ty, tz, camera_id, name = line.split(None, 9)
+                pose = [float(number) for number in (qw, qx, qy, qz, tx, ty, tz)]
+                images.append(_Image(name, int(camera_id), pose))
+            next(lines, None)  # observations, which may be none
+        return images
     with _records(path) as records:
         for _ in range(records.take("<Q")[0]):
             _, *pose, camera_id = records.take("<I7dI")
             name = records.take_name()
             records.skip(records.take("<Q")[0] * 24)  # observations
-            images.append(_Image(name, camera_id, tuple(pose[:4]), tuple(pose[4:])))
+            images.append(_Image(name, camera_id, pose))
     return images
 
 
-def _text_images(path: Path) -> Iterator[_Image]:
-    """Two lines each: the pose, and the observations, which may be empty."""
-    lines = iter(_lines(path))
-    for line in lines:
-        if not line or line.startswith("#"):
-            continue
-        try:
-            _, *pose, camera_id, name = line.split(None, 9)
-            values = [float(number) for number in pose]
-            if len(values) != 7:
-                raise ValueError
-            image = _Image(name, int(camera_id), tuple(values[:4]), tuple(values[4:]))
-        except ValueError:
-            expected = "'ID QW QX QY QZ TX TY TZ CAMERA NAME'"
-            raise ValueError(f"{path}: expected {expected}, found {line[:60]!r}") from None
-        next(lines, None)
-        yield image
-
-
 def _read_points(path: Path) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    found = []
     if path.suffix == ".txt":
-        positions, colors = _text_points(path)
+        for line in _lines(path):
+            with _fields(path, "ID X Y Z R G B ERROR TRACK", line):
+                x, y, z, *color = line.split(None, 8)[1:7]
+                rgb = [int(word) for word in color]
+                if len(rgb) != 3 or min(rgb) < 0 or max(rgb) > 255:
+                    raise ValueError
+                found.append([float(x), float(y), float(z), *rgb])
     else:
-        found = []
         with _records(path) as records:
             for _ in range(records.take("<Q")[0]):
                 _, *point, _, track = records.take("<Q3d3BdQ")
                 found.append(point)
                 records.skip(track * 8)
-        table = np.array(found, np.float64).reshape(-1, 6)
-        positions, colors = table[:, :3], table[:, 3:].astype(np.uint8)
+    table = np.array(found, np.float64).reshape(-1, 6)
+    positions, colors = table[:, :3], table[:, 3:].astype(np.uint8)
     if not np.isfinite(positions).all() or np.abs(positions).max(initial=0) > 1e30:
         raise ValueError(f"{path}: expected finite points, found nan, infinity or more than 1e30")
     return torch.from_numpy(positions).float(), torch.from_numpy(colors).float() / 255
 
 
-def _text_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    positions, colors = [], []
-    for line in _lines(path):
-        if not line or line.startswith("#"):
-            continue
-        words = line.split(None, 8)
-        try:
-            position, color = np.array(words[1:4], np.float64), np.array([int(word) for word in words[4:7]])
-        except (ValueError, OverflowError):
-            position = color = np.empty(0)
-        if len(position) != 3 or len(color) != 3 or color.min() < 0 or color.max() > 255:
-            raise ValueError(f"{path}: expected 'ID X Y Z R G B ERROR TRACK', found {line[:60]!r}")
-        positions.append(position)
-        colors.append(color.astype(np.uint8))
-    return np.array(positions).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3)
-
-
-def _lines(path: Path) -> list[str]:
+def _lines(path: Path, *, every: bool = False) -> list[str]:
+    """The lines of a text file, without empty ones and comments unless `every` line counts."""
     try:
-        return [line.strip() for line in path.read_text("utf-8").splitlines()]
+        lines = [line.strip() for line in path.read_text("utf-8").splitlines()]
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: expected UTF-8 text, found {error.reason} at byte {error.start}") from None
+    return [line for line in lines if every or (line and not line.startswith("#"))]
+
+
+@contextmanager
+def _fields(path: Path, names: str, line: str) -> Iterator[None]:
+    """Turns what fails when `line` is parsed into a ValueError that names the file and the fields."""
+    try:
+        yield
+    except (ValueError, OverflowError):
+        raise ValueError(f"{path}: expected '{names}', found {line[:60]!r}") from None
 
 
 @dataclass

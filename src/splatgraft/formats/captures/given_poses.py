@@ -4,10 +4,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
 
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures.colmap import is_colmap, read_colmap
+from splatgraft.formats.captures import find_poses, read_capture_file
 from splatgraft.formats.captures.masks import PhotoFiles
-from splatgraft.formats.captures.transforms_json import read_json
-from splatgraft.formats.captures.views import CaptureFile, fitted_to_file, posed_images
+from splatgraft.formats.captures.views import fitted_to_file, posed_images
 
 _MIN_PHOTOS = 3
 """Photos with a pose: below it nothing is seen from two sides and checked by a third."""
@@ -29,13 +28,13 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
     """The `photos` with the poses in `source`; a pose belongs to the photo with its name, whatever its suffix.
 
     Args:
-        source: A folder with a COLMAP model or a transforms.json, or that file itself.
+        source: A folder with a COLMAP model or a transforms.json, or a file of these.
         photos: With their masks.
-
-    Raises:
-        ValueError: There is no such thing at `source`, it is broken, or fewer than three photos have a pose.
     """
-    file = _read(source)
+    found = find_poses(source) or find_poses(source.parent if source.is_file() else source)
+    if found is None:
+        raise ValueError(f"{source}: expected poses (a COLMAP model or transforms.json), found neither")
+    file = read_capture_file(found)
     views = file.records()
     masks = photos.masks or (None,) * len(photos.paths)
     by_stem = {path.stem: (path, mask) for path, mask in zip(photos.paths, masks, strict=True)}
@@ -59,16 +58,6 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> GivenPoses:
         without_pose=tuple(path.name for path in photos.paths if path.stem not in stems),
         without_photo=tuple(view.name for view, stem in zip(views, stems, strict=True) if stem not in by_stem),
     )
-
-
-def _read(source: Path) -> CaptureFile:
-    transforms = next((f for f in (source, source / "transforms.json") if f.suffix == ".json" and f.is_file()), None)
-    if transforms is not None:
-        return read_json(transforms)
-    folder = source.parent if source.is_file() else source
-    if not is_colmap(folder):
-        raise ValueError(f"{source}: expected poses (a COLMAP model or transforms.json), found neither")
-    return read_colmap(folder)
 
 
 def _stem(name: str, known: dict[str, str]) -> str:

@@ -18,26 +18,13 @@ _DIRECTIONS = {"L": (-1, 0, 0), "R": (1, 0, 0), "U": (0, -1, 0), "D": (0, 1, 0),
 """In the axes RDF."""
 
 
-def require_axes(name: str) -> str:
-    """The name in capitals."""
-    found = name.upper()
-    if len(found) != 3 or any(sum(letter in pair for letter in found) != 1 for pair in ("LR", "UD", "BF")):
-        raise ValueError(f"axes: expected directions of x, y and z such as RDF, RUB or LUF, found {name[:20]!r}")
-    return found
-
-
 def rdf_from(name: str) -> Float[Tensor, "3 3"]:
     """The matrix that takes coordinates in the axes `name`, such as RUB, to RDF; a reflection for left-handed axes."""
     return torch.tensor([_DIRECTIONS[letter] for letter in name], dtype=torch.float32).T
 
 
 def change_axes(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians:
-    """The scene in other axes.
-
-    Args:
-        gaussians: In the old axes.
-        matrix: Signed permutation, new from old; its determinant may be -1.
-    """
+    """The scene in other axes; `matrix` is a signed permutation, new from old, whose determinant may be -1."""
     g = gaussians
     permutation = matrix.abs()
     # matrix @ R @ matrix.T is a rotation whose axis turns as a pseudovector; it acts on permuted own axes
@@ -56,11 +43,13 @@ def change_axes(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians
 
 def with_axes(scene: SceneFile, axes: str) -> SceneFile:
     """The scene, with the file's axes taken to be `axes` instead of those that were found."""
-    name = require_axes(axes)
+    name = axes.upper()
+    if len(name) != 3 or any(sum(letter in pair for letter in name) != 1 for pair in ("LR", "UD", "BF")):
+        raise ValueError(f"axes: expected directions of x, y and z such as RDF, RUB or LUF, found {axes[:20]!r}")
     if name == scene.axes:
         return scene
-    matrix = rdf_from(name) @ rdf_from(scene.axes).T
-    if scene.up is not None:
-        x, y, z = (matrix @ torch.tensor(scene.up)).tolist()
-        scene = replace(scene, up=(x, y, z))
-    return replace(scene, gaussians=change_axes(scene.gaussians, matrix), axes=name)
+    matrix, metadata = rdf_from(name) @ rdf_from(scene.axes).T, scene.metadata
+    if metadata.up is not None:
+        x, y, z = (matrix @ torch.tensor(metadata.up)).tolist()
+        metadata = replace(metadata, up=(x, y, z))
+    return replace(scene, gaussians=change_axes(scene.gaussians, matrix), axes=name, metadata=metadata)

@@ -92,7 +92,7 @@ def _bands(header: ply.PlyHeader, sh: ply.Element, count: int) -> Float[Tensor, 
 
 def write_compressed_ply(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
     """Write positions and log scales in 11, 10 and 11 bits of each chunk's bounds, the rest in 8 to 10 bits."""
-    g = writable(path, gaussians, "compressed .ply")
+    g = writable(path, gaussians)
     g = g.select(morton_order(g.means))
     log_scales = g.log_scales.clamp(-_LARGEST_LOG_SCALE, _LARGEST_LOG_SCALE)
     values = torch.cat([g.means, log_scales, spherical_harmonics.rgb_from_dc(g.sh[:, 0])], 1)

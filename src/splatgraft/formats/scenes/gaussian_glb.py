@@ -170,17 +170,8 @@ def _placed(path: Path, gaussians: Gaussians, matrix: Float[np.ndarray, "4 4"]) 
 
 
 def write_gaussian_glb(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
-    """Write all fields exactly but for the exponentials of scales and opacities.
-
-    Args:
-        path: The file.
-        gaussians: The scene.
-        metadata: Stands in the asset's extras.
-
-    Raises:
-        ValueError: There are no Gaussians, some are not finite, or the file would be larger than 4 GB.
-    """
-    arrays = _attributes(change_axes(writable(path, gaussians, ".glb"), rdf_from(AXES).T))
+    """Write all fields exactly but for the exponentials of scales and opacities; metadata as the asset's extras."""
+    arrays = _attributes(change_axes(writable(path, gaussians), rdf_from(AXES).T))
     kinds = {width: kind for kind, width in _WIDTHS.items()}
     views, accessors, at = [], [], 0
     for values in arrays.values():

@@ -38,9 +38,7 @@ def read_gaussian_ply(path: Path) -> SceneFile:
     if vertex is None:
         raise ValueError(f"{path}: expected an element 'vertex', found {[e.name for e in header.elements]}")
     if is_compressed(header):
-        return SceneFile(
-            read_compressed_ply(header), up=header.metadata.up, metres_per_unit=header.metadata.metres_per_unit
-        )
+        return SceneFile(read_compressed_ply(header), metadata=header.metadata)
     rest = _require_gaussians(path, vertex)
     n, bands = vertex.count, len(rest) // 3
     means, log_scales, quaternions = (np.empty((n, width), np.float32) for width in (3, 3, 4))
@@ -55,9 +53,7 @@ def read_gaussian_ply(path: Path) -> SceneFile:
     ]
     ply.read_into(header, vertex, columns)
     gaussians = Gaussians(*map(torch.from_numpy, (means, log_scales, quaternions, logits, sh)))
-    return SceneFile(
-        gaussians, up=header.metadata.up, metres_per_unit=header.metadata.metres_per_unit, notes=_unused(vertex)
-    )
+    return SceneFile(gaussians, metadata=header.metadata, notes=_unused(vertex))
 
 
 def _require_gaussians(path: Path, vertex: ply.Element) -> tuple[str, ...]:

@@ -24,23 +24,13 @@ _SIGMAS = 3.0
 
 
 def write_gaussian_usdz(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
-    """Write a package with one prim /Scene/Gaussians; the file appears whole or not at all.
-
-    Args:
-        path: The file.
-        gaussians: The scene; its y points down, as in a .ply, and becomes the stage's y upwards.
-        metadata: Metres per unit; 1 where it is not known.
-
-    Raises:
-        ValueError: There are no Gaussians, some are not finite, or the installed USD has no such schema.
-        ModuleNotFoundError: usd-core is not installed.
-    """
+    """Write a package with one prim /Scene/Gaussians, of 1 m per unit where that is not known."""
     from pxr import Usd, UsdGeom, UsdUtils, UsdVol
 
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         found = ".".join(map(str, Usd.GetVersion()[1:]))
         raise ValueError(f"{path}: expected OpenUSD 26.3 or later, which has Gaussians, found {found}")
-    g = writable(path, gaussians, ".usdz")
+    g = writable(path, gaussians)
     if not path.parent.is_dir():
         raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")
     with tempfile.TemporaryDirectory(prefix=".splatgraft_usd_", dir=path.parent) as folder:

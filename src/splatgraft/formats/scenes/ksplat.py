@@ -5,12 +5,11 @@ positions are 16-bit offsets from the middle of a bucket, SH bands 8 bits at lev
 """
 
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians, concatenate
@@ -23,49 +22,35 @@ _REST = (0, 9, 24)
 """Numbers of bands above 0, by degree."""
 
 
-@dataclass(frozen=True)
-class _Section:
-    """The header of a section."""
-
-    count: int
-    room: int
-    """Gaussians that its storage has room for."""
-    bucket_capacity: int
-    bucket_count: int
-    block_size: float
-    """Side of a bucket, world units."""
-    bucket_bytes: int
-    position_range: int
-    """Integer that stands for half a bucket."""
-    full_buckets: int
-    partial_buckets: int
-    degree: int
-
-
 def read_ksplat(path: Path) -> SceneFile:
     """The scene in a .ksplat file."""
     data = path.read_bytes()
-    count, total = struct.unpack_from("<I", data, 4)[0], struct.unpack_from("<I", data, 16)[0]
+    sections, total = struct.unpack_from("<I", data, 4)[0], struct.unpack_from("<I", data, 16)[0]
     level = struct.unpack_from("<H", data, 20)[0]
     low, high = struct.unpack_from("<ff", data, 36)
     if data[0] != 0 or data[1] < 1 or level > 2:
         raise ValueError(f"{path}: expected a .ksplat of version 0.1, found {data[:2]!r} of level {level}")
-    at = _HEADER_BYTES + count * _SECTION_HEADER_BYTES
+    at = _HEADER_BYTES + sections * _SECTION_HEADER_BYTES
     parts: list[Gaussians] = []
-    for i in range(count):
-        section = _Section(*_SECTION.unpack_from(data, _HEADER_BYTES + i * _SECTION_HEADER_BYTES))
-        row = _row(level, section.degree)
-        centers_at = at + 4 * section.partial_buckets
-        rows_at = centers_at + section.bucket_bytes * section.bucket_count
-        rows = np.frombuffer(data, row, section.count, rows_at)
+    for i in range(sections):
+        # the storage has room for more than `count`; a bucket is `side` world units wide, `half` stands for half of it
+        count, room, capacity, buckets, side, bucket_bytes, half, full, partial, degree = _SECTION.unpack_from(
+            data, _HEADER_BYTES + i * _SECTION_HEADER_BYTES
+        )
+        row, centers_at = _row(level, degree), at + 4 * partial
+        rows_at = centers_at + bucket_bytes * buckets
+        rows = np.frombuffer(data, row, count, rows_at)
         positions = rows["position"].astype(np.float32)
         if level:
-            half = section.position_range or 32767
-            # buckets may be wider than their centre
-            centers = np.ndarray((section.bucket_count, 3), "<f4", data, centers_at, (section.bucket_bytes, 4))
-            positions = (positions - half) * (section.block_size / 2 / half) + centers[_buckets(data, section, at)]
-        parts.append(_gaussians(path, rows, positions, _bands(rows, section.degree, level, (low or -1.5, high or 1.5))))
-        at = rows_at + row.itemsize * section.room
+            half = half or 32767
+            # full buckets come first, then partial ones of given sizes; they may be wider than their centre
+            sizes = np.frombuffer(data, "<u4", partial, at).astype(np.int64)
+            ends = np.cumsum(np.concatenate([np.full(min(full, count), capacity), sizes]))
+            centers = np.ndarray((buckets, 3), "<f4", data, centers_at, (bucket_bytes, 4))
+            own = centers[np.searchsorted(ends, np.arange(count), side="right")]
+            positions = (positions - half) * (side / 2 / half) + own
+        parts.append(_gaussians(path, rows, positions, _bands(rows, degree, level, (low or -1.5, high or 1.5))))
+        at = rows_at + row.itemsize * room
     if sum(part.count for part in parts) != total:
         raise ValueError(f"{path}: expected {total} Gaussians, found {sum(part.count for part in parts)} in sections")
     return SceneFile(concatenate(parts))
@@ -90,13 +75,6 @@ def _gaussians(path: Path, rows: np.ndarray, positions: np.ndarray, bands: np.nd
         opacity_logits=logits_from_bytes(torch.from_numpy(rows["rgba"][:, 3].copy())),
         sh=torch.cat([dc[:, None], torch.from_numpy(bands)], 1),
     )
-
-
-def _buckets(data: bytes, section: _Section, start: int) -> Int64[np.ndarray, "n"]:
-    """The bucket of each Gaussian: full ones first, then partial ones of given sizes."""
-    sizes = np.frombuffer(data, "<u4", section.partial_buckets, start).astype(np.int64)
-    full = np.full(min(section.full_buckets, section.count), section.bucket_capacity)
-    return np.searchsorted(np.cumsum(np.concatenate([full, sizes])), np.arange(section.count), side="right")
 
 
 def _bands(rows: np.ndarray, degree: int, level: int, bounds: tuple[float, float]) -> Float[np.ndarray, "n k 3"]:

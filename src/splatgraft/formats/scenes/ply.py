@@ -5,7 +5,7 @@ Element counts of a header are checked against the size of the file before anyth
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
-from splatgraft.formats.scenes.scene_file import SceneMetadata
+from splatgraft.formats.scenes.scene_file import SceneMetadata, stated_metadata
 from splatgraft.runtime.files import atomic_write
 
 _MAX_HEADER_BYTES = 1 << 20
@@ -89,12 +89,10 @@ def _metadata(comments: list[str]) -> SceneMetadata:
     up = metres = None
     for comment in comments:
         if found := _UP.fullmatch(comment):
-            x, y, z = map(float, found.groups())
-            length = (x * x + y * y + z * z) ** 0.5
-            up = (x / length, y / length, z / length) if length > 0 else None
+            up = [float(number) for number in found.groups()]
         elif found := _METRES.fullmatch(comment):
-            metres = float(found[1]) if float(found[1]) > 0 else None
-    return SceneMetadata(up, metres)
+            metres = float(found[1])
+    return stated_metadata(up, metres)
 
 
 def _parse(path: Path, lines: list[str]) -> tuple[str, tuple[Element, ...]]:
@@ -109,11 +107,10 @@ def _parse(path: Path, lines: list[str]) -> tuple[str, tuple[Element, ...]]:
             case ["element", name, count] if re.fullmatch(r"[0-9]{1,15}", count):
                 elements.append(Element(name, int(count), {}))
             case ["property", kind, name] if kind in _TYPES and elements and name not in elements[-1].types:
-                last = elements[-1]
-                elements[-1] = Element(last.name, last.count, {**last.types, name: _TYPES[kind]}, last.has_lists)
+                elements[-1] = replace(elements[-1], types={**elements[-1].types, name: _TYPES[kind]})
             case ["property", "list", length, _, name] if length in _TYPES and elements:
-                last = elements[-1]
-                elements[-1] = Element(last.name, last.count, {**last.types, name: _TYPES[length]}, has_lists=True)
+                types = {**elements[-1].types, name: _TYPES[length]}
+                elements[-1] = replace(elements[-1], types=types, has_lists=True)
             case _:
                 raise ValueError(f"{path}: expected a PLY header line, found {line[:60]!r}")
     if order is None:
@@ -199,14 +196,8 @@ def write_header(
 def read_points(path: Path) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """Read a coloured point cloud, or Gaussians as points with their mean colour.
 
-    Args:
-        path: A .ply.
-
     Returns:
         Positions, and sRGB in [0, 1]: mid grey where the file has no colours.
-
-    Raises:
-        ValueError: The file is no whole PLY with finite x, y, z.
     """
     header = read_header(path)
     vertex = header.element("vertex")

@@ -42,21 +42,10 @@ def _others(largest: Int64[Tensor, "n 1"]) -> Int64[Tensor, "n 3"]:
     return torch.arange(3) + (torch.arange(3) >= largest)
 
 
-def writable(path: Path, gaussians: Gaussians, kind: str) -> Gaussians:
-    """The Gaussians in float32 on the CPU, of which there is at least one, all finite.
-
-    Args:
-        path: The file that is written, for the message.
-        gaussians: The scene.
-        kind: What the message calls the format.
-    """
-    if gaussians.count == 0:
-        raise ValueError(f"{path}: expected at least one Gaussian for a {kind} file, found none")
-    return finite(path, gaussians)
-
-
-def finite(path: Path, gaussians: Gaussians) -> Gaussians:
-    """The Gaussians in float32 on the CPU, as quantised formats store neither nan nor infinity."""
+def writable(path: Path, gaussians: Gaussians, *, least: int = 1) -> Gaussians:
+    """The Gaussians in float32 on the CPU, at least so many, all finite, as formats other than .ply need them."""
+    if gaussians.count < least:
+        raise ValueError(f"{path}: expected at least one Gaussian for a {path.suffix} file, found none")
     fields = [gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh.flatten(1)]
     bad = ~torch.isfinite(torch.cat(fields, 1)).all(1) | gaussians.opacity_logits.isnan()
     if bool(bad.any()):

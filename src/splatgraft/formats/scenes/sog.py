@@ -14,7 +14,6 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from splatgraft.formats.scenes.quantization import (
     smallest_three,
     writable,
 )
-from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
+from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata, stated_metadata
 from splatgraft.runtime.files import atomic_write
 
 _META_FILE = "meta.json"
@@ -84,15 +83,14 @@ def sog_files(path: Path) -> tuple[Path, ...]:
 
 def read_sog(path: Path) -> SceneFile:
     """The scene in a .sog, or in a folder with meta.json and pictures, or of that meta.json."""
-    load = _loader(path)
-    meta = json.loads(load(_META_FILE))
+    meta = json.loads(_load(path, _META_FILE))
     n = meta["count"]
     if meta["version"] != 2 or not 0 <= n < 1 << 28:
         raise ValueError(f"{path}: expected SOG version 2, found version {meta['version']} of {n} Gaussians")
 
     def picture(key: str, index: int = 0) -> UInt8[np.ndarray, "h w 4"]:
         name = meta[key]["files"][index]
-        return _read_picture(path, name, load(name))
+        return _read_picture(path, name, _load(path, name))
 
     def pixels(key: str, index: int = 0) -> UInt8[np.ndarray, "n 4"]:
         found = picture(key, index).reshape(-1, 4)
@@ -124,30 +122,17 @@ def read_sog(path: Path) -> SceneFile:
         sh=torch.from_numpy(np.ascontiguousarray(sh)),
     )
     own = meta.get(_OWN_KEY, {})
-    up = None
-    if "up" in own:
-        length = math.hypot(*own["up"])
-        up = (own["up"][0] / length, own["up"][1] / length, own["up"][2] / length)
-    return SceneFile(gaussians, up=up, metres_per_unit=own.get("metres_per_unit"))
+    return SceneFile(gaussians, metadata=stated_metadata(own.get("up"), own.get("metres_per_unit")))
 
 
-def _loader(path: Path) -> Callable[[str], bytes]:
-    """A function that gives the bytes of a file of the scene."""
-    if path.is_dir() or path.name.lower() == _META_FILE:
-        folder = path if path.is_dir() else path.parent
-        return lambda name: (folder / _plain(path, name)).read_bytes()
-
-    def load(name: str) -> bytes:
+def _load(path: Path, name: str) -> bytes:
+    """The bytes of a file of the scene."""
+    if path.is_file() and path.name.lower() != _META_FILE:
         with zipfile.ZipFile(path) as archive:
             return archive.read(name)
-
-    return load
-
-
-def _plain(path: Path, name: str) -> str:
     if Path(name).name != name or "\\" in name:
         raise ValueError(f"{path}: expected plain file names in {_META_FILE}, found {name[:60]!r}")
-    return name
+    return ((path if path.is_dir() else path.parent) / name).read_bytes()
 
 
 def _read_picture(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "h w 4"]:
@@ -184,7 +169,7 @@ def write_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneM
 
 def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> bytes:
     """The bytes of a .sog; `path` is for messages."""
-    g = writable(path, gaussians, ".sog")
+    g = writable(path, gaussians)
     g = g.select(morton_order(g.means))
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "splatgraft"}, "count": g.count, "antialias": False}
     pictures: dict[str, bytes] = {}
@@ -273,12 +258,7 @@ def nearest_codes(values: Float[np.ndarray, "*shape"], codes: Float[np.ndarray, 
 
 
 def palette(rows: Float[Tensor, "n f"], size: int) -> tuple[Float[Tensor, "p f"], Int64[Tensor, "n"]]:
-    """At most `size` rows that represent all, and which of them represents each row.
-
-    Args:
-        rows: Feature vectors.
-        size: Most entries; all rows themselves are entries where they are no more.
-    """
+    """At most `size` rows that represent all, and which of them represents each row; all where they are no more."""
     n = len(rows)
     if n <= size:
         return rows, torch.arange(n)

@@ -12,7 +12,7 @@ import torch
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.quantization import SMALLEST_SCALE, bytes_from_unit, logits_from_bytes, writable
-from splatgraft.formats.scenes.scene_file import SceneFile
+from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
 from splatgraft.runtime.files import atomic_write
 
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)])
@@ -37,9 +37,9 @@ def read_splat(path: Path) -> SceneFile:
     return SceneFile(gaussians, notes=("the format has colours without view dependence",))
 
 
-def write_splat(path: Path, gaussians: Gaussians) -> None:
+def write_splat(path: Path, gaussians: Gaussians, _: SceneMetadata = SceneMetadata()) -> None:
     """Write positions and scales exactly, the rest in 8 bits; bands above 0 are lost, as the format has none."""
-    g = writable(path, gaussians, ".splat")
+    g = writable(path, gaussians)
     rows = np.empty(g.count, _ROW)
     rows["position"] = g.means.numpy()
     rows["scale"] = g.scales.numpy()

@@ -18,15 +18,14 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.formats.scenes.quantization import (
     bytes_from_unit,
-    finite,
     from_smallest_three,
     logits_from_bytes,
     smallest_three,
+    writable,
 )
-from splatgraft.formats.scenes.scene_file import SceneFile
+from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
 from splatgraft.runtime.files import atomic_write
 
-SPZ_VERSIONS = (2, 3, 4)
 AXES = "RUB"
 """Right, up, back."""
 _MAGIC = 0x5053474E
@@ -135,20 +134,14 @@ def _four_bytes_unpacked(rotations: UInt8[Tensor, "n 4"]) -> Float[Tensor, "n 4"
     return from_smallest_three(packed >> 30, values)[:, [3, 0, 1, 2]]
 
 
-def write_spz(path: Path, gaussians: Gaussians, *, version: int = 4) -> None:
+def write_spz(path: Path, gaussians: Gaussians, _: SceneMetadata = SceneMetadata(), *, version: int = 4) -> None:
     """Write positions in 24 bits of the scene's extent, the rest in 8 bits.
 
-    Args:
-        path: The file.
-        gaussians: The scene.
-        version: 4 (zstd streams), 3 (one gzip stream), or 2 (rotations in 3 bytes, for the oldest readers).
-
-    Raises:
-        ValueError: A Gaussian is not finite or further out than 8 million units, or the version is another.
+    Version 4 has zstd streams, 3 one gzip stream, and 2 rotations in 3 bytes, for the oldest readers.
     """
-    if version not in SPZ_VERSIONS:
+    if version not in (2, 3, 4):
         raise ValueError(f"{path}: expected .spz version 2, 3 or 4 to write, found {version}")
-    g = change_axes(finite(path, gaussians), rdf_from(AXES))
+    g = change_axes(writable(path, gaussians, least=0), rdf_from(AXES))
     extent = float(g.means.abs().max()) if g.count else 1.0
     bits = max(b for b in range(-64, 24) if b < -60 or extent * 2.0**b <= 0x7FFFFF)
     if bits < 0:
