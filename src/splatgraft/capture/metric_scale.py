@@ -37,17 +37,10 @@ _MIN_ANGLE = 1e-4
 
 
 def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> tuple[Float[Tensor, "3"], float]:
-    """The point nearest to the rays of the cameras through their pixels.
-
-    Args:
-        cameras: Two or more.
-        pixels: x and y, one per camera.
+    """The point nearest to the rays of two or more cameras through one pixel each, x and y.
 
     Returns:
         The point, world units, and the mean distance of its projections from the given pixels.
-
-    Raises:
-        ValueError: The rays are parallel.
     """
     homogeneous = torch.cat([pixels.double(), torch.ones(len(pixels), 1, dtype=torch.float64)], 1)[..., None]
     in_camera = torch.linalg.inv(cameras.intrinsics.double()) @ homogeneous
@@ -63,11 +56,7 @@ def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> tuple[Float[T
 
 
 def scale_from_length(ends: tuple[Float[Tensor, "3"], Float[Tensor, "3"]], metres: float) -> MetricScale:
-    """The scale at which the distance of two points is `metres`.
-
-    Raises:
-        ValueError: The points are one, or the length is not above 0.
-    """
+    """The scale at which the distance of two points is `metres`."""
     distance = float((ends[0] - ends[1]).norm())
     if not (distance > 0 and metres > 0):
         raise ValueError(f"--length: expected two points apart and metres above 0, found {distance:g} and {metres:g}")
@@ -88,9 +77,6 @@ def scale_from_marker(
         cameras: Cameras of the pictures.
         side_m: Length of the black square's side, metres.
         progress: Called per picture.
-
-    Raises:
-        ValueError: No marker is in two pictures, or its corners do not meet.
     """
     seen = _marker_corners(images, progress)
     several = {key: views for key, views in seen.items() if len(views) >= 2}

@@ -7,7 +7,7 @@ is shown: how much the picture loses when it is blurred once more.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -79,76 +79,64 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Link:
-    """Two photos that show the same place."""
-
-    first: int
-    """Index of a photo."""
-    second: int
-    """Index of another photo."""
-    matches: int
-    """Verified matches."""
-    stops: float
-    """How much brighter the second photo shows the same surfaces, median over matches."""
-
-
-@dataclass(frozen=True)
-class Inspection:
-    """What was found in n photos."""
-
-    blur: tuple[float, ...]
-    """Blur of each photo, in [0, 1]; 0 is sharp."""
-    links: tuple[Link, ...]
-    """Pairs of photos that show the same place, as far as they were looked for."""
-    groups: tuple[tuple[int, ...], ...]
-    """Photos that hang together by links, the largest group first."""
-
-
-@dataclass(frozen=True)
 class _Features:
     points: np.ndarray
     descriptors: np.ndarray
     luminance: np.ndarray
 
 
-def inspect_photos(photos: Iterable[Grey], *, progress: Progress = silent, count: int) -> Inspection:
-    """Inspect photos in the order in which they were taken.
+@dataclass(frozen=True)
+class _Link:
+    """Two photos, by index, that show the same place."""
+
+    first: int
+    second: int
+    matches: int
+    """Verified."""
+    stops: float
+    """How much brighter the second photo shows the same surfaces, median over matches."""
+
+
+def find_in_photos(
+    photos: Iterable[Grey], names: Sequence[str], *, has_poses: bool, progress: Progress = silent
+) -> tuple[Finding, ...]:
+    """Sharpness, overlap and brightness of photos in the order in which they were taken.
 
     Args:
         photos: Grey versions, longest side at most `SIDE_PX`; read one at a time.
+        names: The photos' names.
+        has_poses: Whether the photos have poses, so that no matches between them are needed.
         progress: Called per photo.
-        count: Number of photos.
     """
     blur: list[float] = []
     features: list[_Features] = []
-    sift = cv2.SIFT.create(nfeatures=_FEATURES)
+    n, sift = len(names), cv2.SIFT.create(nfeatures=_FEATURES)
     for index, photo in enumerate(photos):
         blur.append(blur_of(photo))
         features.append(_features(sift, photo))
-        progress(index + 1, count, "looking at photos")
-    n = len(features)
-    links: dict[tuple[int, int], Link | None] = {}
+        progress(index + 1, n, "looking at photos")
+    found: dict[tuple[int, int], _Link | None] = {}
 
     def match(one: int, other: int) -> None:
         pair = min(one, other), max(one, other)
-        if one != other and pair not in links:
-            links[pair] = _link(features, *pair)
-
-    def groups() -> tuple[tuple[int, ...], ...]:
-        return _groups(n, [pair for pair, link in links.items() if link is not None])
+        if one != other and pair not in found:
+            found[pair] = _link(features, *pair)
 
     for index in range(n):
         for step in range(1, min(_NEIGHBOURS, n - 1) + 1):
             match(index, (index + step) % n)
         progress(index + 1, n, "comparing neighbours")
     # photos of the smaller groups with photos spread over the rest, which may join them
-    apart = groups()
+    apart = _groups(n, found)
     for group in apart[1:]:
         others = [i for other in apart if other is not group for i in other]
         for i in group:
             for j in others[:: max(1, len(others) // _CANDIDATES)]:
                 match(i, j)
-    return Inspection(tuple(blur), tuple(link for link in links.values() if link is not None), groups())
+    links, overlap = [link for link in found.values() if link is not None], _overlap(found, names)
+    if has_poses and overlap.level != "good":
+        overlap = Finding("overlap", "good", f"{overlap.text}; poses are given, which need none", photos=overlap.photos)
+    return _sharpness(blur), overlap, _exposure(links, names)
 
 
 def blur_of(photo: Grey) -> float:
@@ -164,13 +152,12 @@ def blur_of(photo: Grey) -> float:
     return max(found)
 
 
-def _groups(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, ...], ...]:
-    """Connected components of `count` photos, the largest first."""
-    rows = np.array(list(pairs), int).reshape(-1, 2)
+def _groups(count: int, found: Mapping[tuple[int, int], _Link | None]) -> list[list[int]]:
+    """Photos that hang together by links, the largest group first."""
+    rows = np.array([pair for pair, link in found.items() if link is not None], int).reshape(-1, 2)
     graph = coo_array((np.ones(len(rows), bool), (rows[:, 0], rows[:, 1])), shape=(count, count))
     number, label = connected_components(graph, directed=False)
-    groups = [tuple(np.flatnonzero(label == k).tolist()) for k in range(number)]
-    return tuple(sorted(groups, key=len, reverse=True))
+    return sorted((np.flatnonzero(label == k).tolist() for k in range(number)), key=len, reverse=True)
 
 
 def _features(sift: cv2.SIFT, photo: Grey) -> _Features:
@@ -186,7 +173,7 @@ def _features(sift: cv2.SIFT, photo: Grey) -> _Features:
     return _Features(points, descriptors.astype(np.float32), light[rows, columns])
 
 
-def _link(features: Sequence[_Features], i: int, j: int) -> Link | None:
+def _link(features: Sequence[_Features], i: int, j: int) -> _Link | None:
     """The verified matches of two photos; None where there are too few."""
     one, other = features[i], features[j]
     if min(len(one.points), len(other.points)) < _MIN_MATCHES:
@@ -207,7 +194,7 @@ def _link(features: Sequence[_Features], i: int, j: int) -> Link | None:
     if verified.sum() < _MIN_MATCHES:
         return None
     ratio = np.maximum(other.luminance[best[kept]], 1e-4) / np.maximum(one.luminance[kept], 1e-4)
-    return Link(i, j, int(verified.sum()), float(np.median(np.log2(ratio[verified]))))
+    return _Link(i, j, int(verified.sum()), float(np.median(np.log2(ratio[verified]))))
 
 
 def _verified(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -265,68 +252,52 @@ def find_in_odd_photos(odd: Sequence[LeftOut], count: int) -> Finding:
     return Finding("left out", level, text, f"{names[0]}: {why}", names)
 
 
-def find_in_photos(inspection: Inspection, names: Sequence[str], *, has_poses: bool) -> tuple[Finding, ...]:
-    """Sharpness, overlap and brightness.
-
-    Args:
-        inspection: The figures of n photos.
-        names: The photos' names.
-        has_poses: Whether the photos have poses, so that no matches between them are needed.
-    """
-    overlap = _overlap(inspection, names)
-    if has_poses and overlap.level != "good":
-        overlap = Finding("overlap", "good", f"{overlap.text}; poses are given, which need none", photos=overlap.photos)
-    return _sharpness(inspection), overlap, _exposure(inspection, names)
-
-
 def _named(photos: Sequence[str]) -> str:
     """The first of some names, and how many more there are."""
     more = f" and {len(photos) - _NAMED} more" if len(photos) > _NAMED else ""
     return ", ".join(photos[:_NAMED]) + more
 
 
-def _sharpness(inspection: Inspection) -> Finding:
-    blur = np.array(inspection.blur)
+def _sharpness(blur: Sequence[float]) -> Finding:
     middle = float(np.median(blur))
     if middle > _BLUR_OF_ALL:
         text = f"most photos are blurred (median blur {middle:.2f}, sharp captures have 0.23 to 0.37)"
         return Finding("sharpness", "doubtful", text, "photograph again with shorter exposure and in focus")
-    return Finding("sharpness", "good", f"the photos are sharp (blur {blur.min():.2f} to {blur.max():.2f})")
+    return Finding("sharpness", "good", f"the photos are sharp (blur {min(blur):.2f} to {max(blur):.2f})")
 
 
-def _overlap(inspection: Inspection, names: Sequence[str]) -> Finding:
-    n, largest = len(names), inspection.groups[0]
-    next_to = [link.matches for link in inspection.links if link.second - link.first == 1]
+def _overlap(found: Mapping[tuple[int, int], _Link | None], names: Sequence[str]) -> Finding:
+    groups, n = _groups(len(names), found), len(names)
+    largest = groups[0]
+    next_to = [link.matches for link in found.values() if link is not None and link.second - link.first == 1]
     middle = f"{np.median(next_to):.0f}" if next_to else "no"
     if len(largest) == n:
         return Finding("overlap", "good", f"all photos hang together, {middle} matches between neighbours")
-    apart = tuple(names[i] for group in inspection.groups[1:] for i in group)
+    apart = tuple(names[i] for group in groups[1:] for i in group)
     if len(largest) < _MIN_TOGETHER * n:
         text = f"only {len(largest)} of {n} photos show one place together; the largest groups have "
-        sizes = ", ".join(str(len(group)) for group in inspection.groups[:4])
+        sizes = ", ".join(str(len(group)) for group in groups[:4])
         remedy = "take photos a step apart that share two thirds of the picture, with texture in view, of one place"
         return Finding("overlap", "unusable", text + sizes, remedy, apart)
     text = f"{len(apart)} of {n} photos show nothing in common with the rest: {_named(apart)}"
     return Finding("overlap", "doubtful", text, "leave them out, or take photos between them and the rest", apart)
 
 
-def _exposure(inspection: Inspection, names: Sequence[str]) -> Finding:
+def _exposure(links: Sequence[_Link], names: Sequence[str]) -> Finding:
     """How much brighter each photo shows surfaces than the photos before and after it do, in the mean of both.
 
     Gloss changes smoothly from photo to photo, so that it cancels; a change of exposure does not.
     """
     before: list[list[float]] = [[] for _ in names]
     after: list[list[float]] = [[] for _ in names]
-    for link in inspection.links:
+    for link in links:
         if link.second - link.first <= len(names) // 2:
             before[link.second].append(link.stops)
             after[link.first].append(-link.stops)
     pairs = zip(before, after, strict=True)
     jumps = [abs(0.5 * float(np.median(b) + np.median(a))) if a and b else 0.0 for b, a in pairs]
-    # the largest first
-    odd = tuple(
-        name for jump, name in sorted(zip(jumps, names, strict=True), key=lambda x: -x[0]) if jump > _JUMP_STOPS
-    )
+    largest_first = sorted(range(len(names)), key=lambda i: -jumps[i])
+    odd = tuple(names[i] for i in largest_first if jumps[i] > _JUMP_STOPS)
     if odd:
         text = f"{len(odd)} photos are up to {max(jumps):.1f} stops off their neighbours in brightness: {_named(odd)}"
         return Finding("exposure", "doubtful", text, "lock exposure and white balance, or leave them out", odd)

@@ -20,10 +20,7 @@ from splatgraft.runtime.progress import Progress, silent
 
 
 def working_copies(photos: Sequence[Path], folder: Path, max_size_px: int) -> list[Path]:
-    """Upright copies, at most `max_size_px` on the longest side, that keep the EXIF focal length.
-
-    Raises: ValueError where two photos have one name, or one cannot be read.
-    """
+    """Upright copies, at most `max_size_px` on the longest side, that keep the EXIF focal length."""
     names = [photo.stem + ".jpg" for photo in photos]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -48,20 +45,10 @@ def _on_black(image: Image.Image) -> Image.Image:
 
 
 def working_masks(masks: Sequence[Path | None], copies: Sequence[Path], folder: Path) -> dict[str, Path]:
-    """Masks at the size of the working copies, as COLMAP wants them: NAME.jpg.png, black where nothing counts.
+    """Masks by the name of their copy, at its size, as COLMAP wants them: NAME.jpg.png, black where nothing counts.
 
     A mask is upright as its photo is shown: its pixels as they are, or turned by the EXIF orientation of a photo whose
     alpha channel it is.
-
-    Args:
-        masks: One per copy, or none at all.
-        copies: Working copies.
-        folder: Where the masks go.
-
-    Returns:
-        The masks by the name of their copy.
-
-    Raises: ValueError where a mask cannot be read, or has another shape than its photo.
     """
     written: dict[str, Path] = {}
     for mask, copy in zip(masks, copies, strict=bool(masks)):
@@ -109,44 +96,44 @@ def _camera_traits(copy: Path) -> tuple[object, ...]:
         return (image.size, exif.get(Base.Make), exif.get(Base.Model), *(f and float(f) for f in focal))
 
 
-def write_undistorted(copy: Path, path: Path, distortion: Distortion) -> torch.Tensor:
-    """Write the pinhole image of `copy` as JPEG with its exposure metadata, and give that pinhole's matrix (3, 3)."""
+def write_undistorted(
+    copy: Path, path: Path, mask: tuple[Path, Path] | None, distortion: Distortion
+) -> Float[Tensor, "3 3"]:
+    """Write the pinhole image of `copy` to `path` as JPEG with its exposure metadata, and of a mask (from, to) as PNG.
+
+    Returns:
+        The pinhole's matrix.
+    """
     width, height = distortion.size
     intrinsics = torch.from_numpy(distortion.pinhole())
     _write_jpeg(path, distortion.undistort(read_rgb(copy), intrinsics, width=width, height=height), copy)
+    if mask is not None:
+        coverage = read_mask(mask[0])[..., None].expand(-1, -1, 3)
+        write_image(mask[1], distortion.undistort(coverage, intrinsics, width=width, height=height)[..., 0])
     return intrinsics.float()
 
 
 def write_reduced(posed: PosedImages, folder: Path, longest_px: int, *, progress: Progress = silent) -> PosedImages:
-    """The capture at `longest_px` at most; larger image files are reduced once and written, undistorted.
+    """The capture at `longest_px` at most; larger image files are reduced once and written to `folder`, undistorted.
 
-    Args:
-        posed: A capture of any sizes.
-        folder: An existing folder; images/ and masks/ are made in it where they are needed.
-        longest_px: Longest side, pixels.
-        progress: Moves a bar.
-
-    Returns:
-        Smaller images are referred to as before.
+    Smaller images are referred to as before.
     """
     limited = posed.limited(longest_px)
-    sizes = [(int(width), int(height)) for width, height in limited.cameras.sizes.tolist()]
-    large = [max(stored_size(path, size)) > longest_px for path, size in zip(posed.image_paths, sizes, strict=True)]
     stems = [Path(name).stem for name in posed.cameras.names]
     images, masks = list(limited.image_paths), list(limited.mask_paths)
     distortions = list(limited.distortions)
-    for index in [i for i, is_large in enumerate(large) if is_large]:
+    for index, (photo, size) in enumerate(zip(posed.image_paths, limited.cameras.sizes.tolist(), strict=True)):
+        if max(stored_size(photo, (size[0], size[1]))) <= longest_px:
+            continue
         stem = stems[index] if stems.count(stems[index]) == 1 else posed.cameras.names[index]
-        pixels = limited.reduced_image(index)
-        mask = limited.mask(index)
         images[index] = folder / "images" / f"{stem}.jpg"
         images[index].parent.mkdir(exist_ok=True)
-        _write_jpeg(images[index], pixels, posed.image_paths[index])
+        _write_jpeg(images[index], limited.reduced_image(index), photo)
+        mask = limited.mask(index)
         if mask is not None:
-            path = folder / "masks" / f"{stem}.png"
+            masks[index] = path = folder / "masks" / f"{stem}.png"
             path.parent.mkdir(exist_ok=True)
             write_image(path, mask)
-            masks[index] = path
         if distortions:
             distortions[index] = None
         progress(index + 1, len(posed), "reducing photos")
@@ -163,11 +150,3 @@ def _write_jpeg(path: Path, pixels: Float[Tensor, "h w 3"], photo: Path) -> None
     array = (pixels.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     with atomic_write(path) as stream:
         Image.fromarray(array).save(stream, "JPEG", quality=95, subsampling=0, exif=exif_of(read_exposure(photo)))
-
-
-def write_undistorted_mask(mask: Path, path: Path, distortion: Distortion) -> None:
-    """Write the pinhole image of a working mask as PNG."""
-    width, height = distortion.size
-    intrinsics = torch.from_numpy(distortion.pinhole())
-    coverage = read_mask(mask)[..., None].expand(-1, -1, 3)
-    write_image(path, distortion.undistort(coverage, intrinsics, width=width, height=height)[..., 0])

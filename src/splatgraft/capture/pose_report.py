@@ -4,14 +4,13 @@ A wrong model often has all photos and a small reprojection error, since COLMAP 
 verified matches that the model explains does not have this weakness: it counts what was dropped.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from splatgraft.runtime.files import atomic_write
+from splatgraft.formats.json_file import load, save
 
 POSE_REPORT_FILE = "pose_report.json"
 
@@ -147,58 +146,46 @@ def find_doubts(
         mean_reprojection_px: Pixels of the (shrunk) photos.
         lenses: Cameras of the photos with a pose.
     """
-    registered, seen = len(observations), float(np.median(observations)) if observations else 0.0
-    error = f"{mean_reprojection_px:.2f} px"
-    figures = [
-        (
-            registered >= _MIN_REGISTERED * photos,
-            Doubt("photos with a pose", f"{registered} of {photos}", f"at least {_MIN_REGISTERED:.0%}"),
-        ),
-        (
-            explained >= _MIN_EXPLAINED,
-            Doubt("matches that the cameras explain", f"{explained:.0%}", f"at least {_MIN_EXPLAINED:.0%}"),
-        ),
-        (
-            mean_reprojection_px <= _MAX_REPROJECTION_PX,
-            Doubt("mean reprojection error", error, f"at most {_MAX_REPROJECTION_PX:.2f} px"),
-        ),
-        (
-            seen >= _MIN_OBSERVATIONS,
-            Doubt("points seen by the median photo", f"{seen:.0f}", f"{_MIN_OBSERVATIONS}"),
-        ),
-    ]
+    doubts: list[Doubt] = []
+
+    def demand(is_good: bool, what: str, found: str, expected: str) -> None:
+        if not is_good:
+            doubts.append(Doubt(what, found, expected))
+
+    posed, seen = len(observations), float(np.median(observations)) if observations else 0.0
+    is_good, least = posed >= _MIN_REGISTERED * photos, f"at least {_MIN_REGISTERED:.0%}"
+    demand(is_good, "photos with a pose", f"{posed} of {photos}", least)
+    is_good, least = explained >= _MIN_EXPLAINED, f"at least {_MIN_EXPLAINED:.0%}"
+    demand(is_good, "matches that the cameras explain", f"{explained:.0%}", least)
+    is_good, most = mean_reprojection_px <= _MAX_REPROJECTION_PX, f"at most {_MAX_REPROJECTION_PX:.2f} px"
+    demand(is_good, "mean reprojection error", f"{mean_reprojection_px:.2f} px", most)
+    demand(seen >= _MIN_OBSERVATIONS, "points seen by the median photo", f"{seen:.0f}", f"{_MIN_OBSERVATIONS}")
     low, high = _FOCAL_IN_SIDES
     for lens in lenses:
         of = f"of {lens.photos[0]}" + (f" and {len(lens.photos) - 1} more" if len(lens.photos) > 1 else "")
         side, shift = max(lens.size), abs(lens.corner_shift)
         usual = f"{low * side:.0f} to {high * side:.0f} px at {side} px"
-        allowed = f"at most {_MAX_CORNER_SHIFT:.0%} at the corners"
-        figures += [
-            (low <= lens.focal_px / side <= high, Doubt(f"focal length {of}", f"{lens.focal_px:.0f} px", usual)),
-            (shift <= _MAX_CORNER_SHIFT, Doubt(f"distortion {of}", f"{shift:.0%}", allowed)),
-        ]
+        demand(low <= lens.focal_px / side <= high, f"focal length {of}", f"{lens.focal_px:.0f} px", usual)
+        most = f"at most {_MAX_CORNER_SHIFT:.0%} at the corners"
+        demand(shift <= _MAX_CORNER_SHIFT, f"distortion {of}", f"{shift:.0%}", most)
     shifts = [lens.corner_shift for lens in lenses for _ in lens.photos]
     spread = float(np.percentile(shifts, 90) - np.percentile(shifts, 10)) if shifts else 0.0
-    what, allowed = "spread of the distortion between photos", f"at most {_MAX_CORNER_SPREAD:.0%} at the corners"
-    figures.append((spread <= _MAX_CORNER_SPREAD, Doubt(what, f"{spread:.0%}", allowed)))
-    return tuple(doubt for is_good, doubt in figures if not is_good)
+    most = f"at most {_MAX_CORNER_SPREAD:.0%} at the corners"
+    demand(spread <= _MAX_CORNER_SPREAD, "spread of the distortion between photos", f"{spread:.0%}", most)
+    return tuple(doubts)
 
 
 def write_pose_report(folder: Path, report: PoseReport) -> None:
     """Write pose_report.json into `folder`."""
-    with atomic_write(folder / POSE_REPORT_FILE) as stream:
-        stream.write((json.dumps(asdict(report), indent=1) + "\n").encode())
+    save(folder / POSE_REPORT_FILE, asdict(report))
 
 
 def read_doubts(folder: Path) -> tuple[Doubt, ...]:
-    """The doubts about the poses of a folder; none where structure from motion did not find them.
-
-    Raises: ValueError where the file with them is damaged.
-    """
+    """The doubts about the poses of a folder; none where structure from motion did not find them."""
     path = folder / POSE_REPORT_FILE
     if not path.is_file():
         return ()
     try:
-        return tuple(Doubt(**doubt) for doubt in json.loads(path.read_text())["doubts"])
-    except (ValueError, KeyError, TypeError) as error:
+        return tuple(Doubt(**doubt) for doubt in load(path)["doubts"])
+    except (KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected figures of poses, found {type(error).__name__}: {error}") from error

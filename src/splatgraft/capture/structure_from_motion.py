@@ -13,13 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.capture.colmap_process.job import MAX_ERROR_PX, MIN_TRACK, PHASES, Job
-from splatgraft.capture.photos import (
-    camera_groups,
-    working_copies,
-    working_masks,
-    write_undistorted,
-    write_undistorted_mask,
-)
+from splatgraft.capture.photos import camera_groups, working_copies, working_masks, write_undistorted
 from splatgraft.capture.pose_report import Lens, PoseReport, Unposed, find_doubts
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
@@ -90,12 +84,6 @@ def pose_photos(
         options: How structure from motion is run.
         progress: Moves a bar.
         say: Takes a sentence before a longer part begins, and the time that each part took.
-
-    Returns:
-        The photos with a pose, and figures that say how far to trust them (`PoseReport.doubts`).
-
-    Raises:
-        ValueError: Where pycolmap is missing, names clash, a photo or mask is unreadable, or under half get a pose.
     """
     if find_spec("pycolmap") is None:
         raise ValueError("photos without poses: expected pycolmap (pip install 'splatgraft[sfm]'), found none")
@@ -222,11 +210,9 @@ def _posed_images(model: Mapping[str, Any], photos: Path, masks: Mapping[str, Pa
         size = stored_size(copy)
         matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
         distortion = Distortion(matrix, torch.tensor([*coefficients, 0], dtype=torch.float64), size)
-        intrinsics.append(write_undistorted(copy, path, distortion))
-        mask_paths.append(None)
-        if copy.name in masks:
-            mask_paths[-1] = workspace / "masks" / f"{copy.stem}.png"
-            write_undistorted_mask(masks[copy.name], mask_paths[-1], distortion)
+        mask = (masks[copy.name], workspace / "masks" / f"{copy.stem}.png") if copy.name in masks else None
+        intrinsics.append(write_undistorted(copy, path, mask, distortion))
+        mask_paths.append(mask[1] if mask else None)
         poses.append([*image["world_from_camera"], [0, 0, 0, 1]])
         sizes.append(size)
         paths.append(path)
@@ -251,10 +237,6 @@ def upright(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Similarity:
     """upright_from_world: +z up, the support plane at z = 0 where one is clear, the median point above the origin.
 
     The median distance of the cameras from the median point becomes 1, since structure from motion has no scale.
-
-    Args:
-        cameras: In any frame.
-        points: Sparse points in the same frame; may be empty.
     """
     up = estimate_up(cameras)
     plane = dominant_level_plane(points, up)

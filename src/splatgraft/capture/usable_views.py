@@ -65,16 +65,13 @@ class _Photo:
 def usable_photos(
     photos: Sequence[Path], name: str, *, keep_odd: bool = False, progress: Progress = silent
 ) -> tuple[list[Path], tuple[LeftOut, ...]]:
-    """The photos without poses that are worth a pose, and the others.
+    """The photos without poses that are worth a pose, at least 8, and the others.
 
     Args:
         photos: Image files.
         name: The capture, for the message.
         keep_odd: Whether copies and blurred photos stay; unreadable ones never do.
         progress: Moves a bar.
-
-    Raises:
-        ValueError: Where fewer than 8 different photos are left.
     """
     odd = find_odd_photos(photos, keep_odd=keep_odd, progress=progress)
     out = {one.name for one in odd}
@@ -90,15 +87,7 @@ def usable_photos(
 
 
 def usable_masks(photos: PhotoFiles) -> tuple[PhotoFiles, tuple[LeftOut, ...]]:
-    """Photos without poses, whose masks are all of use, and the masks that were left out.
-
-    Args:
-        photos: Readable photos, with masks or without.
-
-    Returns:
-        The same photos without masks that are unreadable, of another shape than their photo, or black or white all
-        over; and these, with the reason for each.
-    """
+    """The photos without masks that are unreadable, of another shape, or black or white all over; and these."""
 
     def reason_against(photo: Path, mask: Path) -> str:
         check_mask(mask, stored_size(photo))
@@ -109,15 +98,9 @@ def usable_masks(photos: PhotoFiles) -> tuple[PhotoFiles, tuple[LeftOut, ...]]:
 
 
 def usable_views(posed: PosedImages, *, keep_odd: bool = False, progress: Progress = silent) -> PosedImages:
-    """The posed views without odd photos, and without masks that are black or white all over.
+    """The posed views without odd photos, and without masks that are black or white all over; added to `left_out`.
 
-    Args:
-        posed: Views whose files exist.
-        keep_odd: Whether copies and blurred photos stay; unreadable ones never do.
-        progress: Moves a bar.
-
-    Returns:
-        The others; what was left out is added to `left_out`.
+    With `keep_odd` copies and blurred photos stay; unreadable ones never do.
     """
     kept = _without(posed, find_odd_photos(posed.image_paths, keep_odd=keep_odd, progress=progress))
     names = kept.cameras.names
@@ -171,15 +154,9 @@ def _emptiness(mask: Path) -> str:
 def find_odd_photos(
     photos: Sequence[Path], *, keep_odd: bool = False, progress: Progress = silent
 ) -> tuple[LeftOut, ...]:
-    """The photos to leave out, each with the reason; the first of several copies stays.
+    """The photos to leave out, by full path in their order, each with the reason; the first of several copies stays.
 
-    Args:
-        photos: Image files, which are each decoded once.
-        keep_odd: Whether to leave out only what cannot be decoded to its end or is too small.
-        progress: Moves a bar.
-
-    Returns:
-        Odd photos by full path, in the order of `photos`.
+    With `keep_odd` only those that cannot be decoded to their end or are too small.
     """
     examined: list[_Photo] = []
     reasons: dict[Path, str] = {}
@@ -250,10 +227,8 @@ def _copies(photos: Sequence[_Photo]) -> tuple[list[_Photo], dict[Path, str]]:
     """The photos of different pictures, and the reason against each copy."""
     kept: list[_Photo] = []
     reasons: dict[Path, str] = {}
-    means = {photo.path: float(photo.thumbnail.mean()) for photo in photos}
     for photo in photos:
-        near = [other for other in kept if abs(means[other.path] - means[photo.path]) <= _COPY_LEVELS]
-        first = next((p for p in near if np.abs(p.thumbnail - photo.thumbnail).max() <= _COPY_LEVELS), None)
+        first = next((p for p in kept if np.abs(p.thumbnail - photo.thumbnail).max() <= _COPY_LEVELS), None)
         if first is None:
             kept.append(photo)
         else:
@@ -278,15 +253,7 @@ def _blurred(photos: Sequence[_Photo]) -> dict[Path, str]:
 
 
 def require_coverage(capture: PosedImages, name: str) -> None:
-    """Refuse views that are too few or too close together; a good capture has ten times as much.
-
-    Args:
-        capture: Posed views; without points, parallax is measured at the place that the cameras look at.
-        name: The capture, for the message.
-
-    Raises:
-        ValueError: With what is needed, in number and parallax, and what was found.
-    """
+    """Refuse views of the capture `name` that are too few or too close together; a good one has ten times as much."""
     needed = (
         f"expected at least {MIN_VIEWS} posed views with a parallax of {_MIN_PARALLAX_DEG:g} degrees or more "
         f"(40 or more views from all around are usual)"
@@ -304,10 +271,8 @@ def require_coverage(capture: PosedImages, name: str) -> None:
 def median_parallax_deg(cameras: Cameras, points: Float[Tensor, "m 3"]) -> float | None:
     """The angle between the outermost cameras that see a point, in the median over points; None where unknown.
 
-    Args:
-        cameras: In the points' frame.
-        points: Where there are none that two cameras see, the focus point of the cameras serves; where the cameras look
-            outwards, there is none either, and only cameras in one place are known to have no parallax.
+    Where two cameras see none of the points, the focus point of the cameras serves; where the cameras look outwards,
+    there is none either, and only cameras in one place are known to have no parallax.
     """
     some = cameras.spread(_CAMERAS)
     centers = some.centers.double()

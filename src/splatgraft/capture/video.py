@@ -5,10 +5,10 @@ from a reference frame, which is renewed after a known displacement: jitter and 
 not add up. Lengths are over the picture's longest side; constants are set by hand.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from itertools import tee
 from pathlib import Path
 
 import cv2
@@ -51,11 +51,7 @@ _NAMED_CUTS = 5
 
 
 def describe_video(video: Path) -> str:
-    """Duration and size of a video, by its header and its first frame.
-
-    Raises:
-        ValueError: There is no such file, OpenCV cannot read it, or it announces fewer than three frames.
-    """
+    """Duration and size of a video, by its header and its first frame."""
     with _opened(video) as capture:
         is_read, frame = capture.read()
         frames, rate = _announced(capture), capture.get(cv2.CAP_PROP_FPS)
@@ -82,14 +78,11 @@ def extract_frames(
 
     Returns:
         The files, in order of time, and how the frames were chosen: pauses, cuts, a truncated file.
-
-    Raises:
-        ValueError: Where `video` cannot be read, or has fewer than three frames or different views.
     """
     with _opened(video) as capture:
         announced, rate = _announced(capture), capture.get(cv2.CAP_PROP_FPS)
         rate = rate if math.isfinite(rate) and 1 <= rate <= 1000 else 30.0
-        tracked, measured = tee(_frames(capture, progress, "looking for sharp frames"))
+        tracked, measured = itertools.tee(_frames(capture, progress, "looking for sharp frames"))
         seen = [(*m, s) for m, s in zip(motion(tracked), map(_sharpness, measured), strict=True)]
     if len(seen) < _MIN_FRAMES:
         raise ValueError(f"{video}: expected a video of at least {_MIN_FRAMES} frames, found {len(seen)}")
@@ -115,16 +108,7 @@ def extract_frames(
 
 
 def grey_frames(video: Path, count: int, longest_px: int) -> list[UInt8[np.ndarray, "_ _"]]:
-    """Luma of at most `count` frames spread evenly over a video.
-
-    Args:
-        video: The file.
-        count: Most frames.
-        longest_px: Longest side, pixels.
-
-    Raises:
-        ValueError: Where it cannot be read, or has fewer than three frames.
-    """
+    """Luma of at most `count` frames spread evenly over a video, with a longest side of at most `longest_px`."""
     found: list[np.ndarray] = []
     with _opened(video) as capture:
         total = _announced(capture)
@@ -187,16 +171,13 @@ def _moved(old: np.ndarray, corners: Float[np.ndarray, "n 1 2"], new: np.ndarray
 def choose_frames(
     path: Float[np.ndarray, "n"], sharpness: Float[np.ndarray, "n"], shots: np.ndarray, count: int
 ) -> tuple[list[int], float]:
-    """The sharpest frame of each of at most `count` stretches of equal motion; shots are not mixed.
+    """The sharpest frame of each of at most `count` stretches of equal motion, one more per shot, and their length.
 
     Args:
         path: Motion up to each frame, over the picture's longest side.
         sharpness: Sharpness of each frame, any unit.
-        shots: Number of the shot of each frame, from 0 up.
-        count: Largest number of frames; one more per shot may come.
-
-    Returns:
-        Positions in order, and the length of a stretch.
+        shots: Number of the shot of each frame, from 0 up; shots are not mixed.
+        count: Largest number of frames.
     """
     total = sum(float(np.ptp(path[shots == shot])) for shot in np.unique(shots))
     step = max(total / count, _MIN_STEP)
@@ -260,13 +241,12 @@ def _announced(capture: cv2.VideoCapture) -> int:
 
 
 def _frames(capture: cv2.VideoCapture, progress: Progress, message: str) -> Iterator[np.ndarray]:
-    total, done = _announced(capture), 0
-    while True:
-        readable, frame = capture.read()
-        if not readable:
+    total = _announced(capture)
+    for done in itertools.count(1):
+        is_read, frame = capture.read()
+        if not is_read:
             return
         yield frame
-        done += 1
         if done % 25 == 0:
             progress(done, max(done, total), message)
 

@@ -138,14 +138,7 @@ def place_virtual_cameras(
 ) -> VirtualCameras:
     """Place rings of cameras around the scene's dense part or within it, without those whose view is blocked.
 
-    Args:
-        scene: A trained scene in any frame.
-        options: Number, size and kind of the views.
-        stated_up: Up direction that the scene's file states; `options.up` goes before it.
-        progress: Called after each view.
-
-    Raises:
-        ValueError: Where the scene has too few solid Gaussians.
+    The up direction that the scene's file states counts where `options` have none.
     """
     solid = _solid(scene)
     centre, radius = dense_part(solid.means)
@@ -155,9 +148,7 @@ def place_virtual_cameras(
     else:
         up = torch.nn.functional.normalize(torch.tensor(given), dim=0)
         reason = "as given" if options.up else "as the file's header states; another is named by --up"
-    positions = _positions_around if options.look == "around" else _positions_within
-    candidates = positions(centre, radius, up, options.views)
-    poses, dropped = _unoccluded_poses(scene, candidates, up, progress)
+    poses, dropped = _unoccluded_poses(scene, _positions(options, centre, radius, up), up, progress)
     width = options.picture_width
     focal = 0.5 * width / math.tan(_HALF_FOV)
     cameras = pinhole(poses, focal, width=width, height=width * 3 // 4, prefix="look")
@@ -212,11 +203,6 @@ def estimate_scene_up(
     The conventions of files decide the sign where the normal is nearly z (+z, since there may be as much below a table
     as on it), and where both sides are alike (-y, as structure from motion leaves it, or +z).
 
-    Args:
-        points: Centres of solid Gaussians.
-        centre: Centre of the dense part.
-        radius: Radius of the dense part, world units.
-
     Returns:
         A unit vector, and the reason for it, for the user.
     """
@@ -247,29 +233,21 @@ def estimate_scene_up(
     return normal if customary_side else -normal, f"{share}; which of its sides is a guess by custom"
 
 
-def _positions_around(
-    centre: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"], views: int
+def _positions(
+    options: VirtualCameraOptions, centre: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"]
 ) -> list[list[_Position]]:
-    """Per view, positions along one direction from the centre that look at it, the best first."""
-    out = []
-    for direction in _directions(views, up, _ELEVATIONS_DEG):
-        distances = [k * radius for k in _DISTANCES]
-        edges = [_CLEAR_AT_EDGES * d for d in distances]
-        out.append(
-            [
-                _Position(centre + d * direction, centre, d - _CLEAR * radius, edge, 0.0)
-                for d, edge in zip(distances, edges, strict=True)
-            ]
-        )
-    return out
-
-
-def _positions_within(
-    centre: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"], views: int
-) -> list[list[_Position]]:
-    """Per view, positions near the centre that look outwards, on the whole slightly down, the best first."""
-    out = []
-    for direction in _directions(views, up, _ELEVATIONS_WITHIN_DEG):
+    """Per view, positions along one direction from the centre that look at it, the best first; or, within the scene,
+    near the centre, from which one looks outwards, on the whole slightly down."""
+    out: list[list[_Position]] = []
+    around = options.look == "around"
+    for direction in _directions(options.views, up, _ELEVATIONS_DEG if around else _ELEVATIONS_WITHIN_DEG):
+        if around:
+            distances = [k * radius for k in _DISTANCES]
+            clear = [(d - _CLEAR * radius, _CLEAR_AT_EDGES * d) for d in distances]
+            out.append(
+                [_Position(centre + d * direction, centre, *c, 0.0) for d, c in zip(distances, clear, strict=True)]
+            )
+            continue
         flat = torch.nn.functional.normalize(direction - (direction @ up) * up, dim=0)
         eyes = [centre - _STEP_BACK * radius * flat + k * radius * up for k in _HEIGHTS]
         clear, edges = _CLEAR_WITHIN * radius, _CLEAR_AT_EDGES_WITHIN * radius

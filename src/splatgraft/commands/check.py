@@ -14,7 +14,6 @@ from splatgraft.capture.photo_inspection import (
     find_in_odd_photos,
     find_in_photos,
     find_in_sizes,
-    inspect_photos,
 )
 from splatgraft.capture.usable_views import find_odd_photos
 from splatgraft.capture.video import grey_frames
@@ -80,8 +79,7 @@ class Check:
         yield find_in_sizes([stored_size(path) for path in used], names)
         with console.bar("check") as progress:
             greys = (read_grey(path, SIDE_PX) for path in used)
-            found = inspect_photos(greys, count=len(used), progress=progress)
-        yield from find_in_photos(found, names, has_poses=posed is not None)
+            yield from find_in_photos(greys, names, has_poses=posed is not None, progress=progress)
         yield find_in_exposures([read_exposure(path) for path in used])
         yield _lens(used)
         if posed is not None:
@@ -93,12 +91,11 @@ class Check:
 
     def _of_video(self, console: Console) -> Iterator[Finding]:
         frames = grey_frames(self.capture, _FRAMES, SIDE_PX)
-        with console.bar("check") as progress:
-            found = inspect_photos(frames, count=len(frames), progress=progress)
         names = [f"frame {i + 1} of {len(frames)}" for i in range(len(frames))]
         yield Finding("video", "good", f"{len(frames)} frames spread over it were looked at")
-        # frames that lie three times as far apart as those that `capture` takes need not overlap
-        yield from find_in_photos(found, names, has_poses=True)
+        with console.bar("check") as progress:
+            # frames that lie three times as far apart as those that `capture` takes need not overlap
+            yield from find_in_photos(frames, names, has_poses=True, progress=progress)
         yield _masks(0)
         yield _time(3 * len(frames))
 

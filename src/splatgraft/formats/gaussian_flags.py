@@ -15,18 +15,12 @@ from splatgraft.runtime.files import atomic_write
 
 
 def read_flags(path: Path) -> Bool[Tensor, "n"]:
-    """The flags in `path`.
-
-    Raises: ValueError where the file is no one-dimensional array of bools.
-    """
+    """The flags in `path`."""
     return torch.from_numpy(_read(path, np.dtype(np.bool_)))
 
 
 def read_selection(path: Path, count: int, scene: Path) -> Bool[Tensor, "n"]:
-    """The flags in `path`, one for each of the `count` Gaussians of `scene`.
-
-    Raises: ValueError where the file is no array of bools, or has another number of them.
-    """
+    """The flags in `path`, one for each of the `count` Gaussians of `scene`."""
     flags = read_flags(path)
     if len(flags) != count:
         raise ValueError(f"{path}: expected one flag for each of the {count} Gaussians of {scene}, found {len(flags)}")
@@ -34,10 +28,7 @@ def read_selection(path: Path, count: int, scene: Path) -> Bool[Tensor, "n"]:
 
 
 def read_corrections(path: Path) -> Int8[Tensor, "n"]:
-    """The corrections in `path`.
-
-    Raises: ValueError where the file is no one-dimensional int8 array of -1, 0 and 1.
-    """
+    """The corrections in `path`."""
     corrections = _read(path, np.dtype(np.int8))
     if (abs(corrections) > 1).any():
         raise ValueError(f"{path}: expected one int8 of -1, 0 or 1 per Gaussian, found {int(corrections.max())}")
@@ -53,12 +44,11 @@ def write_flags(path: Path, flags: Bool[Tensor, "n"] | Int8[Tensor, "n"]) -> Non
 def _read(path: Path, kind: np.dtype) -> np.ndarray:
     try:
         array = np.load(path, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise ValueError(f"{path}: expected a .npy with one {kind} per Gaussian, found no file") from error
+        if isinstance(array, np.ndarray) and array.dtype == kind and array.ndim == 1:
+            return array
+        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+    except FileNotFoundError:
+        found = "no file"
     except (ValueError, OSError, EOFError, SyntaxError, MemoryError) as error:
         found = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{path}: expected a .npy with one {kind} per Gaussian, found {found}") from error
-    if not isinstance(array, np.ndarray) or array.dtype != kind or array.ndim != 1:
-        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-        raise ValueError(f"{path}: expected a .npy with one {kind} per Gaussian, found {found}")
-    return array
+    raise ValueError(f"{path}: expected a .npy with one {kind} per Gaussian, found {found}")

@@ -1,4 +1,7 @@
-"""Checked access to the values of a JSON file: numbers, image sides, file names and arrays."""
+"""JSON files: written whole, and checked access to their values: numbers, image sides, file names and arrays.
+
+What is not as expected raises a ValueError that begins with `where`, the file or a place in it.
+"""
 
 import json
 from pathlib import Path
@@ -7,16 +10,14 @@ from typing import Any
 import numpy as np
 
 from splatgraft.formats.captures.views import MAX_SIDE
+from splatgraft.runtime.files import atomic_write
 
 _LONGEST = 60
 """Characters of a value in an error message."""
 
 
 def load(path: Path) -> Any:
-    """The file's content.
-
-    Raises: ValueError where the file is missing or is no JSON.
-    """
+    """The file's content."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a JSON file, found none")
     try:
@@ -25,11 +26,14 @@ def load(path: Path) -> Any:
         raise ValueError(f"{path}: expected JSON, found {str(error)[:200]}") from None
 
 
-def number(where: Path | str, entry: dict[str, Any], key: str, default: float | None = None) -> float:
-    """A finite number below 1e9.
+def save(path: Path, content: Any) -> None:
+    """Write JSON with indents, atomically."""
+    with atomic_write(path) as stream:
+        stream.write((json.dumps(content, indent=1) + "\n").encode())
 
-    Raises: ValueError where the value is none.
-    """
+
+def number(where: Path | str, entry: dict[str, Any], key: str, default: float | None = None) -> float:
+    """A finite number below 1e9."""
     value = entry.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
         raise ValueError(f"{where}: expected a finite number for '{key}', found {excerpt(value)}")
@@ -37,10 +41,7 @@ def number(where: Path | str, entry: dict[str, Any], key: str, default: float | 
 
 
 def whole_side(where: Path | str, entry: dict[str, Any], key: str) -> int:
-    """An image side, pixels.
-
-    Raises: ValueError where the value is no whole number from 1 to `MAX_SIDE`.
-    """
+    """An image side, pixels."""
     value = number(where, entry, key)
     if not (value.is_integer() and 1 <= value <= MAX_SIDE):
         raise ValueError(f"{where}: expected a whole number from 1 to {MAX_SIDE} for '{key}', found {value:g}")
@@ -48,10 +49,7 @@ def whole_side(where: Path | str, entry: dict[str, Any], key: str) -> int:
 
 
 def text(where: Path | str, entry: dict[str, Any], key: str) -> str:
-    """A file name, with forward slashes.
-
-    Raises: ValueError where the value is none.
-    """
+    """A file name, with forward slashes."""
     value = entry.get(key)
     if not isinstance(value, str) or not value.strip("./\\ ") or not value.isprintable() or len(value) > 1024:
         raise ValueError(f"{where}: expected a file name for '{key}', found {excerpt(value)}")
@@ -59,10 +57,7 @@ def text(where: Path | str, entry: dict[str, Any], key: str) -> str:
 
 
 def array(where: Path | str, entry: dict[str, Any], key: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
-    """Numbers in one of `shapes`, float64; they may be nan.
-
-    Raises: ValueError where the value has another shape.
-    """
+    """Numbers in one of `shapes`, float64; they may be nan."""
     value = entry.get(key)
     try:
         out = np.array(value, np.float64)

@@ -5,12 +5,10 @@
 It lies in the capture's folder; of a capture that a step made, beside it, so that doing the step again keeps it.
 """
 
-import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from splatgraft.formats.json_file import excerpt, load, number
-from splatgraft.runtime.files import atomic_write
+from splatgraft.formats.json_file import excerpt, load, number, save
 
 SCALE_FILE = "scale.json"
 
@@ -26,24 +24,13 @@ class MetricScale:
 
 
 def scale_path(capture: Path) -> Path:
-    """Where the scale of a capture is stored.
-
-    Args:
-        capture: Its folder, or a file in it such as transforms.json.
-    """
+    """Where the scale of a capture is stored: a folder, or a file in it such as transforms.json."""
     folder = capture if capture.is_dir() else capture.parent
     return (folder.parent if (folder / "step.json").is_file() else folder) / SCALE_FILE
 
 
 def read_scale(capture: Path) -> MetricScale | None:
-    """The scale of a capture; None where it has none.
-
-    Args:
-        capture: Its folder, or a file in it.
-
-    Raises:
-        ValueError: Its scale.json is broken.
-    """
+    """The scale of a capture; None where it has none."""
     path = scale_path(capture)
     if not path.is_file():
         return None
@@ -59,7 +46,5 @@ def read_scale(capture: Path) -> MetricScale | None:
 def write_scale(capture: Path, scale: MetricScale) -> Path:
     """Store the scale of a capture; gives the file."""
     path = scale_path(capture)
-    content = {"metres_per_unit": scale.metres_per_unit, "source": scale.source}
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(content, indent=1) + "\n").encode())
+    save(path, asdict(scale))
     return path

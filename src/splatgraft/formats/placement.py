@@ -7,7 +7,6 @@
 file; x_in_target = scale * rotation @ x_in_object + translation. erased.npy: one bool per Gaussian of the target.
 """
 
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +20,7 @@ from torch import Tensor
 from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats.gaussian_flags import read_flags, write_flags
-from splatgraft.formats.json_file import array, excerpt, load, number
-from splatgraft.runtime.files import atomic_write
+from splatgraft.formats.json_file import array, excerpt, load, number, save
 
 _ERASED_FILE = "erased.npy"
 _DEFAULTS = {"object": None, "scale": 1.0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
@@ -51,10 +49,7 @@ class Placement:
 
 
 def read_placement(path: Path) -> Placement:
-    """Read placement.json and the erased.npy that it names.
-
-    Raises: ValueError where either file is missing, broken or inconsistent.
-    """
+    """Read placement.json and the erased.npy that it names."""
     content = load(path)
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
         raise ValueError(f'{path}: expected an object with a list "objects", found {excerpt(content)}')
@@ -70,18 +65,15 @@ def write_placement(path: Path, placement: Placement) -> None:
     """Write placement.json, and erased.npy beside it where anything is erased; both are read back exactly."""
     entries = []
     for item in placement.objects:
-        entry: dict[str, Any] = {}
-        if item.object_path is not None:
-            entry["object"] = os.path.relpath(item.object_path, path.parent)
+        named = {} if item.object_path is None else {"object": os.path.relpath(item.object_path, path.parent)}
         move = item.target_from_object
-        entry |= {"scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()}
-        entries.append(entry)
+        place = {"scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()}
+        entries.append(named | place)
     content: dict[str, Any] = {"objects": entries}
     if placement.erased is not None:
         content["erased"] = _ERASED_FILE
         write_flags(path.parent / _ERASED_FILE, placement.erased)
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(content, indent=1) + "\n").encode())
+    save(path, content)
 
 
 def _object(entry: Any, path: Path, where: str) -> ObjectPlacement:

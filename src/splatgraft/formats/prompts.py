@@ -8,7 +8,6 @@
 Keys are names of pictures, with or without folder and suffix. The same as JSON: {"DSC_0423": {"inside": [[412, 300]]}}.
 """
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,47 +18,28 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.prompts import ViewPrompt
-from splatgraft.formats.json_file import excerpt, load
-from splatgraft.runtime.files import atomic_write
+from splatgraft.formats.json_file import excerpt, load, save
 from splatgraft.runtime.settings import read_toml
 
 _KEYS = ("inside", "outside", "box")
 
 
 def read_prompts(path: Path) -> dict[str, ViewPrompt]:
-    """The prompts of a file, by the name of the picture.
-
-    Raises:
-        ValueError: The file is missing or broken, or says nothing.
-    """
+    """The prompts of a file, by the name of the picture."""
     return prompts_from_json(load(path) if path.suffix.lower() == ".json" else read_toml(path), str(path))
 
 
 def prompts_from_json(content: Any, where: str) -> dict[str, ViewPrompt]:
-    """The prompts of a file's content, by the name of the picture.
-
-    Args:
-        content: Tables, lists and numbers, as JSON and TOML have them.
-        where: The file, for messages.
-
-    Raises:
-        ValueError: It is broken, or says nothing.
-    """
+    """The prompts of a file's tables, lists and numbers, by the name of the picture; `where` is for messages."""
     if not isinstance(content, dict) or not content:
         raise ValueError(f"{where}: expected a table of points per picture, found {excerpt(content)}")
     return {name: _prompt(where, name, entry) for name, entry in content.items()}
 
 
 def write_prompts(path: Path, prompts: Mapping[str, ViewPrompt]) -> None:
-    """Write prompts as JSON, so that `read_prompts` gives the same back.
-
-    Args:
-        path: The file; its suffix is .json.
-        prompts: By the name of the picture, pixels as a viewer shows it.
-    """
+    """Write prompts as JSON, so that `read_prompts` gives the same back."""
     assert path.suffix.lower() == ".json", path
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(prompts_to_json(prompts), indent=1) + "\n").encode())
+    save(path, prompts_to_json(prompts))
 
 
 def prompts_to_json(prompts: Mapping[str, ViewPrompt]) -> dict[str, Any]:

@@ -1,10 +1,9 @@
 """Exposure metadata of photographs: from EXIF tags to `Exposure`, and back to the tags of a written image."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 from PIL import Image
 from PIL.ExifTags import IFD, Base
@@ -22,21 +21,17 @@ _MAX_STOPS = 40.0
 
 
 def read_exposure(path: Path) -> Exposure:
-    """Read the exposure metadata of a photo.
-
-    Tags that are missing, zero, not finite or not numbers count as not known.
-
-    Args:
-        path: An image file; JPEG, PNG, WebP and TIFF can have EXIF.
-    """
-    tags = read_exif(path)
-    balance = _number(tags.get(Base.WhiteBalance))
+    """Read the exposure metadata of a photo; tags that are missing, zero or no finite numbers count as not known."""
+    numbers = {tag: _number(value) for tag, value in read_exif(path).items()}
+    positive = {tag: number for tag, number in numbers.items() if number is not None and number > 0}
+    stops = {tag: number for tag, number in numbers.items() if number is not None and abs(number) <= _MAX_STOPS}
+    balance = numbers.get(Base.WhiteBalance)
     return Exposure(
-        shutter_s=_positive(tags, Base.ExposureTime),
-        aperture=_positive(tags, Base.FNumber),
-        iso=_positive(tags, Base.ISOSpeedRatings),
-        bias_stops=_stops(tags, Base.ExposureBiasValue),
-        brightness_stops=_stops(tags, Base.BrightnessValue),
+        shutter_s=positive.get(Base.ExposureTime),
+        aperture=positive.get(Base.FNumber),
+        iso=positive.get(Base.ISOSpeedRatings),
+        bias_stops=stops.get(Base.ExposureBiasValue),
+        brightness_stops=stops.get(Base.BrightnessValue),
         auto_white_balance=balance == _AUTO if balance in (_AUTO, _MANUAL) else None,
     )
 
@@ -60,16 +55,6 @@ def exif_of(exposure: Exposure) -> Image.Exif:
     if exposure.auto_white_balance is not None:
         tags[Base.WhiteBalance] = _AUTO if exposure.auto_white_balance else _MANUAL
     return exif
-
-
-def _stops(tags: Mapping[int, Any], tag: int) -> float | None:
-    value = _number(tags.get(tag))
-    return None if value is None or abs(value) > _MAX_STOPS else value
-
-
-def _positive(tags: Mapping[int, Any], tag: int) -> float | None:
-    value = _number(tags.get(tag))
-    return None if value is None or value <= 0 else value
 
 
 def _number(value: object) -> float | None:

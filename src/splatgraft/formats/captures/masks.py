@@ -37,17 +37,13 @@ def find_photos(folder: Path) -> PhotoFiles:
     Masks are looked for beside the photos and beside their folder; a file NAME_mask is a mask and no photo where
     there is a photo NAME.
     """
-    photos = next(
-        (place for place in (folder, *(folder / name for name in PHOTO_FOLDERS)) if place.is_dir() and _photos(place)),
-        None,
-    )
-    if photos is None:
-        inside = sorted(entry.name for entry in folder.iterdir())[:6]
-        raise ValueError(f"{folder}: expected photos, in the folder itself or in images/, found {inside}")
-    paths = _photos(photos)
-    roots = [folder, photos, *([photos.parent] if photos.name in PHOTO_FOLDERS else [])]
-    masks = masks_of({path: path.name for path in paths}, roots)
-    return PhotoFiles(tuple(paths), tuple(masks.get(path) for path in paths) if masks else ())
+    for place in (folder, *(folder / name for name in PHOTO_FOLDERS)):
+        if place.is_dir() and (paths := _photos(place)):
+            roots = [folder, place, *([place.parent] if place.name in PHOTO_FOLDERS else [])]
+            masks = masks_of({path: path.name for path in paths}, roots)
+            return PhotoFiles(tuple(paths), tuple(masks.get(path) for path in paths) if masks else ())
+    inside = sorted(entry.name for entry in folder.iterdir())[:6]
+    raise ValueError(f"{folder}: expected photos, in the folder itself or in images/, found {inside}")
 
 
 def describe_masks(images: Sequence[Path], masks: Sequence[Path | None]) -> str:
@@ -100,18 +96,17 @@ def _alpha_masks(paths: list[Path]) -> dict[Path, Path]:
 
     A photo that cannot be read has none: whether the capture goes on without it is not decided here.
     """
-    transparent = [path for path in paths if _is_readable_with(has_transparency, path)]
+
+    def holds(test: Callable[[Path], bool], path: Path) -> bool:
+        try:
+            return test(path)
+        except ValueError:
+            return False
+
+    transparent = [path for path in paths if holds(has_transparency, path)]
     sample = transparent[:: max(1, len(transparent) // _ALPHA_SAMPLES)]
-    if not any(_is_readable_with(lambda one: bool((read_alpha(one) < 1).any()), path) for path in sample):
-        return {}
-    return {path: path for path in transparent}
-
-
-def _is_readable_with(test: Callable[[Path], bool], path: Path) -> bool:
-    try:
-        return test(path)
-    except ValueError:
-        return False
+    varies = any(holds(lambda one: bool((read_alpha(one) < 1).any()), path) for path in sample)
+    return {path: path for path in transparent} if varies else {}
 
 
 def _mask_beside(image: Path) -> Path | None:

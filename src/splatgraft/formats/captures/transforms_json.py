@@ -3,7 +3,6 @@
 Also reads cameras.json, which the original 3DGS code writes beside a scene.
 """
 
-import json
 import math
 import os
 from functools import partial
@@ -11,24 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import IMAGE_SUFFIXES, stored_size
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.formats.captures.views import (
-    CaptureFile,
-    ViewRecord,
-    existing_file,
-    rigid,
-    view_or_reason,
-)
-from splatgraft.formats.json_file import array, excerpt, load, number, text, whole_side
+from splatgraft.formats.captures.views import CaptureFile, ViewRecord, existing_file, rigid, view_or_reason
+from splatgraft.formats.json_file import array, excerpt, load, number, save, text, whole_side
 from splatgraft.formats.scenes.ply import read_points, write_points
-from splatgraft.runtime.files import atomic_write
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
@@ -47,12 +36,8 @@ def read_json(path: Path) -> CaptureFile:
         for index, frame in enumerate(meta["frames"])
     ]
     if meta.get("ply_file_path") is None:
-        return CaptureFile(path, path.parent, views, _no_points)
+        return CaptureFile(path, path.parent, views)
     return CaptureFile(path, path.parent, views, lambda: read_points(path.parent / text(path, meta, "ply_file_path")))
-
-
-def _no_points() -> tuple[Float[Tensor, "0 3"], Float[Tensor, "0 3"]]:
-    return torch.zeros(0, 3), torch.zeros(0, 3)
 
 
 def _cameras_json(path: Path, entries: list[Any]) -> CaptureFile:
@@ -77,7 +62,7 @@ def _cameras_json(path: Path, entries: list[Any]) -> CaptureFile:
         )
     if not views:
         raise ValueError(f"{path}: expected a list of cameras, found none")
-    return CaptureFile(path, path.parent, views, _no_points)
+    return CaptureFile(path, path.parent, views)
 
 
 def _view(path: Path, index: int, meta: dict[str, Any], frame: Any) -> ViewRecord:
@@ -132,9 +117,9 @@ def _size(path: Path, camera: dict[str, Any], image_path: Path | None) -> tuple[
 
 def _focal(path: Path, camera: dict[str, Any], axis: str, extent: int) -> float | None:
     if f"fl_{axis}" in camera:
-        return number(path, camera, f"fl_{axis}", 0.0)
+        return number(path, camera, f"fl_{axis}")
     if f"camera_angle_{axis}" in camera:
-        angle = number(path, camera, f"camera_angle_{axis}", 0.0)
+        angle = number(path, camera, f"camera_angle_{axis}")
         if not 0 < angle < math.pi:
             raise ValueError(f"{path}: expected camera_angle_{axis} in (0, pi), found {angle:g}")
         return extent / 2 / math.tan(angle / 2)
@@ -198,5 +183,4 @@ def _dump(path: Path, shared: dict[str, Any], frames: list[dict[str, Any]]) -> N
     if all(frame.get(k) == frames[0].get(k) for frame in frames for k in (*same, *_COEFFICIENTS)):
         shared = {**shared, **{k: frames[0][k] for k in same}}
         frames = [{k: v for k, v in frame.items() if k not in same} for frame in frames]
-    with atomic_write(path) as stream:
-        stream.write((json.dumps({**shared, "frames": frames}, indent=1) + "\n").encode("utf-8"))
+    save(path, {**shared, "frames": frames})

@@ -60,7 +60,7 @@ class CaptureFile:
     """Where masks/ is looked for."""
     views: Sequence[ViewRecord | LeftOut]
     """One per photograph, or why it is left out."""
-    points: Callable[[], tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]]
+    points: Callable[[], tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]] = lambda: (torch.zeros(0, 3),) * 2
     """Reads sparse points, world units, and their colours, sRGB in [0, 1]."""
 
     def records(self) -> list[ViewRecord]:
@@ -110,7 +110,7 @@ def posed_images(file: CaptureFile, *, with_points: bool = True) -> PosedImages:
     fitted, without_mask = _with_masks(kept, file.folder)
     _require_share(sum(view.mask_path is not None for view in fitted), without_mask, "masks", file.source)
     cameras, distortions = _cameras_of(fitted, file.source)
-    points, colors = file.points() if with_points else (torch.zeros(0, 3), torch.zeros(0, 3))
+    points, colors = file.points() if with_points else (torch.zeros(0, 3),) * 2
     return PosedImages(
         image_paths=tuple(view.image_path for view in fitted if view.image_path),
         cameras=cameras,

@@ -150,12 +150,9 @@ def _accessor(
     start = view.get("byteOffset", 0)
     data = binary[start : start + view["byteLength"]]
     strides = (view.get("byteStride", dtype.itemsize * width), dtype.itemsize)
-    values = (
-        np.ndarray((count, width), dtype, data, accessor.get("byteOffset", 0), strides)
-        if count
-        else np.empty((0, width))
-    )
-    out = values.astype(np.float32)
+    if not count:
+        return np.empty((0, width), np.float32)
+    out = np.ndarray((count, width), dtype, data, accessor.get("byteOffset", 0), strides).astype(np.float32)
     return np.maximum(out / np.iinfo(dtype).max, -1) if accessor.get("normalized") and dtype.kind in "iu" else out
 
 
@@ -175,16 +172,12 @@ def write_gaussian_glb(path: Path, gaussians: Gaussians, metadata: SceneMetadata
     kinds = {width: kind for kind, width in _WIDTHS.items()}
     views, accessors, at = [], [], 0
     for values in arrays.values():
+        component = {"componentType": _FLOAT, "normalized": False}
+        if values.dtype != np.float32:
+            component = {"componentType": _BYTE, "normalized": True}
+        shape = {"count": len(values), "type": kinds[values.shape[1]]}
+        accessors.append({"bufferView": len(accessors), **component, **shape})
         views.append({"buffer": 0, "byteOffset": at, "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
-        accessors.append(
-            {
-                "bufferView": len(accessors),
-                "componentType": _FLOAT if values.dtype == np.float32 else _BYTE,
-                "normalized": values.dtype != np.float32,
-                "count": len(values),
-                "type": kinds[values.shape[1]],
-            }
-        )
         at += values.nbytes
     # the specification asks for these of positions
     accessors[0] |= {"min": arrays["POSITION"].min(0).tolist(), "max": arrays["POSITION"].max(0).tolist()}
