@@ -10,6 +10,7 @@ from typing import Any
 from splatgraft.core.images import read_mask, read_rgb
 from splatgraft.project.step import Device, Positional, choose_device, locked
 from splatgraft.runtime.console import Console
+from splatgraft_paper.synthesis.jobs import parse_image_size
 from splatgraft_paper.training.generate import (
     LICENCE,
     Photograph,
@@ -22,7 +23,6 @@ from splatgraft_paper.training.generate import (
 )
 from splatgraft_paper.training.pairs import crop_to_size
 from splatgraft_paper.training.prompts import prompt
-from splatgraft_paper.training.recipes import parse_image_size
 
 
 @dataclass(frozen=True)

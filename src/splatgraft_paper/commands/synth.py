@@ -5,10 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.project.step import Positional, locked
@@ -18,17 +15,14 @@ from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE, write_true_li
 from splatgraft_paper.synthesis import benchmark, pairs
 from splatgraft_paper.synthesis.jobs import (
     RenderWorkers,
+    parse_image_size,
     read_render_size,
     render_job,
     write_failures,
 )
 from splatgraft_paper.synthesis.places import SUPPLIED_MAPS
-from splatgraft_paper.synthesis.spheres import render_spheres
-from splatgraft_paper.training.pairs import RECORD_FILE, RelitSample, write_relit_manifest, write_sample
-from splatgraft_paper.training.recipes import parse_image_size
-
-_MAPS = (".hdr", ".exr")
-_MODELS = (".glb", ".gltf", ".obj", ".blend")
+from splatgraft_paper.training.pairs import RECORD_FILE, write_relit_manifest, write_sample
+from splatgraft_paper.training.spheres import render_spheres
 
 
 @dataclass(frozen=True)
@@ -60,13 +54,12 @@ class SynthPairs:
     def execute(self, console: Console) -> int:
         """Render what is missing, check everything; 1 where a scene failed or a pair is faulty."""
         plan = pairs.PairPlan(
-            scenes=self.scenes,
             objects=self.objects,
             lights=self.lights,
             seed=self.seed,
             size=read_render_size(self.size, self.samples),
-            maps=_files(self.maps, _MAPS, "--maps") or SUPPLIED_MAPS,
-            models=_files(self.models, _MODELS, "--models"),
+            maps=_files(self.maps, (".hdr", ".exr"), "--maps") or SUPPLIED_MAPS,
+            models=_files(self.models, (".glb", ".gltf", ".obj", ".blend"), "--models"),
         )
         python = self.workers.python(console)
         with locked(self.out):
@@ -114,18 +107,16 @@ class SynthBenchmark:
 
     def execute(self, console: Console) -> int:
         """Render what is missing, write the scenes as captures and check them; 1 where one failed."""
-        chosen, size = self._chosen(), self._size()
+        size = self._size()
+        planned = {which: list(zip(benchmark.plan(which, size), self._folders(which), strict=True))
+                   for which in self._chosen()}  # fmt: skip
         python = self.workers.python(console)
         with locked(self.out):
-            tasks = [
-                Task(folder.name, partial(render_job, job, folder, python))
-                for which in chosen
-                for job, folder in zip(benchmark.plan(which, size), self._folders(which), strict=True)
-            ]
+            jobs = [one for both in planned.values() for one in both]
+            tasks = [Task(folder.name, partial(render_job, job, folder, python)) for job, folder in jobs]
             failures = self.workers.run(tasks, console)
-            for which in chosen:
-                target, source = benchmark.plan(which, size)
-                if target.is_done(self._folders(which)[0]) and source.is_done(self._folders(which)[1]):
+            for which, both in planned.items():
+                if all(job.is_done(folder) for job, folder in both):
                     failures += self._gather(which, console)
             write_failures(self.out, failures, console)
         return 1 if failures else 0
@@ -151,7 +142,7 @@ class SynthBenchmark:
         return [known[name] for name in names] + (list(benchmark.ROTATIONS) if self.rotations else [])
 
     def _size(self) -> benchmark.BenchmarkSize:
-        named = benchmark.BenchmarkSize.named(self.size)
+        named = benchmark.SIZES[self.size]
         pixels = self.pixels or f"{named.render.width}x{named.render.height}"
         render = read_render_size(pixels, self.samples or named.render.samples)
         return benchmark.BenchmarkSize(render, self.views or named.views)
@@ -228,18 +219,11 @@ class SynthSpheres:
             for number in range(self.scenes):
                 folder = self.out / f"{number:05d}"
                 if not (folder / RECORD_FILE).is_file():
-                    shown = render_spheres(
-                        self.seed * 1_000_003 + number, width=width, height=height, lights=self.lights
-                    )
-                    relit = [_tensor(picture) for picture in shown.relit]
-                    sample = RelitSample(_tensor(shown.target), _tensor(shown.background), _tensor(shown.mask), relit)
+                    seed = self.seed * 1_000_003 + number
+                    sample = render_spheres(seed, width=width, height=height, lights=self.lights)
                     write_sample(folder, sample, {"group": folder.name, "licence": "own render"})
                 progress(number + 1, self.scenes, folder.name)
             count = write_relit_manifest(self.out)
         console.say(f"{count} scenes with {self.lights} pairs each")
         console.result(self.out / "manifest.jsonl")
         return 0
-
-
-def _tensor(picture: np.ndarray) -> Float[Tensor, "h w *c"]:
-    return torch.from_numpy(np.ascontiguousarray(picture)).float()

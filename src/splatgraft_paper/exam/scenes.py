@@ -2,6 +2,7 @@
 
 import random
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,7 +32,7 @@ from splatgraft.runtime.workers import Task, run_tasks
 from splatgraft_paper.benchmark.measure import true_view
 from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY, GroundTruthScene, compose_scene
 from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE, read_probe, write_true_light
-from splatgraft_paper.synthesis.benchmark import BenchmarkScene, BenchmarkSize, draw_scene, find_defect, gather, plan
+from splatgraft_paper.synthesis.benchmark import BenchmarkScene, BenchmarkSize, find_defect, gather, plan
 from splatgraft_paper.synthesis.jobs import RenderSize, render_job
 from splatgraft_paper.synthesis.places import KINDS
 
@@ -54,8 +55,15 @@ def draw_scenes(number: int, count: int) -> tuple[BenchmarkScene, ...]:
     """
     rng = random.Random(f"exam-{number}")
     kinds = rng.sample(KINDS, len(KINDS))
-    order = [kinds[i % len(kinds)] for i in range(count)]
-    return tuple(draw_scene(rng, f"{i:02d}_{kind}", kind, _SEEDS, SIZE) for i, kind in enumerate(order))
+    scenes: list[BenchmarkScene] = []
+    while len(scenes) < count:
+        kind = kinds[len(scenes) % len(kinds)]
+        seeds = rng.randrange(*_SEEDS), rng.randrange(*_SEEDS)
+        scene = BenchmarkScene(f"{len(scenes):02d}_{kind}", kind, *seeds)
+        with suppress(ValueError):
+            plan(scene, SIZE)
+            scenes.append(scene)
+    return tuple(scenes)
 
 
 def render_scene(which: BenchmarkScene, out: Path, blender_python: Path, *, jobs: int) -> Path:

@@ -29,7 +29,7 @@ from splatgraft_paper.synthesis import objects
 from splatgraft_paper.synthesis.furniture import Palette, box, cabinet, placed, plant
 from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take
 from splatgraft_paper.synthesis.places import SUPPLIED_MAPS, make_scene
-from splatgraft_paper.synthesis.scene import Material, Part, Place, Scene, World, capture_cameras
+from splatgraft_paper.synthesis.scene import Material, Part, Place, Scene, World, add, capture_cameras
 
 _OBJECT_POINTS = 40_000
 """Sampled points on the object, from which its true normals follow."""
@@ -77,14 +77,8 @@ class BenchmarkSize:
     render: RenderSize
     views: int
 
-    @staticmethod
-    def named(name: str) -> "BenchmarkSize":
-        """Look up a size: `small` (352x248, 40 views) or `paper` (704x496, 200 views)."""
-        if name == "small":
-            return BenchmarkSize(RenderSize.small(), 40)
-        if name == "paper":
-            return BenchmarkSize(RenderSize(), 200)
-        raise ValueError(f"benchmark size: expected small or paper, found '{name}'")
+
+SIZES = {"small": BenchmarkSize(RenderSize(352, 248, 16), 40), "paper": BenchmarkSize(RenderSize(), 200)}
 
 
 def pedestal_scene(seed: int, place: Place) -> Scene:
@@ -93,8 +87,8 @@ def pedestal_scene(seed: int, place: Place) -> Scene:
     palette = Palette(rng)
     x, y, z = place.location
     top = max(0.5, 3.2 * place.radius)
-    pedestal_material = replace(palette.stone(), roughness=0.7, scale=2.0)
-    pedestal = Part("cylinder", (top, top, 0.4), (x, y, z - 0.2), pedestal_material, bevel=0.02)
+    stone = replace(palette.stone(), roughness=0.7, scale=2.0)
+    pedestal = Part("cylinder", (top, top, 0.4), (x, y, z - 0.2), stone, bevel=0.02)
     ground = box((14, 14, 0.1), (x, y, z - 0.45), Material("tiles", (0.3, 0.29, 0.27), (0.2, 0.2, 0.2), 0.7))
     parts = [pedestal, ground]
     for i in range(5):
@@ -122,53 +116,35 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
     parts = objects.make(which.object_seed, place)
     height = max(part.location[2] + part.size[2] / 2 for part in parts)
     yaw = random.Random(f"yaw-{which.seed}").uniform(0, 6.283)
-    source_parts = placed(parts, place.location, yaw)
-    target_parts = placed(parts, place.location, yaw + math.radians(which.pose_deg))
-    object_passes: tuple[str, ...] = ("color", "mask", "depth")
-    middle = (place.location[0], place.location[1], place.location[2] + height / 2)
-    provenance = {"scene": which.name, "pose_deg": str(which.pose_deg), "licence": "own render"}
-    target = Job(
-        scene=scene,
-        objects={"object": target_parts},
-        cameras=capture_cameras(scene, place, height, size.views, which.seed),
-        takes=(
-            Take("target", scene=True, passes=("color", "depth")),
-            Take("ground_truth", scene=True, object="object", passes=object_passes),
-            Take("light", scene=True, probe=middle),
-        ),
-        size=size.render,
-        provenance=provenance,
-    )
-    pedestal = pedestal_scene(which.object_seed, place)
-    source = Job(
-        scene=pedestal,
-        objects={"object": source_parts},
-        cameras=capture_cameras(pedestal, place, height, size.views, which.object_seed),
-        takes=(
-            Take("source", scene=True, object="object", passes=object_passes),
-            Take("old_light", scene=True, probe=middle),
-            Take(
-                "surface",
-                scene=False,
-                object="object",
-                surface=SurfaceSampling(_OBJECT_POINTS, middle, _SURFACE_RADIUS),
-            ),
-        ),
-        size=size.render,
-        provenance=provenance,
-    )
+    middle = add(place.location, (0, 0, height / 2))
+
+    def job(scene: Scene, yaw: float, seed: int, *takes: Take) -> Job:
+        return Job(
+            scene=scene,
+            objects={"object": placed(parts, place.location, yaw)},
+            cameras=capture_cameras(scene, place, height, size.views, seed),
+            takes=takes,
+            size=size.render,
+            provenance={"scene": which.name, "pose_deg": str(which.pose_deg), "licence": "own render"},
+        )
+
+    def with_object(name: str) -> Take:
+        return Take(name, scene=True, object="object", passes=("color", "mask", "depth"))
+
+    target = job(
+        scene, yaw + math.radians(which.pose_deg), which.seed,
+        Take("target", scene=True, passes=("color", "depth")),
+        with_object("ground_truth"),
+        Take("light", scene=True, probe=middle),
+    )  # fmt: skip
+    surface = SurfaceSampling(_OBJECT_POINTS, middle, _SURFACE_RADIUS)
+    source = job(
+        pedestal_scene(which.object_seed, place), yaw, which.object_seed,
+        with_object("source"),
+        Take("old_light", scene=True, probe=middle),
+        Take("surface", scene=False, object="object", surface=surface),
+    )  # fmt: skip
     return target, source
-
-
-def draw_scene(rng: random.Random, name: str, kind: str, seeds: tuple[int, int], size: BenchmarkSize) -> BenchmarkScene:
-    """Draw the seeds of a scene and its object; those whose scene has no room for the cameras are drawn again."""
-    while True:
-        scene = BenchmarkScene(name, kind, rng.randrange(*seeds), rng.randrange(*seeds))
-        try:
-            plan(scene, size)
-        except ValueError:
-            continue
-        return scene
 
 
 def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
@@ -220,9 +196,8 @@ def gather_capture(rendered: Path, take: str, out: Path, *, passes: tuple[str, .
                 shutil.copyfile(rendered / take / f"{stem}{suffix}", out / folder / f"{stem}{ending}")
     cameras = rendered_cameras(rendered, tuple(f"{stem}.png" for stem in stems))
     found, colors = sparse_points(rendered / take, cameras) if points else (torch.zeros(0, 3), torch.zeros(0, 3))
-    image_paths = tuple(out / "images" / f"{stem}.png" for stem in stems)
-    mask_paths = tuple(out / "masks" / f"{stem}.png" for stem in stems) if "masks" in passes else ()
-    write_capture(out, PosedImages(image_paths, cameras, found, colors, mask_paths))
+    image_paths, mask_paths = (tuple(out / name / f"{stem}.png" for stem in stems) for name in ("images", "masks"))
+    write_capture(out, PosedImages(image_paths, cameras, found, colors, mask_paths if "masks" in passes else ()))
 
 
 _CLIPPED, _MAX_CLIPPED = 0.995, 0.6
@@ -238,9 +213,8 @@ def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out:
     """Write one rendered scene as captures, with its placement, its true lights and the object's true surface."""
     gather_capture(source_render, "source", out / "source", passes=("images", "masks"), points=True)
     gather_capture(target_render, "target", out / "target", passes=("images",), points=True)
-    gather_capture(
-        target_render, "ground_truth", out / "ground_truth", passes=("images", "masks", "depth"), points=False
-    )
+    passes = ("images", "masks", "depth")
+    gather_capture(target_render, "ground_truth", out / "ground_truth", passes=passes, points=False)
     scene = make_scene(which.kind, which.seed)
     angle = math.radians(which.pose_deg)
     c, s = math.cos(angle), math.sin(angle)
@@ -248,12 +222,15 @@ def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out:
     center = torch.tensor(scene.places[0].location)
     moved = Similarity(scale=1.0, rotation=rotation, translation=center - rotation @ center)
     write_placement(out / "placement.json", Placement((ObjectPlacement(moved),)))
-    shutil.copyfile(target_render / "light" / "0000.npy", out / "probe.npy")
-    shutil.copyfile(target_render / "light" / "suns.json", out / "suns.json")
     (out / "old_light").mkdir(exist_ok=True)
-    for name in ("0000.npy", "suns.json"):
-        shutil.copyfile(source_render / "old_light" / name, out / "old_light" / name)
-    shutil.copyfile(source_render / "surface" / "0000.npy", out / "surface.npy")
+    for given, name in (
+        (target_render / "light" / "0000.npy", "probe.npy"),
+        (target_render / "light" / "suns.json", "suns.json"),
+        (source_render / "old_light" / "0000.npy", "old_light/0000.npy"),
+        (source_render / "old_light" / "suns.json", "old_light/suns.json"),
+        (source_render / "surface" / "0000.npy", "surface.npy"),
+    ):
+        shutil.copyfile(given, out / name)
     record = {"kind": which.kind, "pose_deg": which.pose_deg, "seed": which.seed, **scene.notes}
     (out / "scene.json").write_text(json.dumps(record, indent=1) + "\n")
 
@@ -261,13 +238,11 @@ def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out:
 def find_defect(folder: Path) -> str | None:
     """Describe the first defect of a scene in one line, or None: a missing, broken, black, clipped or empty picture."""
     try:
-        truth, target = read_capture(folder / "ground_truth"), read_capture(folder / "target")
-        source = read_capture(folder / "source")
-        for capture, masked in ((truth, True), (target, False), (source, True)):
-            for index in range(len(capture)):
-                defect = _find_view_defect(capture, index, masked=masked)
-                if defect:
-                    return defect
+        for name in ("ground_truth", "target", "source"):
+            capture = read_capture(folder / name)
+            found = (_find_view_defect(capture, index, masked=name != "target") for index in range(len(capture)))
+            if defect := next(filter(None, found), None):
+                return defect
     except ValueError as error:
         return str(error)
     return None
@@ -277,9 +252,8 @@ def _find_view_defect(capture: PosedImages, index: int, *, masked: bool) -> str 
     path, image = capture.image_paths[index], capture.image(index)
     mean, deviation, clipped = float(image.mean()), float(image.std()), float((image > _CLIPPED).float().mean())
     if mean < _MIN_MEAN or deviation < _MIN_DEVIATION or clipped > _MAX_CLIPPED:
-        return (
-            f"{path}: expected a lit picture, found mean {mean:.3f}, deviation {deviation:.3f}, {clipped:.0%} clipped"
-        )
+        found = f"mean {mean:.3f}, deviation {deviation:.3f}, {clipped:.0%} clipped"
+        return f"{path}: expected a lit picture, found {found}"
     mask = capture.mask(index) if masked else None
     if masked and mask is None:
         return f"{path}: expected a mask beside it, found none"

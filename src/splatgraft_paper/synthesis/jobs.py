@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -25,11 +24,6 @@ class RenderSize:
     height: int = 496
     samples: int = 128
     """Light paths per pixel."""
-
-    @staticmethod
-    def small() -> "RenderSize":
-        """A quarter of the paper's pixels, with 16 samples."""
-        return RenderSize(width=352, height=248, samples=16)
 
 
 @dataclass(frozen=True)
@@ -84,24 +78,18 @@ class Job:
     provenance: dict[str, str] = field(default_factory=dict)
     """Seeds, kinds and licences, written beside the pictures."""
 
-    def files(self, out: Path) -> Iterator[Path]:
-        """List the files that mark finished pictures, one per take and camera."""
-        for take in self.takes:
-            for i in range(len(self.cameras)) if take.is_pictures else (0,):
-                yield out / take.name / f"{i:04d}.done"
-
     def is_done(self, out: Path) -> bool:
-        """Whether everything is rendered."""
-        return all(path.exists() for path in self.files(out))
+        """Whether everything is rendered; a file marks each picture of a take."""
+        counts = {take.name: len(self.cameras) if take.is_pictures else 1 for take in self.takes}
+        return all((out / name / f"{i:04d}.done").exists() for name, count in counts.items() for i in range(count))
 
 
 def _description(job: Job, out: Path) -> str:
-    takes = [{key: value for key, value in asdict(take).items() if value is not None} for take in job.takes]
-    scene = json.loads(job.scene.to_json())
-    objects = {key: [asdict(part) for part in parts] for key, parts in job.objects.items()}
-    cameras = [asdict(camera) for camera in job.cameras]
-    found = {"out": str(out), "scene": scene, "objects": objects, "cameras": cameras, "takes": takes, "seed": job.seed}
-    return json.dumps({**found, **asdict(job.size), "provenance": job.provenance}, indent=1)
+    found = asdict(job)
+    takes = [{key: value for key, value in take.items() if value is not None} for take in found["takes"]]
+    named = {name: found[name] for name in ("scene", "objects", "cameras")}
+    record = {"out": str(out), **named, "takes": takes, "seed": job.seed, **found["size"]}
+    return json.dumps({**record, "provenance": job.provenance}, indent=1)
 
 
 def render_job(job: Job, out: Path, blender_python: Path) -> None:
@@ -114,10 +102,8 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
     log = out / "render.log"
     code = run_logged([str(blender_python), str(_WORKER), str(description)], log)
     if not job.is_done(out):
-        tail = log.read_text(errors="replace").strip().splitlines()
-        said = next(
-            (line for line in reversed(tail) if "Error" in line and "freed" not in line), tail[-1] if tail else ""
-        )
+        tail = log.read_text(errors="replace").strip().splitlines() or [""]
+        said = next((line for line in reversed(tail) if "Error" in line and "freed" not in line), tail[-1])
         raise ValueError(f"{log}: expected Blender to render every picture, found exit code {code}: {said}")
 
 
@@ -138,7 +124,6 @@ def check_blender(blender_python: Path) -> str:
     return found[-1].removeprefix("version ")
 
 
-FAILURES_FILE = "failures.txt"
 _SHOWN_FAILURES = 10
 
 
@@ -165,19 +150,26 @@ class RenderWorkers:
             return run_tasks(tasks, at_once=self.processes, ray_address=self.ray, progress=progress)
 
 
-def read_render_size(text: str, samples: int) -> RenderSize:
-    """Parse WIDTHxHEIGHT."""
+def parse_image_size(text: str, *, multiple_of: int = 1) -> tuple[int, int]:
+    """Parse --size WIDTHxHEIGHT; both must be multiples of `multiple_of` pixels."""
     parts = text.split("x")
-    if len(parts) != 2 or not all(part.isdigit() and int(part) >= 16 for part in parts) or samples < 1:
-        raise ValueError(
-            f"--size, --samples: expected such as 704x496 and at least one sample, found {text}, {samples}"
-        )
-    return RenderSize(int(parts[0]), int(parts[1]), samples)
+    if len(parts) != 2 or not all(part.isdigit() and int(part) and int(part) % multiple_of == 0 for part in parts):
+        wanted = "WIDTHxHEIGHT" if multiple_of == 1 else f"WIDTHxHEIGHT in multiples of {multiple_of}"
+        raise ValueError(f"--size: expected {wanted}, found {text}")
+    return int(parts[0]), int(parts[1])
+
+
+def read_render_size(text: str, samples: int) -> RenderSize:
+    """Parse WIDTHxHEIGHT of pictures that Blender is to render."""
+    size = parse_image_size(text)
+    if min(*size, 16 * samples) < 16:
+        raise ValueError(f"--size, --samples: expected at least 16x16 and one sample, found {text}, {samples}")
+    return RenderSize(*size, samples)
 
 
 def write_failures(out: Path, failures: list[str], console: Console) -> None:
     """Write failures.txt, or remove it where nothing failed, and say the first lines."""
-    path = out / FAILURES_FILE
+    path = out / "failures.txt"
     path.unlink(missing_ok=True)
     if failures:
         path.write_text("\n".join(failures) + "\n")

@@ -27,11 +27,12 @@ from torch import Tensor
 
 from splatgraft.core.images import read_rgb, read_straight_rgb
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import atomic_write
 from splatgraft_paper.synthesis import objects
 from splatgraft_paper.synthesis.furniture import placed
 from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take, write_failures
 from splatgraft_paper.synthesis.places import KINDS, SUPPLIED_MAPS, make_scene
-from splatgraft_paper.synthesis.scene import World, camera_arc
+from splatgraft_paper.synthesis.scene import World, add, camera_arc
 
 _OBJECT_POINTS, _SCENE_POINTS = 12_000, 100_000
 """Sampled points per object and per scene."""
@@ -41,16 +42,14 @@ _SURFACE_RADIUS = 8.0
 
 @dataclass(frozen=True)
 class PairPlan:
-    """Options of a set of pairs; there are scenes x 5 cameras x objects x lights pairs."""
+    """Options of a set of pairs; a scene gives 5 cameras x objects x lights pairs."""
 
-    scenes: int = 60
     objects: int = 2
     """Per scene; the background is rendered once for all."""
     lights: int = 3
     """Environment maps per object."""
     seed: int = 0
     size: RenderSize = field(default_factory=RenderSize)
-    kinds: tuple[str, ...] = KINDS
     maps: tuple[str, ...] = SUPPLIED_MAPS
     """Environment maps: files, or names of those that come with Blender."""
     models: tuple[str, ...] = ()
@@ -60,7 +59,7 @@ class PairPlan:
 def plan(options: PairPlan, number: int) -> Job:
     """Plan the job of scene `number`, determined by it and the seed."""
     rng = random.Random(f"pairs-{options.seed}-{number}")
-    kind = options.kinds[number % len(options.kinds)]
+    kind = KINDS[number % len(KINDS)]
     scene = make_scene(kind, options.seed * 100_003 + number)
     place = scene.places[0]
     things, heights = {}, []
@@ -71,7 +70,8 @@ def plan(options: PairPlan, number: int) -> Job:
             parts = objects.make(rng.randrange(2**31), place)
         heights.append(max(part.location[2] + part.size[2] / 2 for part in parts))
         things[f"object{i}"] = placed(parts, place.location, rng.uniform(0, 6.283))
-    middle = (place.location[0], place.location[1], place.location[2] + 0.5 * max(heights))
+    middle = add(place.location, (0, 0, 0.5 * max(heights)))
+    on_object, on_scene = (SurfaceSampling(n, middle, _SURFACE_RADIUS) for n in (_OBJECT_POINTS, _SCENE_POINTS))
     takes = [Take("background", scene=True)]
     for name in things:
         takes.append(Take(name, scene=True, object=name, passes=("color", "mask", "depth", "normal", "albedo")))
@@ -80,16 +80,8 @@ def plan(options: PairPlan, number: int) -> Job:
             alone = f"{name}_light{light}"
             takes.append(Take(alone, scene=False, object=name, world=world, exposure_group=alone))
             takes.append(Take(f"{alone}_probe", scene=False, world=world, exposure_group=alone, probe=middle))
-        takes.append(
-            Take(
-                f"{name}_surface",
-                scene=False,
-                object=name,
-                surface=SurfaceSampling(_OBJECT_POINTS, middle, _SURFACE_RADIUS),
-            )
-        )
-    takes.append(Take("place_probe", scene=True, probe=middle))
-    takes.append(Take("scene_surface", scene=True, surface=SurfaceSampling(_SCENE_POINTS, middle, _SURFACE_RADIUS)))
+        takes.append(Take(f"{name}_surface", scene=False, object=name, surface=on_object))
+    takes += [Take("place_probe", scene=True, probe=middle), Take("scene_surface", scene=True, surface=on_scene)]
     cameras = camera_arc(scene, place, max(heights), number)
     provenance = {"kind": kind, "seed": str(options.seed), "number": str(number), "licence": "own render"}
     return Job(scene, things, cameras, tuple(takes), options.size, number, provenance)
@@ -165,21 +157,20 @@ def find_defect(sample: PairSample) -> str | None:
     luma, inside = target.mean(-1), mask > 0.5
     covered, clipped = float(inside.float().mean()), float((luma > 0.995).float().mean())
     mean, deviation = float(luma.mean()), float(luma.std())
+    level = f"mean {mean:.3f}, deviation {deviation:.3f}"
     far = torch.nn.functional.max_pool2d(mask[None, None], 31, 1, 15)[0, 0] < 0.01
     difference = float((target - background)[far].abs().median()) if bool(far.any()) else 0.0
     lit = float(relit[inside].mean()) if covered else 0.0
-    lines = f"mean {mean:.3f}, deviation {deviation:.3f}"
     # thresholds set by hand on rendered pairs
     checks = (
         (0.002 <= covered <= 0.7, mask_path, "a mask of 0.2% to 70%", f"{covered:.2%}"),
-        (mean > 0.02 and deviation > 0.01, target_path, "a lit picture", lines),
+        (mean > 0.02 and deviation > 0.01, target_path, "a lit picture", level),
         (clipped <= 0.4, target_path, "at most 40% clipped", f"{clipped:.0%}"),
         (lit > 0.01, relit_path, "a lit object", f"mean {lit:.3f}"),
         (difference <= 0.08, background_path, "the target's scene", f"a median difference of {difference:.3f}"),
     )
-    return next(
-        (f"{path}: expected {expected}, found {found}" for sound, path, expected, found in checks if not sound), None
-    )
+    wrong = (f"{path}: expected {expected}, found {found}" for sound, path, expected, found in checks if not sound)
+    return next(wrong, None)
 
 
 def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
@@ -188,15 +179,13 @@ def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
     for folder in folders:
         provenance = json.loads((folder / "job.json").read_text()).get("provenance", {})
         for sample in samples_in(folder):
-            defect = find_defect(sample)
-            if defect:
+            if defect := find_defect(sample):
                 defects.append(defect)
                 continue
             entry = {"folder": folder.name, "camera": sample.camera, "object": sample.object, "light": sample.light}
-            lines.append(json.dumps({**entry, **provenance}))
-    partial = out / "manifest.jsonl.partial"
-    partial.write_text("\n".join(lines) + "\n" if lines else "")
-    partial.replace(out / "manifest.jsonl")
+            lines.append(json.dumps({**entry, **provenance}) + "\n")
+    with atomic_write(out / "manifest.jsonl") as stream:
+        stream.write("".join(lines).encode())
     return len(lines), defects
 
 
@@ -204,18 +193,15 @@ def read_manifest(out: Path) -> list[PairSample]:
     """Read the sound pairs of a folder."""
     path = out / "manifest.jsonl"
     if not path.is_file():
-        raise ValueError(
-            f"{path}: expected the manifest of rendered pairs, found none (splatgraft paper synth pairs makes one)"
-        )
+        raise ValueError(f"{path}: expected the manifest of rendered pairs, found none (splatgraft paper synth pairs)")
     samples = []
     for number, line in enumerate(path.read_text().splitlines(), 1):
         try:
             entry = json.loads(line)
             samples.append(PairSample(out / entry["folder"], int(entry["camera"]), entry["object"], entry["light"]))
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"{path}, line {number}: expected folder, camera, object and light, found {line[:80]}"
-            ) from error
+            wanted = "folder, camera, object and light"
+            raise ValueError(f"{path}, line {number}: expected {wanted}, found {line[:80]}") from error
     return samples
 
 

@@ -4,10 +4,9 @@ All values are plain data (numbers, strings, tuples), in metres with z up, so th
 Blender's interpreter can read. Colours are linear RGB.
 """
 
-import json
 import math
 import random
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Literal
 
 Number = float | int
@@ -15,22 +14,9 @@ Vector = tuple[Number, Number, Number]
 Color = tuple[float, float, float]
 
 Pattern = Literal[
-    "plain",
-    "planks",
-    "wood",
-    "tiles",
-    "brick",
-    "fabric",
-    "rug",
-    "marble",
-    "plaster",
-    "speckle",
-    "stripes",
-    "checker",
-    "painting",
-    "grass",
-    "metal",
-]
+    "plain", "planks", "wood", "tiles", "brick", "fabric", "rug", "marble", "plaster", "speckle", "stripes", "checker",
+    "painting", "grass", "metal",
+]  # fmt: skip
 Shape = Literal[
     "box", "cushion", "cylinder", "sphere", "turned", "extruded", "blob", "torus", "tuft", "foliage", "model"
 ]
@@ -154,10 +140,6 @@ class Scene:
     notes: dict[str, str] = field(default_factory=dict)
     """Description of the true light, for the benchmark's `scene.json`."""
 
-    def to_json(self) -> str:
-        """The scene as JSON, which `blender/` reads without this package."""
-        return json.dumps(asdict(self), indent=1)
-
 
 def rotate_z(point: Vector, angle: Number) -> Vector:
     """Rotate `point` about the z axis, radians."""
@@ -172,17 +154,12 @@ def add(a: Vector, b: Vector) -> Vector:
 
 def direction(azimuth: Number, elevation: Number) -> Vector:
     """Unit vector towards an azimuth (from +x towards +y) and an elevation above the horizon, radians."""
-    return (
-        math.cos(elevation) * math.cos(azimuth),
-        math.cos(elevation) * math.sin(azimuth),
-        math.sin(elevation),
-    )
+    flat = math.cos(elevation)
+    return (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
 
 
 ARC_LENGTH = 5
 """Views per camera arc (paper, Sec. 5.2)."""
-
-
 _OBSTACLE_MARGIN = 0.12
 """Metres between cameras and obstacles."""
 _ARC_TRIES, _CAPTURE_TRIES = 400, 40
@@ -199,11 +176,7 @@ def _is_free(scene: Scene, eye: Vector) -> bool:
 
 def _eye(target: Vector, azimuth: Number, elevation: Number, distance: Number) -> Vector:
     flat = distance * math.cos(elevation)
-    return (
-        target[0] + flat * math.cos(azimuth),
-        target[1] + flat * math.sin(azimuth),
-        target[2] + distance * math.sin(elevation),
-    )
+    return add(target, (flat * math.cos(azimuth), flat * math.sin(azimuth), distance * math.sin(elevation)))
 
 
 def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> tuple[Camera, ...]:
@@ -211,16 +184,15 @@ def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> 
     rng = random.Random(f"arc-{scene.name}-{seed}")
     # outdoors, a camera that looks steeply down sees only the ground
     highest = 0.45 if scene.world.kind != "color" else 0.8
-    target = (place.location[0], place.location[1], place.location[2] + 0.45 * object_height)
+    target = add(place.location, (0, 0, 0.45 * object_height))
     for _ in range(_ARC_TRIES):
         azimuth, elevation = rng.uniform(0, 2 * math.pi), rng.uniform(0.12, highest)
         distance = max(0.55, object_height * rng.uniform(2.4, 5.0))
         sweep = rng.uniform(0.25, 0.6)
         field = rng.uniform(0.8, 1.1)
-        aim = (target[0] + rng.gauss(0, 0.06), target[1] + rng.gauss(0, 0.06), target[2] + rng.gauss(0, 0.03))
-        eyes = [
-            _eye(target, azimuth + sweep * (i / (ARC_LENGTH - 1) - 0.5), elevation, distance) for i in range(ARC_LENGTH)
-        ]
+        aim = add(target, (rng.gauss(0, 0.06), rng.gauss(0, 0.06), rng.gauss(0, 0.03)))
+        turns = [sweep * (i / (ARC_LENGTH - 1) - 0.5) for i in range(ARC_LENGTH)]
+        eyes = [_eye(target, azimuth + turn, elevation, distance) for turn in turns]
         if all(_is_free(scene, eye) for eye in eyes):
             return tuple(Camera(eye, aim, field) for eye in eyes)
     raise ValueError(f"scene {scene.name}: expected room for an arc of cameras around {place.location}, found none")
@@ -229,7 +201,7 @@ def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> 
 def capture_cameras(scene: Scene, place: Place, object_height: Number, count: int, seed: int) -> tuple[Camera, ...]:
     """Place cameras all around the object in three rings of different heights, ordered by ring and azimuth."""
     rng = random.Random(f"capture-{scene.name}-{seed}")
-    target = (place.location[0], place.location[1], place.location[2] + 0.4 * object_height)
+    target = add(place.location, (0, 0, 0.4 * object_height))
     cameras: list[Camera] = []
     rings = 3
     for i in range(count * _CAPTURE_TRIES):
@@ -245,7 +217,7 @@ def capture_cameras(scene: Scene, place: Place, object_height: Number, count: in
         eye = _eye(target, azimuth, min(1.3, max(0.08, elevation)), distance)
         if not _is_free(scene, eye):
             continue
-        aim = (target[0] + rng.gauss(0, 0.07), target[1] + rng.gauss(0, 0.07), target[2] + rng.gauss(0, 0.05))
+        aim = add(target, (rng.gauss(0, 0.07), rng.gauss(0, 0.07), rng.gauss(0, 0.05)))
         cameras.append(Camera(eye, aim, 1.05))
     if len(cameras) < count:
         raise ValueError(f"scene {scene.name}: expected room for {count} cameras, found {len(cameras)}")

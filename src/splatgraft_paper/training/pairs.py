@@ -22,8 +22,9 @@ from torch import Tensor
 
 from splatgraft.core.images import read_mask, read_rgb, read_straight_rgb, resize, write_image
 from splatgraft.runtime.files import atomic_folder, atomic_write
+from splatgraft_paper.synthesis.jobs import parse_image_size
 from splatgraft_paper.synthesis.pairs import composite, match_statistics, read_manifest
-from splatgraft_paper.training.recipes import Recipe, parse_image_size
+from splatgraft_paper.training.recipes import Recipe
 
 Role = Literal["composite", "target", "background", "mask"]
 MANIFEST_FILE = "manifest.jsonl"

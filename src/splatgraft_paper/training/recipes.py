@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splatgraft_paper.synthesis.jobs import parse_image_size
+
 _FOLDER = Path(__file__).with_name("recipe_files")
 _GPU_SECONDS_PER_PAIR = 48 * 3600 * 4 / (50_000 * 4)
 """FLUX at 704x496 with all weights on an H100: the paper's two days on four for 50K steps of 4 pairs (Sec. 5.3)."""
@@ -168,12 +170,3 @@ def _size(count: int) -> str:
     if count >= 1e8:
         return f"{count / 1e9:.{0 if count >= 1e10 else 1}f} GB"
     return f"{count / 1e6:.0f} MB"
-
-
-def parse_image_size(text: str, *, multiple_of: int = 1) -> tuple[int, int]:
-    """Parse --size WIDTHxHEIGHT; both must be multiples of `multiple_of` pixels."""
-    parts = text.split("x")
-    if len(parts) != 2 or not all(part.isdigit() and int(part) and int(part) % multiple_of == 0 for part in parts):
-        wanted = "WIDTHxHEIGHT" if multiple_of == 1 else f"WIDTHxHEIGHT in multiples of {multiple_of}"
-        raise ValueError(f"--size: expected {wanted}, found {text}")
-    return int(parts[0]), int(parts[1])

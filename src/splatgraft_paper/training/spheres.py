@@ -8,6 +8,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+
+from splatgraft_paper.training.pairs import RelitSample
 
 _SAMPLES = 3
 """Rays per pixel and side, so that masks have soft edges."""
@@ -27,19 +30,7 @@ class Sun:
     """On a surface that faces it, linear RGB."""
 
 
-@dataclass(frozen=True)
-class SpherePictures:
-    """The pictures of one pair source, sRGB in [0, 1], (h w 3) each but the mask."""
-
-    target: np.ndarray
-    background: np.ndarray
-    mask: np.ndarray
-    """Coverage by the object, (h w)."""
-    relit: tuple[np.ndarray, ...]
-    """The target's view under other suns."""
-
-
-def render_spheres(seed: int, *, width: int, height: int, lights: int) -> SpherePictures:
+def render_spheres(seed: int, *, width: int, height: int, lights: int) -> RelitSample:
     """Render the scene of a seed, and its view under so many other suns."""
     rng = np.random.default_rng(seed)
     floor, sky = rng.uniform(0.2, 0.6, 3), rng.uniform(0.2, 0.8, 3)
@@ -50,16 +41,19 @@ def render_spheres(seed: int, *, width: int, height: int, lights: int) -> Sphere
     suns = [_sun(rng) for _ in range(1 + lights)]
     rays, eye = _rays(width, height)
 
-    def picture(shown: list, sun: Sun) -> np.ndarray:
-        return _reduced(_srgb(_radiance(rays, eye, shown, (floor, sky), sun)), width, height)
+    def reduced(samples: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(samples.reshape(height, _SAMPLES, width, _SAMPLES, -1).mean((1, 3))).float()
+
+    def picture(shown: list, sun: Sun) -> torch.Tensor:
+        return reduced(_srgb(_radiance(rays, eye, shown, (floor, sky), sun)))
 
     hit = _distance(rays, eye, balls[1])
     first = np.isfinite(hit) & (hit < _distance(rays, eye, balls[0]))
-    return SpherePictures(
+    return RelitSample(
         target=picture(balls, suns[0]),
         background=picture(balls[:1], suns[0]),
-        mask=_reduced(first[..., None].astype(float), width, height)[..., 0],
-        relit=tuple(picture(balls, sun) for sun in suns[1:]),
+        mask=reduced(first[..., None].astype(float))[..., 0],
+        relit=[picture(balls, sun) for sun in suns[1:]],
     )
 
 
@@ -121,7 +115,3 @@ def _radiance(rays: np.ndarray, eye: np.ndarray, balls: list, surroundings: tupl
 def _srgb(linear: np.ndarray) -> np.ndarray:
     linear = linear.clip(0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def _reduced(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    return picture.reshape(height, _SAMPLES, width, _SAMPLES, -1).mean((1, 3))
