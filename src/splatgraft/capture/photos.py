@@ -97,7 +97,7 @@ def _camera_traits(copy: Path) -> tuple[object, ...]:
 
 
 def write_undistorted(
-    copy: Path, path: Path, mask: tuple[Path, Path] | None, distortion: Distortion
+    copy: Path, path: Path, distortion: Distortion, *, mask: tuple[Path, Path] | None = None
 ) -> Float[Tensor, "3 3"]:
     """Write the pinhole image of `copy` to `path` as JPEG with its exposure metadata, and of a mask (from, to) as PNG.
 

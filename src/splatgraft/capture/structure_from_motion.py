@@ -211,7 +211,7 @@ def _posed_images(model: Mapping[str, Any], photos: Path, masks: Mapping[str, Pa
         matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
         distortion = Distortion(matrix, torch.tensor([*coefficients, 0], dtype=torch.float64), size)
         mask = (masks[copy.name], workspace / "masks" / f"{copy.stem}.png") if copy.name in masks else None
-        intrinsics.append(write_undistorted(copy, path, mask, distortion))
+        intrinsics.append(write_undistorted(copy, path, distortion, mask=mask))
         mask_paths.append(mask[1] if mask else None)
         poses.append([*image["world_from_camera"], [0, 0, 0, 1]])
         sizes.append(size)
