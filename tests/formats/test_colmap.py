@@ -11,8 +11,8 @@ from PIL import Image
 from splatgraft import formats
 
 
-def with_photos(root, names=("b.png", "a.png"), **options):
-    poses = format_files.write_colmap(root / "sparse" / "0", names=names, **options)
+def with_photos(root, names=("b.png", "a.png"), model="sparse/0", **options):
+    poses = format_files.write_colmap(root / model, names=names, **options)
     for i, name in enumerate(names):
         format_files.write_photo(root / "images" / name, seed=i)
     return poses
@@ -44,12 +44,7 @@ def test_poses_points_and_pictures(tmp_path, text):
         ("PINHOLE", (20.0, 21.0, 12.0, 8.0), (20, 21, 12, 8), None),
         ("SIMPLE_RADIAL", (20.0, 12.0, 8.0, 0.1), (20, 20, 12, 8), (0.1, 0, 0, 0, 0)),
         ("RADIAL", (20.0, 12.0, 8.0, 0.1, 0.02), (20, 20, 12, 8), (0.1, 0.02, 0, 0, 0)),
-        (
-            "OPENCV",
-            (20.0, 21.0, 12.0, 8.0, 0.1, 0.02, 0.003, 0.004),
-            (20, 21, 12, 8),
-            (0.1, 0.02, 0.003, 0.004, 0),
-        ),
+        ("OPENCV", (20.0, 21.0, 12.0, 8.0, 0.1, 0.02, 3e-3, 4e-3), (20, 21, 12, 8), (0.1, 0.02, 3e-3, 4e-3, 0)),
     ],
 )
 def test_camera_models(tmp_path, model, parameters, matrix, coefficients):
@@ -63,19 +58,13 @@ def test_camera_models(tmp_path, model, parameters, matrix, coefficients):
 
 @pytest.mark.parametrize("layout", ["sparse", ".", "colmap/sparse/0"])
 def test_layouts(tmp_path, layout):
-    format_files.write_colmap(tmp_path / layout)
-    for name in ("a.png", "b.png"):
-        format_files.write_photo(tmp_path / "images" / name)
+    with_photos(tmp_path, model=layout)
     assert len(formats.read_capture(tmp_path)) == 2
 
 
-def test_the_models_own_folder_finds_the_images(tmp_path):
+def test_the_largest_model_counts_and_the_models_own_folder_finds_the_images(tmp_path):
     with_photos(tmp_path)
     assert len(formats.read_capture(tmp_path / "sparse" / "0")) == 2
-
-
-def test_the_largest_model_counts(tmp_path):
-    with_photos(tmp_path)
     format_files.write_colmap(tmp_path / "sparse" / "1", names=("a.png", "b.png", "c.png"), text=True)
     format_files.write_colmap(tmp_path / "sparse" / "2", names=("a.png",))
     format_files.write_photo(tmp_path / "images" / "c.png")

@@ -4,6 +4,7 @@ Small files that claim to be huge are refused before memory is taken.
 """
 
 import json
+import re
 import shutil
 import struct
 import tracemalloc
@@ -20,47 +21,22 @@ from hypothesis import strategies as st
 
 from splatgraft import formats
 from splatgraft.core.images import read_alpha, read_mask, read_rgb, stored_size
-from splatgraft.core.posed_images import PosedImages
 
 FEW, MANY = 6, 60
 """Examples of each case; many in `make test-all`."""
 FROM_TOOLS = ("scene.sog", "scene.glb", "scene.v3.spz", "scene.v4.spz", "scene.level0.ksplat", "scene.level2.ksplat")
 
-LIES = [
-    b"0",
-    b"-1",
-    b"1e9",
-    b"nan",
-    b"999999999999",
-    b"18446744073709551615",
-    b"inf",
-    b"\xff\xfe",
-    b"null",
-    b"[]",
-    b"{}",
-]
-BINARY_LIES = [struct.pack("<Q", value) for value in (0, 1, 2**16, 2**31, 2**32 - 1, 2**63, 2**64 - 1)] + [
-    struct.pack("<f", float("nan")),
-    struct.pack("<d", float("inf")),
-    struct.pack("<d", 1e300),
-]
+LIES = b"0 -1 1e9 nan 999999999999 18446744073709551615 inf \xff\xfe null [] {}".split()
+BINARY_LIES = [struct.pack("<Q", value) for value in (0, 1, 2**16, 2**31, 2**32 - 1, 2**63, 2**64 - 1)]
+BINARY_LIES += [struct.pack("<f", float("nan")), struct.pack("<d", float("inf")), struct.pack("<d", 1e300)]
 
 
 @st.composite
 def damages(draw) -> Callable[[bytes], bytes]:
     """One to three of: cut, flipped bits, a stretch replaced, repeated or removed, a number replaced by a lie."""
-    steps = draw(
-        st.lists(
-            st.tuples(
-                st.sampled_from(["cut", "flip", "replace", "repeat", "remove", "number", "lie", "append"]),
-                st.floats(0, 1),
-                st.binary(min_size=1, max_size=12),
-                st.integers(1, 24),
-            ),
-            min_size=1,
-            max_size=3,
-        )
-    )
+    kinds = st.sampled_from(["cut", "flip", "replace", "repeat", "remove", "number", "lie", "append"])
+    step = st.tuples(kinds, st.floats(0, 1), st.binary(min_size=1, max_size=12), st.integers(1, 24))
+    steps = draw(st.lists(step, min_size=1, max_size=3))
 
     def apply(data: bytes) -> bytes:
         for kind, where, noise, length in steps:
@@ -89,21 +65,10 @@ def damages(draw) -> Callable[[bytes], bytes]:
     return apply
 
 
-def check(read: Callable[[], object], named: Path, size: int) -> None:
-    tracemalloc.start()
-    try:
-        read()
-    except ValueError as error:
-        message = str(error)
-        assert str(named) in message, message
-        assert "\n" not in message
-        assert "expected" in message
-        assert "found" in message
-    finally:
-        _, peak = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-    # a deflated byte may honestly hold 1032; text becomes objects of about 60 bytes per word; 4 MB for code and headers
-    assert peak < 1100 * size + 4_000_000
+def assert_refused(message: str, named: Path) -> None:
+    assert str(named) in message, message
+    assert "\n" not in message
+    assert re.search("expected .*found", message), message
 
 
 @pytest.fixture(scope="module")
@@ -149,12 +114,19 @@ def fuzz(seeds: Path, relative: str, reader: Callable[[Path], object], damage: C
     """The file damaged in place, read, and put back."""
     path = seeds / relative
     whole = path.read_bytes()
-    broken = damage(whole)
-    path.write_bytes(broken)
+    path.write_bytes(damage(whole))
+    size = path.stat().st_size + 50_000  # the other files of the capture
+    tracemalloc.start()
     try:
-        check(lambda: reader(path), seeds, len(broken) + 50_000)  # the other files of the capture
+        reader(path)
+    except ValueError as error:
+        assert_refused(str(error), seeds)
     finally:
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
         path.write_bytes(whole)
+    # a deflated byte may honestly hold 1032; text becomes objects of about 60 bytes per word; 4 MB for code and headers
+    assert peak < 1100 * size + 4_000_000
 
 
 anything = st.one_of(damages(), damages(), damages(), st.binary(max_size=200).map(lambda noise: lambda data: noise))
@@ -165,17 +137,14 @@ def reader_of(seeds: Path, name: str) -> Callable[[Path], object]:
     if name.startswith("sog/"):
         return lambda path: formats.read_scene(path.parent / "meta.json")
     if name.startswith("nerf/"):
-        return lambda path: all_pixels(formats.read_capture(seeds / "nerf"))
+        return lambda path: [
+            (c.image(i), c.mask(i)) for c in [formats.read_capture(seeds / "nerf")] for i in range(len(c))
+        ]
     if name.startswith("colmap"):
         return lambda path: formats.read_capture(seeds / name.split("/", maxsplit=1)[0])
     if name.startswith("pictures/"):
         return lambda path: [reader(path) for reader in (stored_size, read_rgb, read_mask, read_alpha)]
     return {"points.ply": formats.read_points, "cameras.json": formats.read_cameras}.get(name, formats.read_scene)
-
-
-def all_pixels(capture: PosedImages) -> None:
-    for i in range(len(capture)):
-        capture.image(i), capture.mask(i)
 
 
 FILES = (
@@ -224,13 +193,12 @@ def refused(path: Path) -> str:
     formats.read_scene(format_files.TOOLS / "scene.sog")  # what is loaded at the first use is not the file's
     tracemalloc.start()
     try:
-        with pytest.raises(ValueError, match=r"expected .*found") as caught:
+        with pytest.raises(ValueError, match="expected") as caught:
             formats.read_scene(path)
         assert tracemalloc.get_traced_memory()[1] < 64 << 20
     finally:
         tracemalloc.stop()
-    assert "\n" not in str(caught.value)
-    assert str(path) in str(caught.value)
+    assert_refused(str(caught.value), path)
     return str(caught.value)
 
 
@@ -257,26 +225,18 @@ def test_spz_that_unpacks_without_measure(tmp_path, make: Callable[[], bytes]):
     assert "6000000 Gaussians as the header says" in refused(tmp_path / "a.spz")
 
 
-def packed_spz(change: Callable[[bytearray], None]) -> bytes:
-    payload = bytearray(zlib.decompress((format_files.GOLDEN / "v3.spz").read_bytes(), 31))
-    change(payload)
-    return zlib.compress(bytes(payload), wbits=31)
-
-
 def test_spz_with_a_wrong_header_or_checksum(tmp_path):
     data = (format_files.GOLDEN / "v3.spz").read_bytes()
-    damaged = [
-        data[:-1],
-        data[:50] + bytes([data[50] ^ 4]) + data[51:],
-        data[:-6] + bytes(6),  # checksum and length
-        packed_spz(lambda p: p.__setitem__(slice(8, 12), struct.pack("<I", 8))),
-        packed_spz(lambda p: p.__setitem__(slice(8, 12), struct.pack("<I", 4_000_000_000))),
-        packed_spz(lambda p: p.__setitem__(12, 9)),
-        packed_spz(lambda p: p.__setitem__(4, 77)),
-    ]
-    for i, content in enumerate(damaged):
-        (tmp_path / f"{i}.spz").write_bytes(content)
-        refused(tmp_path / f"{i}.spz")
+    payload = zlib.decompress(data, 31)
+
+    def packed(at: int, value: bytes) -> bytes:
+        return zlib.compress(payload[:at] + value + payload[at + len(value) :], wbits=31)
+
+    counts = [packed(8, struct.pack("<I", count)) for count in (8, 4_000_000_000)]
+    flipped, unchecked = data[:50] + bytes([data[50] ^ 4]) + data[51:], data[:-6] + bytes(6)
+    for content in (data[:-1], flipped, unchecked, *counts, packed(12, b"\x09"), packed(4, b"\x4d")):
+        (tmp_path / "a.spz").write_bytes(content)
+        refused(tmp_path / "a.spz")
 
 
 def test_picture_bomb(tmp_path):
@@ -291,17 +251,14 @@ def test_picture_bomb(tmp_path):
     assert "found 9000 x 9000" in refused(path)
 
 
-@pytest.mark.parametrize("change", [{"count": 1 << 20}, {"count": -1}, {"count": None}, {"version": 1}, {"quats": {}}])
-def test_sog_with_another_meta_json(tmp_path, change):
+def test_sog_with_another_meta_json_or_names_of_files_elsewhere(tmp_path, seeds):
     files = format_files.files_of_zip(format_files.TOOLS / "scene.sog")
-    files["meta.json"] = json.dumps(json.loads(files["meta.json"]) | change).encode()
-    refused(format_files.write_zip(tmp_path / "a.sog", files))
-
-
-def test_sog_cannot_name_files_elsewhere(tmp_path, seeds):
+    meta = json.loads(files["meta.json"])
+    for change in ({"count": 1 << 20}, {"count": -1}, {"count": None}, {"version": 1}, {"quats": {}}):
+        changed = {"meta.json": json.dumps(meta | change).encode()}
+        refused(format_files.write_zip(tmp_path / "a.sog", files | changed))
     folder = tmp_path / "sog"
     shutil.copytree(seeds / "sog", folder)
-    meta = json.loads((folder / "meta.json").read_text())
     (tmp_path / "secret.webp").write_bytes((folder / "quats.webp").read_bytes())
     for name in ("../secret.webp", "/etc/passwd", "a\\b.webp", ""):
         meta["quats"]["files"] = [name]
@@ -309,28 +266,20 @@ def test_sog_cannot_name_files_elsewhere(tmp_path, seeds):
         refused(folder)
 
 
-@pytest.mark.parametrize("count", [1 << 33, -1, "40"])
-def test_glb_that_claims_another_count(tmp_path, count):
+def test_glb_with_other_counts_nodes_or_numbers(tmp_path):
     content, binary = format_files.parts_of_glb((format_files.TOOLS / "scene.glb").read_bytes())
-    for accessor in content["accessors"]:
-        accessor["count"] = count
-    (tmp_path / "a.glb").write_bytes(format_files.glb(content, binary))
-    refused(tmp_path / "a.glb")
-
-
-@pytest.mark.parametrize("children", [[1], [0, 1]])
-def test_glb_whose_nodes_form_a_cycle(tmp_path, children):
-    content, binary = format_files.parts_of_glb((format_files.TOOLS / "scene.glb").read_bytes())
-    content["nodes"] = [{"children": [1]}, {"children": children}]
-    (tmp_path / "a.glb").write_bytes(format_files.glb(content, binary))
-    assert "without cycles" in refused(tmp_path / "a.glb")
-
-
-def test_glb_keeps_what_is_no_number(tmp_path):
-    """Positions that are no numbers stay in a .glb as in a .ply, and are culled when drawn."""
-    content, binary = format_files.parts_of_glb((format_files.TOOLS / "scene.glb").read_bytes())
-    (tmp_path / "a.glb").write_bytes(format_files.glb(content, np.float32(np.nan).tobytes() + binary[4:]))
-    assert not bool(formats.read_gaussians(tmp_path / "a.glb").means[0].isfinite().all())
+    path = tmp_path / "a.glb"
+    for count in (1 << 33, -1, "40"):
+        accessors = [accessor | {"count": count} for accessor in content["accessors"]]
+        path.write_bytes(format_files.glb(content | {"accessors": accessors}, binary))
+        refused(path)
+    for children in ([1], [0, 1]):
+        nodes = [{"children": [1]}, {"children": children}]
+        path.write_bytes(format_files.glb(content | {"nodes": nodes}, binary))
+        assert "without cycles" in refused(path)
+    # positions that are no numbers stay in a .glb as in a .ply, and are culled when drawn
+    path.write_bytes(format_files.glb(content, np.float32(np.nan).tobytes() + binary[4:]))
+    assert not bool(formats.read_gaussians(path).means[0].isfinite().all())
 
 
 @pytest.mark.parametrize(("offset", "value"), [(4, 1 << 20), (16, 1 << 30), (4096, 1 << 30)])
@@ -343,7 +292,7 @@ def test_ksplat_that_claims_more(tmp_path, offset, value):
 
 @pytest.mark.parametrize("suffix", [".spz", ".sog", ".glb", ".ksplat", ".splat", ".ply"])
 def test_files_of_another_kind(tmp_path, suffix):
-    for content in (b"", b"\0" * 5001, b"PK\x03\x04", b"\x1f\x8b"):
+    for content in (b"", b"\0" * 5001, b"PK\x03\x04", b"\x1f\x8b", b"1" * 33):
         (tmp_path / f"a{suffix}").write_bytes(content)
         refused(tmp_path / f"a{suffix}")
 
@@ -351,19 +300,14 @@ def test_files_of_another_kind(tmp_path, suffix):
 @pytest.mark.parametrize("read", [formats.read_gaussians, formats.read_capture, formats.read_cameras])
 @pytest.mark.parametrize("name", ["a.ply", "a.json", "none", "a" * 300])
 def test_what_is_not_there_is_named(tmp_path, read, name):
-    with pytest.raises(ValueError, match=r": expected .*found") as caught:
+    with pytest.raises(ValueError, match="expected") as caught:
         read(tmp_path / name)
-    assert str(tmp_path / name) in str(caught.value)
+    assert_refused(str(caught.value), tmp_path / name)
 
 
-def test_splat_of_no_numbers(tmp_path):
+def test_splat_of_no_numbers_and_compressed_ply_without_its_chunks(tmp_path):
     (tmp_path / "a.splat").write_bytes(struct.pack("<3f", 1, float("nan"), 0) + bytes(20))
     assert "is this a .splat?" in refused(tmp_path / "a.splat")
-    (tmp_path / "a.splat").write_bytes(b"1" * 33)
-    refused(tmp_path / "a.splat")
-
-
-def test_compressed_ply_without_its_chunks(tmp_path):
     data = (format_files.GOLDEN / "supersplat.compressed.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(data.replace(b"element chunk", b"element chink"))
     assert "expected one chunk for 256 packed Gaussians, found 0" in refused(tmp_path / "a.ply")

@@ -28,13 +28,6 @@ def test_masks_in_folders(tmp_path):
     assert [path.parent.name for path in found] == ["left", "right"]
 
 
-def test_no_masks(tmp_path):
-    format_files.write_transforms(tmp_path, {})
-    capture = formats.read_capture(tmp_path)
-    assert capture.mask_paths == ()
-    assert capture.mask(0) is None
-
-
 @pytest.mark.parametrize("names", [("other.png",), ("0000.png", "0000.jpg"), ()])
 def test_refusals(tmp_path, names):
     format_files.write_transforms(tmp_path, {})
@@ -57,17 +50,6 @@ def test_mask_of_another_shape_is_refused(tmp_path):
     assert [str(one) for one in capture.left_out] == ["the mask of images/0000.png"]
 
 
-def test_mask_that_varies_in_alpha_only(tmp_path):
-    rgba = np.zeros((16, 24, 4), np.uint8)
-    rgba[:8, :, 3] = 255
-    format_files.write_transforms(tmp_path, {})
-    (tmp_path / "masks").mkdir()
-    Image.fromarray(rgba).save(tmp_path / "masks" / "0000.png")
-    mask = formats.read_capture(tmp_path).mask(0)
-    assert mask[:8].min() == 1
-    assert mask[8:].max() == 0
-
-
 def test_photographs_alpha_is_the_mask_and_black_what_it_hides(tmp_path):
     format_files.write_transforms(tmp_path, {})
     rgba = np.random.default_rng(0).integers(0, 256, (16, 24, 4), dtype=np.uint8)
@@ -86,8 +68,9 @@ def test_photographs_alpha_is_the_mask_and_black_what_it_hides(tmp_path):
     assert torch.equal(formats.read_capture(tmp_path / "copy").mask(0), capture.mask(0))
 
 
-def test_alpha_that_is_full_everywhere_is_no_mask(tmp_path):
+def test_no_masks_and_alpha_that_is_full_everywhere_is_none(tmp_path):
     format_files.write_transforms(tmp_path, {})
+    assert formats.read_capture(tmp_path).mask(0) is None
     for i in range(2):
         Image.fromarray(np.full((16, 24, 4), 255, np.uint8)).save(tmp_path / "images" / f"{i:04d}.png")
     assert formats.read_capture(tmp_path).mask_paths == ()
@@ -109,23 +92,27 @@ def test_masks_by_the_conventions_of_the_field(tmp_path, place):
         assert ("NAME_mask" if "images/" in place else place.split("/")[0] + "/") in said
 
 
-def test_alpha_channels_of_photos_without_poses_are_masks(tmp_path):
+def test_alpha_channels_of_masks_and_of_photos_without_poses_are_masks(tmp_path):
     rgba = np.zeros((16, 24, 4), np.uint8)
     rgba[:8, :, 3] = 255
-    for i in range(3):
-        Image.fromarray(rgba).save(tmp_path / f"{i}.png")
-    found = find_photos(tmp_path)
-    assert found.masks == found.paths
-    assert describe_masks(found.paths, found.masks) == "3 of 3 photos have masks, in alpha channels"
+    format_files.write_transforms(tmp_path, {})
+    for folder in ("masks", "photos"):
+        (tmp_path / folder).mkdir()
+        for i in range(2):
+            Image.fromarray(rgba).save(tmp_path / folder / f"{i:04d}.png")
+    mask = formats.read_capture(tmp_path).mask(0)
+    assert mask[:8].min() == 1
+    assert mask[8:].max() == 0
+    found = find_photos(tmp_path / "photos")
+    assert describe_masks(found.paths, found.paths) == "2 of 2 photos have masks, in alpha channels"
+    (tmp_path / "masks").rename(tmp_path / "others")
+    assert find_photos(tmp_path / "photos").masks == found.paths
 
 
-def test_a_folder_without_photos_says_what_is_there(tmp_path):
+def test_a_folder_without_photos_and_a_photo_that_cannot_be_read(tmp_path):
     (tmp_path / "sparse").mkdir()
     with pytest.raises(ValueError, match=r"expected photos, in the folder itself or in images/, found \['sparse'\]"):
         find_photos(tmp_path)
-
-
-def test_a_photo_that_cannot_be_read_does_not_hide_the_others(tmp_path):
     for name in ("0.png", "1.png"):
         format_files.write_photo(tmp_path / name)
     (tmp_path / "2.jpg").write_bytes(b"")

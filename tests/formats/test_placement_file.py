@@ -15,21 +15,11 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.formats.placement import ObjectPlacement, Placement, read_placement, write_placement
 
 
-def random_similarity(seed):
-    g = torch.Generator().manual_seed(seed)
-    return Similarity(
-        scale=float(torch.rand(1, generator=g) + 0.1),
-        rotation=rotation_from_quaternion(torch.randn(1, 4, generator=g))[0],
-        translation=torch.randn(3, generator=g),
-    )
-
-
 def test_round_trip_is_bit_exact(tmp_path):
     erased = torch.arange(11) % 2 == 0
-    objects = (
-        ObjectPlacement(random_similarity(0), tmp_path / "objects" / "vase.ply"),
-        ObjectPlacement(Similarity.identity()),
-    )
+    rotation = rotation_from_quaternion(torch.tensor([[0.3, -0.5, 0.7, 0.1]]))[0]
+    moved = Similarity(scale=0.7531, rotation=rotation, translation=torch.tensor([0.1, -2.3, 1 / 3]))
+    objects = (ObjectPlacement(moved, tmp_path / "objects" / "vase.ply"), ObjectPlacement(Similarity.identity()))
     write_placement(tmp_path / "placement.json", Placement(objects=objects, erased=erased))
     read = read_placement(tmp_path / "placement.json")
     assert [o.object_path for o in read.objects] == [tmp_path / "objects" / "vase.ply", None]
@@ -86,29 +76,22 @@ def test_what_is_wrong_is_said_in_one_line_that_names_the_file(tmp_path, content
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("array", [np.zeros(3), np.zeros((2, 2), bool), np.array([None, 1], dtype=object)])
-def test_erased_of_another_kind_is_refused(tmp_path, array):
-    np.save(tmp_path / "erased.npy", array, allow_pickle=True)
-    (tmp_path / "placement.json").write_text('{"objects": [], "erased": "erased.npy"}')
-    with pytest.raises(ValueError, match=r"erased.npy: expected a"):
-        read_placement(tmp_path / "placement.json")
-
-
-def test_missing_file_is_named(tmp_path):
+def test_erased_of_another_kind_and_missing_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="expected a JSON file, found none"):
         read_placement(tmp_path / "placement.json")
+    (tmp_path / "placement.json").write_text('{"objects": [], "erased": "erased.npy"}')
+    for array in (np.zeros(3), np.zeros((2, 2), bool), np.array([None, 1], dtype=object)):
+        np.save(tmp_path / "erased.npy", array, allow_pickle=True)
+        with pytest.raises(ValueError, match=r"erased.npy: expected a"):
+            read_placement(tmp_path / "placement.json")
+
+
+KEYS = st.sampled_from(["objects", "erased", "scale", "rotation", "translation", "object"])
+SIMPLE = st.none() | st.booleans() | st.floats() | st.text()
 
 
 @settings(max_examples=50, deadline=None)
-@given(
-    st.recursive(
-        st.none() | st.booleans() | st.floats() | st.text(),
-        lambda x: (
-            st.lists(x)
-            | st.dictionaries(st.sampled_from(["objects", "erased", "scale", "rotation", "translation", "object"]), x)
-        ),
-    )
-)
+@given(st.recursive(SIMPLE, lambda x: st.lists(x) | st.dictionaries(KEYS, x)))
 def test_any_json_is_read_or_refused_with_a_line(tmp_path_factory, content):
     path = Path(tmp_path_factory.getbasetemp()) / "fuzz.json"
     path.write_text(json.dumps(content))

@@ -161,8 +161,7 @@ def test_axes_that_are_none(axes):
 
 
 def test_glb_places_its_mesh_by_its_nodes(original, tmp_path):
-    glb = format_files.parts_of_glb((TOOLS / "scene.glb").read_bytes())
-    content, binary = glb
+    content, binary = format_files.parts_of_glb((TOOLS / "scene.glb").read_bytes())
     turn = [0.0, 0.0, 2**-0.5, 2**-0.5]  # a quarter turn about z
     content["nodes"] = [{"children": [1], "translation": [1, 2, 3]}, {"mesh": 0, "rotation": turn, "scale": [2, 2, 2]}]
     (tmp_path / "a.glb").write_bytes(format_files.glb(content, binary))
@@ -172,15 +171,11 @@ def test_glb_places_its_mesh_by_its_nodes(original, tmp_path):
     expected = (2 * in_gltf @ rotation.T + torch.tensor([1.0, 2, 3])) * torch.tensor([-1.0, -1, 1])
     torch.testing.assert_close(found.means, expected, atol=1e-5, rtol=0)  # float32
     torch.testing.assert_close(found.log_scales, original.log_scales + torch.tensor(2.0).log())
-
-
-@pytest.mark.parametrize("change", [{"scale": [1, 2, 1]}, {"scale": [-1, 1, 1]}])
-def test_glb_whose_nodes_distort(tmp_path, change):
-    content, binary = format_files.parts_of_glb((TOOLS / "scene.glb").read_bytes())
-    content["nodes"][0] |= change
-    (tmp_path / "a.glb").write_bytes(format_files.glb(content, binary))
-    with pytest.raises(ValueError, match=r"a\.glb: expected nodes that rotate and scale uniformly"):
-        formats.read_gaussians(tmp_path / "a.glb")
+    for distorted in ([1, 2, 1], [-1, 1, 1]):
+        content["nodes"][1]["scale"] = distorted
+        (tmp_path / "a.glb").write_bytes(format_files.glb(content, binary))
+        with pytest.raises(ValueError, match=r"a\.glb: expected nodes that rotate and scale uniformly"):
+            formats.read_gaussians(tmp_path / "a.glb")
 
 
 def test_glb_with_quantised_attributes(original, tmp_path):

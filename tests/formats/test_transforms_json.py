@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from splatgraft import formats
-from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.cameras import look_at, pinhole
 
 
 def test_opengl_axes_become_opencv_axes(tmp_path):
@@ -44,9 +44,7 @@ def test_blender_keys_and_missing_suffixes(tmp_path):
 
 def test_nerfstudio_keys_for_each_frame(tmp_path):
     path = format_files.write_transforms(tmp_path, {"w": 24, "h": 16, "applied_transform": [[1, 0, 0, 9]], "k1": 0.0})
-    meta = json.loads(path.read_text())
-    meta["frames"][1] |= {"fl_x": 30, "fl_y": 31, "cx": 11, "cy": 9, "k1": 0.1, "p2": 0.01}
-    path.write_text(json.dumps(meta))
+    change(path, [1], {"fl_x": 30, "fl_y": 31, "cx": 11, "cy": 9, "k1": 0.1, "p2": 0.01})
     capture = formats.read_capture(path)
     assert capture.cameras.intrinsics[0].tolist() == [[20, 0, 12], [0, 20, 8], [0, 0, 1]]
     assert capture.distortions[0] is None
@@ -54,13 +52,9 @@ def test_nerfstudio_keys_for_each_frame(tmp_path):
     assert capture.distortions[1].coefficients.tolist() == [0.1, 0, 0, 0.01, 0]
 
 
-def some_cameras(v=5) -> Cameras:
-    poses = look_at(torch.randn(v, 3) * 3, torch.zeros(3), torch.tensor([0.0, 0, 1]))
-    return pinhole(poses, 33.3, width=24, height=16)
-
-
-def test_cameras_round_trip_bit_for_bit(tmp_path):
-    cameras = some_cameras()
+def test_cameras_round_trip_bit_for_bit_and_none_are_not_written(tmp_path):
+    poses = look_at(torch.randn(5, 3) * 3, torch.zeros(3), torch.tensor([0.0, 0, 1]))
+    cameras = pinhole(poses, 33.3, width=24, height=16)
     cameras.intrinsics[2, 0, 2] += 0.123  # not shared by all
     formats.write_cameras(tmp_path / "y.json", cameras)
     back = formats.read_cameras(tmp_path / "y.json")
@@ -68,6 +62,8 @@ def test_cameras_round_trip_bit_for_bit(tmp_path):
     assert torch.equal(back.intrinsics, cameras.intrinsics)
     assert torch.equal(back.sizes, cameras.sizes)
     assert back.names == cameras.names
+    with pytest.raises(ValueError, match=r"y\.json: expected at least one camera"):
+        formats.write_cameras(tmp_path / "y.json", cameras[[]])
 
 
 @pytest.mark.parametrize(
@@ -116,25 +112,15 @@ def test_cameras_json_of_the_original_code(tmp_path):
     assert cameras.names == ("a.jpg",)
 
 
-def test_links_keep_their_names(tmp_path):
-    scenes_folder = tmp_path / "capture"
-    format_files.write_transforms(scenes_folder, {})
-    (scenes_folder / "images" / "0000.png").rename(tmp_path / "stored.png")
-    (scenes_folder / "images" / "0000.png").symlink_to(tmp_path / "stored.png")
+def test_links_keep_their_names_which_cannot_lead_out_of_a_folder(tmp_path):
+    path = format_files.write_transforms(tmp_path / "capture", {"w": 24, "h": 16})
+    first = tmp_path / "capture" / "images" / "0000.png"
+    first.symlink_to(first.rename(tmp_path / "stored.png"))
     (tmp_path / "copy").mkdir()
-    formats.write_capture(tmp_path / "copy", formats.read_capture(scenes_folder))
+    formats.write_capture(tmp_path / "copy", formats.read_capture(tmp_path / "capture"))
     assert formats.read_capture(tmp_path / "copy").cameras.names == ("0000.png", "0001.png")
-
-
-def test_names_cannot_lead_out_of_a_folder(tmp_path):
-    path = format_files.write_transforms(tmp_path, {"w": 24, "h": 16})
     path.write_text(path.read_text().replace("images/0000.png", "../../a/..").replace("images/0001.png", "/etc/none"))
     assert formats.read_cameras(path).names == ("a", "none")
-
-
-def test_no_cameras_are_not_written(tmp_path):
-    with pytest.raises(ValueError, match=r"y\.json: expected at least one camera"):
-        formats.write_cameras(tmp_path / "y.json", some_cameras()[[]])
 
 
 SCALED = (np.eye(4) * np.array([2, 2, 2, 1])).tolist()
@@ -161,17 +147,20 @@ MIRRORED = np.diag([1.0, 1, -1, 1]).tolist()
 )
 def test_refusals(tmp_path, frame, content, expected):
     path = format_files.write_transforms(tmp_path, content, frames=3)
-    meta = json.loads(path.read_text())
-    if meta["frames"] and isinstance(meta["frames"], list):
-        for broken in meta["frames"][:2]:  # more than half
-            broken.update(frame)
-    path.write_text(json.dumps(meta))
+    change(path, [0, 1] if content.get("frames", True) else [], frame)  # more than half
     with pytest.raises(ValueError, match=r"expected .*found") as caught:
         formats.read_capture(tmp_path)
     message = str(caught.value)
     assert str(tmp_path) in message
     assert expected in message
     assert "\n" not in message
+
+
+def change(path, frames, keys):
+    meta = json.loads(path.read_text())
+    for index in frames:
+        meta["frames"][index] |= keys
+    path.write_text(json.dumps(meta))
 
 
 @pytest.mark.parametrize(
@@ -184,27 +173,20 @@ def test_refusals(tmp_path, frame, content, expected):
         ({"fl_x": 0}, "focal length above 0"),
         ({"fl_x": 10, "k1": -3.0}, "distortion that can be undone"),
         ({"w": 48, "h": 48}, "found 24x16"),
+        ({}, "images/0001.png"),
     ],
 )
 def test_one_frame_that_is_not_usable_is_left_out_and_named(tmp_path, frame, expected):
     path = format_files.write_transforms(tmp_path, {}, frames=3)
-    meta = json.loads(path.read_text())
-    meta["frames"][1] |= frame
-    path.write_text(json.dumps(meta))
+    change(path, [1], frame)
+    if not frame:
+        (tmp_path / "images/0001.png").write_bytes(b"\x89PNG\r\n\x1a\n cut short")
     capture = formats.read_capture(tmp_path)
     assert capture.cameras.names == ("0000.png", "0002.png")
-    assert len(capture.left_out) == 1
-    assert expected in capture.left_out[0].reason
-    assert str(tmp_path) in capture.left_out[0].reason
-    assert not capture.left_out[0].mask_only
-
-
-def test_one_image_without_a_readable_header_is_left_out_and_named(tmp_path):
-    format_files.write_transforms(tmp_path, {"w": 24, "h": 16}, frames=3)
-    (tmp_path / "images/0001.png").write_bytes(b"\x89PNG\r\n\x1a\n cut short")
-    capture = formats.read_capture(tmp_path)
-    assert capture.cameras.names == ("0000.png", "0002.png")
-    assert [str(one) for one in capture.left_out] == ["images/0001.png"]
+    (left_out,) = capture.left_out
+    assert expected in left_out.reason
+    assert str(tmp_path) in left_out.reason
+    assert not left_out.mask_only
 
 
 def test_a_photo_posed_upright_is_read_upright(tmp_path):

@@ -1,5 +1,7 @@
 """Scenes as .usdz, read back by OpenUSD itself, and beside what NVIDIA's converter makes of the same .ply."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,8 @@ from format_files import TOOLS, random_gaussians
 from splatgraft import formats
 from splatgraft.cli import main
 from splatgraft.core.gaussians import empty
+from splatgraft.core.rotations import rotation_from_quaternion
+from splatgraft.formats.scenes.axes import change_axes, rdf_from
 
 WRITTEN = TOOLS.parent / "written"
 
@@ -34,8 +38,6 @@ def read(path):
 
 
 def rotations(wxyz: np.ndarray) -> np.ndarray:
-    from splatgraft.core.rotations import rotation_from_quaternion
-
     return rotation_from_quaternion(torch.from_numpy(wxyz).float()).numpy()
 
 
@@ -60,8 +62,6 @@ def test_values_are_those_of_another_converter(tmp_path):
     pytest.importorskip("pxr.UsdVol")
     theirs = read(WRITTEN / "scene.usd-convert-gsplat.usdc")
     g = formats.read_gaussians(TOOLS / "scene.ply")
-    from splatgraft.formats.scenes.axes import change_axes, rdf_from
-
     # turned beforehand, so that the writer turns it back
     formats.write_gaussians(tmp_path / "a.usdz", change_axes(g, rdf_from("RUB")))
     ours = read(tmp_path / "a.usdz")
@@ -81,8 +81,6 @@ def test_what_cannot_be_written(tmp_path):
 
 
 def test_without_usd_the_extra_is_named(tmp_path, capsys, monkeypatch):
-    import sys
-
     monkeypatch.setitem(sys.modules, "pxr", None)
     formats.write_gaussians(tmp_path / "a.ply", random_gaussians(3))
     assert main(["export", str(tmp_path / "a.ply"), "--to", str(tmp_path / "a.usdz")]) == 2

@@ -10,18 +10,7 @@ import numpy as np
 import pytest
 import torch
 from format_files import GOLDEN, TOOLS, equal, parts_of_glb, random_gaussians
-from test_scenes_of_other_tools import (
-    BYTE,
-    COMPRESSED,
-    EXACT,
-    GLB,
-    SH_BYTE,
-    SOG,
-    SPLAT,
-    SPZ,
-    assert_within,
-    cameras,
-)
+from test_scenes_of_other_tools import BYTE, COMPRESSED, EXACT, GLB, SH_BYTE, SOG, SPLAT, SPZ, assert_within, cameras
 
 from splatgraft import formats
 from splatgraft.core.gaussians import Gaussians, empty
@@ -43,11 +32,9 @@ STEPS = {
     "scene.glb": GLB,
 }
 BY_SPLAT_TRANSFORM = [name for name in STEPS if name not in ("scene.ply", "scene.glb")]
-SAME = {"means": 1e-6, "log_scales": 1e-6, "ellipsoids": 1e-5, "opacities": 1e-6, "dc": 1e-6, "bands": 1e-6}
-"""The same decoding in float32 and float64."""
-DECODED = dict.fromkeys(BY_SPLAT_TRANSFORM, SAME) | {
-    "scene.v2.spz": SAME | {"ellipsoids": 1e-4},  # w as a root of what is nearly 0
-    "scene.splat": SAME | {"ellipsoids": 0.03},  # it takes a byte b for 2 b / 255 - 1, others for (b - 128) / 128
+DECODED = dict.fromkeys(BY_SPLAT_TRANSFORM, EXACT) | {
+    "scene.v2.spz": EXACT | {"ellipsoids": 1e-4},  # w as a root of what is nearly 0
+    "scene.splat": EXACT | {"ellipsoids": 0.03},  # it takes a byte b for 2 b / 255 - 1, others for (b - 128) / 128
 }
 
 
@@ -94,22 +81,15 @@ def test_every_degree_and_several_chunks(tmp_path, suffix):
         g = random_gaussians(600, degree)
         formats.write_gaussians(tmp_path / f"a{suffix}", g)
         back = formats.read_gaussians(tmp_path / f"a{suffix}")
-        assert back.count == 600
         assert back.sh_degree == (0 if suffix == ".splat" else degree)
+        # 256 codes, or steps of a byte, for numbers of up to 1
+        assert_within(g, back, {"dc": 0.03, "bands": 0.03})
 
 
-def test_spz_is_within_its_steps_and_stays_there(tmp_path):
+def test_spz_within_its_steps_stays_there(tmp_path):
     g = random_gaussians(300, 3)
     formats.write_gaussians(tmp_path / "a.spz", g)
     back = formats.read_gaussians(tmp_path / "a.spz")
-    extent = float(g.means.abs().max())
-    # half a step: 24 signed bits of at most twice the extent; 1/16 of log scale; 1/255; 1/(255 * 0.15); 1/128
-    assert (back.means - g.means).abs().max() <= extent * 2 / 2**23
-    assert (back.log_scales - g.log_scales).abs().max() <= 0.5 / 16 + 1e-6
-    assert (back.opacities - g.opacities).abs().max() <= 0.5 / 255 + 1e-6
-    assert (back.sh[:, :1] - g.sh[:, :1]).abs().max() <= 0.5 / 255 / 0.15 + 1e-6
-    inside = g.sh[:, 1:].abs() < 127 / 128
-    assert ((back.sh[:, 1:] - g.sh[:, 1:]).abs()[inside] <= 0.5 / 128 + 1e-6).all()
     # three components each off by half of sqrt(1/2)/511, the fourth by up to their sum: angle below 2 * |difference|
     dot = (torch.nn.functional.normalize(g.quaternions, dim=1) * back.quaternions).sum(1).abs()
     assert torch.arccos(dot.clamp(max=1)).max() <= 5 * 0.5 * 0.7072 / 511
@@ -139,11 +119,6 @@ def test_up_and_size_are_read_back(tmp_path, suffix):
     assert any("one unit is 0.21 m" in sentence for sentence in found.said())
 
 
-def test_a_ply_without_metadata_has_the_original_header(tmp_path):
-    formats.write_gaussians(tmp_path / "a.ply", random_gaussians(2, 0))
-    assert b"comment" not in (tmp_path / "a.ply").read_bytes()
-
-
 @pytest.mark.parametrize("comment", ["up: 0 0 0", "up: a b c", "metres_per_unit: 0", "metres_per_unit: -1"])
 def test_comments_that_state_nothing(tmp_path, comment):
     formats.write_gaussians(tmp_path / "a.ply", random_gaussians(2, 0))
@@ -171,11 +146,8 @@ def test_spz_may_be_empty_and_has_bounds(tmp_path):
     g.means[0, 0] = 1e8
     with pytest.raises(ValueError, match=r"a\.spz: expected positions within 8388607"):
         formats.write_gaussians(tmp_path / "a.spz", g)
-
-
-def test_other_versions_of_spz_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"a\.spz: expected \.spz version 2, 3 or 4 to write, found 1"):
-        write_spz(tmp_path / "a.spz", random_gaussians(3), version=1)
+        write_spz(tmp_path / "a.spz", g, version=1)
 
 
 def test_the_glb_is_what_the_specification_asks_for(original, tmp_path):
@@ -222,32 +194,18 @@ def test_the_pictures_stay(original, tmp_path):
     assert torch.isfinite(expected).all()
 
 
-@pytest.mark.parametrize("degree", [0, 2, 3])
-def test_few_gaussians_of_sog_are_within_the_steps_of_the_format(tmp_path, degree):
-    g = random_gaussians(40, degree, seed=11)
-    formats.write_gaussians(tmp_path / "a.sog", g)
-    # fewer numbers than codes: exact, but for bands, whose 256 codes hold up to 40 * 45 values
-    steps = SOG | {"log_scales": 1e-5, "dc": 1e-5, "opacities": 0.51 / 255, "bands": 0.02}
-    assert_within(g, formats.read_gaussians(tmp_path / "a.sog"), steps)
-
-
-def test_the_same_scene_gives_the_same_bytes(tmp_path):
-    g = random_gaussians(2000, 3)
-    for name in ("a.sog", "b.sog"):
-        formats.write_gaussians(tmp_path / name, g)
-    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
-
-
-def test_meta_json_of_sog(tmp_path):
+def test_meta_json_of_sog_and_the_same_bytes_twice(tmp_path):
     metadata = formats.SceneMetadata(up=(0.0, 0.0, 1.0), metres_per_unit=0.25)
-    formats.write_gaussians(tmp_path / "a.sog", random_gaussians(10, 2), metadata=metadata)
+    for name in ("b.sog", "a.sog"):
+        formats.write_gaussians(tmp_path / name, random_gaussians(2000, 2), metadata=metadata)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
         meta = json.loads(archive.read("meta.json"))
         assert {name for part in meta.values() if isinstance(part, dict) for name in part.get("files", [])} == {
             entry for entry in archive.namelist() if entry != "meta.json"
         }
-    assert (meta["version"], meta["count"], meta["shN"]["bands"]) == (2, 10, 2)
+    assert (meta["version"], meta["count"], meta["shN"]["bands"]) == (2, 2000, 2)
     assert meta["splatgraft"] == {"up": [0, 0, 1], "metres_per_unit": 0.25}
 
 
