@@ -1,13 +1,15 @@
 """Captures of made-up photos: noise with the spectrum of photographs, cameras on a ring."""
 
-import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import shapes
 import torch
 from PIL import Image
+from torch import Tensor
 
-from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats import write_capture
 
@@ -24,10 +26,8 @@ def texture(seed: int, size: tuple[int, int] = SIZE) -> np.ndarray:
     return (128 + 40 * total / total.std()).clip(0, 255).astype(np.uint8)
 
 
-def ring(count: int, radius: float = 2.0) -> Cameras:
-    angle = torch.arange(count) * (2 * math.pi / count)
-    eye = torch.stack([radius * angle.cos(), radius * angle.sin(), torch.full((count,), 1.0)], -1)
-    return pinhole(look_at(eye, torch.zeros(3), torch.tensor([0.0, 0, 1])), 150.0, width=SIZE[0], height=SIZE[1])
+def ring(count: int) -> Cameras:
+    return shapes.ring(count, height=1.0, radius=2.0, focal=150.0, size=SIZE)
 
 
 def write_photos(folder: Path, count: int, suffix: str = ".png") -> list[Path]:
@@ -56,3 +56,21 @@ def write_posed(folder: Path, count: int = 10, *, masks: bool = False) -> list[P
 def disc() -> np.ndarray:
     v, u = np.mgrid[: SIZE[1], : SIZE[0]]
     return np.where((u - 80) ** 2 + (v - 60) ** 2 < 900, 255, 0).astype(np.uint8)
+
+
+def colmap_answer(names: list[str], poses: Tensor, size: tuple[int, int], **figures: Any) -> dict[str, Any]:
+    """What the COLMAP process answers: photos of one lens with these poses (n, 4, 4)."""
+    width, height = size
+    focal = 1.25 * width
+    images = [
+        {
+            "name": name,
+            "world_from_camera": pose[:3].tolist(),
+            "camera": [focal, focal, width / 2, height / 2, 0.01, 0.0, 0.0, 0.0],
+            "camera_id": 1,
+            "observations": 500,
+        }
+        for name, pose in zip(names, poses, strict=True)
+    ]
+    fixed = {"models": 1, "method": "global", "explained": 0.8, "mean_reprojection_px": 0.4, "points": []}
+    return fixed | {"seconds": {}, "cpu_seconds": {}, "unposed": [], "images": images} | figures

@@ -18,8 +18,8 @@ def turntable(folder: Path, count: int, step_deg: float, *, wall: bool = True) -
     (folder / "images").mkdir(parents=True)
     (folder / "masks").mkdir()
     generator = np.random.default_rng(0)
-    textures = [_texture(generator, 256) for _ in range(6)]
-    behind = np.kron(_texture(generator, 200), np.ones((1, 2, 1), np.float32))[:300, :400]
+    textures = [texture(generator, 512) for _ in range(6)]
+    behind = np.kron(texture(generator, 400), np.ones((1, 2, 1), np.float32))[:300, :400]
     poses = np.stack([_pose(np.deg2rad(i * step_deg)) for i in range(count)])
     for i, pose in enumerate(poses):
         color, hit = _box(pose, textures)
@@ -29,9 +29,19 @@ def turntable(folder: Path, count: int, step_deg: float, *, wall: bool = True) -
     return poses
 
 
-def _texture(generator: np.random.Generator, side: int) -> np.ndarray:
+def texture(generator: np.random.Generator, side: int) -> np.ndarray:
     layers = [generator.random((8 * 2**i, 8 * 2**i, 3)).astype(np.float32) for i in range(4)]
-    return sum(cv2.resize(layer, (2 * side, 2 * side)) / 4 for layer in layers)
+    return sum(cv2.resize(layer, (side, side)) / 4 for layer in layers)
+
+
+def similarity_to(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, float]:
+    """The best similarity transform's rotation (Umeyama 1991), and the largest distance of the points after it."""
+    x, y = found - found.mean(0), truth - truth.mean(0)
+    u, s, vt = np.linalg.svd(y.T @ x)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * np.diag(sign)).sum() / (x**2).sum()
+    rotation = u @ sign @ vt
+    return rotation, float(np.linalg.norm(y - scale * x @ rotation.T, axis=1).max())
 
 
 def _pose(angle: float) -> np.ndarray:

@@ -1,13 +1,14 @@
 """`capture` on broken and unusual captures: goes on and says so, or refuses in one line and keeps what was there."""
 
 import json
+import shutil
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from made_captures import SIZE, disc, texture, write_photos, write_posed
+from made_captures import SIZE, colmap_answer, disc, texture, write_photos, write_posed
 from PIL import Image
 
 from splatgraft.capture import read_doubts, structure_from_motion
@@ -33,15 +34,12 @@ def capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     return run
 
 
-def change(folder: Path, **keys: object) -> None:
-    path = folder / "transforms.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | keys))
-
-
-def change_frame(folder: Path, index: int, **keys: object) -> None:
+def change(folder: Path, *frames: int, **keys: object) -> None:
+    """Change keys of a transforms.json, or of some of its frames."""
     path = folder / "transforms.json"
     meta = json.loads(path.read_text())
-    meta["frames"][index] |= keys
+    for entry in [meta["frames"][index] for index in frames] if frames else [meta]:
+        entry.update(keys)
     path.write_text(json.dumps(meta))
 
 
@@ -50,7 +48,7 @@ def test_what_is_not_usable_is_named_counted_and_left_out(tmp_path: Path, captur
     photos[1].unlink()
     photos[2].write_bytes(photos[2].read_bytes()[:5000])
     Image.new("RGB", (1, 1)).save(photos[3])
-    change_frame(tmp_path / "c", 4, transform_matrix=[[float("nan")] * 4] * 4)
+    change(tmp_path / "c", 4, transform_matrix=[[float("nan")] * 4] * 4)
     Image.fromarray(texture(0)).save(photos[5])
     status, said = capture()
     assert status == 0
@@ -81,21 +79,7 @@ def test_fewer_than_half_are_refused_and_the_earlier_result_stays(tmp_path: Path
     assert not (tmp_path / ".out.new").exists()
 
 
-@pytest.mark.parametrize(
-    ("keys", "expected"),
-    [({"fl_x": 0, "fl_y": 0}, "focal length above 0"), ({"fl_x": float("nan")}, "finite number for 'fl_x', found nan")],
-)
-def test_intrinsics_of_zero_or_nan_are_refused_in_one_line(tmp_path: Path, capture, keys, expected: str) -> None:
-    write_posed(tmp_path / "c")
-    change(tmp_path / "c", **keys)
-    status, said = capture()
-    assert status == 2
-    (line,) = said.splitlines()
-    assert "c/transforms.json" in line
-    assert expected in line
-
-
-def test_images_without_a_pose_are_counted(tmp_path: Path, capture) -> None:
+def test_images_without_a_pose_are_counted_and_intrinsics_of_zero_refused_in_one_line(tmp_path: Path, capture) -> None:
     write_posed(tmp_path / "c", 30)
     frames = json.loads((tmp_path / "c" / "transforms.json").read_text())["frames"]
     change(tmp_path / "c", frames=frames[::3])
@@ -106,6 +90,12 @@ def test_images_without_a_pose_are_counted(tmp_path: Path, capture) -> None:
     status, said = capture()
     assert status == 2
     assert "are usual), found 3" in said.splitlines()[-1]
+    change(tmp_path / "c", fl_x=0, fl_y=0)
+    status, said = capture()
+    assert status == 2
+    (line,) = said.splitlines()
+    assert "c/transforms.json" in line
+    assert "focal length above 0" in line
 
 
 def test_masks_of_one_colour_or_another_size_are_left_out(tmp_path: Path, capture) -> None:
@@ -137,7 +127,7 @@ def test_large_photos_are_reduced_once_with_masks_and_exposure(tmp_path: Path, c
     photos[3].unlink()
     exif = exif_of(Exposure(1 / 60, 8.0, 100.0))
     Image.fromarray(texture(3)).resize(LARGE, Image.Resampling.BICUBIC).save(large, quality=97, exif=exif)
-    change_frame(tmp_path / "c", 3, file_path="images/0003.jpg")
+    change(tmp_path / "c", 3, file_path="images/0003.jpg")
     assert capture("--max-side", "200")[0] == 0
     found, given = read_capture(tmp_path / "out"), read_capture(tmp_path / "c")
     # the others are referred to where they are
@@ -169,10 +159,9 @@ def test_distorted_large_photos_are_reduced_without_distortion(tmp_path: Path, c
 def test_small_photos_are_not_shrunk_with_large_ones(tmp_path: Path, capture) -> None:
     photos = write_posed(tmp_path / "c", 10)
     Image.fromarray(texture(3)).resize(LARGE, Image.Resampling.BICUBIC).save(photos[3])
-    for index in range(10):
-        factor = 8 if index == 3 else 1
-        size = {"w": 160, "h": 120, "fl_x": 150, "fl_y": 150, "cx": 80, "cy": 60}
-        change_frame(tmp_path / "c", index, **{key: value * factor for key, value in size.items()})
+    size = {"w": 160, "h": 120, "fl_x": 150, "fl_y": 150, "cx": 80, "cy": 60}
+    change(tmp_path / "c", *range(10), **size)
+    change(tmp_path / "c", 3, **{key: value * 8 for key, value in size.items()})
     assert capture("--max-side", "320")[0] == 0
     assert read_capture(tmp_path / "out").cameras.sizes.tolist() == [[160, 120]] * 3 + [[320, 240]] + [[160, 120]] * 6
 
@@ -212,26 +201,20 @@ def test_heic_is_read(tmp_path: Path) -> None:
     assert images.stored_size(tmp_path / "a.heic") == SIZE
 
 
-def write_poses(folder: Path, names: list[str]) -> Path:
-    """Poses of another program on a line, in which the photos have other folders and suffixes."""
-    folder.mkdir()
-    frames = []
-    for i, name in enumerate(names):
-        pose = np.eye(4)
-        pose[0, 3] = i
-        frames.append({"file_path": f"somewhere/{name}", "transform_matrix": pose.tolist()})
-    path = folder / "transforms.json"
-    path.write_text(json.dumps({"w": SIZE[0], "h": SIZE[1], "fl_x": 130.0, "frames": frames}))
-    return path
-
-
 def test_given_poses_and_masks_come_together_and_what_has_no_partner_is_named(tmp_path: Path, capture) -> None:
     photos = write_photos(tmp_path / "c" / "images", 14, ".jpg")
     masks = {0: disc(), 1: 0 * disc(), 2: 0 * disc() + 255, 3: disc()[:, 20:140]}
     for index, mask in masks.items():
         Image.fromarray(mask).save(photos[index].with_name(f"{photos[index].stem}_mask.png"))
     posed = [i for i in range(14) if i != 5]
-    poses = write_poses(tmp_path / "theirs", [*(f"{i:04d}.png" for i in posed), "99.png"])
+    frames = []
+    for i, name in enumerate([*(f"{i:04d}.png" for i in posed), "99.png"]):
+        pose = np.eye(4)
+        pose[0, 3] = i
+        frames.append({"file_path": f"somewhere/{name}", "transform_matrix": pose.tolist()})
+    poses = tmp_path / "theirs" / "transforms.json"
+    poses.parent.mkdir()
+    poses.write_text(json.dumps({"w": SIZE[0], "h": SIZE[1], "fl_x": 130.0, "frames": frames}))
     for given in (poses, poses.parent):
         status, said = capture("--poses", str(given))
         assert status == 0
@@ -249,11 +232,9 @@ def test_given_poses_and_masks_come_together_and_what_has_no_partner_is_named(tm
             "0003_mask.png: expected 160x120 px",
         ):
             assert expected in said
-
-
-def test_poses_beside_a_video_are_refused(tmp_path: Path, capture) -> None:
+    shutil.rmtree(tmp_path / "c")
     (tmp_path / "c").touch()
-    status, said = capture("--poses", str(write_poses(tmp_path / "theirs", ["0.png"])))
+    status, said = capture("--poses", str(poses))
     assert status == 2
     assert "expected a folder of photos beside --poses" in said
 
@@ -265,19 +246,10 @@ def doubtful(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def answer(job, advance, say):
         calls.append(job.photos)
-        images = [
-            {
-                "name": name,
-                "world_from_camera": (torch.eye(4)[:3] + torch.tensor([0, 0, 0, float(i)])).tolist(),
-                "camera": [150.0, 150.0, 80.0, 60.0, 0.0, 0.0, 0.0, 0.0],
-                "camera_id": 1,
-                "observations": 500,
-            }
-            for i, name in enumerate(name for group in job.groups for name in group)
-        ]
-        fixed = {"models": 1, "method": "global", "explained": 0.7, "seconds": {}, "cpu_seconds": {}, "unposed": []}
+        poses = torch.eye(4).repeat(8, 1, 1)
+        poses[:, :3, 3] = torch.arange(8.0)[:, None]
         points = [[0.0, 0.0, 5.0, 255, 0, 0, 0.3, 4]]
-        return fixed | {"mean_reprojection_px": 1.05, "images": images, "points": points}
+        return colmap_answer(job.names, poses, SIZE, mean_reprojection_px=1.05, points=points)
 
     monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: object())
     monkeypatch.setattr(structure_from_motion, "_run", answer)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_up_photos import FOCAL, turntable
+from made_up_photos import FOCAL, similarity_to, turntable
 
 from splatgraft.capture import colmap_process
 from splatgraft.capture.colmap_process.job import Job
@@ -50,15 +50,6 @@ def finish(job: Job) -> dict[str, Any]:
     return {key: value for key, value in best.items() if not key.endswith("seconds")}
 
 
-def error_after_alignment(found: np.ndarray, truth: np.ndarray) -> float:
-    """Largest distance after the best similarity transform (Umeyama 1991)."""
-    x, y = found - found.mean(0), truth - truth.mean(0)
-    u, s, vt = np.linalg.svd(y.T @ x)
-    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-    scale = (s * np.diag(sign)).sum() / (x**2).sum()
-    return float(np.linalg.norm(y - scale * x @ (u @ sign @ vt).T, axis=1).max())
-
-
 @pytest.mark.long
 def test_an_object_on_a_turntable_is_posed_by_its_masks(tmp_path: Path) -> None:
     truth = turntable(tmp_path, 12, 15)
@@ -72,7 +63,7 @@ def test_an_object_on_a_turntable_is_posed_by_its_masks(tmp_path: Path) -> None:
     centers = np.array([image["world_from_camera"] for image in masked["images"]])[:, :, 3]
     # a third of a pixel (SIFT) at a focal length of 500 px and a distance of 4.5 is 3 mm; hundreds of points share it,
     # while focal length and distance trade against each other: one percent of 4.5
-    assert error_after_alignment(centers, truth[:, :3, 3]) < 0.045
+    assert similarity_to(truth[:, :3, 3], centers)[1] < 0.045
 
 
 @pytest.mark.long

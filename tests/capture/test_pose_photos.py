@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from made_captures import colmap_answer
+from made_up_photos import similarity_to, texture
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
@@ -50,26 +52,8 @@ def circle(count, height=1.0):
 
 def model_of(posed, photos):
     """What the COLMAP process answers: so many photos with a pose."""
-    return {
-        "models": 1,
-        "method": "global",
-        "explained": 0.8,
-        "seconds": {"features": 1.0, "matching": 2.0, "mapping": 0.5},
-        "cpu_seconds": {"features": 1.0, "matching": 2.0, "mapping": 0.5},
-        "unposed": [{"name": f"{i:02d}.jpg", "features": 900, "matches": 12} for i in range(posed, photos)],
-        "mean_reprojection_px": 0.4,
-        "images": [
-            {
-                "name": f"{i:02d}.jpg",
-                "world_from_camera": pose[:3].tolist(),
-                "camera": [50.0, 50.0, 20.0, 15.0, 0.01, 0.0, 0.0, 0.0],
-                "camera_id": 1,
-                "observations": 500,
-            }
-            for i, pose in enumerate(circle(posed))
-        ],
-        "points": [],
-    }
+    unposed = [{"name": f"{i:02d}.jpg", "features": 900, "matches": 12} for i in range(posed, photos)]
+    return colmap_answer([f"{i:02d}.jpg" for i in range(posed)], circle(posed), (40, 30), unposed=unposed)
 
 
 @pytest.fixture
@@ -85,8 +69,10 @@ def answer(monkeypatch):
     return give
 
 
-def test_what_cannot_be_posed_is_said_first(tmp_path, answer, monkeypatch):
-    answer()
+def test_what_cannot_be_posed_is_said(tmp_path, answer, monkeypatch):
+    answer(model_of(2, 8), model_of(3, 8))
+    with pytest.raises(ValueError, match=r"half of 8 photos to register, found 3; take more photos"):
+        pose(photo_paths(tmp_path / "photos", 8), tmp_path)
     photos = photo_paths(tmp_path / "photos", 3)
     with pytest.raises(ValueError, match="at least 3 photos"):
         pose(PhotoFiles(photos.paths[:2]), tmp_path)
@@ -101,12 +87,6 @@ def test_what_cannot_be_posed_is_said_first(tmp_path, answer, monkeypatch):
     monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"splatgraft\[sfm\]"):
         pose(photos, tmp_path)
-
-
-def test_under_half_registered_says_what_to_do(tmp_path, answer):
-    answer(model_of(2, 8), model_of(3, 8))
-    with pytest.raises(ValueError, match=r"half of 8 photos to register, found 3; take more photos"):
-        pose(photo_paths(tmp_path / "photos", 8), tmp_path)
 
 
 def test_a_doubtful_model_is_sought_once_more_and_the_better_one_is_taken_and_reported(tmp_path, answer):
@@ -239,16 +219,12 @@ def test_in_any_frame_the_floor_comes_to_z_zero_with_cameras_above_at_a_median_d
     middle = found.points(points.median(0).values)  # a median by coordinate, so taken in the frame that upright saw
     # float32 at distances of about ten
     assert torch.isclose((centers - middle).norm(dim=1).median(), torch.tensor(1.0), atol=1e-4)
+    wall = torch.rand(500, 3, generator=generator)
+    wall[:, 0] = 0
+    assert dominant_level_plane(wall, UP) is None
     # without a plane the cameras say what is up; these are exactly level, and exact then up to a prior
     turn = upright(cameras, lost.points(torch.randn(400, 3, generator=generator)))
     assert float((turn.rotation @ rotation @ UP)[2]) > math.cos(math.radians(1))
-
-
-def test_a_wall_and_a_few_points_are_no_support():
-    wall = torch.rand(500, 3, generator=torch.Generator().manual_seed(1))
-    wall[:, 0] = 0
-    assert dominant_level_plane(wall, UP) is None
-    assert dominant_level_plane(torch.rand(10, 3), UP) is None
 
 
 def corner_photo(camera):
@@ -260,13 +236,11 @@ def corner_photo(camera):
     generator = np.random.default_rng(0)
     color, nearest = np.zeros((height, width, 3), np.float32), np.full((height, width), np.inf)
     for axis in range(3):
-        layers = [generator.random((8 * 2**i, 8 * 2**i, 3)).astype(np.float32) for i in range(4)]
-        texture = sum(cv2.resize(layer, (1024, 1024)) / 4 for layer in layers)
         distance = (-1 - pose[axis, 3]) / rays[..., axis]
         hit = (distance > 0) & (distance < nearest)
         spot = pose[:3, 3] + distance[..., None] * rays
         a, b = ((np.delete(spot, axis, -1) + 1) * 200).astype(np.float32).transpose(2, 0, 1)
-        looked_up = cv2.remap(texture, a, b, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        looked_up = cv2.remap(texture(generator, 1024), a, b, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         color[hit], nearest[hit] = looked_up[hit], distance[hit]
     return torch.from_numpy(color).clamp(0, 1)
 
@@ -287,16 +261,12 @@ def test_true_poses_come_back_and_crops_have_their_optical_axis_where_it_was(tmp
     assert report.registered == 10
     # SIFT places features to about a third of a pixel
     assert report.mean_reprojection_px < 1
-    # the best similarity transform (Umeyama 1991)
-    x, y = (cameras.centers.double() - cameras.centers.double().mean(0) for cameras in (posed.cameras, truth))
-    u, _, vt = torch.linalg.svd(y.T @ x)
-    rotation = u @ torch.diag(torch.tensor([1, 1, torch.det(u @ vt)]).double()) @ vt
-    scale = (y * (x @ rotation.T)).sum() / x.square().sum()
+    rotation, distance = similarity_to(*(cameras.centers.double().numpy() for cameras in (truth, posed.cameras)))
     # a third of a pixel at a focal length of 400 and a distance of 4 is 3 mm; hundreds of points share it, but focal
     # length and distance trade against each other: one percent of the path's 2 m
-    assert (scale * x @ rotation.T - y).norm(dim=1).max() < 0.02
+    assert distance < 0.02
     # the floor, which fills most of the pictures, lies level
-    assert float((rotation @ UP.double())[2]) > math.cos(math.radians(5))
+    assert rotation[2, 2] > math.cos(math.radians(5))
     for i in (3, 6):
         # an optical axis off by d pixels is made up for by a turn of d / 400: a tenth of the 60 px that it is off, and
         # as much of the turn against the next whole photo

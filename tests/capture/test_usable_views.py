@@ -27,6 +27,9 @@ def test_different_sharp_photos_all_stay_also_one_of_less_contrast(tmp_path):
     photos = write_photos(tmp_path / "photos", 12)
     Image.fromarray((100 + texture(4) // 4).astype(np.uint8)).save(photos[4])
     assert find_odd_photos(photos) == ()
+    for i, photo in enumerate(photos):  # nor is any odd where all are soft
+        Image.fromarray(cv2.GaussianBlur(texture(i), (0, 0), 2)).save(photo)
+    assert find_odd_photos(photos) == ()
 
 
 @pytest.mark.parametrize(
@@ -44,13 +47,6 @@ def test_one_blurred_photo_is_named(tmp_path, blur):
     (odd,) = find_odd_photos(photos)
     assert odd.name == str(photos[4])
     assert "blurred" in odd.reason
-
-
-def test_where_all_are_soft_none_is_odd(tmp_path):
-    photos = write_photos(tmp_path / "photos", 12)
-    for i, photo in enumerate(photos):
-        Image.fromarray(cv2.GaussianBlur(texture(i), (0, 0), 2)).save(photo)
-    assert find_odd_photos(photos) == ()
 
 
 def test_copies_are_found_also_saved_again_smaller_and_black(tmp_path):
@@ -81,14 +77,6 @@ def test_unreadable_and_tiny_photos_are_named_also_where_copies_and_blur_are_wan
     kept, left_out = usable_photos(photos, "here", keep_odd=True)
     assert {one.name: one.reason for one in left_out} == odd
     assert kept == [photos[0], *photos[4:]]
-
-
-def test_one_photo_many_times_is_refused_with_what_is_needed(tmp_path):
-    photos = write_photos(tmp_path / "photos", 20)
-    for photo in photos:
-        Image.fromarray(texture(0)).save(photo)
-    with pytest.raises(ValueError, match=r"^here: expected at least 8 different photos .*found 1 of 20; .*copy of it"):
-        usable_photos(photos, "here")
 
 
 def capture(cameras: Cameras, points: torch.Tensor = NO_POINTS) -> PosedImages:
