@@ -109,9 +109,6 @@ def cut_object(
 
     Returns:
         A mask per picture, 0 or 1, and the share of each Gaussian in the masks, in [0, 1].
-
-    Raises:
-        ValueError: Where fewer than two pictures show the selection.
     """
     count = len(views.images)
     voting = sorted({round(i) for i in torch.linspace(0, count - 1, min(count, _VOTING)).tolist()})
@@ -120,11 +117,17 @@ def cut_object(
     masks: dict[int, Tensor] = {}
 
     def cut_and_lift(chosen: Sequence[int], what: str) -> tuple[dict[int, Tensor], Tensor]:
-        def told(done: int, total: int, _: str) -> None:
-            progress(done, total, f"cutting masks, {what}")
-
-        made, lifted = _cut_and_lift(views, scene, feature, chosen, cutter, told)
-        return made, lifted * may_be
+        """The masks of the chosen pictures, cut by the evidence of `feature`, and the feature lifted from them."""
+        total, made = torch.zeros(scene.count, 2, device=scene.device), {}
+        for done, index in enumerate(chosen):
+            progress(done, len(chosen), f"cutting masks, {what}")
+            operator = view_operator(scene, views.cameras[index], RenderOptions())
+            evidence = Evidence(operator.blend(feature[:, None])[..., 0].cpu(), views.prompts.get(index, ViewPrompt()))
+            # a picture in which neither the selection nor a click shows has no object
+            shows = int((evidence.lifted > 0.5).sum()) >= _MIN_PIXELS or len(evidence.prompt.inside)
+            made[index] = cutter(views.images[index], evidence) if shows else torch.zeros_like(evidence.lifted)
+            total += weight_inside(operator, made[index].to(scene.device))
+        return made, share_inside(total) * may_be
 
     for round_ in range(_ROUNDS):
         before = masks
@@ -142,27 +145,6 @@ def cut_object(
     return [masks[i] for i in range(count)], feature
 
 
-def _cut_and_lift(
-    views: CutViews,
-    scene: Gaussians,
-    feature: Float[Tensor, "n"],
-    chosen: Sequence[int],
-    cutter: ViewCutter,
-    progress: Progress,
-) -> tuple[dict[int, Tensor], Float[Tensor, "n"]]:
-    """The masks of the chosen pictures, cut by the evidence of `feature`, and the feature lifted from them."""
-    total, masks = torch.zeros(scene.count, 2, device=scene.device), {}
-    for done, index in enumerate(chosen):
-        progress(done, len(chosen), "")
-        operator = view_operator(scene, views.cameras[index], RenderOptions())
-        evidence = Evidence(operator.blend(feature[:, None])[..., 0].cpu(), views.prompts.get(index, ViewPrompt()))
-        # a picture in which neither the selection nor a click shows has no object
-        shows = int((evidence.lifted > 0.5).sum()) >= _MIN_PIXELS or len(evidence.prompt.inside)
-        masks[index] = cutter(views.images[index], evidence) if shows else torch.zeros_like(evidence.lifted)
-        total += weight_inside(operator, masks[index].to(scene.device))
-    return masks, share_inside(total)
-
-
 def measure_agreement(
     masks: Sequence[Float[Tensor, "_ _"]],
     scene: Gaussians,
@@ -171,15 +153,7 @@ def measure_agreement(
     *,
     progress: Progress = silent,
 ) -> Agreement:
-    """Compare the masks with the selected Gaussians, rendered in front of and behind all others.
-
-    Args:
-        masks: One per camera, of its size, in [0, 1].
-        scene: n Gaussians.
-        cameras: Cameras of the masks.
-        selection: The object's Gaussians.
-        progress: Called per picture.
-    """
+    """Compare the masks, one per camera, with the selected Gaussians, rendered in front of and behind all others."""
     feature = selection[:, None].float().to(scene.device)
     values = []
     for index, (mask, camera) in enumerate(zip(masks, cameras, strict=True)):

@@ -33,15 +33,7 @@ _HOLE = 1000
 
 
 def grabcut_mask(image: Float[Tensor, "h w 3"], evidence: Evidence) -> Float[Tensor, "h w"]:
-    """Cut the object out of one picture; a `ViewCutter`.
-
-    Args:
-        image: sRGB in [0, 1].
-        evidence: What is known of the object in this picture.
-
-    Returns:
-        The object's mask, 0 or 1.
-    """
+    """The object's mask, 0 or 1, in one picture, sRGB in [0, 1]; a `ViewCutter`."""
     prior = _prior(evidence.lifted.cpu().numpy(), evidence.prompt)
     labels = np.zeros_like(prior)
     window = _window(prior != cv2.GC_BGD)

@@ -59,9 +59,6 @@ def lift_masks(
 
     Returns:
         The feature in [0, 1]; 0 for a Gaussian that no view sees.
-
-    Raises:
-        ValueError: There is not one mask per camera, or one has another size.
     """
     if not masks or len(masks) != len(cameras):
         raise ValueError(f"masks: expected one for each of {len(cameras)} cameras, found {len(masks)}")

@@ -111,7 +111,7 @@ def seed_selection(
     prompts: Mapping[int, ViewPrompt] | None = None,
     known: Bool[Tensor, "n"] | None = None,
 ) -> tuple[Bool[Tensor, "n"], ObjectRegion]:
-    """Select the Gaussians that are likely the object's.
+    """Select the Gaussians that are likely the object's, and tell the region in which they were looked for.
 
     Args:
         scene: n Gaussians.
@@ -119,12 +119,6 @@ def seed_selection(
         box: Around the object, world units; guessed where None.
         prompts: What the user says, by index of the camera, pixels of its picture.
         known: Gaussians that masks of some pictures give to the object; None where there are no masks.
-
-    Returns:
-        Which Gaussians are likely the object's, and the region in which they were looked for.
-
-    Raises:
-        ValueError: Where nothing tells where the object is, or nothing is there.
     """
     prompts = prompts or {}
     opaque = scene.opacities > _MIN_OPACITY
@@ -133,10 +127,8 @@ def seed_selection(
     if box is not None:
         region = region_of_box(cameras, scene.means[opaque], box)
     else:
-        pointed_at = inside if len(inside) else None
-        if known is not None and bool((known & opaque).any()):
-            pointed_at = torch.cat([inside, scene.means[known & opaque]])
-        region = guess_region(cameras, scene.means[opaque & framed], pointed_at)
+        pointed_at = inside if known is None else torch.cat([inside, scene.means[known & opaque]])
+        region = guess_region(cameras, scene.means[opaque & framed], pointed_at if len(pointed_at) else None)
     selection = region.contains(scene.means) & framed
     if known is not None:
         selection = selection & known
@@ -153,11 +145,7 @@ def seed_selection(
 def default_box(capture: PosedImages) -> Box:
     """A box around the object that a capture goes round, from its cameras and sparse points alone.
 
-    Args:
-        capture: Cameras and sparse points; without points the box is a cube where the optical axes meet.
-
-    Raises:
-        ValueError: Where the cameras do not look at one place.
+    Without points it is a cube where the optical axes meet.
     """
     return guess_region(capture.cameras, capture.points).box
 
@@ -165,16 +153,7 @@ def default_box(capture: PosedImages) -> Box:
 def guess_region(
     cameras: Cameras, points: Float[Tensor, "m 3"], pointed_at: Float[Tensor, "k 3"] | None = None
 ) -> ObjectRegion:
-    """The region of the object that the cameras look at, or that a user pointed at.
-
-    Args:
-        cameras: Cameras of the capture.
-        points: Surface points, world units; may be empty.
-        pointed_at: Points on the object, world units; None where nobody pointed.
-
-    Raises:
-        ValueError: Where nobody pointed and the cameras do not look at one place.
-    """
+    """The region of the object that the cameras look at, or that a user pointed at, in surface points, world units."""
     middle = focus_point(cameras) if pointed_at is None else pointed_at.median(0).values.to(cameras.centers)
     source = "the cameras look at" if pointed_at is None else "the points name"
     points = _drawn(points.to(middle))
@@ -203,13 +182,7 @@ def guess_region(
 
 
 def region_of_box(cameras: Cameras, points: Float[Tensor, "m 3"], box: Box) -> ObjectRegion:
-    """The region of a box that a user gave, without the support that it may cut.
-
-    Args:
-        cameras: Cameras of the capture.
-        points: Surface points, world units.
-        box: As given.
-    """
+    """The region of a box that a user gave, without the support that it may cut."""
     middle, radius = (box.lower + box.upper) / 2, 0.75 * float((box.upper - box.lower).norm())
     support = _find_support(cameras, _drawn(points), middle, radius)
     if support is not None:
@@ -273,9 +246,8 @@ def _find_group(
 ) -> tuple[Float[Tensor, "k 3"], float, bool] | None:
     """The group of points around the middle and above the support, from the smallest sphere that holds all of it.
 
-    Returns:
-        The points, the radius of the sphere, and whether they end within it; where no sphere holds all of it, the
-        group of the smallest sphere. None where hardly any points are known.
+    With the radius of the sphere, and whether the points end within it; where no sphere holds all of it, the group of
+    the smallest sphere. None where hardly any points are known.
     """
     points, first = points[_above(points, support, _ABOVE_SUPPORT)], None
     for factor in _SPHERES:
@@ -355,9 +327,7 @@ def _nearer_inside(
     graph = coo_array((cost.ravel(), (rows.ravel(), np.asarray(neighbour).ravel())), shape=(len(means),) * 2).tocsr()
 
     def touched(points: Tensor) -> np.ndarray:
-        if not len(points):
-            return np.zeros(0, np.int64)
-        return np.unique(np.asarray(tree.query(points.cpu().numpy(), k=_TOUCHED)[1]))
+        return np.unique(np.asarray(tree.query(points.reshape(-1, 3).cpu().numpy(), k=_TOUCHED)[1]))
 
     def way_from(sources: np.ndarray) -> np.ndarray:
         if not len(sources):

@@ -109,9 +109,6 @@ def load_birefnet(weights: Path | str = BIREFNET_REPOSITORY, *, threads: int | N
     Args:
         weights: An .onnx file, or a repository on the Hugging Face hub, downloaded once; none of its code runs.
         threads: CPU threads, where it runs on the CPU; all cores that this process may use where not given.
-
-    Raises:
-        ValueError: Where a package is missing, or the file is no such network.
     """
     path = weights if isinstance(weights, Path) else _from_hub(weights)
     session = _opened(path, "birefnet", threads)
@@ -123,16 +120,7 @@ def load_birefnet(weights: Path | str = BIREFNET_REPOSITORY, *, threads: int | N
 
 
 def load_sam2(encoder: Path, decoder: Path, *, threads: int | None = None) -> Sam2:
-    """Load the networks.
-
-    Args:
-        encoder: An .onnx file of the image encoder.
-        decoder: An .onnx file of the prompt decoder that belongs to it.
-        threads: CPU threads; all cores that this process may use where not given.
-
-    Raises:
-        ValueError: Where onnxruntime is missing, or a file is no such network.
-    """
+    """Load the .onnx files of an image encoder and its prompt decoder, for so many CPU threads (by default all)."""
     encodes, decodes = (_opened(path, "sam2", threads) for path in (encoder, decoder))
     shape = encodes.get_inputs()[0].shape
     if len(shape) != 4 or shape[1] != 3 or not isinstance(shape[2], int) or shape[2] != shape[3]:

@@ -49,12 +49,6 @@ def segment(
         select: Which Gaussians are the object.
         solidify: Length and rates of the fit of the object alone; None leaves its Gaussians as they are in the scene.
         progress: Called with steps done, steps in all and a short text.
-
-    Returns:
-        The object, its surroundings, and which Gaussian is which.
-
-    Raises:
-        ValueError: The capture has no masks, or no Gaussian is inside them.
     """
     masked = capture.with_masks()
     if len(masked) == 0:

@@ -118,15 +118,7 @@ def _component_opacity(gaussians: Gaussians) -> Float[Tensor, "n"]:
 
 
 def apply_corrections(lifted: Bool[Tensor, "n"], corrections: Int8[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
-    """The selection with the user's corrections.
-
-    Args:
-        lifted: The selection from the masks.
-        corrections: 1 adds a Gaussian, -1 removes it, 0 leaves it; None changes nothing.
-
-    Raises:
-        ValueError: Where there is not one correction per Gaussian.
-    """
+    """The selection from the masks with the user's corrections: 1 adds a Gaussian, -1 removes it, 0 leaves it."""
     if corrections is None:
         return lifted
     if len(corrections) != len(lifted):

@@ -94,9 +94,6 @@ def solidify_object(
     Returns:
         The object's Gaussians, changed in every field, and more of them where the photographs show it larger than they
         are many.
-
-    Raises:
-        ValueError: All masks are empty.
     """
     chosen = scene.select(selection)
     views = [
