@@ -27,8 +27,6 @@ _FOCAL_RANGE = (0.35, 5.0)
 
 Selection = Callable[[int, np.ndarray], np.ndarray]
 """From the number of a photo and its features (n, 2 or more: x, y, shape) to the indices of those that stay."""
-Focals = dict[int, float]
-"""Focal length in pixels by the number of the camera in a database."""
 
 
 def find_features(job: Job) -> None:
@@ -197,10 +195,21 @@ def _promising_pairs(job: Job, database: Path) -> Path:
     return listed
 
 
-def calibrated_focals(database: Path, seed: int) -> Focals:
-    """Focal length by camera: from EXIF where COLMAP read one, else from the fundamental matrices of all pairs.
+def copy_with_cameras(source: Path, target: Path, change: Callable[[Any], None]) -> Path:
+    """A copy of the database `source` at `target`, each camera as `change` leaves it."""
+    copy_database(source, fresh(target))
+    with pycolmap.Database.open(target) as opened:
+        for camera in opened.read_all_cameras():
+            change(camera)
+            opened.update_camera(camera)
+    return target
 
-    On a copy, since COLMAP also estimates the pairs anew, and with its 1 px that leaves fewer matches.
+
+def with_calibrated_focals(database: Path, target: Path, seed: int) -> Path:
+    """A copy at `target` with a focal length by camera: from EXIF where COLMAP read one, else from all pairs' geometry.
+
+    They are found on another copy, since COLMAP also estimates the pairs anew, and with its 1 px that leaves fewer
+    matches.
     """
     copy = copy_database(database, database.with_suffix(".calibrated.db"))
     with pycolmap.Database.open(database) as original:
@@ -211,7 +220,7 @@ def calibrated_focals(database: Path, seed: int) -> Focals:
         found = {camera.camera_id: float(camera.params[0]) for camera in calibrated.read_all_cameras()}
     count = {i: sum(image.camera_id == i for image in images) for i in cameras}
     common = max(cameras, key=lambda i: count[i])
-    focals: Focals = {}
+    focals: dict[int, float] = {}
     for i in sorted(cameras, key=lambda i: -count[i]):
         size, low, high = max(cameras[i].width, cameras[i].height), *_FOCAL_RANGE
         believed = low * size < found[i] < high * size
@@ -222,15 +231,8 @@ def calibrated_focals(database: Path, seed: int) -> Focals:
             focals[i] = focals[common] * size / max(cameras[common].width, cameras[common].height)
         else:
             focals[i] = found[i]
-    return focals
 
+    def start(camera: Any) -> None:
+        camera.params = [focals[camera.camera_id], *camera.params[1:]]
 
-def with_focals(database: Path, target: Path, focals: Focals) -> Path:
-    """A copy of `database` at `target` whose cameras start from `focals`."""
-    copy_database(database, fresh(target))
-    with pycolmap.Database.open(target) as opened:
-        for camera in opened.read_all_cameras():
-            if camera.camera_id in focals:
-                camera.params = [focals[camera.camera_id], *camera.params[1:]]
-                opened.update_camera(camera)
-    return target
+    return copy_with_cameras(database, target, start)

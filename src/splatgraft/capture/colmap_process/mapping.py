@@ -18,14 +18,13 @@ from typing import Any
 import pycolmap
 
 from .database import (
-    calibrated_focals,
     copy_with_features,
     find_features,
     inside_masks,
     levels,
     match,
     unmatched_pairs,
-    with_focals,
+    with_calibrated_focals,
 )
 from .job import Clock, Job, say
 from .refinement import refined
@@ -117,7 +116,7 @@ def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
         path.parent.mkdir(exist_ok=True)
         matched, work = _database(job, name), job.folder / "mapping.db"
         with clock.phase("mapping"):
-            models = _global_models(job, with_focals(matched, work, calibrated_focals(matched, job.seed)))
+            models = _global_models(job, with_calibrated_focals(matched, work, job.seed))
         with clock.phase("refinement"):
             better = [refined(job, work, models)] if models else []
         found = best_of(matched, [*models, *better], len(job.names))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from .database import copy_database, fresh
+from .database import copy_with_cameras
 from .job import Job, say
 from .scores import ALIKE, Matches, explained_shares, lens_numbers, posed_and_explained, read_matches
 
@@ -106,15 +106,14 @@ def _crops(model: Any) -> dict[int, list[int]]:
 
 def _with_full_lenses(database: Path, target: Path, cameras: set[int]) -> Path:
     """A copy of `database` at `target` in which `cameras` have OPENCV's lens."""
-    copy_database(database, fresh(target))
-    with pycolmap.Database.open(target) as opened:
-        for camera in opened.read_all_cameras():
-            if camera.camera_id in cameras:
-                params = lens_numbers(camera)
-                camera.model = pycolmap.CameraModelId.OPENCV
-                camera.params = params
-                opened.update_camera(camera)
-    return target
+
+    def widen(camera: Any) -> None:
+        if camera.camera_id in cameras:
+            params = lens_numbers(camera)
+            camera.model = pycolmap.CameraModelId.OPENCV
+            camera.params = params
+
+    return copy_with_cameras(database, target, widen)
 
 
 def _mean_error_px(model: Any, images: list[int]) -> float:

@@ -53,7 +53,7 @@ def best_of(database: Path, models: list[Any], photos: int) -> Answer:
 def posed_and_explained(matches: Matches, model: Any) -> float:
     """The number of photos with a pose that counts times the share of `matches` explained."""
     seen = _seen_points(model)
-    return len(seen) * _count_explained(seen, matches) / max(sum(len(rows) for *_, rows in matches), 1)
+    return len(seen) * _count_explained(seen, matches) / _count(matches)
 
 
 def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
@@ -70,6 +70,10 @@ def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
 def connected_photos(database: Path) -> int:
     """Photos that can have a pose at all: with enough verified matches to some other photo."""
     return len({i for *pair, rows in read_matches(database) if len(rows) >= _MIN_OBSERVATIONS for i in pair})
+
+
+def _count(matches: Matches) -> int:
+    return max(sum(len(rows) for *_, rows in matches), 1)
 
 
 def _count_explained(seen: dict[int, np.ndarray], matches: Matches) -> int:
@@ -97,7 +101,7 @@ def _seen_points(model: Any) -> dict[int, np.ndarray]:
 def _numbers(matches: Matches, model: Any) -> Answer:
     seen = _seen_points(model)
     return {
-        "explained": _count_explained(seen, matches) / max(sum(len(rows) for *_, rows in matches), 1),
+        "explained": _count_explained(seen, matches) / _count(matches),
         "mean_reprojection_px": float(model.compute_mean_reprojection_error()),
         "images": [
             {

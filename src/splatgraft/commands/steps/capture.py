@@ -29,7 +29,7 @@ from splatgraft.folders.capture_files import (
     unposed_notes,
 )
 from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, write_capture
-from splatgraft.formats.captures.given_poses import read_given_poses
+from splatgraft.formats.captures import read_given_poses
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.project.step import Context, Inputs, Positional
 from splatgraft.runtime.note import Note
@@ -115,14 +115,14 @@ class Capture:
         """Photos with the poses of another program."""
         photos = self._photos(self.out, context)
         context.console.tell(*exposure_notes(self.capture, photos.paths))
-        given = read_given_poses(poses, photos)
+        posed, without_pose, without_photo = read_given_poses(poses, photos)
         say = context.console.say
-        say(f"{poses}: poses of {len(given.posed)} of {len(photos.paths)} photos, {len(given.posed.points)} points")
-        if given.without_pose:
-            say(f"{poses}: without a pose, left out: {', '.join(given.without_pose)}")
-        if given.without_photo:
-            say(f"{self.capture}: without a photo, left out: {', '.join(given.without_photo)}")
-        return given.posed
+        say(f"{poses}: poses of {len(posed)} of {len(photos.paths)} photos, {len(posed.points)} points")
+        if without_pose:
+            say(f"{poses}: without a pose, left out: {', '.join(without_pose)}")
+        if without_photo:
+            say(f"{self.capture}: without a photo, left out: {', '.join(without_photo)}")
+        return posed
 
     def _pictures(self, folder: Path, context: Context) -> PosedImages:
         """Pictures of a scene that came without photographs."""
