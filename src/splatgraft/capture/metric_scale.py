@@ -70,14 +70,7 @@ def scale_from_marker(
     *,
     progress: Progress = silent,
 ) -> MetricScale:
-    """The scale at which a square marker that the pictures show has sides of `side_m` metres.
-
-    Args:
-        images: sRGB in [0, 1], one per camera.
-        cameras: Cameras of the pictures.
-        side_m: Length of the black square's side, metres.
-        progress: Called per picture.
-    """
+    """The scale at which the black square of a marker in the pictures, sRGB in [0, 1], has sides of `side_m` metres."""
     seen = _marker_corners(images, progress)
     several = {key: views for key, views in seen.items() if len(views) >= 2}
     if not several:

@@ -100,13 +100,9 @@ class _Link:
 def find_in_photos(
     photos: Iterable[Grey], names: Sequence[str], *, has_poses: bool, progress: Progress = silent
 ) -> tuple[Finding, ...]:
-    """Sharpness, overlap and brightness of photos in the order in which they were taken.
+    """Sharpness, overlap and brightness of photos in the order in which they were taken, read one at a time.
 
-    Args:
-        photos: Grey versions, longest side at most `SIDE_PX`; read one at a time.
-        names: The photos' names.
-        has_poses: Whether the photos have poses, so that no matches between them are needed.
-        progress: Called per photo.
+    Their longest side is `SIDE_PX` at most. Photos that have poses need no matches.
     """
     blur: list[float] = []
     features: list[_Features] = []

@@ -65,13 +65,9 @@ class _Photo:
 def usable_photos(
     photos: Sequence[Path], name: str, *, keep_odd: bool = False, progress: Progress = silent
 ) -> tuple[list[Path], tuple[LeftOut, ...]]:
-    """The photos without poses that are worth a pose, at least 8, and the others.
+    """The photos of the capture `name` without poses that are worth a pose, at least 8, and the others.
 
-    Args:
-        photos: Image files.
-        name: The capture, for the message.
-        keep_odd: Whether copies and blurred photos stay; unreadable ones never do.
-        progress: Moves a bar.
+    With `keep_odd` copies and blurred photos stay; unreadable ones never do.
     """
     odd = find_odd_photos(photos, keep_odd=keep_odd, progress=progress)
     out = {one.name for one in odd}

@@ -201,10 +201,7 @@ def estimate_scene_up(
     """Up direction of a scene: the normal of the largest plane in the dense part, on the side with more points.
 
     The conventions of files decide the sign where the normal is nearly z (+z, since there may be as much below a table
-    as on it), and where both sides are alike (-y, as structure from motion leaves it, or +z).
-
-    Returns:
-        A unit vector, and the reason for it, for the user.
+    as on it), and where both sides are alike (-y, as structure from motion leaves it, or +z). With the reason.
     """
     near = points[(points - centre).norm(dim=1) < 2 * radius]
     near = near[:: max(1, len(near) // _PLANE_POINTS)]
@@ -260,9 +257,7 @@ def _unoccluded_poses(
 ) -> tuple[Float[Tensor, "v 4 4"], int]:
     """Poses at the first position of each view that is not occluded, tested by rendering the scene at 48 x 36 pixels.
 
-    Returns:
-        The poses, and the number of views without such a position. Of these the least occluded poses are added while
-        there are fewer than `_MIN_VIEWS`.
+    With the number of views without such a position, of which the least occluded are added up to `_MIN_VIEWS`.
     """
     chosen: list[Tensor] = []
     rejected: list[tuple[float, Tensor]] = []

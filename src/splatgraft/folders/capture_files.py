@@ -23,10 +23,7 @@ def has_poses(path: Path) -> bool:
 
 
 def description_files(path: Path) -> tuple[Path, ...]:
-    """The files with poses and points: all in the folder except images, step.json and hidden files.
-
-    Raises: ValueError where there is nothing at `path`.
-    """
+    """The files with poses and points: all in the folder except images, step.json and hidden files."""
     if path.is_file():
         return (path,)
     if not path.is_dir():
@@ -55,10 +52,7 @@ def unposed_notes(path: Path, capture: PosedImages) -> list[Note]:
 
 
 def camera_files(path: Path) -> tuple[Path, ...]:
-    """The files that the cameras of `path`, a file or a folder of a capture, are read from.
-
-    Raises: ValueError where there is no capture at `path`.
-    """
+    """The files that the cameras of `path`, a file or a folder of a capture, are read from."""
     if not path.is_dir():
         return (path,)
     found = find_poses(path)
@@ -70,13 +64,7 @@ def camera_files(path: Path) -> tuple[Path, ...]:
 
 
 def left_out_notes(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[Note]:
-    """What of the capture at `path` is not used: a warning with number and names, then a note per kind of reason.
-
-    Args:
-        path: The capture.
-        kept: Images that are used.
-        left_out: The others, and masks that are not used.
-    """
+    """What of the capture at `path` is not used: a warning with number and names, then a note per kind of reason."""
     if not left_out:
         return []
     total = kept + sum(not one.mask_only for one in left_out)
@@ -95,23 +83,13 @@ def left_out_notes(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[N
 
 
 def exposure_notes(name: Path, photos: Sequence[Path]) -> list[Note]:
-    """At most one warning that starts with `name`, where the photos' exposures differ or white balance was automatic.
-
-    Raises: ValueError where a photo is no readable image.
-    """
+    """At most one warning that starts with `name`: exposures of photos differ, or white balance was automatic."""
     found = describe_inconsistency([read_exposure(photo) for photo in photos])
     return [] if found is None else [Note(f"{name}: {found}", "minor")]
 
 
 def read_luminance_scale(cameras: Path) -> LuminanceScale | None:
-    """The luminance behind the values of a capture; None where its images do not exist or have no exposure data.
-
-    Args:
-        cameras: The capture's folder or transforms.json.
-
-    Raises:
-        ValueError: An image exists and is not readable, or there is no capture.
-    """
+    """The luminance behind the values of a capture; None where its images do not exist or have no exposure data."""
     photos = list_capture_images(cameras)
     exposures = [read_exposure(photo) for photo in photos]
     if all(one.ev100 is None for one in exposures):

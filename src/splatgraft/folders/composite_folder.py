@@ -17,20 +17,14 @@ from splatgraft.project.layout import IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
 
 
 def placement_files(path: Path) -> tuple[Path, ...]:
-    """placement.json and all files that it names.
-
-    Raises: ValueError where it is missing or broken.
-    """
+    """placement.json and all files that it names."""
     placement = read_placement(path)
     erased = (path.parent / "erased.npy",) if placement.erased is not None else ()
     return (path, *erased, *(item.object_path for item in placement.objects if item.object_path is not None))
 
 
 def read_composite(target: Path, placement: Path) -> Composite:
-    """The composite of a target scene and the objects that a placement names.
-
-    Raises: ValueError where a file is missing or broken, or an object is not named.
-    """
+    """The composite of a target scene and the objects that a placement names."""
     found = read_placement(placement)
     for index, item in enumerate(found.objects):
         if item.object_path is None:
@@ -44,8 +38,6 @@ def composite_of(
     """The composite of a target scene and the objects that `placement` names, each file read once.
 
     `known` holds scenes that were read before, by path.
-
-    Raises: ValueError where an object's file is missing or broken, or what is erased belongs to another target.
     """
     read, objects = dict(known), []
     for item in placement.objects:

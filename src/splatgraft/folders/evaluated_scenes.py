@@ -64,10 +64,7 @@ class EvaluatedScenes:
 
     @staticmethod
     def read(result: Path, composite: Path, cameras: Path, *, device: torch.device) -> "EvaluatedScenes":
-        """Read all scenes.
-
-        Raises: ValueError where a file is missing or broken, or they do not belong together.
-        """
+        """Read all scenes."""
         scene = read_gaussians(composite / SCENE_FILE)
         is_object = read_selection(composite / IS_OBJECT_FILE, scene.count, composite / SCENE_FILE)
         return EvaluatedScenes(
@@ -120,10 +117,7 @@ class TrueViews:
 
     @staticmethod
     def read(truth: Path, target_capture: Path | None, harmonized: Path | None) -> "TrueViews":
-        """Match the views of the truth with the target's.
-
-        Raises: ValueError where the truth has no masks or the target no image of the same name.
-        """
+        """Match the views of the truth with the target's."""
         views = read_images(truth)
         if target_capture is None:
             raise ValueError("--ground-truth: expected --target-capture, the images without the object, found none")

@@ -29,9 +29,6 @@ def read_export_source(path: Path, *, cameras: Path | None = None) -> ExportSour
         path: A scene file, a folder with scene.ply, a project's folder or its project.toml. Of a project, and of the
             folders that `relight` and `consolidate` made in one, the scene before the transfer and its parts are known.
         cameras: The capture that a scene was made from, in its frame; found in a project.
-
-    Raises:
-        ValueError: There is none of these, or a file is broken.
     """
     if path.name == PROJECT_FILE:
         path = path.parent

@@ -63,14 +63,7 @@ def finished(kept: Path, views: ViewFolder) -> set[int]:
 
 
 def harmonize_part(part: Part, say: Callable[[str], None] = lambda sentence: None, progress: Progress = silent) -> int:
-    """Harmonise the views of the part that are not finished.
-
-    Returns:
-        Their number.
-
-    Raises:
-        ValueError: The method's weights or packages are missing, or a view is damaged.
-    """
+    """Harmonise the views of the part that are not finished; gives their number."""
     views = ViewFolder.open(part.views)
     missing = part.missing(views)
     if not missing:
@@ -97,11 +90,7 @@ def harmonize_part(part: Part, say: Callable[[str], None] = lambda sentence: Non
 
 
 def harmonize_with_processes(whole: Part, processes: int, *, say: Callable[[str], None], progress: Progress) -> None:
-    """Split the views over processes on this machine, one per GPU where there are GPUs.
-
-    Raises:
-        ValueError: A process failed.
-    """
+    """Split the views over processes on this machine, one per GPU where there are GPUs."""
     gpus = 0 if whole.device == "cpu" else torch.cuda.device_count()
     devices = [f"cuda:{number % gpus}" if gpus else "cpu" for number in range(processes)]
     parts = [replace(whole, number=i, of=processes, device=device) for i, device in enumerate(devices)]
@@ -123,11 +112,7 @@ def harmonize_with_processes(whole: Part, processes: int, *, say: Callable[[str]
 
 
 def harmonize_with_ray(whole: Part, parts: int, *, address: str, progress: Progress) -> None:
-    """Split the views into parts that Ray's workers harmonise, each with a GPU unless the device is cpu.
-
-    Raises:
-        ValueError: A part failed.
-    """
+    """Split the views into parts that Ray's workers harmonise, each with a GPU unless the device is cpu."""
     split = [replace(whole, number=i, of=parts) for i in range(parts)]
     tasks = [Task(f"part {part.number}", partial(harmonize_part, part)) for part in split]
     gpus = 0 if whole.device == "cpu" else 1

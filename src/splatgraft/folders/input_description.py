@@ -33,11 +33,7 @@ class InputDescription:
 
 
 def describe_input(path: Path) -> InputDescription:
-    """Look at a path without changing anything.
-
-    Args:
-        path: A file or a folder, which need not exist.
-    """
+    """Look at a path, which need not exist, without changing anything."""
     try:
         return _described(path)
     except (ValueError, OSError) as error:

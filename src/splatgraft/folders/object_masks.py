@@ -69,10 +69,7 @@ class MaskedViews:
 
 
 def with_mask_folder(capture: PosedImages, folder: Path | None, path: Path) -> PosedImages:
-    """The views of `capture` that have a mask: in `folder` by name, or the capture's own.
-
-    Raises: ValueError where no view has one.
-    """
+    """The views of `capture` that have a mask: in `folder` by name, or the capture's own."""
     paths = capture.mask_paths
     if folder is not None:
         if not folder.is_dir():
@@ -106,16 +103,6 @@ def cut_masks(
     """The capture with masks that agree in 3D, written to `folder`; with the region of the object.
 
     Pictures are cut at `CUT_SIDE_PX`. Masks of some pictures that are there already tell where the object is.
-
-    Args:
-        capture: The pictures.
-        scene: Reconstructed from them.
-        request: The algorithm, and what the user says.
-        folder: For the masks; made here.
-        progress: Called per picture.
-
-    Raises:
-        ValueError: Where nothing tells where the object is, or hardly any picture shows it.
     """
     factor = min(1.0, CUT_SIDE_PX / int(capture.cameras.sizes.max()))
     small = capture.resized(factor)
@@ -145,10 +132,7 @@ def _known(capture: PosedImages, scene: Gaussians) -> Bool[Tensor, "n"] | None:
 
 
 def network_masks(capture: PosedImages, *, weights: Path | None, folder: Path, progress: Progress) -> MaskedViews:
-    """The capture with masks of the foreground from BiRefNet, written to `folder`.
-
-    Raises: ValueError where a package or the weights are missing.
-    """
+    """The capture with masks of the foreground from BiRefNet, written to `folder`."""
     network = load_birefnet() if weights is None else load_birefnet(weights)
 
     def made() -> Iterator[Tensor]:
@@ -175,15 +159,7 @@ def _with_masks(capture: PosedImages, paths: tuple[Path | None, ...], which: Boo
 def write_mask_sheet(
     path: Path, masked: MaskedViews, chosen: Sequence[int], *, scene: Gaussians, selection: Bool[Tensor, "n"]
 ) -> None:
-    """Write photographs in rows, the surroundings darkened, with two outlines: red the mask, blue the selection.
-
-    Args:
-        path: The picture's file.
-        masked: Photographs and masks.
-        chosen: Which of them, in this order.
-        scene: n Gaussians.
-        selection: The object's.
-    """
+    """Write `chosen` photographs in rows, the surroundings darkened, outlined: red the mask, blue the selection."""
     cells = [_cell(masked, index, scene, selection) for index in chosen]
     height, width = max(c.shape[0] for c in cells), max(c.shape[1] for c in cells)
     padded = [torch.nn.functional.pad(c, (0, 0, 0, width - c.shape[1], 0, height - c.shape[0]), value=1) for c in cells]

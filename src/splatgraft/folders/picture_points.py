@@ -16,16 +16,7 @@ from splatgraft.rendering import surface_points
 
 
 def prompts_by_view(capture: PosedImages, prompts: Mapping[str, ViewPrompt], path: Path) -> dict[int, ViewPrompt]:
-    """The prompts of a file by the index of their view, in pixels of its camera, undistorted.
-
-    Args:
-        capture: The pictures.
-        prompts: By name of the picture, with or without folder and suffix, pixels as a viewer shows it.
-        path: The file that they come from, for messages.
-
-    Raises:
-        ValueError: Where no picture, or more than one, has a name.
-    """
+    """The prompts of the file `path`, by picture's name, by index of their view in pixels of its undistorted camera."""
     found = {}
     for name, prompt in prompts.items():
         index = picture_called(capture.cameras.names, name, str(path))
@@ -34,16 +25,7 @@ def prompts_by_view(capture: PosedImages, prompts: Mapping[str, ViewPrompt], pat
 
 
 def picture_called(names: Sequence[str], name: str, where: str) -> int:
-    """The index of the one picture of that name, with or without folder and suffix.
-
-    Args:
-        names: Of all pictures.
-        name: As a user writes it.
-        where: The file or option that has the name, for messages.
-
-    Raises:
-        ValueError: Where no picture, or more than one, has the name.
-    """
+    """The index of the one picture of that name, with or without folder and suffix; `where` has the name."""
     paths, called = [PurePath(other) for other in names], PurePath(name)
     wanted = [i for i, other in enumerate(paths) if name in (str(other), other.name, other.stem)]
     wanted = wanted or [i for i, other in enumerate(paths) if called.stem == other.stem]
@@ -82,9 +64,6 @@ def point_in_world(text: str, capture: PosedImages, scene: Gaussians | None, *, 
         capture: The pictures.
         scene: Gives the surface of a single picture; None where there is none.
         option: For messages.
-
-    Raises:
-        ValueError: The text is another, or nothing is seen there.
     """
     parts = text.split()
     if len(parts) == 1 and ":" not in text and len(numbers := _numbers(text)) == 3:

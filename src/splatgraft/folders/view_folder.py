@@ -26,10 +26,7 @@ PICTURES = ("composite", "background", "prior", "mask", "normal", "depth")
 
 
 def file_stems(cameras: Cameras) -> tuple[str, ...]:
-    """A file name without suffix for each camera, made of the camera's name and its last folder.
-
-    Raises: ValueError where two cameras would get the same.
-    """
+    """A file name without suffix for each camera, made of the camera's name and its last folder."""
     stems = tuple("_".join(PurePosixPath(name).with_suffix("").parts[-2:]) for name in cameras.names)
     stems = tuple(stem.removeprefix("images_") for stem in stems)
     if len(set(stems)) < len(stems):
@@ -60,10 +57,7 @@ class ViewFolder:
 
     @staticmethod
     def open(folder: Path) -> "ViewFolder":
-        """Open a folder that `create` and `write` made.
-
-        Raises: ValueError where `folder` is none.
-        """
+        """Open a folder that `create` and `write` made."""
         cameras = read_cameras(folder / CAMERAS_FILE)
         return ViewFolder(folder, cameras, file_stems(cameras))
 
@@ -88,10 +82,7 @@ class ViewFolder:
             np.save(stream, view.depth.cpu().numpy().astype(np.float32))
 
     def read(self, index: int) -> HarmonizerInputs:
-        """All pictures of one view.
-
-        Raises: ValueError where one is missing or broken.
-        """
+        """All pictures of one view."""
         composite, background, prior = (read_rgb(self.path(name, index)) for name in PICTURES[:3])
         depth = _read_depth(self.path("depth", index))
         normal = _normal_from_rgb(read_rgb(self.path("normal", index)))

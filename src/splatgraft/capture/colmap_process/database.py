@@ -140,11 +140,7 @@ def levels(job: Job) -> list[str]:
 
 
 def match(job: Job, database: Path, level: str) -> int:
-    """Match the pairs of `level`; those that are matched already are not matched again.
-
-    Returns:
-        The number of pairs that were matched.
-    """
+    """Match the pairs of `level` that are not matched already; gives their number."""
     before = _matched(database)
     matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     if job.thorough:

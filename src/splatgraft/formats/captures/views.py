@@ -5,6 +5,7 @@ Image sizes are checked against the files, distortion is separated from pinhole 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -103,7 +104,15 @@ def existing_file(path: Path) -> Path | None:
 
 def posed_images(file: CaptureFile, *, with_points: bool = True) -> PosedImages:
     """The capture without views whose image is missing or unreadable or does not fit its camera."""
-    checked = [view if isinstance(view, LeftOut) else _usable(view, file.source, file.folder) for view in file.views]
+
+    def usable(view: ViewRecord) -> ViewRecord:
+        if view.image_path is None:
+            raise ValueError(f"{file.source}: expected the image file {view.name}, found none in {file.folder}")
+        fitted = fitted_to_file(view, file.source)
+        _pinhole(fitted, file.source)
+        return fitted
+
+    checked = [v if isinstance(v, LeftOut) else view_or_reason(v.name, partial(usable, v)) for v in file.views]
     left_out = [view for view in checked if isinstance(view, LeftOut)]
     kept = [view for view in checked if isinstance(view, ViewRecord)]
     _require_share(len(kept), left_out, "images", file.source)
@@ -168,17 +177,6 @@ def _require_share(kept: int, left_out: Sequence[LeftOut], what: str, source: Pa
     )
 
 
-def _usable(view: ViewRecord, source: Path, folder: Path) -> ViewRecord | LeftOut:
-    def read() -> ViewRecord:
-        if view.image_path is None:
-            raise ValueError(f"{source}: expected the image file {view.name}, found none in {folder}")
-        fitted = fitted_to_file(view, source)
-        _pinhole(fitted, source)
-        return fitted
-
-    return view_or_reason(view.name, read)
-
-
 def fitted_to_file(view: ViewRecord, source: Path) -> ViewRecord:
     """The view with intrinsics for its file's size, where that is smaller than the camera's and of the same shape.
 
@@ -186,25 +184,17 @@ def fitted_to_file(view: ViewRecord, source: Path) -> ViewRecord:
     """
     if view.image_path is None:
         return view
-    (width, height), (file_width, file_height) = view.size, stored_size(view.image_path, view.size)
-    if max(file_width, file_height) > MAX_SIDE:
-        raise ValueError(f"{view.image_path}: expected sides up to {MAX_SIDE} px, found {file_width}x{file_height}")
-    if (width, height) == (file_width, file_height):
+    (width, height), size = view.size, stored_size(view.image_path, view.size)
+    found = f"found {size[0]}x{size[1]}"
+    if max(size) > MAX_SIDE:
+        raise ValueError(f"{view.image_path}: expected sides up to {MAX_SIDE} px, {found}")
+    if not same_shape(view.size, size):
+        raise ValueError(f"{view.image_path}: expected {width}x{height} px, as in {source}, or those scaled, {found}")
+    if size[0] >= width:
         return view
-    if not same_shape((width, height), (file_width, file_height)):
-        raise ValueError(
-            f"{view.image_path}: expected {width}x{height} px, as in {source}, or those scaled, "
-            f"found {file_width}x{file_height}"
-        )
-    if file_width >= width:
-        return view
-    x, y = file_width / width, file_height / height
-    return replace(
-        view,
-        size=(file_width, file_height),
-        focal=(view.focal[0] * x, view.focal[1] * y),
-        center=(view.center[0] * x, view.center[1] * y),
-    )
+    x, y = size[0] / width, size[1] / height
+    focal, center = (view.focal[0] * x, view.focal[1] * y), (view.center[0] * x, view.center[1] * y)
+    return replace(view, size=size, focal=focal, center=center)
 
 
 def _cameras_of(views: Sequence[ViewRecord], source: Path) -> tuple[Cameras, tuple[Distortion | None, ...]]:

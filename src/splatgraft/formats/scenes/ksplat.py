@@ -5,15 +5,15 @@ positions are 16-bit offsets from the middle of a bucket, SH bands 8 bits at lev
 """
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.formats.scenes.quantization import SMALLEST_SCALE, logits_from_bytes
+from splatgraft.formats.scenes.quantization import from_linear
 from splatgraft.formats.scenes.scene_file import SceneFile
 
 _HEADER_BYTES, _SECTION_HEADER_BYTES = 4096, 1024
@@ -49,7 +49,10 @@ def read_ksplat(path: Path) -> SceneFile:
             centers = np.ndarray((buckets, 3), "<f4", data, centers_at, (bucket_bytes, 4))
             own = centers[np.searchsorted(ends, np.arange(count), side="right")]
             positions = (positions - half) * (side / 2 / half) + own
-        parts.append(_gaussians(path, rows, positions, _bands(rows, degree, level, (low or -1.5, high or 1.5))))
+        fields = [torch.from_numpy(rows[name].astype(np.float32)) for name in ("scale", "quaternion")]
+        part = from_linear(path, torch.from_numpy(positions), *fields, torch.from_numpy(rows["rgba"].copy()))
+        bands = torch.from_numpy(_bands(rows, degree, level, (low or -1.5, high or 1.5)))
+        parts.append(replace(part, sh=torch.cat([part.sh, bands], 1)))
         at = rows_at + row.itemsize * room
     if sum(part.count for part in parts) != total:
         raise ValueError(f"{path}: expected {total} Gaussians, found {sum(part.count for part in parts)} in sections")
@@ -61,20 +64,6 @@ def _row(level: int, degree: int) -> np.dtype:
     real, position, rest = ("<f4", "<f4", "<f4") if level == 0 else ("<f2", "<u2", ("<f2", "u1")[level - 1])
     fields = [("position", position, 3), ("scale", real, 3), ("quaternion", real, 4), ("rgba", "u1", 4)]
     return np.dtype(fields + ([("rest", rest, _REST[degree])] if degree else []))
-
-
-def _gaussians(path: Path, rows: np.ndarray, positions: np.ndarray, bands: np.ndarray) -> Gaussians:
-    scales = rows["scale"].astype(np.float32)
-    if not (np.isfinite(positions).all() and np.isfinite(scales).all() and (scales >= 0).all()):
-        raise ValueError(f"{path}: expected finite positions and scales of 0 or more, found others in a section")
-    dc = spherical_harmonics.dc_from_rgb(torch.from_numpy(rows["rgba"][:, :3].astype(np.float32)) / 255)
-    return Gaussians(
-        means=torch.from_numpy(positions),
-        log_scales=torch.from_numpy(scales).clamp_min(SMALLEST_SCALE).log(),
-        quaternions=torch.from_numpy(rows["quaternion"].astype(np.float32)),
-        opacity_logits=logits_from_bytes(torch.from_numpy(rows["rgba"][:, 3].copy())),
-        sh=torch.cat([dc[:, None], torch.from_numpy(bands)], 1),
-    )
 
 
 def _bands(rows: np.ndarray, degree: int, level: int, bounds: tuple[float, float]) -> Float[np.ndarray, "n k 3"]:

@@ -6,11 +6,32 @@ import torch
 from jaxtyping import Float, Int64, UInt8
 from torch import Tensor
 
+from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 
 SMALLEST_SCALE = 1e-30
 """World units; replaces a linear scale of exactly 0, since its logarithm is stored."""
 _MORTON_BITS = 10
+
+
+def from_linear(
+    path: Path,
+    positions: Float[Tensor, "n 3"],
+    scales: Float[Tensor, "n 3"],
+    quaternions: Float[Tensor, "n 4"],
+    rgba: UInt8[Tensor, "n 4"],
+) -> Gaussians:
+    """Gaussians without bands of linear scales and bytes of sRGB and opacity, as .splat and .ksplat store them."""
+    if not (positions.isfinite().all() and scales.isfinite().all() and (scales >= 0).all()):
+        kind = path.suffix
+        raise ValueError(f"{path}: expected finite positions and scales of 0 or more, found others: is this a {kind}?")
+    return Gaussians(
+        means=positions,
+        log_scales=scales.clamp_min(SMALLEST_SCALE).log(),
+        quaternions=quaternions,
+        opacity_logits=logits_from_bytes(rgba[:, 3]),
+        sh=spherical_harmonics.dc_from_rgb(rgba[:, :3].float() / 255)[:, None],
+    )
 
 
 def logits_from_bytes(alphas: UInt8[Tensor, "n"]) -> Float[Tensor, "n"]:

@@ -11,7 +11,7 @@ import torch
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.formats.scenes.quantization import SMALLEST_SCALE, bytes_from_unit, logits_from_bytes, writable
+from splatgraft.formats.scenes.quantization import bytes_from_unit, from_linear, writable
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
 from splatgraft.runtime.files import atomic_write
 
@@ -24,16 +24,8 @@ def read_splat(path: Path) -> SceneFile:
     if not data or len(data) % _ROW.itemsize:
         raise ValueError(f"{path}: expected a multiple of {_ROW.itemsize} bytes above 0, found {len(data)}")
     rows = {name: torch.from_numpy(np.frombuffer(data, _ROW)[name].copy()) for name in _ROW.names or ()}
-    scales = rows["scale"]
-    if not (rows["position"].isfinite().all() and scales.isfinite().all() and (scales >= 0).all()):
-        raise ValueError(f"{path}: expected finite positions and scales of 0 or more, found others: is this a .splat?")
-    gaussians = Gaussians(
-        means=rows["position"],
-        log_scales=scales.clamp_min(SMALLEST_SCALE).log(),
-        quaternions=(rows["quaternion"].float() - 128) / 128,
-        opacity_logits=logits_from_bytes(rows["rgba"][:, 3]),
-        sh=spherical_harmonics.dc_from_rgb(rows["rgba"][:, :3].float() / 255)[:, None],
-    )
+    quaternions = (rows["quaternion"].float() - 128) / 128
+    gaussians = from_linear(path, rows["position"], rows["scale"], quaternions, rows["rgba"])
     return SceneFile(gaussians, notes=("the format has colours without view dependence",))
 
 
