@@ -61,7 +61,10 @@ class CaptureFile:
     """Where masks/ is looked for."""
     views: Sequence[ViewRecord | LeftOut]
     """One per photograph, or why it is left out."""
-    points: Callable[[], tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]] = lambda: (torch.zeros(0, 3),) * 2
+    points: Callable[[], tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]] = lambda: (
+        torch.zeros(0, 3),
+        torch.zeros(0, 3),
+    )
     """Reads sparse points, world units, and their colours, sRGB in [0, 1]."""
 
     def records(self) -> list[ViewRecord]:

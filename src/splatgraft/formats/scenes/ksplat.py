@@ -49,8 +49,9 @@ def read_ksplat(path: Path) -> SceneFile:
             centers = np.ndarray((buckets, 3), "<f4", data, centers_at, (bucket_bytes, 4))
             own = centers[np.searchsorted(ends, np.arange(count), side="right")]
             positions = (positions - half) * (side / 2 / half) + own
-        fields = [torch.from_numpy(rows[name].astype(np.float32)) for name in ("scale", "quaternion")]
-        part = from_linear(path, torch.from_numpy(positions), *fields, torch.from_numpy(rows["rgba"].copy()))
+        scales, quaternions = (torch.from_numpy(rows[name].astype(np.float32)) for name in ("scale", "quaternion"))
+        rgba = torch.from_numpy(rows["rgba"].copy())
+        part = from_linear(path, torch.from_numpy(positions), scales, quaternions, rgba)
         bands = torch.from_numpy(_bands(rows, degree, level, (low or -1.5, high or 1.5)))
         parts.append(replace(part, sh=torch.cat([part.sh, bands], 1)))
         at = rows_at + row.itemsize * room
