@@ -10,7 +10,6 @@ from format_files import GOLDEN, TOOLS
 
 from splatgraft import formats
 from splatgraft.core import spherical_harmonics
-from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
 
@@ -88,12 +87,6 @@ def assert_within(original: Gaussians, found: Gaussians, steps: dict[str, float]
         # a hundredth for values in float32
         worst = float(differences[name].abs().amax()) if differences[name].numel() else 0.0
         assert worst <= step * 1.01, f"{name}: {worst} above {step}"
-
-
-def cameras() -> Cameras:
-    eyes = torch.tensor([[0.0, 0, -6], [4.0, -3, 4], [-5.0, 2, 1]])
-    poses = look_at(eyes, torch.zeros(3), up=torch.tensor([0.0, -1, 0]))
-    return pinhole(poses, 60.0, width=64, height=48)
 
 
 @pytest.mark.parametrize("name", STEPS)

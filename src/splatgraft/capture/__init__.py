@@ -13,7 +13,7 @@ from splatgraft.capture.usable_views import (
     usable_views,
 )
 from splatgraft.capture.video import VIDEO_FRAMES, describe_video, extract_frames
-from splatgraft.capture.virtual_cameras import VirtualCameraOptions, place_virtual_cameras, render_pictures
+from splatgraft.capture.virtual_cameras import VirtualCameraOptions, place_virtual_cameras
 
 __all__ = [
     "MIN_VIEWS",
@@ -28,7 +28,6 @@ __all__ = [
     "predict_pose_seconds",
     "read_doubts",
     "readable_views",
-    "render_pictures",
     "require_coverage",
     "scale_from_length",
     "scale_from_marker",

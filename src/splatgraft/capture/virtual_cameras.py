@@ -6,7 +6,7 @@ are over the radius of the dense part.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -165,16 +165,6 @@ def place_virtual_cameras(
         report.append("it is hollow: where it was seen from within, as a room from its middle, say look = within")
     colors = rgb_from_dc(solid.sh[:, 0]).clamp(0, 1)
     return VirtualCameras(cameras, solid.means, colors, tuple(report))
-
-
-def render_pictures(
-    scene: Gaussians, found: VirtualCameras, *, write: Callable[[str, Tensor], None], progress: Progress = silent
-) -> None:
-    """Render `scene` from every camera and hand each picture, sRGB, to `write` with the camera's name."""
-    for index, camera in enumerate(found.cameras):
-        color = render(scene, camera).color
-        write(camera.names[0], color[0].clamp(0, 1))
-        progress(index + 1, len(found.cameras), "pictures of the scene")
 
 
 def _solid(scene: Gaussians) -> Gaussians:

@@ -127,32 +127,26 @@ class _Fit:
     """Gaussians that are fitted, and their scores since the start."""
 
     def __init__(self, gaussians: Gaussians) -> None:
-        self._start = gaussians
         radius = float((gaussians.means - gaussians.means.mean(0)).norm(dim=1).quantile(0.9))
-        self._base = gaussians.sh[:, :1].detach().clone().requires_grad_()
-        self._higher = gaussians.sh[:, 1:].detach().clone().requires_grad_()
         rates = {
             "means": _POSITION_RATE * radius,
             "log_scales": _SCALE_RATE,
             "quaternions": _ROTATION_RATIO * _SCALE_RATE,
             "opacity_logits": _OPACITY_RATE,
+            "base": _COLOR_RATE,
+            "higher": _COLOR_RATE / 20,
         }
-        self._leaves = {name: getattr(gaussians, name).detach().clone().requires_grad_() for name in rates}
-        self._optimizer = torch.optim.Adam(
-            [
-                *({"params": [self._leaves[name]], "lr": rate} for name, rate in rates.items()),
-                {"params": [self._base], "lr": _COLOR_RATE},
-                {"params": [self._higher], "lr": _COLOR_RATE / 20},
-            ],
-            eps=1e-15,
-        )
+        start = vars(gaussians) | {"base": gaussians.sh[:, :1], "higher": gaussians.sh[:, 1:]}
+        self._leaves = {name: start[name].detach().clone().requires_grad_() for name in rates}
+        groups = [{"params": [self._leaves[name]], "lr": rate} for name, rate in rates.items()]
+        self._optimizer = torch.optim.Adam(groups, eps=1e-15)
         self.scores = torch.zeros(gaussians.count, device=gaussians.device)
         """Summed length of the loss gradient by the centre, over all pixels."""
 
     def step(self, view: _CroppedView, background: Float[Tensor, "3"]) -> float:
         """One step on one view over one background; gives the loss."""
-        fitted = replace(self._start, **self._leaves, sh=torch.cat([self._base, self._higher], 1))
-        drawn = render(fitted, view.camera, options=RenderOptions(background=tuple(background.tolist()))).color
+        options = RenderOptions(background=tuple(background.tolist()))
+        drawn = render(self._with_leaves(self._leaves), view.camera, options=options).color
         target = view.mask * view.image + (1 - view.mask) * background.to(view.image)
         loss = (view.weight * (drawn[0] - target).abs()).mean()
         self._optimizer.zero_grad(set_to_none=True)
@@ -165,8 +159,12 @@ class _Fit:
     @property
     def gaussians(self) -> Gaussians:
         """The object as it is fitted so far."""
-        leaves = {name: leaf.detach() for name, leaf in self._leaves.items()}
-        return replace(self._start, **leaves, sh=torch.cat([self._base, self._higher], 1).detach())
+        return self._with_leaves({name: leaf.detach() for name, leaf in self._leaves.items()})
+
+    @staticmethod
+    def _with_leaves(leaves: dict[str, Tensor]) -> Gaussians:
+        fields = {name: leaf for name, leaf in leaves.items() if name not in ("base", "higher")}
+        return Gaussians(sh=torch.cat([leaves["base"], leaves["higher"]], 1), **fields)
 
 
 def _with_splits(gaussians: Gaussians, scores: Float[Tensor, "n"], allowed: int) -> Gaussians:

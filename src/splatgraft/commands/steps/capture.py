@@ -10,7 +10,6 @@ from splatgraft.capture import (
     place_virtual_cameras,
     pose_photos,
     read_doubts,
-    render_pictures,
     require_coverage,
     usable_masks,
     usable_photos,
@@ -32,6 +31,7 @@ from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, 
 from splatgraft.formats.captures import read_given_poses
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.project.step import Context, Inputs, Positional
+from splatgraft.rendering import render
 from splatgraft.runtime.note import Note
 
 
@@ -132,16 +132,11 @@ class Capture:
         for sentence in (*read.said(), *found.report):
             context.console.say(f"{self.capture}: {sentence}")
         (folder / "images").mkdir()
-        paths = {name: folder / "images" / f"{name}.png" for name in found.cameras.names}
-        render_pictures(
-            scene, found, write=lambda name, picture: write_image(paths[name], picture), progress=context.progress
-        )
-        return PosedImages(
-            image_paths=tuple(paths.values()),
-            cameras=found.cameras,
-            points=found.points,
-            point_colors=found.point_colors,
-        )
+        paths = tuple(folder / "images" / f"{name}.png" for name in found.cameras.names)
+        for index, (path, camera) in enumerate(zip(paths, found.cameras, strict=True)):
+            write_image(path, render(scene, camera).color[0].clamp(0, 1))
+            context.progress(index + 1, len(paths), "pictures of the scene")
+        return PosedImages(paths, found.cameras, found.points, found.point_colors)
 
     def _photos(self, folder: Path, context: Context) -> PhotoFiles:
         if not self.capture.is_dir():
