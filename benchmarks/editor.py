@@ -4,7 +4,7 @@
 project of two synthetic scenes, the target of SH degree 3, and speaks the page's own protocol through a websocket, at a
 canvas of 1280x720. No browser takes part, so what a browser needs for drawing comes on top. Times are seconds from the
 message that causes a picture to its arrival, medians of REPEATS; `final` is the light as the step computes it. Of a
-large scene the first points and the first picture are of a sample.
+large scene the first points are of a sample.
 """
 
 import contextlib
@@ -181,7 +181,6 @@ def measure(project: Path) -> dict[str, float]:
             "first points": lambda message: bool(client.scenes),
             "all splats": lambda message: "/target/scene" in client.scenes,
             "first picture": is_picture,
-            "whole picture": lambda message: "Copy-paste" in client.caption() and "being read" not in client.caption(),
         }
         while opened:
             for message in client.messages(0.05):

@@ -5,11 +5,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
 from tiny_project import ball, plane
 from viser import GuiEvent
 
 from splatgraft.cli import main
-from splatgraft.core.gaussians import concatenate
+from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.editor.page.opening import Opening
 from splatgraft.editor.page.page import Page
 from splatgraft.editor.page.server import GuardedServer
@@ -58,6 +59,18 @@ def opened_page(project: Path, *, opening: bool = False) -> Iterator[Page]:
             yield page
         finally:
             page.close()
+
+
+def cloud(count: int, seed: int) -> Gaussians:
+    """Random Gaussians of SH degree 1."""
+    generator = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.rand(count, 3, generator=generator),
+        log_scales=-3 + torch.rand(count, 3, generator=generator),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        opacity_logits=torch.randn(count, generator=generator),
+        sh=torch.rand(count, 4, 3, generator=generator),
+    )
 
 
 def arrives(handle: Any, value: Any) -> None:

@@ -10,7 +10,7 @@ from editor_pages import TOKEN, served
 from viser import _messages
 
 from splatgraft.cli import main
-from splatgraft.editor.access import allowed_query, check_access, cookie_name
+from splatgraft.editor.access import allowed_query, cookie_name, why_refused
 from splatgraft.project.step import locked
 
 HERE = {"Host": "127.0.0.1:8080"}
@@ -19,10 +19,10 @@ PAGE = HERE | {"Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
 
 def test_the_page_s_own_requests_are_accepted_with_the_token() -> None:
     for headers in (HERE, PAGE, {"Host": "localhost:8080"}, {"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}):
-        assert check_access("secret", headers, "/?token=secret").allowed, headers
+        assert why_refused("secret", headers, "/?token=secret") is None, headers
         # programs of other users of the machine can send the same headers
-        assert not check_access("secret", headers, "/").allowed, headers
-        assert not check_access("secret", headers, "/?token=guess").allowed, headers
+        assert why_refused("secret", headers, "/"), headers
+        assert why_refused("secret", headers, "/?token=guess"), headers
 
 
 @pytest.mark.parametrize(
@@ -44,20 +44,18 @@ def test_the_page_s_own_requests_are_accepted_with_the_token() -> None:
     ],
 )
 def test_foreign_requests_are_refused(headers: dict[str, str]) -> None:
-    assert not check_access("secret", headers, "/?token=secret").allowed
+    assert why_refused("secret", headers, "/?token=secret")
 
 
 def test_the_token_is_kept_in_a_cookie_of_the_port() -> None:
-    cookie = check_access("first", HERE, "/?token=first").cookie
-    assert cookie == "splatgraft_token_8080=first; HttpOnly; SameSite=Strict; Path=/"
     names = [cookie_name(host) for host in ("127.0.0.1:8080", "127.0.0.1:8081", "[::1]:8080", "localhost")]
     assert names == [f"splatgraft_token_{key}" for key in (8080, 8081, 8080, "default")]
     both = "; ".join(f"{name}={token}" for name, token in zip(names[:2], ("first", "second"), strict=True))
     for port, token in ((8080, "first"), (8081, "second")):
         headers = {"Host": f"127.0.0.1:{port}", "Cookie": both}
-        assert check_access(token, headers, "/assets/x.js").allowed
-        assert not check_access("third", headers, "/").allowed
-        assert not check_access(token, headers | {"Origin": "http://evil.example"}, "/").allowed
+        assert why_refused(token, headers, "/assets/x.js") is None
+        assert why_refused("third", headers, "/")
+        assert why_refused(token, headers | {"Origin": "http://evil.example"}, "/")
 
 
 def test_a_page_s_query_may_hold_the_token_alone() -> None:
@@ -83,7 +81,11 @@ def test_the_server_refuses_what_is_foreign_and_serves_only_shared_files(tmp_pat
         page = answer(f"/?token={TOKEN}")
         assert page.status == 200
         assert page.headers["X-Frame-Options"] == "DENY"
-        cookie = (page.headers["Set-Cookie"] or "").partition(";")[0]
+        cookie, _, attributes = (page.headers["Set-Cookie"] or "").partition("; ")
+        assert (cookie, attributes) == (
+            f"splatgraft_token_{guarded.port}={TOKEN}",
+            "HttpOnly; SameSite=Strict; Path=/",
+        )
         assert answer("/files/a.sog", Cookie=cookie).status == 200
         assert answer("/").status == 403
         assert answer(f"/?token={TOKEN}", Origin="http://evil.example").status == 403

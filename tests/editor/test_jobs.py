@@ -159,7 +159,7 @@ def written(session: Session, kind: str, part: str) -> tuple[Path, JobState]:
     status = job_process.main([str(session.jobs.folder), "Write it", *words])
     for number, handler in zip((signal.SIGINT, signal.SIGTERM), handlers, strict=True):
         signal.signal(number, handler)
-    job = session.job()
+    job = session.jobs.state()
     assert job is not None
     assert status == (0 if job.outcome == "done" else 2)
     return to, job

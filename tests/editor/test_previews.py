@@ -3,9 +3,11 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 import torch
+from editor_pages import cloud
 from test_state import LIGHT, moved
 from tiny_project import copy_of
 
@@ -17,7 +19,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.editor import relit_preview
 from splatgraft.editor.pictures import PICTURE_KINDS, wipe_comparison
 from splatgraft.editor.project import Project
-from splatgraft.editor.relit_preview import CoarseGaussians, coarse_composite, coarsen, upsample_light
+from splatgraft.editor.relit_preview import CoarseGaussians, coarsen, upsample_light
 from splatgraft.editor.session import Session
 from splatgraft.formats import read_gaussians
 from splatgraft.project.toml_edit import with_keys
@@ -78,15 +80,14 @@ def test_the_previewed_light_equals_the_step_s_result(session: Session, light: L
 def test_the_light_after_a_move_equals_the_step_s_result(session: Session) -> None:
     relighting, first = session.relighting, session.placed_state()
     relighting.scene(first)
-    assert not relighting.can_refine(first)
+    assert not relighting.refine(first)
     session.change(moved(first))
     draft = relighting.scene(session.state, draft=True)
     # drafts keep the sources of the light, which were estimated at another place
-    assert relighting.can_refine(session.state)
-    relighting.refined(session.state)
+    assert relighting.refine(session.state)
     assert relighting.scene(session.state, draft=True) is not draft
     relit = relighting.scene(session.state)
-    assert not relighting.can_refine(session.state)
+    assert not relighting.refine(session.state)
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     assert torch.equal(read_gaussians(session.files.relit).sh, relit.sh)
 
@@ -116,17 +117,6 @@ def test_the_preview_of_a_photograph_is_unchanged(session: Session, tmp_path: Pa
     assert torch.equal(torch.from_numpy(photo), (stored * 255).round().to(torch.uint8))
 
 
-def cloud(count: int, seed: int) -> Gaussians:
-    generator = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.rand(count, 3, generator=generator),
-        log_scales=-3 + torch.rand(count, 3, generator=generator),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        opacity_logits=torch.randn(count, generator=generator),
-        sh=torch.rand(count, 4, 3, generator=generator),
-    )
-
-
 def test_a_small_scene_is_not_reduced() -> None:
     scene = cloud(50, 0)
     coarse = coarsen(scene, 50)
@@ -140,10 +130,8 @@ def test_each_gaussian_gets_the_light_of_the_nearest_coarse_one() -> None:
     move = Similarity(scale=0.5, rotation=torch.eye(3), translation=torch.tensor([3.0, 0, 0]))
     composite = compose(target, [object_], target_from_objects=[move], erased=erased)
     parts = [coarsen(target.select(~erased), 60), coarsen(object_, 20)]
-    coarse = coarse_composite(composite, parts[0], parts[1:])
+    coarse = compose(parts[0].gaussians, [parts[1].gaussians], target_from_objects=[move], erased=torch.zeros(60) > 0)
     assert coarse.merged()[0].count == 80
-    # the same tensor for the same parts, so that memos stay valid
-    assert coarse_composite(composite, parts[0], parts[1:]).erased is coarse.erased
     baked, _ = coarse.merged()
     plain = pasted(coarse, "a sentence")
     # light linear in position: its error is proportional to the distance to the nearest coarse Gaussian
@@ -169,6 +157,8 @@ def test_what_drafts_share_is_computed_before_the_first_move(project: Path, monk
         return coarsen(gaussians, budget)
 
     monkeypatch.setattr(relit_preview, "coarsen", counted)
+    drawn = MagicMock(side_effect=relit_preview.Composite)
+    monkeypatch.setattr(relit_preview, "Composite", drawn)
     drafts = []
     for is_prepared in (False, True):
         session = Session(Project(project))
@@ -185,7 +175,10 @@ def test_what_drafts_share_is_computed_before_the_first_move(project: Path, monk
         )
         drafts.append(session.relighting.draft(session.placed_state()))
         assert len(reduced) == 3
+        # the same tensor in all drafts, so that memos of the light stay valid
+        assert len({id(call.kwargs["erased"]) for call in drawn.call_args_list}) == 1
         reduced.clear()
+        drawn.reset_mock()
         session.undo()
     assert torch.equal(drafts[0].shadow, drafts[1].shadow)
     assert torch.equal(drafts[0].shade, drafts[1].shade)

@@ -8,26 +8,13 @@ any header; they do not know the token.
 import hmac
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from urllib.parse import parse_qs, parse_qsl, urlencode, urlsplit
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
-@dataclass(frozen=True)
-class AccessDecision:
-    """The decision on one request."""
-
-    allowed: bool
-    """Whether the request is accepted."""
-    reason: str = ""
-    """Why it is refused, as a message for the user."""
-    cookie: str | None = None
-    """Set-Cookie header that stores the token in the browser; None: no header."""
-
-
-def check_access(token: str, headers: Mapping[str, str], path: str) -> AccessDecision:
-    """Decide on a request.
+def why_refused(token: str, headers: Mapping[str, str], path: str) -> str | None:
+    """Why a request is refused, as a message for the user; None where it is accepted.
 
     Args:
         token: What each request must carry: in the address, or as a cookie afterwards.
@@ -36,19 +23,17 @@ def check_access(token: str, headers: Mapping[str, str], path: str) -> AccessDec
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
     if _name(host) not in LOOPBACK:
-        return AccessDecision(False, "expected the name of this machine in the address, found another")
+        return "expected the name of this machine in the address, found another"
     if origin is not None and origin.lower().partition("://")[2] != host.lower():
-        return AccessDecision(False, "expected a request of the editor's own page, found one of another site")
+        return "expected a request of the editor's own page, found one of another site"
     if headers.get("Upgrade", "").lower() == "websocket" and origin is None:
-        return AccessDecision(False, "expected a websocket of a browser, with an Origin header, found none")
-    given = parse_qs(urlsplit(path).query).get("token", [""])[0]
-    if hmac.compare_digest(given.encode(), token.encode()):
-        return AccessDecision(True, cookie=f"{cookie_name(host)}={token}; HttpOnly; SameSite=Strict; Path=/")
+        return "expected a websocket of a browser, with an Origin header, found none"
     pairs = (pair.strip().partition("=") for pair in headers.get("Cookie", "").split(";"))
-    kept = [value.strip('"') for key, _, value in pairs if key == cookie_name(host)]
-    if any(hmac.compare_digest(value.encode(), token.encode()) for value in kept):
-        return AccessDecision(True)
-    return AccessDecision(False, "expected the token that `splatgraft edit` printed: open the complete address")
+    given = [value.strip('"') for key, _, value in pairs if key == cookie_name(host)]
+    given += parse_qs(urlsplit(path).query).get("token", [])[:1]
+    if any(hmac.compare_digest(value.encode(), token.encode()) for value in given):
+        return None
+    return "expected the token that `splatgraft edit` printed: open the complete address"
 
 
 def cookie_name(host: str) -> str:
@@ -58,13 +43,10 @@ def cookie_name(host: str) -> str:
 
 
 def allowed_query(path: str) -> str | None:
-    """The query with which a page is to be opened instead, with its question mark; None where it can stay.
+    """The query with which a page is to be opened instead of this path, with its question mark; None where it can stay.
 
     Only the token is allowed: viser's page takes the address of another server from its query, whose controls may
     hold scripts.
-
-    Args:
-        path: Request path with its query.
     """
     given = parse_qsl(urlsplit(path).query, keep_blank_values=True)
     allowed = [(key, value) for key, value in given if key == "token"]

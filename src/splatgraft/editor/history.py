@@ -4,12 +4,13 @@ Each state is a file named by the hash of its content, and the history is a list
 unbounded, needs little memory, and survives the end of the editor.
 """
 
+import base64
 import hashlib
 import json
 import os
+import zlib
 from collections import OrderedDict
 from dataclasses import asdict, dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -64,31 +65,27 @@ class StateStore:
     def __init__(self, root: Path, *, project_folder: Path) -> None:
         """Open the store of the results in `root` without reading; objects' paths are relative to the project."""
         self._folder, self._project_folder = root / EDITOR_FOLDER, project_folder
+        self._states = self._folder / _STATES_FOLDER
         self._recent: OrderedDict[str, EditState] = OrderedDict()
-        self._arrays: dict[int, tuple[Tensor, str]] = {}
 
     def save(self, state: EditState) -> str:
         """Write the state unless it is stored already; returns its name."""
-        (self._folder / _STATES_FOLDER).mkdir(parents=True, exist_ok=True)
-        content = json.dumps(self._to_json(state), sort_keys=True).encode()
+        self._states.mkdir(parents=True, exist_ok=True)
+        content = json.dumps(_to_json(state, self._project_folder), sort_keys=True).encode()
         name = _name(content)
-        self._write(self._path(name, ".json"), content)
+        if not self._file(name).is_file():
+            with atomic_write(self._file(name)) as stream:
+                stream.write(content)
         self._remember(name, state)
         return name
 
     def read(self, name: str) -> EditState:
-        """The state of that name.
-
-        Raises:
-            ValueError: If its file is not what was stored.
-            OSError: If its file is missing.
-        """
+        """The state of that name; ValueError or OSError where its file is not what was stored."""
         if name not in self._recent:
-            path = self._path(name, ".json")
-            content = path.read_bytes()
+            content = self._file(name).read_bytes()
             if _name(content) != name:
-                raise ValueError(f"{path}: expected an earlier state, found other bytes")
-            self._remember(name, self._from_json(json.loads(content)))
+                raise ValueError(f"{self._file(name)}: expected an earlier state, found other bytes")
+            self._remember(name, _from_json(json.loads(content), self._project_folder))
         self._recent.move_to_end(name)
         return self._recent[name]
 
@@ -97,9 +94,13 @@ class StateStore:
         try:
             found = json.loads((self._folder / _HISTORY_FILE).read_text(encoding="utf-8"))
             history = History(found["present"], tuple(found["past"]), tuple(found["future"]))
-            self._remove_unused({history.present, *history.past, *history.future})
+            used = {self._file(name) for name in (history.present, *history.past, *history.future)}
         except (OSError, ValueError, KeyError, TypeError):
             return None
+        if not all(path.is_file() for path in used):
+            return None
+        for path in set(self._states.iterdir()) - used:
+            path.unlink()
         return history
 
     def save_history(self, history: History) -> None:
@@ -107,102 +108,74 @@ class StateStore:
         with atomic_write(self._folder / _HISTORY_FILE) as stream:
             stream.write(json.dumps(asdict(history)).encode())
 
-    def _path(self, name: str, suffix: str) -> Path:
-        return self._folder / _STATES_FOLDER / f"{name}{suffix}"
-
-    def _write(self, path: Path, content: bytes) -> None:
-        if not path.is_file():
-            with atomic_write(path) as stream:
-                stream.write(content)
+    def _file(self, name: str) -> Path:
+        return self._states / f"{name}.json"
 
     def _remember(self, name: str, state: EditState) -> None:
         self._recent.setdefault(name, state)
         while len(self._recent) > _IN_MEMORY:
             self._recent.popitem(last=False)
-        used = {id(array) for state in self._recent.values() for array in (state.erased, state.corrections)}
-        self._arrays = {key: value for key, value in self._arrays.items() if key in used}
 
-    def _remove_unused(self, used: set[str]) -> None:
-        """Delete all states but those in `used`, and all arrays that these do not refer to."""
-        arrays: set[str | None] = set()
-        for path in (self._path(name, ".json") for name in used):
-            found = json.loads(path.read_text(encoding="utf-8"))
-            arrays |= {found["erased"], found["corrections"]}
-        for path in (self._folder / _STATES_FOLDER).glob("*"):
-            if path.stem not in used and path.stem not in arrays:
-                path.unlink()
 
-    # a state as JSON; arrays are stored in separate files, because most steps do not change them
+def _to_json(state: EditState, project_folder: Path) -> dict[str, Any]:
+    objects = None
+    if state.objects is not None:
+        objects = [
+            {
+                "scale": item.target_from_object.scale,
+                "rotation": item.target_from_object.rotation.tolist(),
+                "translation": item.target_from_object.translation.tolist(),
+                "object": None if item.object_path is None else os.path.relpath(item.object_path, project_folder),
+            }
+            for item in state.objects
+        ]
+    return {
+        "objects": objects,
+        "erased": _packed(state.erased),
+        "corrections": _packed(state.corrections),
+        "mask_source": state.mask_source,
+        "box": state.box,
+        "keep": state.keep,
+        "prompts": None if state.prompts is None else prompts_to_json(state.prompts),
+        "light": None if state.light is None else light_to_json(state.light),
+        "weights": asdict(state.weights),
+        "harmonizer": state.harmonizer,
+    }
 
-    def _to_json(self, state: EditState) -> dict[str, Any]:
-        objects = None if state.objects is None else [self._object_to_json(item) for item in state.objects]
-        return {
-            "objects": objects,
-            "erased": self._save_array(state.erased),
-            "corrections": self._save_array(state.corrections),
-            "mask_source": state.mask_source,
-            "box": state.box,
-            "keep": state.keep,
-            "prompts": None if state.prompts is None else prompts_to_json(state.prompts),
-            "light": None if state.light is None else light_to_json(state.light),
-            "weights": asdict(state.weights),
-            "harmonizer": state.harmonizer,
-        }
 
-    def _from_json(self, fields: dict[str, Any]) -> EditState:
-        objects, box, prompts, light = (fields.get(name) for name in ("objects", "box", "prompts", "light"))
-        return EditState(
-            objects=None if objects is None else tuple(self._object_from_json(item) for item in objects),
-            erased=self._read_array(fields["erased"]),
-            corrections=self._read_array(fields["corrections"]),
-            mask_source=fields["mask_source"],
-            box=None if box is None else (box[0], box[1], box[2], box[3], box[4], box[5]),
-            keep=fields["keep"],
-            prompts=None if prompts is None else prompts_from_json(prompts, "prompts"),
-            light=None if light is None else light_from_json(light),
-            weights=LayerWeights(**fields["weights"]),
-            harmonizer=fields["harmonizer"],
-        )
+def _from_json(fields: dict[str, Any], project_folder: Path) -> EditState:
+    objects, box, prompts, light = (fields[name] for name in ("objects", "box", "prompts", "light"))
+    if objects is not None:
+        objects = tuple(_object_from_json(item, project_folder) for item in objects)
+    return EditState(
+        objects=objects,
+        erased=_unpacked(fields["erased"], np.bool_),
+        corrections=_unpacked(fields["corrections"], np.int8),
+        mask_source=fields["mask_source"],
+        box=None if box is None else (box[0], box[1], box[2], box[3], box[4], box[5]),
+        keep=fields["keep"],
+        prompts=None if prompts is None else prompts_from_json(prompts, "prompts"),
+        light=None if light is None else light_from_json(light),
+        weights=LayerWeights(**fields["weights"]),
+        harmonizer=fields["harmonizer"],
+    )
 
-    def _object_to_json(self, item: ObjectPlacement) -> dict[str, Any]:
-        placement, path = item.target_from_object, item.object_path
-        return {
-            "scale": placement.scale,
-            "rotation": placement.rotation.tolist(),
-            "translation": placement.translation.tolist(),
-            "object": None if path is None else os.path.relpath(path, self._project_folder),
-        }
 
-    def _object_from_json(self, fields: dict[str, Any]) -> ObjectPlacement:
-        rotation, translation = (torch.tensor(fields[name]) for name in ("rotation", "translation"))
-        placement = Similarity(scale=fields["scale"], rotation=rotation, translation=translation)
-        return ObjectPlacement(placement, None if fields["object"] is None else self._project_folder / fields["object"])
+def _object_from_json(fields: dict[str, Any], project_folder: Path) -> ObjectPlacement:
+    rotation, translation = (torch.tensor(fields[name]) for name in ("rotation", "translation"))
+    placement = Similarity(scale=fields["scale"], rotation=rotation, translation=translation)
+    return ObjectPlacement(placement, None if fields["object"] is None else project_folder / fields["object"])
 
-    def _save_array(self, array: Tensor | None) -> str | None:
-        if array is None:
-            return None
-        known = self._arrays.get(id(array))
-        if known is not None:
-            return known[1]
-        numbers = array.cpu().numpy()
-        name = _name(str(numbers.dtype).encode() + numbers.tobytes())
-        content = BytesIO()
-        np.savez_compressed(content, numbers=numbers)
-        self._write(self._path(name, ".npz"), content.getvalue())
-        self._arrays[id(array)] = (array, name)
-        return name
 
-    def _read_array(self, name: str | None) -> Tensor | None:
-        if name is None:
-            return None
-        # the same tensor as in a recent state, so that memos of it stay valid
-        for array, known in self._arrays.values():
-            if known == name:
-                return array
-        with np.load(self._path(name, ".npz"), allow_pickle=False) as content:
-            array = torch.from_numpy(content["numbers"])
-        self._arrays[id(array)] = (array, name)
-        return array
+def _packed(flags: Tensor | None) -> str | None:
+    """One byte per Gaussian, compressed, as text."""
+    return None if flags is None else base64.b64encode(zlib.compress(flags.numpy().tobytes())).decode()
+
+
+def _unpacked(text: str | None, kind: type[np.generic]) -> Tensor | None:
+    if text is None:
+        return None
+    return torch.from_numpy(np.frombuffer(bytearray(zlib.decompress(base64.b64decode(text))), kind))
 
 
 def _name(content: bytes) -> str:

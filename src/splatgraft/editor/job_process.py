@@ -59,11 +59,7 @@ class JobConsole(Console):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command; progress, outcome and error are in the state file, and the outcome in the exit status.
-
-    Raises:
-        ValueError: If another job holds the folder's lock.
-    """
+    """Run the command; progress, outcome and error are in the state file, and the outcome in the exit status."""
     folder, title, words = Path(arguments[0]), arguments[1], tuple(arguments[2:])
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # a shell starts background processes with SIGINT ignored

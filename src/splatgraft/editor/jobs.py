@@ -18,7 +18,9 @@ import filelock
 from splatgraft.runtime.files import atomic_write
 
 _STATE_FILE, _LOG_FILE, _LOCK_FILE = "job.json", "job.log", "job.lock"
-Outcome = Literal["starting", "running", "done", "failed", "cancelled", "killed"]
+Outcome = Literal["running", "done", "failed", "cancelled", "killed"]
+_WAIT = 0.02
+"""Seconds between looks at the state file of a job that starts."""
 _MIN_SPENT = 2.0
 """Seconds after which a counter's rate is taken for measured."""
 
@@ -72,8 +74,8 @@ class JobState:
 
     @property
     def live(self) -> bool:
-        """Whether the job is starting or running."""
-        return self.outcome in ("starting", "running")
+        """Whether the job is running."""
+        return self.outcome == "running"
 
     @property
     def fraction(self) -> float:
@@ -125,39 +127,32 @@ class Jobs:
         self._child: subprocess.Popen[bytes] | None = None
 
     def start(self, command: Sequence[str], *, title: str, shown: Sequence[str]) -> None:
-        """Start a job.
+        """Start a job, and wait until its process has written its first state.
 
-        Args:
-            command: Command line; its process must call `acquire_job_lock`.
-            title: Title for the user.
-            shown: Arguments of the equivalent `splatgraft` command.
-
-        Raises:
-            ValueError: If a job is running already.
+        `command` must call `acquire_job_lock` first; `shown` are the arguments of the equivalent `splatgraft` command.
+        ValueError where a job is running already.
         """
         state = self.state()
         if state is not None and state.live:
             raise ValueError(f"{state.title}: expected no other job, found this one running; wait or cancel it")
         self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / _STATE_FILE).unlink(missing_ok=True)
         with (self.folder / _LOG_FILE).open("wb") as log:
             self._child = subprocess.Popen(
                 list(command), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
             )
-        first = JobState(title, tuple(shown), self._child.pid, "starting", time.time())
-        # the child may have written a newer state already
-        if not (found := self._read()) or found.pid != self._child.pid:
-            write_state(self.folder, first)
+        while self._read() is None and self._child.poll() is None:
+            time.sleep(_WAIT)
+        if self._read() is None:
+            write_state(self.folder, JobState(title, tuple(shown), self._child.pid, "killed", time.time()))
 
     def state(self) -> JobState | None:
         """The state of the running job, else of the last one; None where there was none."""
         if self._child is not None:
             self._child.poll()
         state = self._read()
-        if state is None or not state.live:
-            return state
-        # a starting process has not locked yet; a running one is alive as long as the lock is held
-        is_alive = _is_locked(self.folder / _LOCK_FILE) if state.outcome == "running" else self._is_alive(state.pid)
-        if is_alive:
+        # the process holds the lock as long as it is alive
+        if state is None or not state.live or _is_locked(self.folder / _LOCK_FILE):
             return state
         state = self._read() or state
         return replace(state, outcome="killed") if state.live else state
@@ -181,22 +176,9 @@ class Jobs:
         # a process is signalled by this number: 0 and below would be a group, or all processes
         return state if state.pid > 1 else None
 
-    def _is_alive(self, pid: int) -> bool:
-        if self._child is not None and self._child.pid == pid:
-            return self._child.poll() is None
-        try:
-            os.kill(pid, 0)
-        except OSError:
-            return False
-        return True
-
 
 def acquire_job_lock(folder: Path) -> filelock.BaseFileLock:
-    """Lock the job folder; the operating system releases the lock when the process ends.
-
-    Raises:
-        ValueError: If another job holds the lock.
-    """
+    """Lock the job folder until the process ends; ValueError where another job holds the lock."""
     lock = filelock.FileLock(folder / _LOCK_FILE)
     try:
         lock.acquire(timeout=0)

@@ -2,8 +2,7 @@
 
 import threading
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -29,14 +28,7 @@ PictureKind = Literal[
     "Source",
     "Object alone",
 ]
-PICTURE_KINDS: tuple[PictureKind, ...] = (
-    "Copy-paste",
-    "Light transfer",
-    "Result",
-    "Target alone",
-    "Shadow layer",
-    "Photograph",
-)
+PICTURE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)[:6]
 """Kinds of pictures of the target."""
 SOURCE_KINDS: tuple[PictureKind, PictureKind] = ("Source", "Object alone")
 """Kinds of pictures of the source."""
@@ -68,15 +60,7 @@ class Pictures:
     ) -> Picture:
         """Render one picture of the target.
 
-        Args:
-            kind: What the picture shows.
-            state: The edits.
-            camera: One camera.
-            draft: Use a draft of the light where the full light transfer is not available yet.
-            budget: Maximum number of Gaussians that are drawn of a coloured picture; None: all.
-
-        Raises:
-            ValueError: If a file that the picture needs does not exist yet.
+        A `draft` needs no full light transfer; of a coloured picture at most `budget` Gaussians are drawn.
         """
         with self._lock:
             if kind == "Photograph":
@@ -85,31 +69,18 @@ class Pictures:
                 return Picture(self._shadow(state, camera, draft=draft))
             scene = self._scene(kind, state, draft=draft)
             if budget is not None and scene.count > budget:
-                inputs = (scene, budget)
                 scene = self._memo.get(
-                    f"coarse {kind}", inputs, lambda: scene.select(largest_coverage_indices(scene, budget))
+                    f"coarse {kind}", (scene,), lambda: scene.select(largest_coverage_indices(scene, budget))
                 )
-            return _drawn(scene, camera)
+            found = render(scene, camera, outputs=frozenset({"color", "depth"}))
+            # where little is drawn, depth is that of haze
+            depth = torch.where(found.alpha[0] > 0.5, found.depth[0], torch.inf)
+            return Picture(_bytes(found.color[0]), depth.numpy())
 
     def source_view(self, which: Bool[Tensor, "n"] | None, camera: Cameras) -> Picture:
         """Render the source scene, or the Gaussians selected by `which`."""
         scene = self._scenes.gaussians(self._scenes.files.source_scene)
         return Picture(_bytes(render(scene if which is None else scene.select(which), camera).color[0]))
-
-    def sampled_view(self, state: EditState, camera: Cameras, *, source: Path | None) -> Picture:
-        """Render a sample of a scene, before the whole scene has been read.
-
-        Args:
-            state: The edits.
-            camera: One camera.
-            source: File of the source, where it is drawn; None: the target with its objects.
-
-        Raises:
-            ValueError: If a file is missing or invalid.
-        """
-        scenes = self._scenes
-        scene = scenes.sampled_composite(state).bake()[0] if source is None else scenes.sampled_gaussians(source)
-        return _drawn(scene, camera)
 
     def _scene(self, kind: PictureKind, state: EditState, *, draft: bool) -> Gaussians:
         if kind == "Result":
@@ -118,7 +89,7 @@ class Pictures:
             return self._scenes.gaussians(self._scenes.files.result)
         if kind == "Light transfer":
             return self._relighting.scene(state, draft=draft)
-        composite = self._relighting.composite(state)
+        composite = self._scenes.composite(state)
         if kind == "Target alone":
             inputs = (composite.target, composite.erased)
             return self._memo.get("target alone", inputs, lambda: composite.target.select(~composite.erased))
@@ -128,7 +99,7 @@ class Pictures:
         relighting = self._relighting
         if not self._scenes.files.transfers_light:
             raise ValueError(f"Shadow layer: expected the physical transfer, found {relighting.light_mode_note()}")
-        relit = relighting.best_available(state) if draft else relighting.relit(state)
+        relit = relighting.layers(state, draft=draft)
         layers = self._memo.get("layers", (relit, state.weights), lambda: relit.ratio(state.weights))
         # a ratio of 1 is mid grey, so that darkening and brightening both show
         rendered = render(relit.gaussians, camera, outputs=frozenset(), features=(0.5 * layers).clamp(0, 1))
@@ -165,13 +136,6 @@ def with_badge(pixels: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarra
     patch[:] = patch // 3
     cv2.putText(out, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (235, 235, 235), 1, cv2.LINE_AA)
     return out
-
-
-def _drawn(scene: Gaussians, camera: Cameras) -> Picture:
-    found = render(scene, camera, outputs=frozenset({"color", "depth"}))
-    # where little is drawn, depth is that of haze
-    depth = torch.where(found.alpha[0] > 0.5, found.depth[0], torch.inf)
-    return Picture(_bytes(found.color[0]), depth.numpy())
 
 
 def _bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

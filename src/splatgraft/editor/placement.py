@@ -9,11 +9,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from splatgraft.composition import ObjectBase, PlaceOptions, object_base, place_object, rest_on_surface
+from splatgraft.composition import ObjectBase, PlaceOptions, place_object, rest_on_surface
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.core.rotations import quaternion_from_rotation, rotation_between, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.state import check_height_cm
 from splatgraft.formats.metric_scale import MetricScale
@@ -96,34 +96,11 @@ class ObjectSize:
         return None if self.own is None else 100 * self.own.metres_per_unit * self.height
 
     def scale_at(self, here_cm: float) -> float:
-        """The `scale` at which the object is that tall in the target.
-
-        Raises:
-            ValueError: The height is out of range, or the target's scale is not known.
-        """
+        """The `scale` at which the object is that tall in the target; ValueError where the target's is not known."""
         check_height_cm(here_cm)
         if self.place is None:
             raise ValueError("target: expected a capture whose scale is known, found none; see `splatgraft scale`")
         return 0.01 * here_cm / (self.place.metres_per_unit * self.height)
-
-    def own_from(self, true_cm: float) -> MetricScale:
-        """The scale of its own capture, where the object is that tall.
-
-        Raises:
-            ValueError: The height is out of range.
-        """
-        check_height_cm(true_cm)
-        return MetricScale(0.01 * true_cm / self.height, f"the object's height of {true_cm:g} cm")
-
-    def place_from(self, here_cm: float) -> MetricScale:
-        """The scale of the target's capture, where the object is that tall at its present scale.
-
-        Raises:
-            ValueError: The height is out of range.
-        """
-        check_height_cm(here_cm)
-        found = 0.01 * here_cm / (self.scale * self.height)
-        return MetricScale(found, f"a placed object's height of {here_cm:g} cm")
 
 
 @dataclass(frozen=True)
@@ -140,24 +117,10 @@ class PlaceableObject:
     """Its capture without the object; None where not known."""
 
 
-def placeable_object(gaussians: Gaussians, cameras: Cameras, surroundings: Gaussians | None) -> PlaceableObject:
-    """Estimate an object's base.
-
-    Raises:
-        ValueError: If the object is empty.
-    """
-    base = object_base(gaussians, up=estimate_up(cameras), surroundings=surroundings)
-    return PlaceableObject(gaussians, base, cameras, surroundings)
-
-
 def suggest_placement(
     target: Gaussians, item: PlaceableObject, cameras: Cameras, options: PlaceOptions = PlaceOptions()
 ) -> Similarity:
-    """A visible, level place at a plausible size, found as by `compose` with `options`.
-
-    Raises:
-        ValueError: If there is no such place.
-    """
+    """A visible, level place at a plausible size, found as by `compose` with `options`; ValueError where is none."""
     both = (cameras, item.cameras)
     placed = place_object(target, item.gaussians, cameras=both, surroundings=item.surroundings, options=options)
     return placed.target_from_object
@@ -168,8 +131,7 @@ def drop_to_surface(
 ) -> Similarity:
     """Move vertically onto the surface and align with it; scale and rotation about the vertical stay.
 
-    Raises:
-        ValueError: If nothing lies below.
+    ValueError where nothing lies below.
     """
     base_point = target_from_object.points(item.base.point)
     # start at half the object's height: a sunk object is lifted, and surfaces above the object are ignored
@@ -183,7 +145,7 @@ def drop_to_surface(
 def align_up(item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]) -> Similarity:
     """Apply the smallest rotation that aligns the object's up with `up`; the base point stays fixed."""
     up = torch.nn.functional.normalize(up, dim=0)
-    rotation = _shortest_rotation(target_from_object.rotation @ item.base.up, up) @ target_from_object.rotation
+    rotation = rotation_between(target_from_object.rotation @ item.base.up, up) @ target_from_object.rotation
     return _about_base_point(item, target_from_object, rotation=rotation, scale=target_from_object.scale)
 
 
@@ -195,34 +157,20 @@ def rescale(item: PlaceableObject, target_from_object: Similarity, scale: float)
 def plausible_scale(
     target: Gaussians, item: PlaceableObject, target_from_object: Similarity, cameras: Cameras
 ) -> float:
-    """The scale at which the object fills the default share of the views at its place.
-
-    Raises:
-        ValueError: If nothing lies below.
-    """
+    """The scale at which the object fills the default share of the views at its place."""
     x, y, z = (
         target_from_object.points(item.base.point)
         + 0.25 * target_from_object.scale * item.base.height * estimate_up(cameras)
     ).tolist()
-    options = PlaceOptions(point=(x, y, z), yaw_deg=0.0)
-    return place_object(
-        target, item.gaussians, cameras=(cameras, item.cameras), surroundings=item.surroundings, options=options
-    ).target_from_object.scale
+    return suggest_placement(target, item, cameras, PlaceOptions(point=(x, y, z), yaw_deg=0.0)).scale
 
 
 def place_beside(
     target: Gaussians, item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]
 ) -> tuple[Similarity, bool]:
-    """The same object on the surface beside itself, at the same height.
+    """The same object on the surface of the target and its objects beside itself, at the same height.
 
-    Args:
-        target: The scene, with the objects that stand in it.
-        item: The object.
-        target_from_object: Its placement.
-        up: Up direction of the target.
-
-    Returns:
-        The placement, and whether a surface at that height was found; else the object stands beside itself in the air.
+    And whether there is a surface at that height; else the object stands beside itself in the air.
     """
     up = torch.nn.functional.normalize(up, dim=0)
     axis = torch.eye(3)[int(up.abs().argmin())]
@@ -274,21 +222,5 @@ def _about_base_point(
 
 def _twist_about(rotation: Float[Tensor, "3 3"], axis: Float[Tensor, "3"]) -> float:
     """The twist angle of `rotation` about unit `axis` (swing-twist decomposition), radians."""
-    skew = torch.stack(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    trace = rotation.diagonal().sum()
-    # the quaternion is (1 + trace, skew) up to a factor, which gives the tangent of half the twist angle
-    return 2 * math.atan2(float(skew @ axis), 1 + float(trace))
-
-
-def _shortest_rotation(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    axis = torch.linalg.cross(start, end)
-    sine, cosine = float(axis.norm()), float(start @ end)
-    if sine < 1e-6:
-        if cosine > 0:
-            return torch.eye(3)
-        helper = torch.eye(3)[int(start.abs().argmin())]
-        axis, sine = torch.linalg.cross(start, helper), 0.0
-    vector = math.atan2(sine, cosine) * torch.nn.functional.normalize(axis, dim=0).double()
-    return torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_matrix()).float()
+    i, j, k, w = Rotation.from_matrix(rotation.double().numpy()).as_quat()
+    return 2 * math.atan2(float(torch.tensor([i, j, k]) @ axis.double()), w)

@@ -104,11 +104,7 @@ class Project:
     """Folder of all results; None: the folder of project.toml."""
 
     def files(self) -> ProjectFiles | None:
-        """The project's files; None where project.toml does not exist yet.
-
-        Raises:
-            ValueError: If project.toml is invalid.
-        """
+        """The project's files; None where project.toml does not exist yet."""
         if not self.file.is_file():
             return None
         flow = read_flow(self.file, self.out)
@@ -146,15 +142,7 @@ class Project:
             return {PROBLEM: str(error)}
 
     def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
-        """Write project.toml.
-
-        Args:
-            captures: Source and target: captures or scene files.
-            scenes: Scenes trained on these captures, where there are any.
-
-        Raises:
-            ValueError: If a capture or a scene is missing, or project.toml exists.
-        """
+        """Write project.toml of two captures or scene files, and of scenes trained on them where there are any."""
         for scene in scenes:
             if scene is not None and not scene.is_file():
                 raise ValueError(f"{scene}: expected a trained scene, found no such file")

@@ -5,8 +5,8 @@ A draft relights a reduced level of detail and copies the layers to the nearest 
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -26,11 +26,8 @@ from splatgraft.relighting.cast_shadows import cast_shadows
 from splatgraft.relighting.gain import relight_by_gain
 from splatgraft.relighting.layers import assemble_layers, pasted
 from splatgraft.relighting.light.panorama import NoLight
-from splatgraft.relighting.prepared_object import PreparedObject, SourceLight, find_source_light, prepare_object
+from splatgraft.relighting.prepared_object import PreparedObject, find_source_light, prepare_object
 from splatgraft.relighting.scene_light import SceneLight, find_scene_light
-
-_KEPT_SOURCE_LIGHTS = 8
-"""Objects and source scenes whose old light is kept."""
 
 TARGET_BUDGET, OBJECT_BUDGET = 30_000, 8_000
 """Numbers of Gaussians; relighting this many after a change of the light takes about a second on one core."""
@@ -45,11 +42,6 @@ class CoarseGaussians:
     nearest: Int[Tensor, "n"]
     """For each of the scene's n Gaussians the index of the nearest of `gaussians`."""
 
-    @cached_property
-    def none_erased(self) -> Bool[Tensor, "m"]:
-        """All False; always the same tensor, so that memos compare it by identity."""
-        return torch.zeros(self.gaussians.count, dtype=torch.bool)
-
 
 def coarsen(gaussians: Gaussians, budget: int) -> CoarseGaussians:
     """Reduce a scene to at most `budget` Gaussians; the same object where it has no more."""
@@ -60,23 +52,10 @@ def coarsen(gaussians: Gaussians, budget: int) -> CoarseGaussians:
     return CoarseGaussians(subset, torch.from_numpy(nearest).long())
 
 
-def coarse_composite(composite: Composite, target: CoarseGaussians, objects: Sequence[CoarseGaussians]) -> Composite:
-    """The composite of the coarse target, from which the erased Gaussians are removed, and the coarse objects."""
-    placed = zip(composite.objects, objects, strict=True)
-    return Composite(
-        target=target.gaussians,
-        objects=tuple(replace(one, gaussians=coarse.gaussians) for one, coarse in placed),
-        erased=target.none_erased,
-    )
-
-
 def upsample_light(relit: Relit, composite: Composite, parts: Sequence[CoarseGaussians]) -> Relit:
     """Copy the layers of a relit coarse composite to all Gaussians of `composite`, from the nearest coarse Gaussian.
 
-    Args:
-        relit: Result on the coarse composite; no Gaussian of it may have been split.
-        composite: The full composite.
-        parts: The coarse target, then the coarse objects.
+    `parts` are the coarse target without what is erased, and the coarse objects; none of their Gaussians is split.
     """
     counts = [part.gaussians.count for part in parts]
     assert relit.gaussians.count == sum(counts)
@@ -114,7 +93,6 @@ class _TransferValues:
 
     def __init__(self) -> None:
         self._memo = Memo()
-        self._source_lights: list[tuple[Gaussians, SourceScene, SourceLight]] = []
 
     def is_moved(self, composite: Composite, cameras: Cameras, light: Light | None, reach: float) -> bool:
         """Whether objects were moved since the light of the scene was found."""
@@ -149,7 +127,7 @@ class _TransferValues:
         self, composite: Composite, cameras: Cameras, light: Light | None, reach: float, *, exact: bool
     ) -> SceneLight | NoLight:
         kind, inputs = _kind(light), (composite.target, composite.erased, cameras, light, reach)
-        poses, kept = _poses(composite), self._memo.peek(_kind(light), inputs)
+        poses, kept = _poses(composite), self._memo.peek(kind, inputs)
         if kept is not None and kept[0] == poses:
             return kept[1]
         spheres = [bounding_sphere(one.in_target()) for one in composite.objects if one.gaussians.count]
@@ -176,26 +154,16 @@ class _TransferValues:
             moved = kept.moved(placed, scene.light)
             if moved is not None:
                 return moved
+        source_light = None
+        if source is not None:
+            # one for all: only the project's own object has a source, and its duplicates share it
+            pair = (placed.gaussians, source)
+            source_light = self._memo.get("source light", pair, lambda: find_source_light(*pair))
         prepared = prepare_object(
-            placed,
-            source,
-            scene.cameras,
-            source_light=self._source_light(placed.gaussians, source),
-            light=scene.light,
-            number=number,
+            placed, source, scene.cameras, source_light=source_light, light=scene.light, number=number
         )
         self._memo.put(name, inputs, prepared)
         return prepared
-
-    def _source_light(self, gaussians: Gaussians, source: SourceScene | None) -> SourceLight:
-        if source is None:
-            return None
-        for of_object, of_source, light in self._source_lights:
-            if of_object is gaussians and of_source is source:
-                return light
-        light = find_source_light(gaussians, source)
-        self._source_lights = [*self._source_lights[1 - _KEPT_SOURCE_LIGHTS :], (gaussians, source, light)]
-        return light
 
 
 class RelitPreview:
@@ -206,99 +174,68 @@ class RelitPreview:
         self._scenes = scenes
         self._full_values, self._draft_values = _TransferValues(), _TransferValues()
         self._memo = Memo()
-        self._full_lock, self._draft_lock, self._composite_lock = threading.RLock(), threading.RLock(), threading.Lock()
-
-    def composite(self, state: EditState) -> Composite:
-        """The target with the placed objects; the same object for the same edits.
-
-        Raises:
-            ValueError: If a file is missing.
-        """
-        inputs = (self._scenes.gaussians(self._scenes.files.target_scene), state.objects, state.erased)
-        # memos recognise a composite by identity: two threads must get the same one
-        with self._composite_lock:
-            return self._memo.get("composite", inputs, lambda: self._scenes.composite(state))
-
-    def has_draft(self, state: EditState) -> bool:
-        """Whether a draft, a refined one or the light itself of this state is memoised."""
-        return (
-            self.is_relit(state) or self.is_refined(state) or self._memo.peek("draft", self._inputs(state)) is not None
-        )
-
-    def is_refined(self, state: EditState) -> bool:
-        """Whether a refined draft of this state is memoised."""
-        return self._memo.peek("refined", self._inputs(state)) is not None
+        self._full_lock, self._draft_lock = threading.RLock(), threading.RLock()
 
     def is_relit(self, state: EditState) -> bool:
         """Whether the light of this state is memoised, or project.toml selects no physical light transfer."""
         return not self._scenes.files.transfers_light or self._memo.peek("relit", self._inputs(state)) is not None
 
+    def best(self, state: EditState) -> Relit | None:
+        """The best of what is memoised of this state: the light, else a refined draft, else a draft; else None."""
+        inputs = self._inputs(state)
+        found = (self._memo.peek(name, inputs) for name in ("relit", "refined", "draft"))
+        return next((relit for relit in found if relit is not None), None)
+
     def relit(self, state: EditState) -> Relit:
-        """The layers of the full light transfer of this state, as the step computes them.
+        """The layers of the full light transfer of this state, as the step computes them."""
 
-        Raises:
-            ValueError: If a file is missing.
+        def make() -> Relit:
+            # the step knows of no place before: sources and shadow maps are those of this one
+            relit = self._transfer(state, exact=True)
+            self._memo.forget("refined")  # a second copy of a large scene
+            return relit
+
+        return self._make_once("relit", state, make, lock=self._full_lock)
+
+    def refine(self, state: EditState) -> bool:
+        """After a move, make all layers at full detail under the sources of the light that were estimated before it.
+
+        Takes less time than `relit`. False where nothing was moved, or these layers are there already.
         """
-        return self._make_once("relit", state, self._relight)
-
-    def can_refine(self, state: EditState) -> bool:
-        """Whether objects were moved since the light was estimated: then `refined` takes less time than `relit`."""
-        return self._full_values.is_moved(
-            self.composite(state), self._cameras(), state.light, self._scenes.files.relight_options.reach
-        )
-
-    def refined(self, state: EditState) -> Relit:
-        """All layers after a move under the sources of the light that were estimated before it, at full detail.
-
-        Raises:
-            ValueError: If a file is missing.
-        """
-        return self._make_once("refined", state, self._refine)
+        reach, composite = self._scenes.files.relight_options.reach, self._scenes.composite(state)
+        is_moved = self._full_values.is_moved(composite, self._cameras(), state.light, reach)
+        if not is_moved or self._memo.peek("refined", self._inputs(state)) is not None:
+            return False
+        self._make_once("refined", state, lambda: self._transfer(state, exact=False), lock=self._full_lock)
+        return True
 
     def draft(self, state: EditState) -> Relit:
-        """A draft of the light transfer: shadow edges are coarse, and the first draft leaves out the source's light.
-
-        Raises:
-            ValueError: If a file is missing.
-        """
-        return self._make_once("draft", state, self._draft)
+        """A draft of the light transfer: shadow edges are coarse, and the first draft leaves out the source's light."""
+        # a draft must not wait for the light itself; of a small scene, both share the values of the transfer
+        lock = self._draft_lock if _is_large(self._scenes.composite(state)) else self._full_lock
+        return self._make_once("draft", state, lambda: self._draft(state), lock=lock)
 
     def prepare_drafts(self, state: EditState) -> None:
-        """Compute once what drafts after a move share, which the first draft left out: what lights the source scene.
-
-        Raises:
-            ValueError: If a file is missing.
-        """
-        composite, sources = self.composite(state), self._scenes.source_scenes(state)
-        if not (_is_large(composite) and self._memo.has("relit")):
-            return
-        with self._draft_lock:
-            shared = (composite.target, composite.erased, *sources)
-            self._memo.get("drafts prepared", shared, lambda: self._draft(state))
-
-    def best_available(self, state: EditState) -> Relit:
-        """The full transfer where it is memoised, else a refined draft, else a draft.
-
-        Raises:
-            ValueError: If a file is missing.
-        """
-        if self.is_relit(state):
-            return self.relit(state)
-        return self.refined(state) if self.is_refined(state) else self.draft(state)
+        """Compute once what drafts after a move share, which the first draft left out: what lights the source scene."""
+        composite, sources = self._scenes.composite(state), self._scenes.source_scenes(state)
+        if _is_large(composite) and self._memo.has("relit"):
+            with self._draft_lock:
+                shared = (composite.target, composite.erased, *sources)
+                self._memo.get("drafts prepared", shared, lambda: self._draft(state))
 
     def scene(self, state: EditState, *, draft: bool = False) -> Gaussians:
-        """The scene that the step `relight` writes, or a draft of it.
-
-        Raises:
-            ValueError: If a file is missing.
-        """
-        composite, light_mode = self.composite(state), self._scenes.files.light_mode
+        """The scene that the step `relight` writes, or a draft of it."""
+        composite, light_mode = self._scenes.composite(state), self._scenes.files.light_mode
         if light_mode == "off":
             return self.pasted(composite)[0]
         if light_mode == "gain":
             return self._memo.get("gain adjusted", (composite,), lambda: self._gain_adjusted(composite, state))
-        relit = self.best_available(state) if draft else self.relit(state)
+        relit = self.layers(state, draft=draft)
         return self._memo.get("scene", (relit, state.weights), lambda: relit.bake(state.weights)[0])
+
+    def layers(self, state: EditState, *, draft: bool) -> Relit:
+        """The layers of the light transfer, or the best draft of them."""
+        return (self.best(state) or self.draft(state)) if draft else self.relit(state)
 
     def pasted(self, composite: Composite) -> tuple[Gaussians, Bool[Tensor, "n"]]:
         """The scene that the step `compose` writes, and which Gaussians belong to objects."""
@@ -316,62 +253,55 @@ class RelitPreview:
         adjusted, _ = relight_by_gain(composite, self._cameras(), sources=self._scenes.source_scenes(state))
         return adjusted.bake()[0]
 
-    def _make_once(self, name: str, state: EditState, make: Callable[[EditState], Relit]) -> Relit:
+    def _make_once(
+        self, name: str, state: EditState, make: Callable[[], Relit], *, lock: AbstractContextManager[object]
+    ) -> Relit:
         inputs = self._inputs(state)
-        # a memoised result must not wait for a computation in another thread, nor a draft for the light itself
+        # a memoised result must not wait for a computation in another thread
         found = self._memo.peek(name, inputs)
         if found is None:
-            # of a small scene, both share a memo of parts
-            is_apart = name == "draft" and _is_large(inputs[0])
-            with self._draft_lock if is_apart else self._full_lock:
-                found = self._memo.get(name, inputs, lambda: make(state))
+            with lock:
+                found = self._memo.get(name, inputs, make)
         return found
 
     def _inputs(self, state: EditState) -> tuple[Any, ...]:
-        return (self.composite(state), state.light, repr(self._scenes.files.relight_options))
+        return (self._scenes.composite(state), state.light, repr(self._scenes.files.relight_options))
 
-    def _relight(self, state: EditState) -> Relit:
-        # the step knows of no place before: sources and shadow maps are those of this one
-        relit = self._transfer(self.composite(state), self._scenes.source_scenes(state), light=state.light)
-        self._memo.forget("refined")  # a second copy of a large scene
-        return relit
-
-    def _refine(self, state: EditState) -> Relit:
-        composite, sources = self.composite(state), self._scenes.source_scenes(state)
-        return self._transfer(composite, sources, light=state.light, exact=False)
+    def _transfer(self, state: EditState, *, exact: bool) -> Relit:
+        return self._full_values.relight(
+            self._scenes.composite(state),
+            self._cameras(),
+            sources=self._scenes.source_scenes(state),
+            light=state.light,
+            options=self._scenes.files.relight_options,
+            exact=exact,
+        )
 
     def _draft(self, state: EditState) -> Relit:
-        composite, sources = self.composite(state), self._scenes.source_scenes(state)
+        composite, sources = self._scenes.composite(state), self._scenes.source_scenes(state)
         if not self._memo.has("relit"):
             # analysing the source scene takes half of the time of the first result
             sources = [None] * len(sources)
-        if not _is_large(composite):
-            return self._draft_transfer(composite, sources, light=state.light)
-        memo, kept = self._memo, (composite.target, composite.erased)
-        target = memo.get("coarse target", kept, lambda: coarsen(kept[0].select(~kept[1]), TARGET_BUDGET))
-        objects = [
-            memo.get(f"coarse object {i}", (one.gaussians,), lambda one=one: coarsen(one.gaussians, OBJECT_BUDGET))
-            for i, one in enumerate(composite.objects)
-        ]
-        coarse = coarse_composite(composite, target, objects)
-        coarse_sources = [None if source is None else self._coarse_source(source) for source in sources]
-        relit = self._draft_transfer(coarse, coarse_sources, light=state.light)
-        return upsample_light(relit, composite, [target, *objects])
-
-    def _transfer(
-        self, composite: Composite, sources: Sequence[SourceScene | None], *, light: Light | None, exact: bool = True
-    ) -> Relit:
-        options = self._scenes.files.relight_options
-        values, cameras = self._full_values, self._cameras()
-        return values.relight(composite, cameras, sources=sources, light=light, options=options, exact=exact)
-
-    def _draft_transfer(
-        self, composite: Composite, sources: Sequence[SourceScene | None], *, light: Light | None
-    ) -> Relit:
+        values, drawn, parts, memo = self._full_values, composite, [], self._memo
+        if _is_large(composite):
+            kept = (composite.target, composite.erased)
+            target = memo.get("coarse target", kept, lambda: coarsen(kept[0].select(~kept[1]), TARGET_BUDGET))
+            objects = [
+                memo.get(f"coarse object {i}", (one.gaussians,), lambda one=one: coarsen(one.gaussians, OBJECT_BUDGET))
+                for i, one in enumerate(composite.objects)
+            ]
+            sources = [None if source is None else self._coarse_source(source) for source in sources]
+            values, parts, coarse = self._draft_values, [target, *objects], target.gaussians
+            drawn = Composite(
+                target=coarse,
+                objects=tuple(
+                    replace(one, gaussians=part.gaussians) for one, part in zip(composite.objects, objects, strict=True)
+                ),
+                erased=memo.get("none erased", (coarse,), lambda: torch.zeros(coarse.count, dtype=torch.bool)),
+            )
         options = replace(self._scenes.files.relight_options, most_added=0.0, fitted_views=0)
-        is_full = composite.target is self._scenes.gaussians(self._scenes.files.target_scene)
-        values, cameras = self._full_values if is_full else self._draft_values, self._cameras()
-        return values.relight(composite, cameras, sources=sources, light=light, options=options, exact=False)
+        relit = values.relight(drawn, self._cameras(), sources=sources, light=state.light, options=options, exact=False)
+        return upsample_light(relit, composite, parts) if parts else relit
 
     def _cameras(self) -> Cameras:
         return self._scenes.cameras(self._scenes.files.target_cameras)

@@ -9,15 +9,16 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from splatgraft.composition import compose
+from splatgraft.composition import compose, object_base
 from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.editor.memo import Memo
-from splatgraft.editor.placement import PlaceableObject, placeable_object
+from splatgraft.editor.placement import PlaceableObject
 from splatgraft.editor.project import ProjectFiles
-from splatgraft.editor.scene_sample import SceneSample, read_sample, sample_count
+from splatgraft.editor.scene_sample import SceneSample, read_sample
 from splatgraft.editor.state import EditState
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.formats.gaussian_flags import read_flags
@@ -44,11 +45,7 @@ class SceneCache:
         self._failed: set[Path] = set()
 
     def gaussians(self, path: Path) -> Gaussians:
-        """The scene in a file.
-
-        Raises:
-            ValueError: If the file is missing or invalid.
-        """
+        """The scene in a file."""
         return self._read("gaussians", path, read_gaussians)
 
     def at_hand(self, paths: Iterable[Path]) -> bool:
@@ -65,52 +62,23 @@ class SceneCache:
             threading.Thread(target=self._read_ahead, args=(path,), name="splatgraft scene", daemon=True).start()
         return not missing
 
-    def count(self, path: Path) -> int | None:
-        """Number of Gaussians in a file; None where only reading all of it would tell.
-
-        Raises:
-            ValueError: If the file is missing or invalid.
-        """
-        return self.gaussians(path).count if self._is_quick(path) else sample_count(path)
-
     def reading_note(self, path: Path) -> str:
         """What the page says while a scene is read."""
-        count = self.count(path)
-        if count is None:
+        sample = self.sample(path)
+        if sample is None:
             return "The scene is being read."
-        return f"{count:,} Gaussians are being read. A sample is shown meanwhile."
+        return f"{sample.total:,} Gaussians are being read. A sample is shown meanwhile."
 
     def sample(self, path: Path) -> SceneSample | None:
         """Some of a scene's Gaussians, without reading all; None where the file's layout does not allow it."""
         return self._read("sample", path, read_sample)
 
-    def sampled_gaussians(self, path: Path, erased: Bool[Tensor, "n"] | None = None) -> Gaussians:
-        """The sample with constant colours, without the erased Gaussians; the whole scene where there is none."""
-        whole = self.sample(path)
-        if whole is None:
-            return self.gaussians(path)
-
-        def make() -> Gaussians:
-            found = whole if erased is None else whole.without(erased.numpy())
-            parts = (found.means, found.log_scales, found.quaternions, found.opacity_logits, found.band_0[:, None])
-            return Gaussians(*(torch.from_numpy(part.copy()) for part in parts))
-
-        return self.derive(f"sampled {path}", (whole, erased), make)
-
     def cameras(self, path: Path) -> Cameras:
-        """The cameras in a file.
-
-        Raises:
-            ValueError: If the file is missing or invalid.
-        """
+        """The cameras in a file."""
         return self._read("cameras", path, read_cameras)
 
     def capture(self, path: Path) -> PosedImages:
-        """The posed images whose cameras are in a file.
-
-        Raises:
-            ValueError: If the file or one that it names is missing or invalid.
-        """
+        """The posed images whose cameras are in a file."""
         return self._read("capture", path, lambda path: read_capture(path.parent))
 
     def segmented(self) -> Bool[Tensor, "n"] | None:
@@ -131,38 +99,31 @@ class SceneCache:
         return (*paths, self.files.surroundings) if self.files.object in paths else paths
 
     def placeable_object(self, item: ObjectPlacement) -> PlaceableObject:
-        """A placed object with its base.
-
-        Raises:
-            ValueError: If its file is missing, invalid or empty.
-        """
+        """A placed object with its base."""
         path = self.object_path(item)
         gaussians, own = self.gaussians(path), path == self.files.object
         cameras = self.cameras(self.files.source_cameras if own else self.files.target_cameras)
         surroundings = self.gaussians(self.files.surroundings) if own and self.files.surroundings.is_file() else None
-        inputs = (gaussians, cameras, surroundings)
-        return self.derive(f"placeable_object {path}", inputs, lambda: placeable_object(*inputs))
+
+        def make() -> PlaceableObject:
+            base = object_base(gaussians, up=estimate_up(cameras), surroundings=surroundings)
+            return PlaceableObject(gaussians, base, cameras, surroundings)
+
+        return self.derive(f"placeable_object {path}", (gaussians, cameras, surroundings), make)
 
     def composite(self, state: EditState) -> Composite:
-        """The target with the placed objects.
+        """The target with the placed objects; the same object for the same edits."""
+        target = self.gaussians(self.files.target_scene)
 
-        Raises:
-            ValueError: If a file is missing or invalid, or the erased flags belong to another target.
-        """
-        target, erased = self.gaussians(self.files.target_scene), state.erased
-        if erased is None:
-            erased = self.derive("none erased", (target,), lambda: torch.zeros(target.count, dtype=torch.bool))
-        return self._composed(target, state.objects or (), erased)
+        def make() -> Composite:
+            items, erased = state.objects or (), state.erased
+            if erased is None:
+                erased = self.derive("none erased", (target,), lambda: torch.zeros(target.count, dtype=torch.bool))
+            objects = [self.gaussians(self.object_path(item)) for item in items]
+            moves = [item.target_from_object for item in items]
+            return compose(target, objects, target_from_objects=moves, erased=erased)
 
-    def sampled_composite(self, state: EditState) -> Composite:
-        """A sample of the target with those placed objects that are in memory or small.
-
-        Raises:
-            ValueError: If a file is missing or invalid.
-        """
-        target = self.sampled_gaussians(self.files.target_scene, state.erased)
-        items = [item for item in state.objects or () if self._is_quick(self.object_path(item))]
-        return self._composed(target, items, torch.zeros(target.count, dtype=torch.bool))
+        return self.derive("composite", (target, state.objects, state.erased), make)
 
     def complement(self, name: str, flags: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """The inverted flags; the same tensor for the same flags of that name."""
@@ -181,10 +142,6 @@ class SceneCache:
         """The memoised result of `make`, computed again when one of `inputs` is another object."""
         with self._lock:
             return self._derived.get(name, inputs, make)
-
-    def _composed(self, target: Gaussians, items: Sequence[ObjectPlacement], erased: Bool[Tensor, "n"]) -> Composite:
-        objects = [self.gaussians(self.object_path(item)) for item in items]
-        return compose(target, objects, target_from_objects=[item.target_from_object for item in items], erased=erased)
 
     def _is_quick(self, path: Path) -> bool:
         """Whether a scene is in memory, or its file is small or missing."""

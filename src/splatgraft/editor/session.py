@@ -1,7 +1,7 @@
 """An open project: its edits with undo history, saved after every change, and its scenes, pictures and job."""
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,16 +13,15 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.history import History, StateStore
-from splatgraft.editor.jobs import Jobs, JobState
+from splatgraft.editor.jobs import Jobs
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.placement import ObjectSize, PlaceableObject
-from splatgraft.editor.project import PROBLEM, ExportPage, Project, ProjectFiles, RenderedViews
+from splatgraft.editor.project import PROBLEM, Project, ProjectFiles, RenderedViews
 from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.scene_cache import SceneCache
-from splatgraft.editor.state import EditState, check_state
+from splatgraft.editor.state import EditState, check_height_cm, check_state
 from splatgraft.editor.state_files import as_written, read_state, state_files, write_state
-from splatgraft.exports.export import Layer
-from splatgraft.formats.metric_scale import read_scale, write_scale
+from splatgraft.formats.metric_scale import MetricScale, read_scale, write_scale
 from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.project.layout import EDITOR_FOLDER, Side
 from splatgraft.segmentation import Box, add_correction, apply_corrections
@@ -50,7 +49,7 @@ class Session:
         self.pictures = Pictures(self.scenes, self.relighting)
         self.jobs = Jobs(files.root / EDITOR_FOLDER)
         self._store = StateStore(files.root, project_folder=files.file.parent)
-        self._stamps = self._read_stamps()
+        self._stamps = stamps_of(files.file)
         self.state: EditState = read_state(files.file)
         """The current edits; `change` replaces them."""
         saved, now = self._store.read_history(), self._store.save(self.state)
@@ -74,43 +73,38 @@ class Session:
             if name != self.history.present:
                 self._apply(self.history.pushed(name), state)
 
-    def has_steps(self) -> bool:
-        """Whether there is anything to undo or to redo."""
-        return bool(self.history.past or self.history.future)
-
     def undo(self) -> bool:
-        """Go back by one step; False where there is none.
-
-        Raises:
-            ValueError: As `change`.
-        """
+        """Go back by one step; False where there is none. Raises as `change`."""
         return self._step(History.undone)
 
     def redo(self) -> bool:
-        """Go forward by one step; False where there is none.
-
-        Raises:
-            ValueError: As `change`.
-        """
+        """Go forward by one step; False where there is none. Raises as `change`."""
         return self._step(History.redone)
 
     def reload(self) -> bool:
         """Load changes made outside the editor as one undo step; whether there were any.
 
-        Raises:
-            ValueError: If a file is invalid; nothing is saved until it is corrected.
+        ValueError where a file is invalid; nothing is saved until it is corrected.
         """
         with self._lock:
-            stamps = self._read_stamps()
+            stamps = stamps_of(self.files.file)
             if stamps == self._stamps:
                 return False
-            self.state, files = read_state(self.files.file), self.project.files()
-            self._stamps = stamps
+            state, files = read_state(self.files.file), self.project.files()
+            self.state, self._stamps = state, stamps
+            self._use_files(files)
             name = self._store.save(self.state)
             if name != self.history.present:
                 self._save_history(self.history.pushed(name))
-            self._use_files(files)
             return True
+
+    def set_view(self, side: Side, views: RenderedViews) -> None:
+        """Set how images of a scene without photographs are rendered; not an undo step. Raises as `change`."""
+        with self._lock:
+            self._refuse_outside_changes()
+            self.project.set_view(side, views)
+            self._stamps = stamps_of(self.files.file)
+            self._use_files(self.project.files())
 
     def _step(self, move: Callable[[History], History]) -> bool:
         with self._lock:
@@ -121,37 +115,24 @@ class Session:
             return True
 
     def _apply(self, history: History, state: EditState) -> None:
+        self._refuse_outside_changes()
+        write_state(self.files.file, self.state, state)
+        self.state, self._stamps = state, stamps_of(self.files.file)
+        self._save_history(history)
+
+    def _refuse_outside_changes(self) -> None:
         if self.reload():
             raise ValueError(
                 f"{self.files.file.name}: changed outside the editor; the change was loaded, please repeat your edit"
             )
-        write_state(self.files.file, self.state, state)
-        self.state, self._stamps = state, self._read_stamps()
-        self._save_history(history)
 
     def _save_history(self, history: History) -> None:
         self.history = history
         self._store.save_history(history)
 
     def _use_files(self, files: ProjectFiles | None) -> None:
-        if files is not None and files != self.files:
+        if files is not None:
             self.files = self.scenes.files = files
-
-    def _read_stamps(self) -> Stamps:
-        return stamps_of(self.files.file)
-
-    def set_view(self, side: Side, views: RenderedViews) -> None:
-        """Set how images of a scene without photographs are rendered; not an undo step.
-
-        Raises:
-            ValueError: As `change`.
-        """
-        with self._lock:
-            if self.reload():
-                raise ValueError(f"{self.files.file.name}: changed outside the editor; please repeat your edit")
-            self.project.set_view(side, views)
-            self._stamps = self._read_stamps()
-            self._use_files(self.project.files())
 
     # the selection in the source
 
@@ -179,11 +160,7 @@ class Session:
         return None if numbers is None else Box(torch.tensor(numbers[:3]), torch.tensor(numbers[3:]))
 
     def correct(self, flags: Bool[Tensor, "n"], *, add: bool) -> None:
-        """Add Gaussians to the object or remove them from it.
-
-        Raises:
-            ValueError: As `change`.
-        """
+        """Add Gaussians to the object or remove them from it."""
         corrections = self.state.corrections
         if corrections is not None and len(corrections) != len(flags):
             corrections = None  # of another reconstruction
@@ -191,23 +168,20 @@ class Session:
 
     # the objects in the target
 
-    def can_place(self) -> bool:
-        """Whether the files of the object and the target exist."""
-        return self.files.object.is_file() and self.files.target_scene.is_file()
-
     def objects(self) -> tuple[ObjectPlacement, ...]:
         """The placed objects: as edited, else as `compose` placed them."""
         if self.state.objects is not None:
             return self.state.objects
-        if not self.can_place() or not self.files.placement.is_file():
+        files = self.files
+        if not all(path.is_file() for path in (files.object, files.target_scene, files.placement)):
             return ()
-        stamp = self.files.placement.stat().st_mtime_ns
+        stamp = files.placement.stat().st_mtime_ns
         if self._composed[0] != stamp:
-            own = self.files.object.resolve()
+            own = files.object.resolve()
             # the project's own object is stored without a path
             items = tuple(
                 replace(item, object_path=None) if item.object_path and item.object_path.resolve() == own else item
-                for item in read_placement(self.files.placement).objects
+                for item in read_placement(files.placement).objects
             )
             self._composed = (stamp, items)
         return self._composed[1]
@@ -221,11 +195,7 @@ class Session:
         return (self.files.target_scene, *(self.scenes.object_path(item) for item in self.objects()))
 
     def placeable_object(self, index: int) -> PlaceableObject:
-        """A placed object with its base.
-
-        Raises:
-            ValueError: If its file is missing or empty.
-        """
+        """A placed object with its base."""
         return self.scenes.placeable_object(self.objects()[index])
 
     def up(self) -> Float[Tensor, "3"]:
@@ -233,22 +203,14 @@ class Session:
         return estimate_up(self.scenes.cameras(self.files.target_cameras))
 
     def set_placement(self, index: int, target_from_object: Similarity) -> None:
-        """Change the placement of one object.
-
-        Raises:
-            ValueError: As `change`.
-        """
+        """Change the placement of one object."""
         item = replace(self.objects()[index], target_from_object=target_from_object)
         self.change(self.placed_state().with_object(index, item))
 
     # metric sizes
 
     def size(self, index: int) -> ObjectSize:
-        """The size of one placed object.
-
-        Raises:
-            ValueError: If its file or a scale.json cannot be read.
-        """
+        """The size of one placed object; ValueError where a scale.json cannot be read."""
         item = self.objects()[index]
         is_own = self.scenes.object_path(item) == self.files.object
         return ObjectSize(
@@ -259,69 +221,37 @@ class Session:
         )
 
     def true_scale(self) -> float | None:
-        """The scale at which the source's object is as large as it was; None where a capture's scale is not known.
-
-        Raises:
-            ValueError: If a scale.json cannot be read.
-        """
+        """The scale at which the source's object is as large as it was; None where a capture's scale is not known."""
         own, place = read_scale(self.files.source_cameras), read_scale(self.files.target_cameras)
         return None if own is None or place is None else own.metres_per_unit / place.metres_per_unit
 
     def set_own_scale(self, index: int, true_cm: float) -> Path:
-        """Store the scale of an object's own capture from the object's true height; gives the file.
-
-        Raises:
-            ValueError: The height is out of range, or the object was added from a file.
-        """
+        """Store the scale of an object's own capture from the object's true height; gives the file."""
+        check_height_cm(true_cm)
         path = self.scenes.object_path(self.objects()[index])
         if path != self.files.object:
             raise ValueError(
                 f"{path}: expected the object of the project's source, found one that was added from a file"
             )
-        return write_scale(self.files.source_cameras, self.size(index).own_from(true_cm))
+        found = MetricScale(0.01 * true_cm / self.size(index).height, f"the object's height of {true_cm:g} cm")
+        return write_scale(self.files.source_cameras, found)
 
     def set_place_scale(self, index: int, here_cm: float) -> Path:
-        """Store the scale of the target's capture from a placed object's height in it; gives the file.
-
-        Raises:
-            ValueError: The height is out of range.
-        """
-        return write_scale(self.files.target_cameras, self.size(index).place_from(here_cm))
+        """Store the scale of the target's capture from a placed object's height in it; gives the file."""
+        check_height_cm(here_cm)
+        size = self.size(index)
+        found = MetricScale(0.01 * here_cm / (size.scale * size.height), f"a placed object's height of {here_cm:g} cm")
+        return write_scale(self.files.target_cameras, found)
 
     # jobs
 
-    def run(self, to: str, title: str) -> None:
-        """Start a child process that runs the stale steps up to `to`.
-
-        Raises:
-            ValueError: If a job is running.
-        """
-        self._start(self.project.run_words(to), title)
-
-    def export(self, to: Path, *, page: ExportPage, layer: Layer) -> JobState | None:
-        """Start a child process that writes the result as a file whose suffix names the format; gives its job.
-
-        Raises:
-            ValueError: If a job is running.
-        """
-        to.parent.mkdir(parents=True, exist_ok=True)
-        self._start(self.project.export_words(to, page=page, layer=layer), f"Write {to.name}")
-        return self.job()
-
-    def _start(self, words: tuple[str, ...], title: str) -> None:
+    def start_job(self, words: tuple[str, ...], title: str) -> None:
+        """Start a child process that runs a command, which is given by the words after `splatgraft`."""
         self.jobs.start(self.project.job_command(words, title), title=title, shown=words)
-
-    def job(self) -> JobState | None:
-        """The running job, else the last one; None where there was none."""
-        return self.jobs.state()
-
-    def reasons(self) -> Mapping[str, str | None]:
-        """For each step why it is stale; None where it is up to date."""
-        return self.project.reasons()
 
     def why_stale(self, step: str) -> str | None:
         """Why the result of a step is out of date, with the first step that is; None where it is up to date."""
-        found = self.reasons()
+        found = self.project.reasons()
         if step not in found:
             return found.get(PROBLEM)
         name, reason = step, found[step]

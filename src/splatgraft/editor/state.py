@@ -61,11 +61,7 @@ class EditState:
 
 
 def check_state(state: EditState) -> None:
-    """Check all values of a state, so that none makes a project unreadable.
-
-    Raises:
-        ValueError: If a value is not finite or out of its range; one line.
-    """
+    """Check all values of a state, so that none makes a project unreadable; ValueError in one line."""
     for index, item in enumerate(state.objects or ()):
         _check_placement(item, f"object {index + 1}")
     if state.box is not None:
@@ -84,21 +80,13 @@ def check_state(state: EditState) -> None:
 
 
 def check_numbers(values: Iterable[float], where: str) -> None:
-    """Check that typed or dragged numbers are finite and not above the largest coordinate.
-
-    Raises:
-        ValueError: As `check_state`.
-    """
+    """Check that typed or dragged numbers are finite and not above the largest coordinate, as `check_state` does."""
     for value in values:
         _check_number(value, where, _COORDINATES)
 
 
 def check_height_cm(value: float) -> None:
-    """Check a typed height in centimetres.
-
-    Raises:
-        ValueError: As `check_state`.
-    """
+    """Check a typed height in centimetres, as `check_state` does."""
     _check_number(value, "height in cm", _HEIGHTS_CM)
 
 

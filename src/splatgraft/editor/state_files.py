@@ -18,14 +18,12 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.settings import MAX_TEXT_BYTES, read_toml
 
 _CORRECTIONS_FILE, _PROMPTS_FILE = "corrections.npy", "prompts.json"
+_KEYS_OF_FILES = {"corrections": "corrections", "prompts": "prompts", "given_light": "light"}
+"""Keys of project.toml that name a file, with the field that it holds."""
 
 
 def read_state(project: Path) -> EditState:
-    """Read the state from project.toml and the files beside it.
-
-    Raises:
-        ValueError: If one of these files is invalid; one line that names the file.
-    """
+    """Read the state from project.toml and the files beside it; ValueError in one line that names an invalid file."""
     content, folder = read_toml(project), project.parent
     segment, relight, harmonize = (_table(content, name, project) for name in ("segment", "relight", "harmonize"))
     placement, file = folder / PLACEMENT_FILE, project
@@ -58,24 +56,20 @@ def read_state(project: Path) -> EditState:
 def write_state(project: Path, before: EditState, after: EditState) -> None:
     """Update the files from state `before` to state `after`; what both agree on stays untouched.
 
-    Files that project.toml refers to are written before it, so that it never refers to a missing file.
-
-    Args:
-        project: project.toml.
-        before: What the files hold.
-        after: What they shall hold.
-
-    Raises:
-        ValueError: If project.toml cannot be changed line by line.
+    Files that project.toml refers to are written before it, so that it never refers to a missing file. ValueError
+    where project.toml cannot be changed line by line.
     """
 
     def is_new(name: str) -> bool:
         return getattr(after, name) is not getattr(before, name)
 
     folder, old = project.parent, project.read_text(encoding="utf-8")
-    text = old
-    for table, keys in _changed_keys(before, after).items():
-        text = with_keys(text, table, keys)
+    text, new_keys, old_keys = old, _keys(after), _keys(before)
+    for (table, key), value in new_keys.items():
+        # the file of what was changed may have another name, given by hand
+        is_file = key in _KEYS_OF_FILES and is_new(_KEYS_OF_FILES[key])
+        if is_file or json.dumps(value) != json.dumps(old_keys[table, key]):
+            text = with_keys(text, table, {key: value})
     if after.corrections is not None and is_new("corrections"):
         write_flags(folder / _CORRECTIONS_FILE, after.corrections)
     if after.prompts is not None and is_new("prompts"):
@@ -104,29 +98,8 @@ def as_written(state: EditState, before: EditState) -> EditState:
 
 def state_files(project: Path) -> tuple[Path, ...]:
     """All files that hold the state."""
-    return (
-        project,
-        *(
-            project.parent / name
-            for name in (PLACEMENT_FILE, ERASED_FILE, _CORRECTIONS_FILE, _PROMPTS_FILE, LIGHT_FILE)
-        ),
-    )
-
-
-def _changed_keys(before: EditState, after: EditState) -> dict[str, dict[str, Any]]:
-    """What changes in each table of project.toml; None removes a key."""
-    new, old = _keys(after), _keys(before)
-    # the file of what was changed may have another name, given by hand
-    renewed = {
-        key
-        for key, field in (("corrections", "corrections"), ("prompts", "prompts"), ("given_light", "light"))
-        if getattr(after, field) is not getattr(before, field)
-    }
-    changes: dict[str, dict[str, Any]] = {}
-    for (table, key), value in new.items():
-        if key in renewed or json.dumps(value) != json.dumps(old[table, key]):
-            changes.setdefault(table, {})[key] = value
-    return changes
+    names = (PLACEMENT_FILE, ERASED_FILE, _CORRECTIONS_FILE, _PROMPTS_FILE, LIGHT_FILE)
+    return (project, *(project.parent / name for name in names))
 
 
 def _keys(state: EditState) -> dict[tuple[str, str], Any]:

@@ -12,12 +12,7 @@ class LatestOnlyWorker(Generic[T]):
     """A thread with at most one waiting request."""
 
     def __init__(self, work: Callable[[T], None], on_error: Callable[[Exception], None]) -> None:
-        """Start the thread.
-
-        Args:
-            work: Called in the thread with one request at a time.
-            on_error: Called in the thread with each exception that `work` raises.
-        """
+        """Start the thread, which calls `work` with one request at a time, and `on_error` where that raises."""
         self._work, self._on_error = work, on_error
         self._waiting: list[T] = []
         self._wake = threading.Condition()

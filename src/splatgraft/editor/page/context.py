@@ -11,11 +11,10 @@ from typing import Any
 import viser
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.editor.page.opening import look_through
+from splatgraft.editor.page.opening import View, look_through, typical_distance
 from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.server import GuardedServer
 from splatgraft.editor.project import Project
-from splatgraft.editor.scene_sample import View, typical_distance
 from splatgraft.editor.session import Session, Stamps, stamps_of
 from splatgraft.runtime.files import atomic_write
 
@@ -32,11 +31,7 @@ def note(text: str, *, kind: str = "note", bad: bool = False, faint: bool = Fals
 
 
 def parse_path(text: str) -> Path:
-    """The path that a text field names.
-
-    Raises:
-        ValueError: If it is empty.
-    """
+    """The path that a text field names; ValueError where it is empty."""
     if not text.strip():
         raise ValueError("path: expected one, found nothing")
     return Path.cwd() / Path(text.strip()).expanduser()
@@ -46,14 +41,7 @@ class PageContext:
     """The open project on a server; `Page` sets the calls that show its changes."""
 
     def __init__(self, guarded: GuardedServer, project: Project, *, budget: int, shown: Path | None = None) -> None:
-        """Open the project where there is one.
-
-        Args:
-            guarded: The server.
-            project: The project, which need not exist.
-            budget: Maximum number of Gaussians per scene that is sent to a browser.
-            shown: The scene of which a sample is shown already.
-        """
+        """Open the project where there is one; `shown` is the scene of which a sample is shown already."""
         self.guarded, self.project = guarded, project
         self.server, self.gui = guarded.viser, guarded.viser.gui
         self.view = SceneView(self.server, budget=budget, coarse=shown)
@@ -94,11 +82,7 @@ class PageContext:
         return self.problem is not None and stamps_of(self.project.file) != self._seen
 
     def require_session(self) -> Session:
-        """The open project.
-
-        Raises:
-            ValueError: If there is none.
-        """
+        """The open project; ValueError where there is none."""
         if self.session is None:
             raise ValueError("project: expected one, found none; name two captures and start")
         return self.session
@@ -113,14 +97,11 @@ class PageContext:
         connect(self.callback(lambda _: work()))
 
     def callback(self, work: Callable[[Any], object]) -> Callable[[Any], None]:
-        """Wrap an event handler: errors are shown in the status line, and the page is refreshed afterwards.
-
-        Events that the program itself causes, by setting a control, are ignored.
-        """
+        """Wrap an event handler: errors are shown in the status line, and the page is refreshed afterwards."""
 
         def call(event: Any) -> None:
             if getattr(event, "client_id", 0) is None:
-                return
+                return  # the program itself has set a control
             with self.lock:
                 with self.reported():
                     work(event)
@@ -148,12 +129,9 @@ class PageContext:
         self.say(str(error), bad=True)
 
     def run(self, to: str, title: str) -> None:
-        """Start a job that runs the stale steps up to `to`.
-
-        Raises:
-            ValueError: If a job is running.
-        """
-        self.require_session().run(to, title)
+        """Start a job that runs the stale steps up to `to`."""
+        session = self.require_session()
+        session.start_job(session.project.run_words(to), title)
         self.say(f"{title}: started; it continues if you close this page")
 
     # files that users name or upload
@@ -211,28 +189,15 @@ class PageContext:
 
     def look_through(self, window: viser.ClientHandle | None, camera: Cameras) -> None:
         """Move a window's view to a camera."""
-        if window is None:
-            return
-        pose = camera.world_from_camera[0].double().numpy()
-        look_through(
-            window,
-            View(
-                position=pose[:3, 3],
-                look_at=pose[:3, 3] + pose[:3, 2] * self.scene_scale(),
-                up=-pose[:3, 1],
-                half_height=camera.height / (2 * float(camera.intrinsics[0, 1, 1])),
-                aspect=camera.width / camera.height,
-            ),
-        )
+        if window is not None:
+            half_height = camera.height / (2 * float(camera.intrinsics[0, 1, 1]))
+            pose, aspect = camera.world_from_camera[0].double().numpy(), camera.width / camera.height
+            look_through(window, View(pose, self.scene_scale(), half_height, aspect))
 
     def show_target(self) -> bool:
         """Show the target and the placed objects in the 3D view, or a sample of a target that is being read.
 
-        Returns:
-            Whether all of them are shown; False where there is no target.
-
-        Raises:
-            ValueError: If a file is invalid.
+        Returns whether all of them are shown; False where there is no target.
         """
         session = self.session
         if session is None or not session.files.target_scene.is_file():

@@ -27,12 +27,8 @@ class JobPanel:
         context.on(self._cancel, self._stop)
 
     def refresh(self) -> None:
-        """Update the panel; redraw the page when a step has ended.
-
-        Raises:
-            ValueError: If the job's state cannot be read.
-        """
-        state = None if self._context.session is None else self._context.session.job()
+        """Update the panel; redraw the page when a step has ended."""
+        state = None if self._context.session is None else self._context.session.jobs.state()
         live = state is not None and state.live
         self._text.visible = self._bar.visible = self._cancel.visible = live
         if state is None:

@@ -141,10 +141,11 @@ class OpenPhase(Phase):
         cameras = (files.source_cameras, files.target_cameras)[index]
         if not scene.is_file():
             return f"<b>{name}</b>: not reconstructed yet"
-        count = session.scenes.count(scene)
-        if count is None and not session.scenes.at_hand([scene]):
+        sample = session.scenes.sample(scene)
+        if sample is None and not session.scenes.at_hand([scene]):
             return f"<b>{name}</b>: being read"
-        text = f"<b>{name}</b>: {count or session.scenes.gaussians(scene).count:,} Gaussians"
+        count = sample.total if sample is not None else session.scenes.gaussians(scene).count
+        text = f"<b>{name}</b>: {count:,} Gaussians"
         if files.without_photos[index] and cameras.is_file():
             made = session.scenes.cameras(cameras)
             up = ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in estimate_up(made).tolist())

@@ -45,14 +45,7 @@ class Page:
     def __init__(
         self, guarded: GuardedServer, project: Project, *, budget: int, opening: Opening | None = None
     ) -> None:
-        """Build the page for a project that exists or is about to be created.
-
-        Args:
-            guarded: The server.
-            project: The project.
-            budget: Maximum number of Gaussians per scene that is sent to a browser.
-            opening: What the windows show by now.
-        """
+        """Build the page for a project that exists or is about to be created, after what the windows show by now."""
         if opening is None:
             set_theme(guarded.viser)
         shown = None if opening is None else opening.scene
@@ -89,8 +82,10 @@ class Page:
         context.on(self._history, lambda: self._undo() if self._history.value == "Undo" else self._redo())
         context.on(undo, self._undo)
         context.on(redo, self._redo)
-        # windows that keep their view, as their user has moved it
-        self._keep_view = frozenset[int]() if opening is None else opening.close()
+        if opening is not None:
+            opening.close()
+        # windows that have their first view already
+        self._placed = frozenset() if opening is None else frozenset(opening.placed)
         guarded.on_windows_changed = self._windows_changed
         context.server.on_client_connect(self._connected)
         guarded.files = lambda name: None if context.session is None else served_file(context.session.files, name)
@@ -109,7 +104,7 @@ class Page:
             where = "no project yet" if session is None else session.files.file.parent.name
             saved = "" if session is None else '<span style="opacity:.6;float:right">all changes are saved</span>'
             self._header.content = note(f'<b style="font-size:1.1em">{html.escape(where)}</b>{saved}', kind="header")
-            self._history.visible = session is not None and session.has_steps()
+            self._history.visible = session is not None and bool(session.history.past or session.history.future)
 
     def show_phase(self, phase: str) -> None:
         """Switch to another phase."""
@@ -175,7 +170,7 @@ class Page:
     def _connected(self, window: viser.ClientHandle) -> None:
         window.camera.on_update(lambda _: self._moved(window))
         camera = self.context.cameras()
-        if window.client_id not in self._keep_view and camera is not None:
+        if window.client_id not in self._placed and camera is not None:
             # the reconstruction covers what the first photograph shows
             self.context.look_through(window, camera[0])
         self._windows_changed()

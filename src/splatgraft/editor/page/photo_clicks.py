@@ -54,11 +54,7 @@ class PhotoView:
         return x, y
 
     def pixel_at(self, place: tuple[float, float]) -> tuple[float, float] | None:
-        """The photo's pixel at a place of the canvas; None beside the photo.
-
-        Args:
-            place: To the right and down, over the canvas's width and height.
-        """
+        """The photo's pixel at a place, over the canvas's width and height; None beside the photo."""
         (left, top), (width, height) = self.corner, self.photo
         x, y = (place[0] * self.canvas[0] - left) / self.scale, (place[1] * self.canvas[1] - top) / self.scale
         return (x, y) if 0 <= x < width and 0 <= y < height else None
@@ -99,12 +95,7 @@ def with_click(
 ) -> dict[str, ViewPrompt] | None:
     """The prompts with one more point, or without the point that was clicked; None where none is left.
 
-    Args:
-        prompts: By the name of a photo.
-        name: Of the photo.
-        pixel: x and y of the photo as a viewer shows it.
-        on_object: Whether a new point is on the object or beside it.
-        longer_side: Of the photo, pixels.
+    `pixel` is x and y of the photo of that name as a viewer shows it, whose `longer_side` is in pixels.
     """
     found, key = dict(prompts or {}), _key(prompts or {}, name)
     prompt, point = found.get(key, ViewPrompt()), torch.tensor([pixel]).round(decimals=1)
@@ -135,7 +126,6 @@ class PhotoClicks:
         self._canvas = Canvas(context.server, context.view)
         self._view: PhotoView | None = None
         self._window: int | None = None
-        self._photo: tuple[object, np.ndarray, tuple[int, int]] | None = None
         context.on(self._show, self._say)
         context.on(self._kind, lambda: None)
         context.on(self._number, lambda: None)
@@ -166,8 +156,9 @@ class PhotoClicks:
         if self._number.max != max(2, len(capture)):
             self._number.max = max(2, len(capture))
         index = self._index(capture)
-        pixels, size = self._pixels(capture, index)
-        name = capture.cameras.names[index]
+        path, name = capture.image_paths[index], capture.cameras.names[index]
+        stamp = path.stat().st_mtime_ns if path.is_file() else 0
+        pixels, size = session.scenes.derive("photo", (str(path), stamp), lambda: read_upright(path, _LONGEST_PX))
         aspect = window.camera.aspect if window.camera.aspect > 0 else 1.5
         width = min(_LONGEST_PX, max(256, window.camera.image_width))
         view = PhotoView(size, (width, max(16, round(width / aspect))))
@@ -183,13 +174,6 @@ class PhotoClicks:
 
     def _index(self, capture: PosedImages) -> int:
         return min(int(self._number.value), len(capture)) - 1
-
-    def _pixels(self, capture: PosedImages, index: int) -> tuple[np.ndarray, tuple[int, int]]:
-        path = capture.image_paths[index]
-        key = (path, path.stat().st_mtime_ns if path.is_file() else 0)
-        if self._photo is None or self._photo[0] != key:
-            self._photo = (key, *read_upright(path, _LONGEST_PX))
-        return self._photo[1], self._photo[2]
 
     def _count(self) -> str:
         prompts = self._context.require_session().state.prompts or {}

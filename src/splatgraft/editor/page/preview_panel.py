@@ -34,6 +34,8 @@ _MAX_DRAFT_SECONDS = 1.5
 """Where drafts of the light take longer, pictures without the light transfer are shown first."""
 _REST_SECONDS = 0.1
 """How long the camera stands still before its picture is drawn; browsers report a moving one more often."""
+_SETTLE_SECONDS = 0.5
+"""How long nothing must change before the light itself is computed."""
 _COARSE_ABOVE = 0.4
 """Seconds; a picture that takes longer is preceded by a coarse one."""
 _COARSE_SHARE, _COARSE_BUDGET = 0.5, 120_000
@@ -64,18 +66,11 @@ class PictureRequest:
     """Whether a draft of the light is drawn."""
     budget: int | None = None
     """Maximum number of Gaussians that are drawn; None: all."""
-    is_sample: bool = False
-    """Whether a sample of the scene is drawn, which needs no whole scene in memory."""
 
     @property
     def is_of_source(self) -> bool:
         """Whether the source is drawn."""
         return self.left in SOURCE_KINDS
-
-    def without_light(self) -> "PictureRequest":
-        """The same with pictures of the pasted object in place of those that need the light transfer."""
-        left, right = ("Copy-paste" if kind in NEEDS_LIGHT else kind for kind in (self.left, self.right))
-        return replace(self, left=left, right=right)
 
     def scenes(self) -> tuple[Path, ...]:
         """The files of the scenes that the picture needs."""
@@ -83,23 +78,16 @@ class PictureRequest:
 
     def key(self) -> tuple[object, ...]:
         """What the pictures depend on, other than their kind; requests with equal keys give equal pictures."""
-        state, result, relighting = self.state, self.session.files.result, self.session.relighting
+        state, result = self.state, self.session.files.result
         stamp = result.stat().st_mtime_ns if result.is_file() else 0
-        found = (self.draft and relighting.is_relit(state), self.draft and relighting.is_refined(state))
-        selection = self.session.selection() if self.is_of_source and not self.is_sample else None
-        drawn = (self.draft, *found, self.budget or 0, self.is_sample, stamp)
-        return (_pose(self.camera), *drawn, state.objects, state.erased, state.light, state.weights, selection)
+        best_draft = self.session.relighting.best(state) if self.draft else None
+        selection = self.session.selection() if self.is_of_source else None
+        drawn = (_pose(self.camera), self.draft, best_draft, self.budget or 0, stamp)
+        return (*drawn, state.objects, state.erased, state.light, state.weights, selection)
 
     def draw(self, kind: PictureKind) -> Picture:
-        """Draw one of the pictures.
-
-        Raises:
-            ValueError: If a file that it needs does not exist yet.
-        """
+        """Draw one of the pictures; ValueError where a file that it needs does not exist yet."""
         session, pictures = self.session, self.session.pictures
-        if self.is_sample:
-            source = session.files.source_scene if self.is_of_source else None
-            return pictures.sampled_view(self.state, self.camera, source=source)
         if self.is_of_source:
             return pictures.source_view(session.selection() if kind == "Object alone" else None, self.camera)
         return pictures.view(kind, self.state, self.camera, draft=self.draft, budget=self.budget)
@@ -113,7 +101,7 @@ class PreviewPanel:
         self._context, gui = context, context.gui
         self._drawn = Memo()
         self._dragged_state: EditState | None = None
-        self._draft_seconds, self._relight_seconds, self._picture_seconds = float("inf"), 0.0, 0.0
+        self._draft_seconds, self._picture_seconds = float("inf"), 0.0
         self._light_note = ""
         self.canvas = Canvas(context.server, context.view)
         self._shown_pose: bytes = b""
@@ -179,11 +167,7 @@ class PreviewPanel:
         self._submit(is_moved=False)
 
     def save_picture(self, path: Path) -> None:
-        """Write the right picture, 1280 pixels wide.
-
-        Raises:
-            ValueError: If there is no target scene.
-        """
+        """Write the right picture, 1280 pixels wide."""
         request = self._request(width=_SAVED_WIDTH)
         if request is None:
             raise ValueError("picture: expected a reconstructed scene with cameras, found none")
@@ -261,20 +245,20 @@ class PreviewPanel:
             return
         relighting, state = request.session.relighting, request.state
         if not request.session.scenes.at_hand(request.scenes()):
-            # drawn again when the scenes are there
-            sampled = replace(request.without_light(), is_sample=True)
-            self._draw_once(sampled, note="the scene is being read", stage="coarse")
-            return
+            self.canvas.clear()
+            self._say("the scene is being read")
+            return  # drawn when the scenes are there
         if not {request.left, request.right} & set(NEEDS_LIGHT) or relighting.is_relit(state):
             self._draw(request, note=self._light_note)
             return
-        if self._draft_seconds > _MAX_DRAFT_SECONDS and not relighting.has_draft(state):
-            # first the pictures that need no light transfer
-            self._draw(request.without_light(), note="light: computing ...", stage="copy-paste")
-            if self._worker.superseded:
-                return
-        start = time.monotonic()
-        if not relighting.has_draft(state):
+        if relighting.best(state) is None:
+            if self._draft_seconds > _MAX_DRAFT_SECONDS:
+                # first the pictures that need no light transfer
+                left, right = ("Copy-paste" if kind in NEEDS_LIGHT else kind for kind in (request.left, request.right))
+                self._draw(replace(request, left=left, right=right), note="light: computing ...", stage="copy-paste")
+                if self._worker.superseded:
+                    return
+            start = time.monotonic()
             relighting.draft(state)
             self._draft_seconds = time.monotonic() - start
         self._draw(replace(request, draft=True), note=f"a draft of the light in {self._draft_seconds:.1f} s")
@@ -284,10 +268,9 @@ class PreviewPanel:
     def _compute_light(self, request: PictureRequest) -> None:
         """The light as the step computes it, when nothing has changed for a moment."""
         relighting, state, worker = request.session.relighting, request.state, self._light_worker
-        if relighting.is_relit(state) or not worker.wait_idle(min(1.5, 0.3 * self._relight_seconds)):
+        if relighting.is_relit(state) or not worker.wait_idle(_SETTLE_SECONDS):
             return
-        if relighting.can_refine(state) and not relighting.is_refined(state):
-            relighting.refined(state)
+        if relighting.refine(state):
             if not worker.closed:
                 self.update()  # once drawn, asks for the light itself
             return
@@ -295,8 +278,7 @@ class PreviewPanel:
         relighting.relit(state)
         if worker.closed:
             return
-        self._relight_seconds = time.monotonic() - start
-        self._light_note = f"light in {self._relight_seconds:.1f} s"
+        self._light_note = f"light in {time.monotonic() - start:.1f} s"
         self.light_ready()
         self.update()
         if worker.wait_idle(_REST_SECONDS):

@@ -67,7 +67,7 @@ class RunPhase(Phase):
         self._context.show_target()
         self._method.value = session.state.harmonizer or "none"
         rows = []
-        for name, reason in session.reasons().items():
+        for name, reason in session.project.reasons().items():
             mark = "&#10003;" if reason is None else "&middot;"
             why = f'<td style="opacity:.6">{html.escape(reason or "")}</td>'
             rows.append(f'<tr><td style="width:1.4em">{mark}</td><td>{name}</td>{why}</tr>')
@@ -137,7 +137,10 @@ class SharePanel:
 
     def _start(self, event: viser.GuiEvent) -> None:
         to, page, layer = self._wanted()
-        job = self._context.require_session().export(to, page=page, layer=layer)
+        session = self._context.require_session()
+        to.parent.mkdir(parents=True, exist_ok=True)
+        session.start_job(session.project.export_words(to, page=page, layer=layer), f"Write {to.name}")
+        job = session.jobs.state()
         if job is not None and event.client is not None:
             self._asked = (job.pid, event.client.client_id)
         self._context.say(f"{to.name}: being written; you can go on meanwhile")

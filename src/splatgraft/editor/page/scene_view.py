@@ -47,13 +47,7 @@ class SceneView:
     """Scene nodes by name; unchanged splats are not sent again."""
 
     def __init__(self, server: viser.ViserServer, *, budget: int, coarse: Path | None = None) -> None:
-        """Show nothing more yet.
-
-        Args:
-            server: The server of the windows.
-            budget: Maximum number of Gaussians per node.
-            coarse: The scene of which a sample is shown already.
-        """
+        """Show at most `budget` Gaussians per node; of the scene `coarse` a sample is shown already."""
         self._server, self._scene, self._budget, self._coarse = server, server.scene, budget, coarse
         self._splats: dict[str, tuple[tuple[object, ...], viser.GaussianSplatHandle | None, ShownCount]] = {}
         self._references: dict[str, object] = {}
@@ -63,7 +57,7 @@ class SceneView:
 
     def show_coarse(self, scene: Path, sample: SceneSample | None) -> None:
         """Show a sample of a scene until `remove_coarse`; None shows what was shown before."""
-        if scene != self._coarse and sample is not None and len(sample.means):
+        if scene != self._coarse and sample is not None:
             add_coarse(self._server, sample)
             self._coarse = scene
 
@@ -87,14 +81,9 @@ class SceneView:
         tint: Color | None = None,
         transform: Similarity | None = None,
     ) -> None:
-        """Show a node of splats; a change of `transform` alone sends no splats again.
+        """Show a node of splats, of the Gaussians of a scene that `which` selects; None: of all.
 
-        Args:
-            name: Path of the node.
-            gaussians: The scene.
-            which: Flags of the Gaussians to show; None: all.
-            tint: Colour blended over the Gaussians' own.
-            transform: World from the scene's frame; None: identity.
+        A change of `transform`, the world from the scene's frame, sends no splats again.
         """
         key = (id(gaussians), id(which), tint)
         known = self._splats.get(name)
@@ -212,13 +201,7 @@ class Canvas:
     def show(
         self, window: viser.ClientHandle, pixels: UInt8[np.ndarray, "h w 3"], depth: Float[np.ndarray, "h w"] | None
     ) -> None:
-        """Show a picture in place of the splats of one window.
-
-        Args:
-            window: The window.
-            pixels: The picture, of the window's camera.
-            depth: Depth along the optical axis, world units; None: gizmos are drawn over all.
-        """
+        """Show a picture of its camera in place of the splats of one window; without `depth` gizmos are over all."""
         if depth is not None:
             size = (max(1, round(depth.shape[1] * _DEPTH_SHARE)), max(1, round(depth.shape[0] * _DEPTH_SHARE)))
             depth = cv2.resize(np.minimum(depth, _MAX_DEPTH), size, interpolation=cv2.INTER_NEAREST)
@@ -249,13 +232,7 @@ class Canvas:
 
 
 def camera_from_viser(camera: viser.CameraHandle, *, width: int, min_aspect: float = 0.0) -> Cameras:
-    """The camera of a window as `Cameras`.
-
-    Args:
-        camera: viser's camera.
-        width: Image width, pixels.
-        min_aspect: Minimum of width over height; a narrower window's field of view is widened.
-    """
+    """The camera of a window, `width` pixels wide; the field of view is widened to at least `min_aspect`."""
     aspect = max(min_aspect, camera.aspect if camera.aspect > 0 else 1.5)
     height = max(16, round(width / aspect))
     pose = torch.eye(4)

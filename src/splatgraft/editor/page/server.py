@@ -4,7 +4,6 @@ import contextlib
 import http
 import http.client
 import io
-import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,7 @@ from viser import _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from splatgraft.editor.access import allowed_query, check_access
+from splatgraft.editor.access import allowed_query, cookie_name, why_refused
 
 FILES_PREFIX = "files/"
 """First part of the addresses of files, below the page's own address."""
@@ -33,7 +32,6 @@ _TYPES = {
     ".gif": "image/gif",
     ".mp4": "video/mp4",
 }
-_PATCH_LOCK = threading.Lock()
 _PROBE_SECONDS = 300
 """Limit of the request to the own server at the start: against a hang, not for a busy machine."""
 
@@ -42,26 +40,21 @@ class GuardedServer:
     """A viser server with access control in front."""
 
     def __init__(self, token: str, *, host: str, port: int) -> None:
-        """Start to listen at `port` or the next free one; each request must carry the token.
-
-        Raises:
-            OSError: If the running viser does not apply the access control.
-        """
+        """Start to listen at `port` or the next free one; each request must carry the token."""
         self.on_windows_changed: Callable[[], None] = lambda: None
         self.files: Callable[[str], Path | None] = lambda name: None
         """Gives the file that is served below FILES_PREFIX."""
         self._token = token
         self._windows: list[int] = []
-        with _PATCH_LOCK:
-            # viser has no hook for requests: websockets.serve is replaced while viser starts
-            original = websockets.asyncio.server.serve
-            websockets.asyncio.server.serve = partial(self._serve, original)  # pyright: ignore
-            try:
-                # viser prints an address without the token to stdout, which is for results
-                with contextlib.redirect_stdout(io.StringIO()):
-                    self.viser = viser.ViserServer(host=host, port=port, verbose=False)
-            finally:
-                websockets.asyncio.server.serve = original
+        # viser has no hook for requests: websockets.serve is replaced while viser starts
+        original = websockets.asyncio.server.serve
+        websockets.asyncio.server.serve = partial(self._serve, original)  # pyright: ignore
+        try:
+            # viser prints an address without the token to stdout, which is for results
+            with contextlib.redirect_stdout(io.StringIO()):
+                self.viser = viser.ViserServer(host=host, port=port, verbose=False)
+        finally:
+            websockets.asyncio.server.serve = original
         inner = self.viser._websock_server
         # setattr, because pyright compares parameter names with viser's
         setattr(inner, "_handle_incoming_message", partial(self._forward_allowed, inner._handle_incoming_message))  # noqa: B010
@@ -104,9 +97,9 @@ class GuardedServer:
         # a repeated header is joined, so that it matches no accepted value
         found = {name: request.headers.get_all(name) for name in ("Host", "Origin", "Upgrade", "Cookie")}
         headers = {name: ("; " if name == "Cookie" else ", ").join(values) for name, values in found.items() if values}
-        decision = check_access(self._token, headers, request.path)
-        if not decision.allowed:
-            return _response(http.HTTPStatus.FORBIDDEN, f"splatgraft: {decision.reason}\n".encode(), "text/plain")
+        refused = why_refused(self._token, headers, request.path)
+        if refused is not None:
+            return _response(http.HTTPStatus.FORBIDDEN, f"splatgraft: {refused}\n".encode(), "text/plain")
         path, query = request.path.partition("?")[0].removeprefix("/"), allowed_query(request.path)
         if query is not None and "Upgrade" not in request.headers:
             moved = _response(http.HTTPStatus.FOUND, b"", "text/plain")
@@ -120,8 +113,8 @@ class GuardedServer:
             return _response(http.HTTPStatus.OK, file.read_bytes(), kind)
         response = inner(connection, request)
         if response is not None:
-            if decision.cookie is not None:
-                response.headers["Set-Cookie"] = decision.cookie
+            cookie = f"{cookie_name(headers['Host'])}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+            response.headers["Set-Cookie"] = cookie
             # no other site may embed this page in a frame (clickjacking), and the address holds the token
             response.headers["X-Frame-Options"] = "DENY"
             response.headers["Referrer-Policy"] = "no-referrer"
