@@ -9,7 +9,6 @@ the numbers are fitted as often without one part of the scenes, and the objectiv
 the fit needs of the scenes is kept in files (`--evidence`), and read from there by later runs.
 """
 
-import argparse
 import json
 import math
 import multiprocessing
@@ -21,16 +20,18 @@ from pathlib import Path
 from typing import TypeAlias
 
 import torch
+from exam_scenes import scene_arguments, scenes_in
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.directions import even_directions
-from splatgraft.relighting.light.estimate import EstimatedLight
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem
 from splatgraft.relighting.light.radiance_search import irradiance_of, search_radiance
-from splatgraft_paper.exam.scenes import ExamScene, estimated_lights, scenes_in
+from splatgraft_paper.exam.scenes import ExamScene
 
 NORMALS = even_directions(200)
 FACTORS = {
@@ -72,9 +73,12 @@ Pair: TypeAlias = tuple[TrainingPlace, TrainingPlace]
 
 
 def places_of(scene: ExamScene) -> Pair:
-    """The new and the old place."""
-    found = estimated_lights(scene)
-    return _place(found["new"], scene.new_light), _place(found["old"], scene.old_light)
+    """The new and the old place, estimated by nothing but the reconstructions."""
+    placed, source = scene.composite.objects[0], scene.source
+    there, thing = bounding_sphere(placed.gaussians), placed.gaussians
+    new = estimate_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
+    old = estimate_light(source.gaussians, there, source.cameras, object_gaussians=thing)
+    return _place(new, scene.new_light), _place(old, scene.old_light)
 
 
 def _place(found: EstimatedLight | NoLight, truth: Light) -> TrainingPlace:
@@ -161,9 +165,7 @@ def fit(
 
 def main() -> None:
     """Fit and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
-    parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
+    parser = scene_arguments(__doc__)
     parser.add_argument("--evidence", type=Path, required=True, help="folder of what the fit needs of each scene")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--minutes", type=float, default=10.0, help="of every fit; 0 measures today's numbers")
@@ -173,12 +175,12 @@ def main() -> None:
     parser.add_argument("--start", type=Path, help="numbers to start from, as --out writes them")
     options = parser.parse_args()
     pairs = {}
-    for one in scenes_in(options.scenes, options.work):
-        kept = options.evidence / f"{one.name}.pt"
+    for name, read in scenes_in(options):
+        kept = options.evidence / f"{name}.pt"
         if not kept.is_file():
             kept.parent.mkdir(parents=True, exist_ok=True)
-            torch.save(places_of(one.read()), kept)
-        pairs[one.name] = torch.load(kept, weights_only=False)
+            torch.save(places_of(read()), kept)
+        pairs[name] = torch.load(kept, weights_only=False)
     scenes = Scenes(pairs, options.jobs)
     everything = range(len(pairs))
     numbers = {name: value for name, value in asdict(RadianceSettings()).items() if name in (*FACTORS, *SHIFTS)}

@@ -7,17 +7,16 @@ scene left out is reported. Gloss stays as today's numbers give it. The shares o
 scenes that benchmarks/fit_light.py did not see: on its own scenes the light is better than elsewhere.
 """
 
-import argparse
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import torch
+from exam_scenes import scene_arguments, scenes_in
 
 from splatgraft.relighting import relight
 from splatgraft.relighting.shading import ShadeSettings, shade_ratio
 from splatgraft_paper.exam.measure import make_row, measure_row
-from splatgraft_paper.exam.scenes import ExamScene, scenes_in
+from splatgraft_paper.exam.scenes import ExamScene
 
 FLOORS = (0.02, 0.08, 0.2)
 LEVEL_SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -46,17 +45,14 @@ def gains(scene: ExamScene, choices: list[ShadeSettings]) -> list[float]:
 
 def main() -> None:
     """Fit and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
-    parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
-    options = parser.parse_args()
+    options = scene_arguments(__doc__).parse_args()
     grid = itertools.product(SPANS, FLOORS, LEVEL_SHARES, TINT_SHARES)
     choices = [ShadeSettings(span, floor, level, tint) for span, floor, level, tint in grid]
     names, rows = [], []
-    for one in scenes_in(options.scenes, options.work):
-        rows.append(gains(one.read(), choices))
-        names.append(one.name)
-        print(f"{one.name}: best {max(rows[-1]):+.2f} dB", flush=True)
+    for name, read in scenes_in(options):
+        rows.append(gains(read(), choices))
+        names.append(name)
+        print(f"{name}: best {max(rows[-1]):+.2f} dB", flush=True)
     table = torch.tensor(rows)
     best = int(table.mean(0).argmax())
     print(f"fitted: {table.mean(0)[best]:+.2f} dB, {choices[best]}")

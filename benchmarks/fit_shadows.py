@@ -8,11 +8,10 @@ Every power of a grid is tried; it is chosen with each scene left out in turn, t
 is reported.
 """
 
-import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import torch
+from exam_scenes import scene_arguments, scenes_in
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.evaluation.measure import find_regions, luminance_ratio
@@ -20,7 +19,7 @@ from splatgraft.relighting import relight
 from splatgraft.relighting.cast_shadows import SHADOW_POWER
 from splatgraft.relighting.shadows.scene_ratio import SceneRatio
 from splatgraft_paper.exam.measure import make_row, measure_row
-from splatgraft_paper.exam.scenes import ExamScene, scenes_in
+from splatgraft_paper.exam.scenes import ExamScene
 
 POWERS = (1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0)
 
@@ -56,17 +55,14 @@ def shares(scene: ExamScene) -> tuple[list[float], list[float]]:
 
 def main() -> None:
     """Fit and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
-    parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
-    options = parser.parse_args()
+    options = scene_arguments(__doc__).parse_args()
     rows, bands = [], []
-    for one in scenes_in(options.scenes, options.work):
-        everywhere, band = shares(one.read())
+    for name, read in scenes_in(options):
+        everywhere, band = shares(read())
         rows.append(everywhere)
         bands.append(band)
         best = POWERS[max(range(len(POWERS)), key=everywhere.__getitem__)]
-        print(f"{one.name}: best {best}; {' '.join(f'{share:.3f}' for share in everywhere)}", flush=True)
+        print(f"{name}: best {best}; {' '.join(f'{share:.3f}' for share in everywhere)}", flush=True)
     table, in_band = torch.tensor(rows), torch.tensor(bands)
     for i, power in enumerate(POWERS):
         print(f"power {power}: removed {table[:, i].mean():.3f}, in the true shadow {in_band[:, i].mean():.3f}")

@@ -1,7 +1,6 @@
 """Scenes of the held-out benchmark: drawn from a number alone, rendered, reconstructed, and read with their truth."""
 
 import random
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +12,6 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
@@ -24,8 +22,6 @@ from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.project.layout import PLACEMENT_FILE
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.relighting import Light, SourceScene
-from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
-from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task, run_tasks
@@ -155,49 +151,6 @@ def _read_normals(path: Path, thing: Gaussians, cameras: Cameras) -> Float[Tenso
         return None
     surface = torch.from_numpy(np.load(path, allow_pickle=False)).float()
     return nearest_normals(thing.means, seen_surface(surface, cameras))
-
-
-_RECONSTRUCTION = ReconstructOptions(iterations=1000, budget=20_000)
-"""Reconstruction of a held-out scene."""
-
-
-@dataclass(frozen=True)
-class TrainingScene:
-    """A rendered scene on disk."""
-
-    name: str
-    """EXAM-SCENE."""
-    files: Path
-    """Folder as `render_scene` leaves it."""
-    work: Path
-    """Its reconstructions, object and composite."""
-
-    def read(self) -> ExamScene:
-        """The scene; it is reconstructed where that is not done yet."""
-        return read_scene(self.files, self.work, _RECONSTRUCTION, Console())
-
-
-def scenes_in(folders: Sequence[Path], works: Sequence[Path]) -> list[TrainingScene]:
-    """All scenes with known light in folders of exams.
-
-    Args:
-        works: Their reconstructions, in the same order.
-    """
-    return [
-        TrainingScene(f"{folder.resolve().parent.name}-{path.name}", path, work / path.name)
-        for folder, work in zip(folders, works, strict=True)
-        for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file())
-    ]
-
-
-def estimated_lights(scene: ExamScene) -> dict[str, EstimatedLight | NoLight]:
-    """The estimates at the `new` and the `old` place of a scene, by nothing but its reconstructions."""
-    placed, source = scene.composite.objects[0], scene.source
-    new = estimate_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
-    old = estimate_light(
-        source.gaussians, bounding_sphere(placed.gaussians), source.cameras, object_gaussians=placed.gaussians
-    )
-    return {"new": new, "old": old}
 
 
 def seen_surface(surface: Float[Tensor, "m 6"], cameras: Cameras) -> Float[Tensor, "s 6"]:

@@ -1,0 +1,28 @@
+"""The rendered scenes over which benchmarks/fit_*.py fit, as `splatgraft paper exam` leaves them."""
+
+import argparse
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.runtime.console import Console
+from splatgraft_paper.exam.scenes import ExamScene, read_scene
+
+RECONSTRUCTION = ReconstructOptions(iterations=1000, budget=20_000)
+
+
+def scene_arguments(description: str | None) -> argparse.ArgumentParser:
+    """The arguments that name scenes."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
+    parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
+    return parser
+
+
+def scenes_in(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], ExamScene]]]:
+    """EXAM-SCENE of each scene with known light, and what reads it after it was reconstructed where need be."""
+    for folder, work in zip(options.scenes, options.work, strict=True):
+        for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file()):
+            name = f"{folder.resolve().parent.name}-{path.name}"
+            yield name, partial(read_scene, path, work / path.name, RECONSTRUCTION, Console())
