@@ -98,16 +98,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
 def read_scene(path: Path | str, *, axes: str | None = None) -> SceneFile:
     """Read a trained scene of another program, with what is known of its frame.
 
-    Args:
-        path: As for `read_gaussians`.
-        axes: Directions of the file's x, y and z, such as RDF or RUB; those of the format, or that the file states,
-            where None.
-
-    Returns:
-        Its Gaussians; the file's up direction where it states one; notes for the user on what was found.
-
-    Raises:
-        ValueError: The suffix is another, the file is not what its suffix says, or `axes` are none.
+    `axes` are the directions of the file's x, y and z, such as RDF or RUB, where those of the format are wrong.
     """
     scene = _read(Path(path))
     return scene if axes is None else with_axes(scene, axes)
