@@ -71,13 +71,6 @@ def test_counts_and_sizes_of_masks_must_fit(scene, cameras, masks):
         lift_masks(scene, cameras, [masks[0][1:], *masks[1:]])
 
 
-def test_threshold_is_inclusive():
-    gaussians = splats(torch.zeros(3, 3), 0.1, 0.9, torch.ones(3, 3))
-    feature = torch.tensor([0.5, 0.495, 1.0])
-    chosen = select_object(gaussians, feature, SelectOptions(threshold=0.5, keep="all"))
-    assert chosen.tolist() == [True, False, True]
-
-
 @pytest.mark.parametrize("factor", [1.0, 1e-3])
 def test_a_small_distant_component_is_removed_in_any_unit_of_length(ball, factor):
     crumb = splats(torch.tensor([[3.0, 0, 0], [3.05, 0, 0]]), 0.05, 0.99, torch.ones(2, 3))
@@ -99,13 +92,10 @@ def test_a_second_part_of_the_object_stays_unless_the_largest_alone_is_wanted(ba
     assert not alone[BALL:].any()
 
 
-def test_box_limits_the_centres(ball):
-    box = Box(torch.tensor([-1.0, -1, 0]), torch.ones(3))
-    chosen = select_object(ball, torch.ones(BALL), SelectOptions(box=box, keep="all"))
-    assert torch.equal(chosen, ball.means[:, 2] >= 0)
-
-
-def test_nothing_left_is_said_and_a_box_has_its_corners_in_order(ball):
+def test_threshold_is_inclusive_box_limits_the_centres_and_nothing_left_is_said(ball):
+    box, heights = Box(torch.tensor([-1.0, -1, 0]), torch.ones(3)), ball.means[:, 2]
+    options = SelectOptions(threshold=float(heights.median()), box=box, keep="all")
+    assert torch.equal(select_object(ball, heights, options), heights >= max(0.0, options.threshold))
     with pytest.raises(ValueError, match=r"at least 0.75, found at most 0.20"):
         select_object(ball, torch.full((BALL,), 0.2))
     away = Box(torch.full((3,), 5.0), torch.full((3,), 6.0))

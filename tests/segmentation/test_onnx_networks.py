@@ -4,6 +4,8 @@ SAM 2's interface (names, order, shapes, dynamic axes) is that of samexporter's 
 1024. The real weights were not run.
 """
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -104,19 +106,13 @@ def test_all_cores_work_and_cuda_is_taken_where_onnxruntime_has_it(red, monkeypa
     assert network.place == "3 cores"
     asked, there = [], ["CUDAExecutionProvider", "CPUExecutionProvider"]
 
-    class OnCuda:
-        def __init__(self, path, options, providers):
-            asked.append(providers)
-            self.get_session_options = lambda: options
-
-        def get_inputs(self):
-            return network.session.get_inputs()
-
-        def get_providers(self):
-            return asked[-1]
+    def on_cuda(path, options, providers):
+        asked.append(providers)
+        inputs = network.session.get_inputs()
+        return SimpleNamespace(get_inputs=lambda: inputs, get_providers=lambda: providers)
 
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: there)
-    monkeypatch.setattr(onnxruntime, "InferenceSession", OnCuda)
+    monkeypatch.setattr(onnxruntime, "InferenceSession", on_cuda)
     found = load_birefnet(path)
     assert asked == [there]
     assert found.place == "CUDA"

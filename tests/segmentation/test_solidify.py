@@ -33,6 +33,9 @@ def test_solid_inside_and_gone_outside(glassy, cameras, photographs, masks):
     assert after[inside].mean() > 0.93
     assert before[outside].max() > 0.5
     assert after[outside].max() < 0.35
+    nothing = [(photo, torch.zeros(72, 96)) for photo in photographs]
+    with pytest.raises(ValueError, match="found all empty"):
+        solidify_object(glassy, selection, cameras, nothing)
 
 
 def test_a_coarse_object_gets_as_many_gaussians_as_its_photographs_show(scene, ball, cameras, masks):
@@ -85,9 +88,3 @@ def striped(scene, cameras):
     is_ball = torch.arange(scene.count) < BALL
     sh = torch.where(is_ball[:, None, None], dc_from_rgb(stripes)[:, None], scene.sh[:, :1])
     return list(render(replace(scene, sh=sh), cameras).color)
-
-
-def test_nothing_to_see_is_said(glassy, cameras, photographs):
-    views = [(photo, torch.zeros(72, 96)) for photo in photographs]
-    with pytest.raises(ValueError, match="found all empty"):
-        solidify_object(glassy, torch.arange(glassy.count) < BALL, cameras, views)
