@@ -121,10 +121,7 @@ def _without_useless(
     names: Sequence[str],
     reason_against: Callable[[Path, Path], str],
 ) -> tuple[tuple[Path | None, ...], tuple[LeftOut, ...]]:
-    """The masks that are of use, none where there are none, and the others with their reasons.
-
-    A mask is the photo itself where its alpha channel is the mask; a ValueError's message is a reason too.
-    """
+    """The masks that are of use, none where there are none, and the others with their reasons, or ValueErrors'."""
     kept, left_out = list(masks), []
     for index, (photo, mask) in enumerate(zip(photos, masks, strict=bool(masks))):
         if mask is None or mask == photo:
@@ -267,8 +264,7 @@ def require_coverage(capture: PosedImages, name: str) -> None:
 def median_parallax_deg(cameras: Cameras, points: Float[Tensor, "m 3"]) -> float | None:
     """The angle between the outermost cameras that see a point, in the median over points; None where unknown.
 
-    Where two cameras see none of the points, the focus point of the cameras serves; where the cameras look outwards,
-    there is none either, and only cameras in one place are known to have no parallax.
+    Without points that two cameras see, the focus point of the cameras serves, where they have one.
     """
     some = cameras.spread(_CAMERAS)
     centers = some.centers.double()

@@ -1,12 +1,10 @@
 """Makes an extracted object opaque and finer: fits it alone to its masked photographs over random backgrounds.
 
-In its own capture an object may be half transparent and still look right, since the Gaussians behind it were fitted
-together with it; at its outline, neighbouring Gaussians may hide those that stick out. Both become visible in another
-scene. Only an opaque object inside its mask matches the photographs over every background.
+In its own capture an object may be half transparent, or stick out of its outline, and still look right before what was
+fitted with it. Only an opaque object inside its mask matches the photographs over every background.
 
-A reconstruction spends most of its Gaussians on the surroundings, which stay behind. So where the object has fewer than
-its size in the photographs asks for, those are split that have the largest gradient (3DGS, Sec. 5). What no photograph
-shows, inside and behind, has colours by chance; it gets those of what is next to it. All constants are set by hand.
+Where the object has fewer Gaussians than its size in the photographs asks for, those are split that have the largest
+gradient (3DGS, Sec. 5). What no photograph shows gets the colours of what is next to it. All constants are set by hand.
 """
 
 from collections.abc import Sequence

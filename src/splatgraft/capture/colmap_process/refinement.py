@@ -1,8 +1,7 @@
 """Refinement of a model: outliers dropped, all cameras adjusted, and the photos that it explains worst posed anew.
 
-The global mapper places all photos at once, and a few of them wrongly: on 73 photos of a bonsai eight had 28% to 59% of
-their matches explained where 74% is usual. The lens that all photos share bends towards them (836 px with, 827 px
-without them). Such photos are taken out, the rest is adjusted, and each is posed from the points of the rest.
+The global mapper places all photos at once, and a few of them wrongly, towards which the shared lens bends. Such photos
+are taken out, the rest is adjusted, and each is posed from the points of the rest.
 
 A camera starts as COLMAP's SIMPLE_RADIAL with the principal point in the middle of the photo. In a photo cut out of a
 larger one it lies elsewhere, and a radial distortion around the middle bends to make up for it. Of photos that are not

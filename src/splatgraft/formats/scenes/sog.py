@@ -2,12 +2,10 @@
 
 A .sog is a zip of these files; a folder of them is read as well. Positions are 16 bits of sign(x) log(1 + |x|), scales
 and colours are looked up in code books of 256 values, and bands above 0 are rows of a palette that is a picture too.
-Axes are those of a .ply. Written Gaussians are sorted along a Morton curve, so that neighbours in the pictures are
-neighbours in space and compress well.
+Axes are those of a .ply. Written Gaussians are sorted along a Morton curve, so that neighbours compress well.
 
-Code books and palette are found by k-means (Lloyd 1982). A palette of thousands of entries is found in two levels, as a
-search over all entries for all Gaussians would take minutes: rows are first divided among coarse groups, then each
-group gets its share of the entries.
+Code books and palette are found by k-means (Lloyd 1982), the palette in two levels for speed: rows are first divided
+among coarse groups, then each group gets its share of the entries.
 """
 
 import io
@@ -233,10 +231,7 @@ def _picture(rgb: np.ndarray, alpha: np.ndarray | int = 255, *, width: int | Non
 
 
 def scalar_codes(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
-    """256 ascending numbers that represent `values` with a small squared error; the last one repeated where fewer do.
-
-    Starts from quantiles of the values, and moves each code to the mean of the values nearest to it.
-    """
+    """256 ascending numbers that represent `values` with a small squared error; the last repeated where fewer do."""
     ordered = np.sort(values.astype(np.float64))
     distinct = np.unique(ordered)
     if len(distinct) <= _CODES:
