@@ -12,7 +12,6 @@ from splatgraft.segmentation import (
     MIN_AGREEMENT,
     Box,
     CutViews,
-    Evidence,
     cut_object,
     default_box,
     grabcut_mask,
@@ -109,15 +108,15 @@ def test_clicks_are_hard_limits_in_their_picture(plain, monkeypatch):
     lifted = plain.masks[0]
     row, column = (int(x) for x in torch.nonzero(lifted)[len(torch.nonzero(lifted)) // 2])
     prompt = ViewPrompt(inside=torch.tensor([[10.0, 10.0]]), outside=torch.tensor([[column + 0.5, row + 0.5]]))
-    mask = grabcut_mask(plain.images[0], Evidence(lifted, prompt))
+    mask = grabcut_mask(plain.images[0], lifted, prompt)
     assert mask[10, 10] == 1
     assert mask[row, column] == 0
 
 
 def test_the_other_views_correct_a_wrong_selection(scene, cameras, photographs, masks, ball):
-    def spoils_one(image, evidence):
-        mask = grabcut_mask(image, evidence)
-        if image is photographs[2] and float(evidence.lifted.max()) == 1.0:
+    def spoils_one(image, lifted, prompt):
+        mask = grabcut_mask(image, lifted, prompt)
+        if image is photographs[2] and float(lifted.max()) == 1.0:
             mask[40:70, 5:40] = 1
         return mask
 

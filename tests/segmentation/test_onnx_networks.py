@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from splatgraft.core.prompts import ViewPrompt
-from splatgraft.segmentation import Evidence, load_birefnet, load_sam2, onnx_networks
+from splatgraft.segmentation import load_birefnet, load_sam2, onnx_networks
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -137,7 +137,7 @@ def test_the_best_proposal_for_the_box_of_the_selection_is_taken(sam2):
     assert network.side == SIDE
     lifted = torch.zeros(96, 128)
     lifted[24:48, 32:96] = 1
-    mask = network.cut(torch.rand(96, 128, 3), Evidence(lifted))
+    mask = network.cut(torch.rand(96, 128, 3), lifted, ViewPrompt())
     assert mask.shape == (96, 128)
     rows, columns = torch.nonzero(mask, as_tuple=True)
     # the margin of 5% of the box, and half a pixel of the 16 x 16 proposal, which is 6 x 8 pixels of the picture
@@ -151,7 +151,7 @@ def test_a_rectangle_of_the_user_comes_first_and_decoders_may_ask_for_the_size(s
     lifted = torch.zeros(64, 64)
     lifted[40:60, 40:60] = 1
     prompt = ViewPrompt(inside=torch.tensor([[12.0, 12.0]]), box=(0.0, 0.0, 32.0, 32.0))
-    mask = network.cut(torch.zeros(64, 64, 3), Evidence(lifted, prompt))
+    mask = network.cut(torch.zeros(64, 64, 3), lifted, prompt)
     assert mask[16, 16] == 1
     assert mask[50, 50] == 0
 

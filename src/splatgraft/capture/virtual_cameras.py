@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.directions import perpendicular
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.planes import least_squares_normal, sample_planes
+from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering import render
 from splatgraft.runtime.progress import Progress, silent
@@ -102,20 +103,6 @@ class VirtualCameraOptions:
 
 
 @dataclass(frozen=True)
-class VirtualCameras:
-    """Cameras placed around or in a scene, and its sparse points."""
-
-    cameras: Cameras
-    """Around the dense part, looking at its middle; or within it, looking outwards."""
-    points: Float[Tensor, "m 3"]
-    """Centres of solid Gaussians, in place of the points of structure from motion."""
-    point_colors: Float[Tensor, "m 3"]
-    """sRGB in [0, 1]."""
-    report: tuple[str, ...]
-    """Sentences for the user: what was assumed."""
-
-
-@dataclass(frozen=True)
 class _Position:
     """An eye, the point it looks at, and what occludes it."""
 
@@ -135,10 +122,13 @@ def place_virtual_cameras(
     *,
     stated_up: tuple[float, float, float] | None = None,
     progress: Progress = silent,
-) -> VirtualCameras:
+) -> tuple[PosedImages, tuple[str, ...]]:
     """Place rings of cameras around the scene's dense part or within it, without those whose view is blocked.
 
     The up direction that the scene's file states counts where `options` have none.
+
+    Returns:
+        A capture whose pictures are not made yet, with the centres of solid Gaussians as points, and what was assumed.
     """
     solid = _solid(scene)
     centre, radius = dense_part(solid.means)
@@ -164,7 +154,7 @@ def place_virtual_cameras(
     if options.look == "around" and inner < _HOLLOW_SHARE:
         report.append("it is hollow: where it was seen from within, as a room from its middle, say look = within")
     colors = rgb_from_dc(solid.sh[:, 0]).clamp(0, 1)
-    return VirtualCameras(cameras, solid.means, colors, tuple(report))
+    return PosedImages((), cameras, solid.means, colors), tuple(report)
 
 
 def _solid(scene: Gaussians) -> Gaussians:

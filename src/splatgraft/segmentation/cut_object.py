@@ -32,19 +32,10 @@ _SETTLED = 0.97
 """Mean IoU of the masks with those of the round before from which another round would change nothing that shows."""
 
 
-@dataclass(frozen=True)
-class Evidence:
-    """What is known of the object in one picture before it is cut."""
-
-    lifted: Float[Tensor, "h w"]
-    """Share of each pixel that belongs to the object by the 3D selection, in [0, 1]; not 0 everywhere."""
-    prompt: ViewPrompt = field(default_factory=ViewPrompt)
-    """What the user says, pixels of the picture."""
-
-
-ViewCutter = Callable[[Tensor, Evidence], Tensor]
-"""From a picture (h, w, 3), sRGB in [0, 1], and what is known of the object in it, to the object's mask (h, w), 0 or
-1: `grabcut_mask`, or the method `cut` of a loaded `Sam2`."""
+ViewCutter = Callable[[Tensor, Tensor, ViewPrompt], Tensor]
+"""From a picture (h, w, 3), sRGB in [0, 1], the share (h, w) of each of its pixels that belongs to the object by the 3D
+selection, not 0 everywhere, and what the user says, to the object's mask (h, w), 0 or 1: `grabcut_mask`, or the method
+`cut` of a loaded `Sam2`."""
 
 
 @dataclass(frozen=True)
@@ -117,15 +108,16 @@ def cut_object(
     masks: dict[int, Tensor] = {}
 
     def cut_and_lift(chosen: Sequence[int], what: str) -> tuple[dict[int, Tensor], Tensor]:
-        """The masks of the chosen pictures, cut by the evidence of `feature`, and the feature lifted from them."""
+        """The masks of the chosen pictures, cut by `feature`, and the feature lifted from them."""
         total, made = torch.zeros(scene.count, 2, device=scene.device), {}
         for done, index in enumerate(chosen):
             progress(done, len(chosen), f"cutting masks, {what}")
             operator = view_operator(scene, views.cameras[index], RenderOptions())
-            evidence = Evidence(operator.blend(feature[:, None])[..., 0].cpu(), views.prompts.get(index, ViewPrompt()))
+            lifted = operator.blend(feature[:, None])[..., 0].cpu()
+            prompt = views.prompts.get(index, ViewPrompt())
             # a picture in which neither the selection nor a click shows has no object
-            shows = int((evidence.lifted > 0.5).sum()) >= _MIN_PIXELS or len(evidence.prompt.inside)
-            made[index] = cutter(views.images[index], evidence) if shows else torch.zeros_like(evidence.lifted)
+            shows = int((lifted > 0.5).sum()) >= _MIN_PIXELS or len(prompt.inside)
+            made[index] = cutter(views.images[index], lifted, prompt) if shows else torch.zeros_like(lifted)
             total += weight_inside(operator, made[index].to(scene.device))
         return made, share_inside(total) * may_be
 

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from splatgraft.core.prompts import ViewPrompt
-from splatgraft.segmentation.cut_object import Evidence
 
 _ITERATIONS = 2
 """GrabCut iterations per picture."""
@@ -32,9 +31,11 @@ _HOLE = 1000
 """The mask over the largest hole that is filled, by area."""
 
 
-def grabcut_mask(image: Float[Tensor, "h w 3"], evidence: Evidence) -> Float[Tensor, "h w"]:
+def grabcut_mask(
+    image: Float[Tensor, "h w 3"], lifted: Float[Tensor, "h w"], prompt: ViewPrompt
+) -> Float[Tensor, "h w"]:
     """The object's mask, 0 or 1, in one picture, sRGB in [0, 1]; a `ViewCutter`."""
-    prior = _prior(evidence.lifted.cpu().numpy(), evidence.prompt)
+    prior = _prior(lifted.cpu().numpy(), prompt)
     labels = np.zeros_like(prior)
     window = _window(prior != cv2.GC_BGD)
     labels[window] = _labels(image[window], prior[window])

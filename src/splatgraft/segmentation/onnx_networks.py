@@ -17,12 +17,12 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.images import resize
+from splatgraft.core.prompts import ViewPrompt
 from splatgraft.runtime.hub import hub_file
-from splatgraft.segmentation.cut_object import Evidence
 
 BIREFNET_REPOSITORY = "onnx-community/BiRefNet-ONNX"
 _BIREFNET_FILE = "onnx/model.onnx"
@@ -78,13 +78,15 @@ class Sam2:
     side: int
     """Width and height of the encoder's picture, pixels."""
 
-    def cut(self, image: Float[Tensor, "h w 3"], evidence: Evidence) -> Float[Tensor, "h w"]:
+    def cut(
+        self, image: Float[Tensor, "h w 3"], lifted: Float[Tensor, "h w"], prompt: ViewPrompt
+    ) -> Float[Tensor, "h w"]:
         """The object's mask, 0 or 1: of the networks' proposals the one that they predict to be the best."""
         height, width = image.shape[:2]
         names = [output.name for output in self.encoder.get_outputs()]
         given = {self.encoder.get_inputs()[0].name: _square(image, self.side)[None].numpy()}
         features = dict(zip(names, self.encoder.run(None, given), strict=True))
-        points, labels = _points(evidence)
+        points, labels = _points((lifted > 0.5).numpy(), prompt)
         factor = np.array([self.side / width, self.side / height], np.float32)
         small = self.side // _SAM2_MASK_STRIDE
         wanted = {name: features[name] for name in _SAM2_FEATURES} | {
@@ -143,9 +145,10 @@ def _square(image: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "3 s s"]:
     return ((resize(image, side, side) - _IMAGENET_MEAN) / _IMAGENET_STD).permute(2, 0, 1).contiguous()
 
 
-def _points(evidence: Evidence) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
+def _points(
+    shown: Bool[np.ndarray, "h w"], prompt: ViewPrompt
+) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
     """Points and labels, pixels of the picture: what the user says, else the 3D selection's box and middle."""
-    prompt, shown = evidence.prompt, (evidence.lifted > 0.5).numpy()
     inside, box = prompt.inside.numpy(), prompt.box
     if shown.any():
         if not len(inside):

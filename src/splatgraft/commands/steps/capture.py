@@ -128,15 +128,15 @@ class Capture:
         """Pictures of a scene that came without photographs."""
         read = read_scene(self.capture, axes=self.axes)
         scene = read.gaussians
-        found = place_virtual_cameras(scene, self.look, stated_up=read.metadata.up, progress=context.progress)
-        for sentence in (*read.said(), *found.report):
+        found, report = place_virtual_cameras(scene, self.look, stated_up=read.metadata.up, progress=context.progress)
+        for sentence in (*read.said(), *report):
             context.console.say(f"{self.capture}: {sentence}")
         (folder / "images").mkdir()
         paths = tuple(folder / "images" / f"{name}.png" for name in found.cameras.names)
         for index, (path, camera) in enumerate(zip(paths, found.cameras, strict=True)):
             write_image(path, render(scene, camera).color[0].clamp(0, 1))
             context.progress(index + 1, len(paths), "pictures of the scene")
-        return PosedImages(paths, found.cameras, found.points, found.point_colors)
+        return replace(found, image_paths=paths)
 
     def _photos(self, folder: Path, context: Context) -> PhotoFiles:
         if not self.capture.is_dir():
