@@ -40,19 +40,15 @@ def start(folder: Path) -> Jobs:
     """Start a job that works until the file `release` exists."""
     jobs = Jobs(folder)
     jobs.start([sys.executable, "-c", WORK, str(folder)], title="work", shown=["run"])
-    wait_until(lambda: outcome(jobs) in ("running", "done"), what="work")
     return jobs
 
 
-def reap(jobs: Jobs) -> None:
-    """Wait for the process, which ends after it has written its outcome."""
+def ends(jobs: Jobs, outcome: str) -> None:
+    """Wait for the outcome of a job, as seen by another process too, and for the end of its process."""
+    for seen in (jobs, Jobs(jobs.folder)):
+        wait_until(lambda seen=seen: (state := seen.state()) is not None and state.outcome == outcome, what=outcome)
     assert jobs._child is not None
     jobs._child.wait(HANG_LIMIT)
-
-
-def outcome(jobs: Jobs) -> str:
-    state = jobs.state()
-    return "" if state is None else state.outcome
 
 
 def test_another_process_sees_a_job_at_work_and_its_end(tmp_path: Path) -> None:
@@ -64,41 +60,31 @@ def test_another_process_sees_a_job_at_work_and_its_end(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="running"):
         other.start(["true"], title="another", shown=[])
     (tmp_path / "release").touch()
-    wait_until(lambda: outcome(other) == "done", what="the end")
-    assert outcome(jobs) == "done"
-    reap(jobs)
+    ends(jobs, "done")
 
 
 def test_cancelled_and_killed_jobs_have_that_outcome(tmp_path: Path) -> None:
     jobs = start(tmp_path)
     jobs.cancel()
-    wait_until(lambda: outcome(jobs) == "cancelled", what="the cancel")
+    ends(jobs, "cancelled")
     jobs.cancel()
-    reap(jobs)
     jobs = start(tmp_path)
     state = jobs.state()
     assert state is not None
     os.kill(state.pid, signal.SIGKILL)
-    wait_until(lambda: outcome(Jobs(tmp_path)) == "killed", what="the kill to be seen")
-    wait_until(lambda: outcome(jobs) == "killed", what="the kill to be seen by the parent")
-    reap(jobs)
+    ends(jobs, "killed")
     # and it does not block the next job
     (tmp_path / "release").touch()
-    again = start(tmp_path)
-    wait_until(lambda: outcome(again) == "done", what="the next")
-    reap(again)
+    ends(start(tmp_path), "done")
 
 
-def test_the_remaining_time_is_extrapolated() -> None:
+def test_the_remaining_time_is_measured_or_not_said() -> None:
     state = JobState("work", (), 1, "running", 0.0, done=3, total=9, begun_at=100.0)
     assert seconds_left(state, 106.0) == 12.0
     assert seconds_left(state, 100.5) is None
     assert seconds_left(JobState("work", (), 1, "running", 0.0), 100.0) is None
     # units of an earlier run do not count for the speed
     assert seconds_left(replace(state, done=60, total=100, begun=50), 120.0) == 80.0
-
-
-def test_the_job_s_remaining_time_is_measured_or_not_said() -> None:
     plan = (PlannedStep("a", 10.0, True), PlannedStep("b", 4.0, True), PlannedStep("c", 6.0, True))
     state = JobState("work", (), 1, "running", 0.0, step="a", step_started=100.0, plan=plan)
     assert seconds_left_in_job(state, 103.0) == 7.0 + 4.0 + 6.0
@@ -130,11 +116,11 @@ def test_a_state_is_read_back_as_written_and_a_damaged_one_does_not_prevent_anot
     for text in ("{", "7", '{"pid": 0}', json.dumps(JobState("a", (), 0, "running", 0.0).__dict__)):
         (tmp_path / "job.json").write_text(text)
         assert jobs.state() is None
+    # a process that ends before it says anything counts as killed
     jobs.start(["true"], title="next", shown=())
-    wait_until(lambda: (found := jobs.state()) is not None and not found.live, what="the end of the job")
     state = jobs.state()
     assert state is not None
-    assert state.title == "next"
+    assert (state.title, state.outcome) == ("next", "killed")
 
 
 # files to share
@@ -165,10 +151,6 @@ def written(session: Session, kind: str, part: str) -> tuple[Path, JobState]:
     return to, job
 
 
-def test_each_format_of_export_can_be_shared() -> None:
-    assert {kind.suffix for kind in sharing.SHARE_KINDS.values()} == set(EXPORT_SUFFIXES)
-
-
 def test_a_job_writes_what_the_command_writes(result: Session, tmp_path: Path) -> None:
     to, job = written(result, "Scene, small (.sog)", "object with shadow")
     assert to == result.files.root / "export" / "a_ball_on_a_plane_object_with_shadow.sog"
@@ -192,6 +174,7 @@ def test_what_cannot_be_written_is_the_error_of_the_job(result: Session) -> None
 
 
 def test_missing_results_and_packages_are_said(result: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert {kind.suffix for kind in sharing.SHARE_KINDS.values()} == set(EXPORT_SUFFIXES)
     page, report = (sharing.SHARE_KINDS[name] for name in ("Page to look at (.html)", "Report as one page (.html)"))
     assert "no report yet" in (sharing.why_not(result.files, report) or "")
     result.files.result.unlink()

@@ -308,11 +308,11 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         run, session = phase_of(page, "Run"), page.context.require_session()
         share = run._share
         assert not run._stale.visible
-        assert not run._renew.visible
+        assert run._transfer.label == "Harmonise and consolidate"
         session.change(replace(session.state, weights=LayerWeights(shadow=0.5)))
         page.refresh()
         assert "relight: " in run._stale.content
-        assert run._renew.visible
+        assert run._transfer.label == "Bring the result up to date"
         sends(share._kind, "Scene, exact (.ply)")
         is_handled(share._write)
         wait_until(lambda: share._bar.visible, what="the progress of the export")

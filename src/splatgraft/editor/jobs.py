@@ -92,11 +92,7 @@ def seconds_left(state: JobState, now: float) -> float | None:
 
 
 def seconds_left_in_job(state: JobState, now: float) -> float | None:
-    """Seconds until the job ends; None unless each part of it was measured.
-
-    The running step counts by its rate, or by its duration in the last run while it has no rate yet; later steps by
-    their durations in the last run.
-    """
+    """Seconds until the job ends, by the running step's rate or its last duration; None unless all was measured."""
     names = [step.name for step in state.plan]
     if not state.live or state.step not in names:
         return None

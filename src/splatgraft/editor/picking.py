@@ -81,13 +81,7 @@ class Ray:
 
 
 def brush_selection(gaussians: Gaussians, rays: Sequence[Ray], *, size: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians a brush stroke selects.
-
-    Args:
-        gaussians: The scene.
-        rays: The stroke.
-        size: Diameter of the brush over the distance of the hit point.
-    """
+    """Which Gaussians a stroke selects; `size` is the diameter of the brush over the distance of the hit point."""
     selected = torch.zeros(gaussians.count, dtype=torch.bool)
     for ray in rays:
         hit = first_surface_hit(gaussians, ray.origin, ray.direction)

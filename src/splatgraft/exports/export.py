@@ -109,10 +109,7 @@ def _write_scene(to: Path, gaussians: Gaussians, source: ExportSource, options: 
 
 
 def layer_of(source: ExportSource, layer: Layer, *, progress: Progress = silent) -> tuple[Gaussians, tuple[str, ...]]:
-    """One layer without Gaussians that are not finite, and sentences on it.
-
-    Raises: ValueError where the source does not know its layers.
-    """
+    """One layer without Gaussians that are not finite, and sentences on it; ValueError where layers are not known."""
     if layer == "all":
         return _finite(source.scene)
     if source.is_object is None or source.place is None:

@@ -132,9 +132,6 @@ def path_around(source: ExportSource, view: FirstView, *, frames: int, width: in
 
     Between the captured viewpoints where there are cameras, else on a circle through the first view. Sides are even
     numbers of pixels, as video needs them.
-
-    Raises:
-        ValueError: Fewer than two frames.
     """
     if frames < 2:
         raise ValueError(f"--frames: expected 2 or more, found {frames}")

@@ -40,17 +40,9 @@ _NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTA
 def write_viewer_page(
     path: Path, scenes: Mapping[str, Gaussians], view: FirstView, *, title: str, background: float = 0.0
 ) -> None:
-    """Write the page.
+    """Write a page of finite scenes by the label of their button; the last one is shown first, a single one has none.
 
-    Args:
-        path: A file that ends in .html.
-        scenes: Label of the button to scene, in one frame; the last one is shown first. No buttons for a single one.
-        view: Where the camera starts.
-        title: Of the page.
-        background: Grey behind the scene, sRGB.
-
-    Raises:
-        ValueError: A scene has no Gaussians, or some that are not finite.
+    `background` is the grey behind the scene, sRGB.
     """
     here = files("splatgraft.exports") / "viewer"
     engine = (here / "playcanvas.js").read_bytes()
@@ -90,15 +82,7 @@ def write_viewer_page(
 
 
 def write_report_file(path: Path, report: Path) -> None:
-    """Write the page.
-
-    Args:
-        path: A file that ends in .html.
-        report: The index.html that `evaluate` wrote, beside its pictures.
-
-    Raises:
-        ValueError: There is no report, or one of its pictures is missing.
-    """
+    """Write the index.html that `evaluate` wrote beside its pictures as one file; ValueError where one is missing."""
     if not report.is_file():
         raise ValueError(f"{report}: expected the report of a project, found none; `splatgraft run` writes it")
     text = report.read_text(encoding="utf-8")

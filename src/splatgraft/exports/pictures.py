@@ -26,15 +26,7 @@ _QUALITY = "19"
 
 
 def write_picture(path: Path, gaussians: Gaussians, view: FirstView, *, width: int, with_alpha: bool) -> None:
-    """Write the first view.
-
-    Args:
-        path: A .png or .jpg.
-        gaussians: The scene.
-        view: The camera.
-        width: Pixels.
-        with_alpha: Whether a .png gets the opacity as alpha, with straight colours, instead of black behind the scene.
-    """
+    """Write the first view as .png or .jpg; a .png `with_alpha` has straight colours, others black behind the scene."""
     drawn = render(gaussians, view.camera(width))
     color = drawn.color[0].clamp(0, 1)
     if not with_alpha:
@@ -48,11 +40,7 @@ def write_picture(path: Path, gaussians: Gaussians, view: FirstView, *, width: i
 
 
 def write_turntable(path: Path, gaussians: Gaussians, cameras: Cameras, *, progress: Progress = silent) -> str:
-    """Write what the cameras of a path see as .mp4, .gif or .webp; gives a sentence on it.
-
-    Raises:
-        ValueError: The encoder does not start.
-    """
+    """Write what the cameras of a path see as .mp4, .gif or .webp; gives a sentence on it."""
     frames = len(cameras)
     if path.suffix.lower() == ".mp4":
         codec = write_video(path, _drawn(gaussians, cameras, progress))
@@ -73,9 +61,6 @@ def write_video(path: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
 
     H.264 where PyAV is installed, which every player knows; else VP9 by OpenCV, which browsers know. The file appears
     whole or not at all.
-
-    Raises:
-        ValueError: The encoder does not start.
     """
     if not path.parent.is_dir():
         raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")

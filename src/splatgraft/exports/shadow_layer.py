@@ -58,15 +58,7 @@ class _View:
 
 
 def shadow_layer(source: ExportSource, *, progress: Progress = silent) -> ShadowLayer:
-    """Fit the layer to the relit scene without its object, against the place.
-
-    Args:
-        source: The transfer.
-        progress: Told of the steps.
-
-    Raises:
-        ValueError: The source does not know its object, its place and its cameras.
-    """
+    """Fit the layer to the relit scene without its object, against the place; ValueError where these are not known."""
     if source.is_object is None or source.place is None or source.cameras is None:
         raise ValueError(
             f"--layer shadow: expected a project with its target's scene and cameras, found {source.title} without"

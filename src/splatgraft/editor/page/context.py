@@ -6,7 +6,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import viser
 
@@ -21,6 +21,7 @@ from splatgraft.runtime.files import atomic_write
 STATUS_ORDER, HISTORY_ORDER, VIEW_ORDER = 1e6, 2e6, 3e6
 """Places in the panel of what stands below the phases."""
 _UPLOADS_FOLDER = "uploads"
+Control = TypeVar("Control")
 
 
 def note(text: str, *, kind: str = "note", bad: bool = False, faint: bool = False) -> str:
@@ -89,12 +90,13 @@ class PageContext:
 
     # events
 
-    def on(self, control: Any, work: Callable[[], object]) -> None:
-        """Call `work` when a control is clicked or changed by a user."""
+    def on(self, control: Control, work: Callable[[], object]) -> Control:
+        """Call `work` when a control is clicked or changed by a user; gives the control."""
         connect = next(
             getattr(control, name) for name in ("on_trigger", "on_click", "on_update") if hasattr(control, name)
         )
         connect(self.callback(lambda _: work()))
+        return control
 
     def callback(self, work: Callable[[Any], object]) -> Callable[[Any], None]:
         """Wrap an event handler: errors are shown in the status line, and the page is refreshed afterwards."""

@@ -23,8 +23,7 @@ class JobPanel:
         """Called with the state of a job that has ended, after the page has been redrawn."""
         self._text = gui.add_html("", visible=False)
         self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
-        self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="red", visible=False)
-        context.on(self._cancel, self._stop)
+        self._cancel = context.on(gui.add_button("Cancel", icon=viser.Icon.X, color="red", visible=False), self._stop)
 
     def refresh(self) -> None:
         """Update the panel; redraw the page when a step has ended."""

@@ -41,20 +41,17 @@ class LightPhase(Phase):
         self._context, self._preview, gui = context, preview, context.gui
         self._text = gui.add_html("")
         self._estimate_button = gui.add_button("Estimate the light", icon=viser.Icon.SUN)
-        self._source_choice = gui.add_dropdown("Source", _NO_NAMES, visible=False)
-        self._strength = gui.add_slider("Strength", 0.0, 3.0, 0.05, 1.0, visible=False)
+        self._source_choice = context.on(gui.add_dropdown("Source", _NO_NAMES, visible=False), self._remove_handle)
+        self._strength = context.on(gui.add_slider("Strength", 0.0, 3.0, 0.05, 1.0, visible=False), self._scale_source)
         usual = LayerWeights()
         self._sliders = {
             key: gui.add_slider(label, *ends, 0.05, float(getattr(usual, key)), hint=hint)
             for key, label, ends, hint in _LAYERS
         }
-        self._reset = gui.add_button("Back to the estimate", color="gray")
+        self._reset = context.on(gui.add_button("Back to the estimate", color="gray"), self._reset_to_estimate)
         self._handle: viser.TransformControlsHandle | None = None
         self._dragged_light: Light | None = None
         context.on(self._estimate_button, self._show_estimate)
-        context.on(self._source_choice, self._remove_handle)
-        context.on(self._strength, self._scale_source)
-        context.on(self._reset, self._reset_to_estimate)
         for slider in self._sliders.values():
             context.on(slider, self._set_weights)
 

@@ -54,7 +54,7 @@ class OpenPhase(Phase):
         with self._trained:
             self._scenes = tuple(gui.add_text(of, "", hint=_TRAINED_HINT) for of in ("Of the object", "Of the place"))
         self._upload = context.add_upload("Upload a video or a scene", (*SCENE_SUFFIXES, *_VIDEOS), self._uploaded)
-        self._start = gui.add_button("Start the project", icon=viser.Icon.PLUS)
+        self._start = context.on(gui.add_button("Start the project", icon=viser.Icon.PLUS), self._create)
         self._facts = gui.add_html("")
         self._looks = {side: gui.add_dropdown(f"Cameras: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}
         self._ups = {side: gui.add_dropdown(f"Up: {side}", tuple(_UPS), visible=False) for side, _ in _SIDES}
@@ -62,7 +62,6 @@ class OpenPhase(Phase):
         self._build = gui.add_button("Reconstruct both scenes", icon=viser.Icon.PLAYER_PLAY)
         for field in (self._source, self._target):
             context.on(field, self._look_later)
-        context.on(self._start, self._create)
         for side, _ in _SIDES:
             for control in (self._looks[side], self._ups[side]):
                 context.on(control, partial(self._set_view, side))

@@ -119,16 +119,14 @@ class PhotoClicks:
         self._context, gui = context, context.gui
         with gui.add_folder("Points in photos", expand_by_default=False):
             self._show = gui.add_checkbox("Show a photo", False, hint="Click into it; a click on a point removes it")
-            self._kind = gui.add_dropdown("A click is", _KINDS)
-            self._number = gui.add_slider("Photo", 1, 2, 1, 1)
+            self._kind = context.on(gui.add_dropdown("A click is", _KINDS), lambda: None)
+            self._number = context.on(gui.add_slider("Photo", 1, 2, 1, 1), lambda: None)
             self._note = gui.add_html("")
             self._clear = gui.add_button("Clear all points", icon=viser.Icon.ERASER, color="gray")
         self._canvas = Canvas(context.server, context.view)
         self._view: PhotoView | None = None
         self._window: int | None = None
         context.on(self._show, self._say)
-        context.on(self._kind, lambda: None)
-        context.on(self._number, lambda: None)
         context.on(self._clear, self._remove_all)
         context.on_moved.append(self._moved)
 

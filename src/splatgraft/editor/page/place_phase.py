@@ -52,8 +52,8 @@ class PlacePhase(Phase):
         self._shown: Gizmo | None = None
         """What the fields of numbers show; as `SelectPhase._shown_box`."""
         self._note = gui.add_html("", visible=False)
-        self._suggest = gui.add_button("Find a place", icon=viser.Icon.WAND)
-        self._object_choice = gui.add_dropdown("Object", _NO_NAMES)
+        self._suggest = context.on(gui.add_button("Find a place", icon=viser.Icon.WAND), self._find_place)
+        self._object_choice = context.on(gui.add_dropdown("Object", _NO_NAMES), self._choose)
         self._position = gui.add_vector3("Position", (0.0, 0.0, 0.0), step=0.001)
         self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=0.01, hint="Degrees about x, y, z")
         self._scale = gui.add_number("Scale", 1.0, min=1e-4, step=0.001)
@@ -64,27 +64,22 @@ class PlacePhase(Phase):
             False,
             hint=f"A drag turns in steps of {SNAP_DEGREES:.0f} degrees and ends on a near surface (key S)",
         )
-        self._object_buttons = gui.add_button_group("Object ", ("Duplicate", "Delete"))
+        self._object_buttons = context.on(gui.add_button_group("Object ", ("Duplicate", "Delete")), self._object_button)
         with gui.add_folder("Another object", expand_by_default=False):
             self._path = gui.add_text("File", "", hint="A trained scene (.ply, .spz, .sog, ...) of the object alone")
             self._add = gui.add_button("Add this file", icon=viser.Icon.PLUS, color="gray")
             context.add_upload("Upload a file", SCENE_SUFFIXES, self._add_file)
         with gui.add_folder("Erase from the target", expand_by_default=False):
-            self._show_box = gui.add_checkbox("Show the box", False)
+            self._show_box = context.on(gui.add_checkbox("Show the box", False), self._toggle_box)
             self._erase = gui.add_button("Erase inside the box", icon=viser.Icon.ERASER, color="gray")
-            self._restore = gui.add_button("Restore all erased", color="gray")
+            self._restore = context.on(gui.add_button("Restore all erased", color="gray"), self._restore_all)
         self._handles = BoxHandles(context.server, context.view, "/target/box", color=(240, 70, 70))
         self._gizmo = ObjectGizmo(context.server, self._dragged)
-        context.on(self._suggest, self._find_place)
-        context.on(self._object_choice, self._choose)
         for control in (self._position, self._degrees, self._scale):
             context.on(control, self._numbers_changed)
         context.on(self._operations, lambda: self._apply_operation(self._operations.value))
-        context.on(self._object_buttons, self._object_button)
         context.on(self._add, lambda: self._add_file(parse_path(self._path.value)))
-        context.on(self._show_box, self._toggle_box)
         context.on(self._erase, self._erase_box)
-        context.on(self._restore, self._restore_all)
         self._add_key("Drop to the surface", "G", lambda: self._apply_operation("Drop"))
         self._add_key("Duplicate the object", "D", self._duplicate)
         self._add_key("Delete the object", "delete", self._delete)
@@ -312,10 +307,9 @@ class SizeControls:
         self._folder = gui.add_folder("Set the scale", expand_by_default=False)
         with self._folder:
             self._known = gui.add_number("True height, cm", 0.0, min=0.0, step=0.1, hint="Of the object, as measured")
-            self._set = gui.add_button_group("Scale of", _SCALES)
+            self._set = context.on(gui.add_button_group("Scale of", _SCALES), lambda: self._set_scale(self._set.value))
         context.on(self._height, self._typed)
         context.on(self._true_size, self._to_true_size)
-        context.on(self._set, lambda: self._set_scale(self._set.value))
 
     def hide(self) -> None:
         """Hide all."""

@@ -126,10 +126,9 @@ class PreviewPanel:
             self._follow = gui.add_checkbox(
                 "Draw on the canvas", True, hint="Otherwise the canvas shows splats, and the panel the camera's picture"
             )
-            self._frusta = gui.add_checkbox("Show the cameras", False)
+            self._frusta = context.on(gui.add_checkbox("Show the cameras", False), self._show_cameras)
         for control in (self._left, self._right, self._split, self._follow):
             control.on_update(lambda event: self.update() if event.client is not None else None)
-        context.on(self._frusta, self._show_cameras)
         context.on(self._camera_slider, self._to_camera)
         context.on(gui.add_command("Previous camera", hotkey="arrowleft"), lambda: self._step(-1))
         context.on(gui.add_command("Next camera", hotkey="arrowright"), lambda: self._step(1))

@@ -38,20 +38,11 @@ class RunPhase(Phase):
         self._steps = gui.add_html("")
         with gui.add_folder("Share"):
             self._stale = gui.add_html("", visible=False)
-            self._renew = gui.add_button("Bring the result up to date", icon=viser.Icon.REFRESH, visible=False)
-            self._renew_report = gui.add_button(
-                "Bring the report up to date", icon=viser.Icon.REFRESH, visible=False, color="gray"
-            )
             self._share = SharePanel(context, preview, job)
             self._link = gui.add_html("")
         context.on(self._method, self._set_method)
-        for button, step, title in (
-            (self._transfer, "consolidate", "Harmonise and consolidate"),
-            (self._report, "evaluate", "Make the report"),
-            (self._renew, "consolidate", "Bring the result up to date"),
-            (self._renew_report, "evaluate", "Bring the report up to date"),
-        ):
-            context.on(button, lambda step=step, title=title: context.run(step, title))
+        context.on(self._transfer, lambda: context.run("consolidate", self._transfer.label))
+        context.on(self._report, lambda: context.run("evaluate", self._report.label))
 
     def enter(self) -> None:
         """Compare with the result in the preview."""
@@ -77,7 +68,8 @@ class RunPhase(Phase):
         has_report = sharing.has_report(session.files)
         why_result = session.why_stale("consolidate") if session.files.result.is_file() else None
         why_report = session.why_stale("evaluate") if has_report else None
-        self._renew.visible, self._renew_report.visible = why_result is not None, why_report is not None
+        self._transfer.label = "Bring the result up to date" if why_result else "Harmonise and consolidate"
+        self._report.label = "Bring the report up to date" if why_report else "Make the report"
         stale = [
             f"<b>{name}</b>: out of date ({html.escape(why)})"
             for name, why in (("The result", why_result), ("The report", why_report))
@@ -102,7 +94,7 @@ class SharePanel:
         self._context, self._preview, gui = context, preview, context.gui
         self._asked: tuple[int, int] | None = None
         """The process of the job that writes a file, and the window that asked for it."""
-        self._kind = gui.add_dropdown("As", tuple(sharing.SHARE_KINDS))
+        self._kind = context.on(gui.add_dropdown("As", tuple(sharing.SHARE_KINDS)), lambda: None)
         self._part = gui.add_dropdown(
             "Part", tuple(sharing.PARTS), hint="Parts share the target's frame; pictures of them have alpha"
         )
@@ -111,7 +103,6 @@ class SharePanel:
         self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
         self._picture = gui.add_button("Picture of this view", icon=viser.Icon.PHOTO, color="gray")
         self._written = gui.add_html("")
-        context.on(self._kind, lambda: None)
         context.on(self._part, lambda: None)
         self._write.on_click(context.callback(self._start))
         self._picture.on_click(context.callback(self._send_picture))

@@ -17,6 +17,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import C0
+from splatgraft.editor.memo import same_inputs
 from splatgraft.editor.page.opening import COARSE_NODE, add_coarse
 from splatgraft.editor.placement import gizmo_from_similarity
 from splatgraft.editor.relit_preview import largest_coverage_indices
@@ -50,7 +51,6 @@ class SceneView:
         """Show at most `budget` Gaussians per node; of the scene `coarse` a sample is shown already."""
         self._server, self._scene, self._budget, self._coarse = server, server.scene, budget, coarse
         self._splats: dict[str, tuple[tuple[object, ...], viser.GaussianSplatHandle | None, ShownCount]] = {}
-        self._references: dict[str, object] = {}
         self._units: dict[str, float] = {}
         self.shown: dict[str, ShownCount] = {}
         """The nodes of splats that are shown."""
@@ -85,11 +85,9 @@ class SceneView:
 
         A change of `transform`, the world from the scene's frame, sends no splats again.
         """
-        key = (id(gaussians), id(which), tint)
+        key = (gaussians, which, tint)
         known = self._splats.get(name)
-        if known is None or known[0] != key:
-            # keeps the objects alive whose ids are in `key`, so that no other object gets the same id
-            self._references[name] = (gaussians, which)
+        if known is None or not same_inputs(known[0], key):
             chosen = gaussians if which is None else gaussians.select(which)
             known = (key, *self._add(name, chosen, tint))
             self._splats[name] = known

@@ -41,10 +41,10 @@ class SelectPhase(Phase):
         self._context, gui = context, context.gui
         self._count = gui.add_html("")
         self._source = gui.add_dropdown("Masks from", tuple(_SOURCES))
-        self._show_box = gui.add_checkbox("Box around the object", False)
+        self._show_box = context.on(gui.add_checkbox("Box around the object", False), self._toggle_box)
         self._lower = gui.add_vector3("Box from", (0.0, 0.0, 0.0), step=0.001, visible=False)
-        self._upper = gui.add_vector3("Box to", (0.0, 0.0, 0.0), step=0.001, visible=False)
-        self._keep = gui.add_dropdown("Keep pieces", _KEEP)
+        self._upper = context.on(gui.add_vector3("Box to", (0.0, 0.0, 0.0), step=0.001, visible=False), self._box_typed)
+        self._keep = context.on(gui.add_dropdown("Keep pieces", _KEEP), lambda: self._set(keep=self._keep.value))
         self._cut = gui.add_button("Cut out the object", icon=viser.Icon.WAND)
         self._photos = PhotoClicks(context)
         with gui.add_folder("Correct by hand"):
@@ -57,7 +57,7 @@ class SelectPhase(Phase):
             self._show_correction_box = gui.add_checkbox("Second box", False, hint="Adds or removes everything in it")
             self._box_group = gui.add_button_group("All in it", ("Add", "Remove"), visible=False)
             self._clear = gui.add_button("Clear all strokes", icon=viser.Icon.ERASER, color="gray")
-        self._isolate = gui.add_checkbox("Show the object alone", False)
+        self._isolate = context.on(gui.add_checkbox("Show the object alone", False), lambda: None)
         server, view = context.server, context.view
         self._handles = BoxHandles(server, view, "/source/box", color=(255, 150, 40), on_dragged=self._box_dragged)
         self._correction_handles = BoxHandles(server, view, "/source/correction_box", color=(60, 160, 255))
@@ -66,12 +66,8 @@ class SelectPhase(Phase):
         """What the fields of the box show. They are written only where the state has something else: the value of a
         refresh would arrive while the next number is typed, and replace it."""
         context.on(self._source, lambda: self._set(mask_source=_SOURCES[self._source.value]))
-        context.on(self._keep, lambda: self._set(keep=self._keep.value))
-        context.on(self._show_box, self._toggle_box)
         context.on(self._lower, self._box_typed)
-        context.on(self._upper, self._box_typed)
         context.on(self._cut, lambda: context.run("segment", "Cut out the object"))
-        context.on(self._isolate, lambda: None)
         context.on(self._use_brush, self._say_brush)
         context.on(self._size, lambda: None)
         context.on(self._show_correction_box, self._toggle_correction_box)
