@@ -8,10 +8,8 @@ import torch
 from tiny_project import ball, photograph, plane
 
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.exports.export_source import ExportSource
-from splatgraft.formats import read_cameras, write_gaussians
+from splatgraft.formats import write_gaussians
 from splatgraft.formats.metric_scale import MetricScale, write_scale
-from splatgraft.formats.scenes.scene_file import SceneMetadata
 
 
 def darkened(gaussians: Gaussians, factor: float) -> Gaussians:
@@ -47,18 +45,3 @@ def write_transfer(root: Path, *, metres_per_unit: float | None = 0.5) -> Path:
     for name in ("relit", "result"):
         write_gaussians(project / name / "scene.ply", concatenate([p["shadowed"], p["relit"]]))
     return project
-
-
-def transfer_source(capture: Path) -> ExportSource:
-    """The same as a value; `capture` is the folder of its cameras."""
-    p = parts()
-    scene = concatenate([p["shadowed"], p["relit"]])
-    return ExportSource(
-        scene=scene,
-        title="A ball on a plane",
-        is_object=torch.arange(scene.count) >= p["place"].count,
-        pasted=concatenate([p["place"], p["object"]]),
-        place=p["place"],
-        cameras=read_cameras(capture),
-        metadata=SceneMetadata(up=(0.0, 0.0, 1.0), metres_per_unit=0.5),
-    )

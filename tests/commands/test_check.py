@@ -106,14 +106,13 @@ def test_faulty_photos_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert all(finding["remedy"] for subject, finding in findings.items() if subject in wanted)
 
 
-def test_one_photo_many_times_is_not_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, findings, verdict = check(save(tmp_path / "photos", [walk(count=1)[0]] * 12), capsys)
+def test_one_photo_many_times_and_pictures_of_nothing_in_common_are_not_usable(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, findings, verdict = check(save(tmp_path / "one", [walk(count=1)[0]] * 12), capsys)
     assert (status, verdict) == (1, "unusable")
     assert findings["left out"]["level"] == findings["count"]["level"] == "unusable"
     assert len(findings["left out"]["photos"]) == 11
-
-
-def test_pictures_of_nothing_in_common_are_not_usable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     screenshots = [texture(seed)[:240, :320] for seed in range(9)]
     status, findings, _ = check(save(tmp_path / "photos", screenshots), capsys)
     assert status == 1
@@ -131,15 +130,14 @@ def test_photos_of_two_places_are_told_apart_and_exposure_settings_are_compared(
     assert "2.0 stops apart" in findings["settings"]["text"]
 
 
-def test_given_poses_and_masks_are_seen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_given_poses_and_masks_are_seen_and_a_video_is_looked_at(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     photograph(tmp_path / "posed", plane((0.3, 0.5, 0.3)), ball())
     _, findings, _ = check(tmp_path / "posed", capsys)
     assert "given for 8 images" in findings["poses"]["text"]
     assert findings["masks"]["text"] == "8 masks"
     assert findings["overlap"]["level"] == "good"
-
-
-def test_a_video_is_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "walk.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, SIZE)
     for photo in walk(count=12):

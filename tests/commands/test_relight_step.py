@@ -1,78 +1,157 @@
-"""The command `relight` on explicit paths: which objects it takes the old light off."""
+"""`relight` on explicit paths: which objects lose the old light, what is drawn; and what commands say of exposure."""
 
+import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
+from PIL import Image
+from PIL.ExifTags import IFD, Base
 from shapes import surfels
 from tiny_project import ball, photograph, plane
 
+from splatgraft.capture.photos import working_copies, write_undistorted
 from splatgraft.cli import main
 from splatgraft.core.directions import even_directions
+from splatgraft.core.distortion import Distortion
+from splatgraft.core.exposure import Exposure
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats import read_gaussians, write_gaussians
+from splatgraft.formats.captures.exif import exif_of, read_exposure
 from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
 
 
-def relight_command(folder: Path, *more: str) -> int:
-    """The command with the files that both tests write."""
-    paths = {
-        "target": "target.ply",
-        "placement": "placement.json",
-        "cameras": "target/transforms.json",
-        "surroundings": "surroundings.ply",
-        "object-cameras": "source/transforms.json",
-        "taken": "own.ply",
-        "out": "relit",
-    }
+def room(gray: float) -> Gaussians:
+    """A plane inside a large sphere."""
+    away = 20 * even_directions(2000)
+    return concatenate([plane((gray, gray, gray)), surfels(away, -away, width=1.0, srgb=gray)])
+
+
+def relit(
+    folder: Path,
+    rooms: tuple[Gaussians, Gaussians],
+    objects: dict[str, tuple[Gaussians, list[Similarity]]],
+    *more: str,
+    exposures: dict[str, list[Exposure]] | None = None,
+) -> Path:
+    """The result of `relight` for a target, a source around a ball, and objects with their places by file."""
+    for name, scene, thing in (("target", rooms[0], None), ("source", rooms[1], ball())):
+        photograph(folder / name, scene, thing)
+        write_gaussians(folder / f"{name}.ply", scene)
+    for name, photos in (exposures or {}).items():
+        exposed(folder / name, photos)
+    for name, (thing, _) in objects.items():
+        write_gaussians(folder / name, thing)
+    placed = [ObjectPlacement(move, folder / name) for name, (_, moves) in objects.items() for move in moves]
+    write_placement(folder / "placement.json", Placement(tuple(placed)))
+    paths = {"target": "target.ply", "surroundings": "source.ply", "placement": "placement.json", "taken": "own.ply"}
+    paths |= {"cameras": "target/transforms.json", "object-cameras": "source/transforms.json", "out": "relit"}
     words = [word for name, path in paths.items() for word in (f"--{name}", str(folder / path))]
-    return main(["relight", *words, *more])
+    assert main(["relight", *words, *more]) == 0
+    return folder / "relit"
+
+
+def at(x: float, y: float, scale: float = 0.5) -> Similarity:
+    return Similarity(scale, torch.eye(3), torch.tensor([x, y, 0.0]))
 
 
 def test_copies_lose_the_same_old_light_and_a_strange_object_keeps_its_own(tmp_path: Path):
     # the source's floor is dark, the target's bright
     target = concatenate([plane((0.8, 0.8, 0.8)), replace(ball(), means=ball().means + torch.tensor([0.0, 0.0, 2.0]))])
-    photograph(tmp_path / "target", target, None)
-    photograph(tmp_path / "source", plane((0.25, 0.25, 0.25)), ball())
-    write_gaussians(tmp_path / "target.ply", target)
-    write_gaussians(tmp_path / "surroundings.ply", plane((0.25, 0.25, 0.25)))
-    files = [tmp_path / "strange.ply", tmp_path / "own.ply", tmp_path / "own.ply"]
-    for path in files[:2]:
-        write_gaussians(path, ball())
     # the copies stand where as much of the target is around them
-    places = ((0.0, 0.5, 0.0), (-0.2, 0.0, 0.0), (0.2, 0.0, 0.0))
-    moves = [Similarity(0.5, torch.eye(3), torch.tensor(place)) for place in places]
-    objects = tuple(ObjectPlacement(move, path) for move, path in zip(moves, files, strict=True))
-    write_placement(tmp_path / "placement.json", Placement(objects))
-    assert relight_command(tmp_path, "--light", "gain") == 0
-    strange, one, other = read_gaussians(tmp_path / "relit" / "scene.ply").sh[-3 * ball().count :].chunk(3)
+    objects = {"strange.ply": (ball(), [at(0, 0.5)]), "own.ply": (ball(), [at(-0.2, 0), at(0.2, 0)])}
+    found = relit(tmp_path, (target, plane((0.25, 0.25, 0.25))), objects, "--light", "gain")
+    strange, one, other = read_gaussians(found / "scene.ply").sh[-3 * ball().count :].chunk(3)
     assert torch.equal(strange[:, 0], ball().sh[:, 0])
     assert float((one - other).abs().max()) < 0.15 * float((one - ball().sh).abs().mean())
     assert float((one - ball().sh).mean()) > 0.05
 
 
 def test_the_lights_of_both_places_are_drawn_past_an_object_without_gaussians(tmp_path: Path):
-    def room(gray: float) -> Gaussians:
-        away = 20 * even_directions(2000)
-        return concatenate([plane((gray, gray, gray)), surfels(away, -away, width=1.0, srgb=gray)])
-
-    target, surroundings = room(0.8), room(0.25)
-    photograph(tmp_path / "target", target, None)
-    photograph(tmp_path / "source", surroundings, ball())
-    write_gaussians(tmp_path / "target.ply", target)
-    write_gaussians(tmp_path / "surroundings.ply", surroundings)
-    write_gaussians(tmp_path / "nothing.ply", ball().select(torch.zeros(0, dtype=torch.int64)))
-    write_gaussians(tmp_path / "own.ply", ball())
-    here = Similarity(0.5, torch.eye(3), torch.zeros(3))
-    objects = tuple(ObjectPlacement(here, tmp_path / name) for name in ("nothing.ply", "own.ply"))
-    write_placement(tmp_path / "placement.json", Placement(objects))
-    assert relight_command(tmp_path) == 0
-    drawn = {path.name: read_rgb(path) for path in (tmp_path / "relit").glob("*.png")}
+    nothing = ball().select(torch.zeros(0, dtype=torch.int64))
+    objects = {"nothing.ply": (nothing, [at(0, 0)]), "own.ply": (ball(), [at(0, 0)])}
+    found = relit(tmp_path, (room(0.8), room(0.25)), objects)
+    drawn = {path.name: read_rgb(path) for path in found.glob("*.png")}
     # numbered as the placement's objects, as in the report
-    assert "Where object 2 comes from" in (tmp_path / "relit" / "light.txt").read_text()
+    assert "Where object 2 comes from" in (found / "light.txt").read_text()
     assert sorted(drawn) == ["light.png", "source_light_2.png"]
-    for picture in drawn.values():
-        assert picture.shape == (256, 768, 3)
+    assert {picture.shape for picture in drawn.values()} == {(256, 768, 3)}
     assert float(drawn["light.png"].mean()) > float(drawn["source_light_2.png"].mean()) + 0.05
+
+
+def exposed(capture: Path, exposures: list[Exposure]) -> None:
+    """Replace the PNG files of a capture by JPEG files with exposure metadata, in turn."""
+    text = (capture / "transforms.json").read_text()
+    for i, path in enumerate(sorted((capture / "images").glob("*.png"))):
+        with Image.open(path) as image:
+            image.save(path.with_suffix(".jpg"), quality=95, exif=exif_of(exposures[i % len(exposures)]))
+        path.unlink()
+        text = text.replace(f"images/{path.name}", f"images/{path.stem}.jpg")
+    (capture / "transforms.json").write_text(text)
+    assert all(frame["file_path"].endswith(".jpg") for frame in json.loads(text)["frames"])
+
+
+def fixed(shutter_s: float) -> Exposure:
+    return Exposure(shutter_s, 8.0, 100.0, auto_white_balance=False)
+
+
+@pytest.mark.parametrize("command", ["capture", "reconstruct"])
+def test_photos_of_different_exposure_are_named(tmp_path: Path, capsys, command: str):
+    photograph(tmp_path / "photos", plane((0.5, 0.5, 0.5)), None)
+    exposed(tmp_path / "photos", [Exposure(1 / 60, 1.8, 50.0, auto_white_balance=True), fixed(1 / 60)])
+    more = ["--iterations", "2", "--budget", "100"] if command == "reconstruct" else []
+    assert main([command, str(tmp_path / "photos"), "--out", str(tmp_path / "out"), *more]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert len(said) == 1
+    assert said[0].startswith(f"warning: {tmp_path / 'photos'}: ")
+    # f/8 to f/1.8 at ISO 100 and 50: 2 log2(8 / 1.8) - 1 = 3.3 stops
+    assert "from 1/60 s f/8 ISO 100 to 1/60 s f/1.8 ISO 50, 3.3 stops apart" in said[0]
+    assert "automatic white balance in 4 of 8 photos" in said[0]
+
+
+@pytest.mark.parametrize("exposures", [[fixed(1 / 60)], [Exposure()]])
+def test_fixed_exposure_and_photos_without_metadata_are_not_worth_a_line(tmp_path: Path, capsys, exposures):
+    photograph(tmp_path / "photos", plane((0.5, 0.5, 0.5)), None)
+    exposed(tmp_path / "photos", exposures)
+    assert main(["capture", str(tmp_path / "photos"), "--out", str(tmp_path / "out")]) == 0
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_undistorted_photos_keep_the_exposure_and_no_other_metadata(tmp_path: Path):
+    exif = exif_of(fixed(1 / 60))
+    exif[Base.Make] = "Maker"
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.jpg", exif=exif)
+    (copy,) = working_copies([tmp_path / "a.jpg"], tmp_path / "copies", 1600)
+    matrix = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]], dtype=torch.float64)
+    lens = Distortion(matrix, torch.tensor([0.01, 0, 0, 0, 0], dtype=torch.float64), (40, 30))
+    write_undistorted(copy, tmp_path / "b.jpg", lens)
+    assert read_exposure(tmp_path / "b.jpg") == read_exposure(tmp_path / "a.jpg")
+    with Image.open(tmp_path / "b.jpg") as image:
+        assert set(image.getexif()) == {IFD.Exif}
+
+
+def exposure_lines(folder: Path, exposures: dict[str, list[Exposure]]) -> list[str]:
+    """What light.txt says of exposure where a ball is moved between two rooms of one picture."""
+    found = relit(folder, (room(0.5), room(0.5)), {"own.ply": (ball(), [at(0, 0, 1.0)])}, exposures=exposures)
+    return [line for line in (found / "light.txt").read_text().splitlines() if "exposure" in line]
+
+
+def test_relight_compares_the_levels_of_both_captures(tmp_path: Path):
+    # equal pictures at an eighth of the exposure show eight times the light
+    (line,) = exposure_lines(tmp_path, {"target": [fixed(1 / 800)], "source": [fixed(1 / 100)]})
+    assert "by the exposure of the photos" in line
+    by_photos, by_light = (float(words.split()[-1]) for words in line.split(" stops brighter")[:2])
+    # the source's photos show the ball too, which is darker: a tenth of a stop or two
+    assert by_photos == pytest.approx(3, abs=0.3)
+    # the same ratio is told in lux, rounded to two digits each
+    words = line.replace(",", "").split()
+    new, old = float(words[words.index("lux") - 1].lstrip("(")), float(words[words.index("at", words.index("lux")) - 1])
+    assert by_light == pytest.approx(math.log2(new / old), abs=0.2)
+
+
+def test_relight_says_nothing_of_exposure_where_one_capture_has_no_metadata(tmp_path: Path):
+    assert exposure_lines(tmp_path, {"target": [fixed(1 / 800)]}) == []

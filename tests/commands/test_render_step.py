@@ -28,15 +28,9 @@ def step(tmp_path: Path) -> Render:
     for name in ("scene.ply", "relit/scene.ply"):
         write_gaussians(tmp_path / name, scene)
     write_flags(tmp_path / "is_object.npy", torch.arange(scene.count) >= scene.count - ball().count)
-    return Render(
-        tmp_path / "scene.ply",
-        tmp_path / "target",
-        tmp_path / "views",
-        is_object=tmp_path / "is_object.npy",
-        prior=tmp_path / "relit" / "scene.ply",
-        light=tmp_path / "relit" / "light.json",
-        device="cpu",
-    )
+    names = {"is_object": "is_object.npy", "prior": "relit/scene.ply", "light": "relit/light.json"}
+    paths = {field: tmp_path / name for field, name in names.items()}
+    return Render(tmp_path / "scene.ply", tmp_path / "target", tmp_path / "views", **paths, device="cpu")
 
 
 def confidence(step: Render) -> float:
@@ -53,13 +47,10 @@ def test_the_confidence_is_that_of_the_light_which_is_handed_over(step: Render) 
     assert confidence(Render(**{**vars(step), "light": None})) == 0
 
 
-def test_a_transfer_that_found_no_light_has_no_confidence(step: Render) -> None:
+def test_a_light_file_is_missed_unless_the_transfer_found_no_light(step: Render) -> None:
+    with pytest.raises(ValueError, match=r"light.json: expected the light.json that relight wrote, found no such file"):
+        perform(step, Console())
     assert step.light is not None
     step.light.with_name("light.txt").write_text("No object is placed: nothing to light.\n")
     assert confidence(step) == 0
     assert "light" not in job_of(step).inputs
-
-
-def test_a_light_file_that_relight_did_not_leave_out_must_be_there(step: Render) -> None:
-    with pytest.raises(ValueError, match=r"light.json: expected the light.json that relight wrote, found no such file"):
-        perform(step, Console())

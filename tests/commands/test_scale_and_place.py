@@ -1,7 +1,6 @@
 """The commands `scale` and `compose`: a size in metres is stored with the captures and used; places named by hand."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import torch
 from tiny_project import ball, photograph, plane
 
 from splatgraft.cli import main
+from splatgraft.core.distortion import Distortion
 from splatgraft.core.gaussians import concatenate
 from splatgraft.formats import read_capture, write_gaussians
 from splatgraft.formats.metric_scale import read_scale
@@ -125,15 +125,8 @@ def test_clicks_in_a_file_select_the_object(captures: Path, capsys) -> None:
     name, _, click = first.partition(":")
     prompts = captures / "prompts.toml"
     prompts.write_text(f"[{name}]\ninside = [[{click}]]\n[{second.partition(':')[0]}]\nbox = [8, 2, 40, 32]\n")
-    words = [
-        "segment",
-        "--scene",
-        str(captures / "scene.ply"),
-        "--capture",
-        str(captures / "source"),
-        "--solidify",
-        "0",
-    ]
+    words = ["segment", "--scene", str(captures / "scene.ply"), "--capture", str(captures / "source")]
+    words += ["--solidify", "0"]
     words += ["--out", str(captures / "object"), "--mask-source", "grabcut", "--prompts", str(prompts)]
     assert main(words) == 0
     selection = torch.from_numpy(np.load(captures / "object" / "selection.npy"))
@@ -147,8 +140,6 @@ def test_clicks_in_a_file_select_the_object(captures: Path, capsys) -> None:
 
 
 def test_clicks_on_a_distorted_photo_are_undistorted() -> None:
-    from splatgraft.core.distortion import Distortion
-
     matrix = torch.tensor([[130.0, 0, 83], [0, 134, 57], [0, 0, 1]], dtype=torch.float64)
     lens = Distortion(matrix, torch.tensor([-0.15, 0.03, 0, 0, 0], dtype=torch.float64), (160, 120))
     pinhole = torch.from_numpy(lens.pinhole()).float()
@@ -160,4 +151,4 @@ def test_clicks_on_a_distorted_photo_are_undistorted() -> None:
     found = lens.undistort_points(torch.tensor([[141.5, 101.5]]), pinhole)[0]
     # a spot of 3 px, blurred by the resampling
     assert torch.allclose(found, middle, atol=0.3)
-    assert replace(lens).undistort_points(torch.zeros(0, 2), pinhole).shape == (0, 2)
+    assert lens.undistort_points(torch.zeros(0, 2), pinhole).shape == (0, 2)

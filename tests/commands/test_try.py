@@ -69,10 +69,8 @@ def test_what_was_mended_is_noted_and_is_not_what_helps_most(
     assert main(["init", str(tmp_path / "p"), "--source", source, "--target", target]) == 0
     flow = read_flow(tmp_path / "p")
     (name, first), (_, second), *_ = flow
-    left_out, doubt = (
-        Note("One photo is blurred.", "minor"),
-        Note("Half of it is fog.", "warning", "leave the photo out"),
-    )
+    left_out = Note("One photo is blurred.", "minor")
+    doubt = Note("Half of it is fog.", "warning", "leave the photo out")
     for step, warnings in ((first, (left_out, left_out)), (second, (doubt,))):
         step.out.mkdir(parents=True)
         record = Record(type(step).__name__.lower(), "0", {}, {}, (), 0.0, 0, warnings)
@@ -86,7 +84,7 @@ def test_what_was_mended_is_noted_and_is_not_what_helps_most(
     assert refinements(flow, tmp_path / "p")[1].startswith("no step warned")
 
 
-def test_a_project_of_other_captures_is_not_replaced(
+def test_a_project_of_other_captures_is_not_replaced_and_what_does_not_exist_leaves_nothing_behind(
     captures: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, target = captures
@@ -96,9 +94,6 @@ def test_a_project_of_other_captures_is_not_replaced(
     assert main(["try", target, source, "--out", folder]) == 2
     assert "project.toml: expected a project of these captures" in capsys.readouterr().err
     assert (tmp_path / "project" / "project.toml").read_text() == text
-
-
-def test_what_does_not_exist_leaves_nothing_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["try", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "out")]) == 2
     assert f"{tmp_path / 'a'}: expected photos, a video" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -1,5 +1,6 @@
 """Every warning of a run stands in step.json of its step and, with its picture, at the top of the report."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -7,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from test_exposure_messages import exposed, fixed
-from tiny_project import copy_of, write_project
+from test_relight_step import exposed, fixed
+from tiny_project import write_project
 
 from splatgraft.cli import main
 from splatgraft.core.similarity import Similarity
@@ -61,17 +62,15 @@ def test_a_warning_is_recorded_with_its_picture_relative_to_the_result(
     assert "warning: So may this. Mend it." in lines
 
 
-@pytest.fixture(scope="module")
-def warned(finished_project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A project whose object stands where nothing was captured, so that there is no light to be found."""
-    path = copy_of(finished_project, tmp_path_factory.mktemp("warned")) / "project.toml"
+def test_the_report_begins_with_all_warnings_of_the_run(
+    copy_project: Callable[[], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    # the object stands where nothing was captured, so that there is no light to be found
+    warned = copy_project() / "project.toml"
     far = Similarity(1.0, torch.eye(3), torch.tensor([500.0, 0.0, 0.0]))
-    write_placement(path.parent / "placement.json", Placement(objects=(ObjectPlacement(target_from_object=far),)))
-    assert main(["run", str(path)]) == 0
-    return path
-
-
-def test_the_report_begins_with_all_warnings_of_the_run(warned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_placement(warned.parent / "placement.json", Placement(objects=(ObjectPlacement(target_from_object=far),)))
+    assert main(["run", str(warned)]) == 0
+    capsys.readouterr()
     layout = read_flow(warned).layout
     relit = read_record(layout.relit)
     assert relit is not None
@@ -88,10 +87,8 @@ def test_the_report_begins_with_all_warnings_of_the_run(warned: Path, capsys: py
         assert picture.size == (48, 36)
     assert main(["status", str(warned)]) == 0
     assert "stale" not in capsys.readouterr().out
-
-
-def test_a_report_that_lacks_a_warning_is_stale(warned: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    step_file = read_flow(warned).layout.relit / "step.json"
+    # a report that lacks a warning is stale
+    step_file = layout.relit / "step.json"
     step_file.write_text(step_file.read_text().replace("It is pasted", "It was pasted"))
     assert main(["status", str(warned)]) == 0
     stale = [line for line in capsys.readouterr().out.splitlines() if "stale" in line]

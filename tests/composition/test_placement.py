@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shapes import UP
 
 from splatgraft.composition import (
     PlaceOptions,
@@ -23,7 +24,6 @@ from splatgraft.core.gaussians import Gaussians, concatenate, empty
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 
-UP = torch.tensor([0.0, 0.0, 1.0])
 TABLE = 0.7
 
 
@@ -48,16 +48,17 @@ def sheet(center, u, v, *, spacing=0.06, noise=0.004, seed=0):
 
 
 def box(center, half, spacing=0.03):
-    x, y, z = center
-    a, b, c = half
+    center, half = torch.tensor(center), torch.diag(torch.tensor(half))
+    sides = [(axis, sign) for axis in (2, 0, 1) for sign in (1, -1)]
     return concatenate(
         [
-            sheet((x, y, z + c), (a, 0, 0), (0, b, 0), spacing=spacing, seed=1),
-            sheet((x, y, z - c), (a, 0, 0), (0, b, 0), spacing=spacing, seed=2),
-            sheet((x + a, y, z), (0, b, 0), (0, 0, c), spacing=spacing, seed=3),
-            sheet((x - a, y, z), (0, b, 0), (0, 0, c), spacing=spacing, seed=4),
-            sheet((x, y + b, z), (a, 0, 0), (0, 0, c), spacing=spacing, seed=5),
-            sheet((x, y - b, z), (a, 0, 0), (0, 0, c), spacing=spacing, seed=6),
+            sheet(
+                (center + sign * half[axis]).tolist(),
+                *(half[i].tolist() for i in range(3) if i != axis),
+                spacing=spacing,
+                seed=seed,
+            )
+            for seed, (axis, sign) in enumerate(sides, 1)
         ]
     )
 
@@ -177,14 +178,11 @@ def test_support_beside_the_table_is_the_floor_and_nothing_below_is_said():
         support_below(room(), torch.tensor([0.0, 0, -0.5]), up=UP, radius=0.15)
 
 
-def test_a_wall_is_a_poor_support():
+def test_a_wall_is_a_poor_support_and_a_hole_below_a_point_takes_the_level_around_it():
     wall = sheet((0, 0, 0), (0.4, 0, 0.9), (0, 1, 0), spacing=0.04)
     found = support_below(wall, torch.tensor([0.0, 0, 0.5]), up=UP, radius=0.2)
     # a slope of 66 degrees rises by 0.9 in a disc of 0.4: the part within 6% of the radius of one level is 2%
     assert found.flat_fraction < 0.15
-
-
-def test_a_hole_below_a_point_takes_the_level_around_it():
     table = sheet((0, 0, TABLE), (0.6, 0, 0), (0, 0.4, 0), spacing=0.03)
     holed = table.select(table.means[:, :2].norm(dim=1) > 0.15)
     found = support_below(holed, torch.tensor([0.0, 0, TABLE + 0.2]), up=UP, radius=0.1)

@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from shapes import surfels
+from shapes import UP, surfels
 
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.composite import Composite, PlacedObject
@@ -34,7 +34,7 @@ def box() -> Gaussians:
     along, up = torch.meshgrid(torch.linspace(-0.2, 0.2, 41), torch.linspace(0.005, 0.4, 40), indexing="ij")
     walls = []
     for turn in range(4):
-        rotation = rotation_about(torch.tensor([0.0, 0.0, 1.0]), turn * torch.pi / 2)
+        rotation = rotation_about(UP, turn * torch.pi / 2)
         points = torch.stack([torch.full_like(along, 0.2), along, up], -1).reshape(-1, 3) @ rotation.T
         walls.append(surfels(points, rotation[:, 0].repeat(len(points), 1), width=0.01))
     return concatenate(walls)
@@ -45,8 +45,7 @@ def floor(half=2.0, count=160) -> Gaussians:
     x = torch.linspace(-half, half, count)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
     z = NOISE * torch.randn(len(grid), 1, generator=torch.Generator().manual_seed(0))
-    up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(grid), 1)
-    return surfels(torch.cat([grid, z], 1), up, width=0.03, thickness=THICKNESS)
+    return surfels(torch.cat([grid, z], 1), UP.repeat(len(grid), 1), width=0.03, thickness=THICKNESS)
 
 
 def wall() -> Gaussians:
@@ -59,17 +58,12 @@ def same_bits(one, other):
     return all(torch.equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(Gaussians))
 
 
-def low_view():
-    """A camera 15 degrees above the floor."""
-    eye, middle = torch.tensor([[2.9, 0.0, 0.8]]), torch.tensor([0.0, 0.0, 0.1])
-    return pinhole(look_at(eye, middle, torch.tensor([0.0, 0.0, 1.0])), 300.0, width=128, height=96)
-
-
 def shown(thing, target) -> tuple[torch.Tensor, torch.Tensor]:
-    """Share of each pixel that an object makes up, with the target as a composite draws it and without."""
+    """Share of each pixel from 15 degrees above the floor that an object makes up, in a composite and alone."""
     placed = (PlacedObject(thing, Similarity.identity()),)
     scene, is_object = Composite(target, placed, torch.zeros(target.count, dtype=torch.bool)).bake()
-    camera = low_view()
+    eye, middle = torch.tensor([[2.9, 0.0, 0.8]]), torch.tensor([0.0, 0.0, 0.1])
+    camera = pinhole(look_at(eye, middle, UP), 300.0, width=128, height=96)
     inside = view_operator(scene, camera).blend(is_object.float()[:, None])[..., 0]
     return inside, view_operator(thing, camera).alpha
 
@@ -113,14 +107,10 @@ def test_centres_move_along_the_normal_and_heights_shrink_by_one_factor():
     torch.testing.assert_close(widths, torch.full_like(widths, 0.2 * THICKNESS), rtol=0.05, atol=0)
 
 
-@pytest.mark.parametrize("height", [0.2, 1.0])
-def test_nothing_changes_below_a_floating_ball(height):
+def test_nothing_changes_below_a_floating_ball_or_without_a_surface_an_object_or_anything_opaque():
     target = floor()
-    assert flatten_contact_layers(target, [ball(height)]) is target
-
-
-def test_nothing_changes_without_a_surface_an_object_or_anything_opaque():
-    target = floor()
+    for height in (0.2, 1.0):
+        assert flatten_contact_layers(target, [ball(height)]) is target
     cloud = replace(target, means=torch.rand(target.count, 3, generator=torch.Generator().manual_seed(1)) - 0.5)
     faint = replace(ball(), opacity_logits=torch.full((4000,), -5.0))
     assert flatten_contact_layers(cloud, [ball(-RADIUS)]) is cloud
@@ -148,9 +138,7 @@ def test_a_wall_beside_the_object_is_not_pressed():
 
 
 def test_a_leaf_that_lies_on_the_floor_and_two_objects_are_safe():
-    leaf = surfels(
-        ball().means * torch.tensor([1.0, 1.0, 0.001]), torch.tensor([[0.0, 0.0, 1.0]]).repeat(4000, 1), width=0.01
-    )
+    leaf = surfels(ball().means * torch.tensor([1.0, 1.0, 0.001]), UP.repeat(4000, 1), width=0.01)
     far = ball(center=(1.2, 0.0))
     target = floor()
     flattened = flatten_contact_layers(target, [leaf, far])
@@ -162,26 +150,20 @@ def test_a_leaf_that_lies_on_the_floor_and_two_objects_are_safe():
         assert bool((flattened.means != target.means).any(1)[changed].all())
 
 
-def test_a_book_on_the_table_beside_the_foot_keeps_its_shape():
+def test_a_book_and_a_cup_on_the_table_beside_the_foot_keep_their_shape():
     x, y = torch.meshgrid(torch.linspace(0.35, 0.6, 40), torch.linspace(-0.2, 0.2, 60), indexing="ij")
     top = torch.stack([x, y, torch.full_like(x, 0.09)], -1).reshape(-1, 3)
-    book = surfels(top, torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(top), 1), width=0.01)
-    both = concatenate([floor(), book])
-    flattened = flatten_contact_layers(both, [ball()])
-    moved = (flattened.means - both.means).norm(dim=1)[-book.count :]
+    both = concatenate([floor(), surfels(top, UP.repeat(len(top), 1), width=0.01)])
+    moved = (flatten_contact_layers(both, [ball()]).means - both.means).norm(dim=1)[-len(top) :]
     inner = (top[:, 0] > 0.4) & (top[:, 0] < 0.55) & (top[:, 1].abs() < 0.15)
     # its edge counts in part, as the floor is next to it
     assert float(moved[inner].max()) == 0.0
-
-
-def test_a_cup_on_the_table_beside_the_foot_keeps_its_shape():
     turn, up = torch.meshgrid(torch.arange(40) / 40 * 2 * torch.pi, torch.linspace(0, 0.3, 30), indexing="ij")
     outward = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1).reshape(-1, 3)
     wall_ = 0.08 * outward + torch.stack([torch.full_like(up, 0.4), torch.zeros_like(up), up], -1).reshape(-1, 3)
     cup = surfels(wall_, outward, width=0.01)
-    both = concatenate([floor(), cup])
-    flattened = flatten_contact_layers(both, [ball()])
-    assert same_bits(flattened.select(torch.arange(both.count) >= floor().count), cup)
+    flattened = flatten_contact_layers(concatenate([floor(), cup]), [ball()])
+    assert same_bits(flattened.select(torch.arange(flattened.count) >= floor().count), cup)
 
 
 def test_the_result_does_not_depend_on_frame_and_scale():

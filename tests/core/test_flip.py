@@ -42,16 +42,13 @@ def test_values_are_those_of_the_authors_program(kind):
         assert float(found[row, column]) == pytest.approx(value, abs=tolerance)
 
 
-def test_it_lies_between_zero_and_one_and_is_symmetric():
+def test_it_lies_between_zero_and_one_is_symmetric_and_a_region_is_the_mean_of_its_pixels():
     first, second = picture_pair("shift")
     found = flip_map(first, second)
     assert float(found.min()) >= 0
     assert float(found.max()) <= 1
     # the same additions in another order, in float64
     assert torch.allclose(found, flip_map(second, first), atol=1e-6)
-
-
-def test_a_region_is_the_mean_of_its_pixels_of_the_whole_picture():
     first, second = picture_pair("square")
     region = torch.zeros(60, 90, dtype=torch.bool)
     region[15:30, 22:45] = True

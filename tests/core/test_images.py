@@ -45,15 +45,12 @@ def test_write_and_read(tmp_path):
         path.unlink()
 
 
-def test_values_outside_are_clamped_on_writing(tmp_path):
-    images.write_image(tmp_path / "a.png", torch.tensor([[-1.0, 0.5, 7.0]]))
-    assert images.read_mask(tmp_path / "a.png").tolist() == [[0, pytest.approx(128 / 255), 1]]
-
-
-def test_unknown_suffix_is_refused_and_leaves_nothing(tmp_path):
+def test_values_outside_are_clamped_and_an_unknown_suffix_leaves_nothing(tmp_path):
     with pytest.raises(ValueError, match=r"a\.xyz: expected an image name"):
         images.write_image(tmp_path / "a.xyz", torch.zeros(2, 2))
     assert list(tmp_path.iterdir()) == []
+    images.write_image(tmp_path / "a.png", torch.tensor([[-1.0, 0.5, 7.0]]))
+    assert images.read_mask(tmp_path / "a.png").tolist() == [[0, pytest.approx(128 / 255), 1]]
 
 
 @pytest.mark.parametrize("orientation", [1, 2, 3, 6, 8])
@@ -67,10 +64,7 @@ def test_exif_turns_the_picture_but_not_the_stored_grid(tmp_path, orientation):
         1: stored,
         2: stored.flip(1),
         3: stored.flip(0, 1),
-        4: stored.flip(0),
-        5: stored.transpose(0, 1),
         6: stored.flip(0).transpose(0, 1),
-        7: stored.flip(0, 1).transpose(0, 1),
         8: stored.flip(1).transpose(0, 1),
     }[orientation]
     assert torch.equal(images.read_rgb(tmp_path / "a.png"), seen)
@@ -107,6 +101,9 @@ def test_every_mode_reads(tmp_path, mode):
 
 
 def test_transparent_palette(tmp_path):
+    Image.fromarray(PIXELS).save(tmp_path / "opaque.png")
+    assert not images.has_transparency(tmp_path / "opaque.png")
+    assert images.read_alpha(tmp_path / "opaque.png").min() == 1
     image = Image.fromarray(np.array([[0, 1], [1, 0]], np.uint8)).convert("P")
     image.putpalette([255, 0, 0, 0, 255, 0])
     image.save(tmp_path / "a.png", transparency=0)
@@ -114,12 +111,6 @@ def test_transparent_palette(tmp_path):
     assert images.read_alpha(tmp_path / "a.png").tolist() == [[0, 1], [1, 0]]
     assert images.read_mask(tmp_path / "a.png").tolist() == [[0, 1], [1, 0]]
     assert images.read_rgb(tmp_path / "a.png")[0].tolist() == [[0, 0, 0], [0, 1, 0]]
-
-
-def test_opaque_has_no_transparency(tmp_path):
-    Image.fromarray(PIXELS).save(tmp_path / "a.png")
-    assert not images.has_transparency(tmp_path / "a.png")
-    assert images.read_alpha(tmp_path / "a.png").min() == 1
 
 
 def png_that_claims(width, height):
@@ -134,7 +125,7 @@ def png_that_claims(width, height):
 @pytest.mark.parametrize(("width", "height"), [(13000, 13000), (2**31 - 1, 2**31 - 1), (0, 5)])
 def test_sizes_that_a_header_claims_take_no_memory(tmp_path, width, height):
     (tmp_path / "a.png").write_bytes(png_that_claims(width, height))
-    resident = images_resident()
+    resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     tracemalloc.start()
     for read in (images.read_rgb, images.read_stored_rgb, images.read_mask, images.read_alpha):
         with pytest.raises(ValueError, match=r"a\.png: expected a readable image, found"):
@@ -142,12 +133,9 @@ def test_sizes_that_a_header_claims_take_no_memory(tmp_path, width, height):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 5_000_000
-    assert images_resident() - resident < 100_000_000  # 13000 x 13000 x 3 would be 507 MB
-
-
-def images_resident() -> int:
-    """Highest resident memory of this process so far, bytes."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    assert (
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - resident < 100_000
+    )  # kB; 13000 x 13000 x 3 would be 507 MB
 
 
 @pytest.mark.parametrize("data", [b"GIF89a", b"\x89PNG\r\n\x1a\n"])
@@ -166,15 +154,12 @@ def test_list_images_is_sorted_and_leaves_out_the_rest(tmp_path):
     assert [path.name for path in images.list_images(tmp_path)] == ["a.png", "b.JPG"]
 
 
-def test_resize_keeps_constants_and_shapes():
+def test_resize_keeps_constants_and_shapes_and_halving_is_the_mean_of_four():
     for size in ((20, 12), (10, 6), (40, 24), (7, 5)):
         for channels in ((), (1,), (3,)):
             resized = images.resize(torch.full((12, 20, *channels), 0.3), *size)
             assert (resized - 0.3).abs().max() < 1e-6  # weights sum to 1 in float32
             assert resized.shape == (size[1], size[0], *channels)
-
-
-def test_halving_is_the_mean_of_four():
     image = torch.rand(12, 20, 3)
     expected = image.reshape(6, 2, 10, 2, 3).mean((1, 3))
     assert (images.resize(image, 10, 6) - expected).abs().max() < 1e-6  # float32 sums of four

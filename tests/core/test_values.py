@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shapes import random_scene
 
 from splatgraft.core import spherical_harmonics as harmonics
 from splatgraft.core.bounds import bounding_sphere
@@ -53,29 +54,23 @@ def test_the_rotation_between_two_vectors_is_the_smallest():
         assert abs(float(rotation.trace()) - (1 + 2 * float(start @ end))) < 4 * TOLERANCE
 
 
-def test_up_becomes_z():
+def test_up_becomes_z_and_tangents_and_normal_are_a_right_handed_frame():
     for up in AXES:
         assert is_rotation(rotation_to_z(up))
         assert torch.allclose(rotation_to_z(up) @ up, torch.tensor([0.0, 0.0, 1.0]), atol=TOLERANCE)
-
-
-def test_tangents_and_normal_are_a_right_handed_frame():
     for axis in (*even_directions(20), *AXES):
         tangent, bitangent = tangents(axis)
         assert is_rotation(torch.stack([tangent, bitangent, axis]))
         assert torch.equal(perpendicular(axis), tangent)
 
 
-def test_even_directions_are_centred_unit_vectors():
+def test_even_directions_are_centred_unit_vectors_and_pairs_exact_opposites():
+    pairs = even_pairs(32)
+    assert torch.equal(pairs[:16], -pairs[16:])
     directions = even_directions(320)
     assert torch.allclose(directions.norm(dim=1), torch.ones(320), rtol=0, atol=TOLERANCE)
     # a clustered set has a mean far from 0; a random one is off by 1 / sqrt(320) = 0.06
     assert directions.mean(0).norm() < 0.005
-
-
-def test_even_pairs_hold_exact_opposites():
-    pairs = even_pairs(32)
-    assert torch.equal(pairs[:16], -pairs[16:])
 
 
 def test_vogel_offsets_lie_in_the_plane_at_their_radii():
@@ -100,17 +95,6 @@ def random_rotations(n, seed=0):
     return rotation_from_quaternion(torch.randn(n, 4, generator=torch.Generator().manual_seed(seed)))
 
 
-def random_gaussians(n=50, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.randn(n, 3, generator=g),
-        log_scales=torch.randn(n, 3, generator=g) * 0.3 - 3,
-        quaternions=torch.randn(n, 4, generator=g),
-        opacity_logits=torch.randn(n, generator=g),
-        sh=torch.randn(n, 16, 3, generator=g) * 0.2,
-    )
-
-
 def test_quaternion_round_trip():
     rotations = torch.cat([random_rotations(200), torch.diag(torch.tensor([1.0, -1, -1]))[None], torch.eye(3)[None]])
     # float32 products of three factors of order 1
@@ -127,17 +111,14 @@ def test_rotated_harmonics_are_the_same_radiance_seen_from_turned_directions():
     assert torch.allclose(before, after, atol=1e-6)  # the rotation itself is float32 here
 
 
-def test_similarity_inverse_and_product():
+def test_similarities_are_a_group_and_move_covariances_like_points():
     a = Similarity(scale=2.0, rotation=random_rotations(1, 1)[0], translation=torch.tensor([1.0, 2, 3]))
     b = Similarity(scale=0.3, rotation=random_rotations(1, 2)[0], translation=torch.tensor([-1.0, 0, 4]))
     x = torch.randn(10, 3)
     assert torch.allclose((a @ b).points(x), a.points(b.points(x)), atol=1e-5)
     assert torch.allclose(a.inverse().points(a.points(x)), x, atol=1e-5)
-
-
-def test_similarity_moves_covariances_like_points():
     move = Similarity(scale=1.7, rotation=random_rotations(1, 5)[0], translation=torch.tensor([0.0, 1, 0]))
-    g = random_gaussians()
+    g = random_scene(50, 3, seed=0)
     expected = move.scale**2 * move.rotation @ g.covariances @ move.rotation.T
     assert torch.allclose(move.gaussians(g).covariances, expected, atol=1e-5)
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shapes import UP
 
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.rotations import rotation_from_quaternion
@@ -28,7 +29,7 @@ def angles_and_rings(cameras):
 @pytest.mark.parametrize("span", [(0, 345), (20, 140)])
 def test_path_is_smooth_closed_and_within_the_capture(span):
     source = captured(*span)
-    path = turntable_cameras(source, CENTER, up=torch.tensor([0.0, 0, 1]))
+    path = turntable_cameras(source, CENTER, up=UP)
     _, ring, level = angles_and_rings(path)
     _, source_ring, source_level = angles_and_rings(source)
     # weighted means cannot leave the range; 1e-4 for float32 of coordinates up to 3
@@ -43,23 +44,18 @@ def test_path_is_smooth_closed_and_within_the_capture(span):
 
 
 def test_every_frame_looks_at_the_center_upright():
-    path = turntable_cameras(captured(0, 345), CENTER, up=torch.tensor([0.0, 0, 1]))
+    path = turntable_cameras(captured(0, 345), CENTER, up=UP)
     in_camera = torch.einsum("vij,j->vi", path.camera_from_world[:, :3, :3], CENTER) + path.camera_from_world[:, :3, 3]
     assert in_camera[:, :2].abs().max() < 1e-5  # float32 rotation of coordinates up to 3
     assert path.world_from_camera[:, 2, 0].abs().max() < 1e-6
     assert (path.world_from_camera[:, 2, 1] < 0).all()
 
 
-def test_an_arc_is_never_left():
-    path = turntable_cameras(captured(20, 140), CENTER, up=torch.tensor([0.0, 0, 1]))
-    angle, _, _ = angles_and_rings(path)
+def test_an_arc_is_never_left_and_a_full_ring_is_gone_round():
+    angle, _, _ = angles_and_rings(turntable_cameras(captured(20, 140), CENTER, up=UP))
     assert math.degrees(angle.min()) >= 20 - 1e-3
     assert math.degrees(angle.max()) <= 140 + 1e-3
-
-
-def test_a_full_ring_is_gone_round():
-    path = turntable_cameras(captured(0, 345), CENTER, up=torch.tensor([0.0, 0, 1]))
-    angle, _, _ = angles_and_rings(path)
+    angle, _, _ = angles_and_rings(turntable_cameras(captured(0, 345), CENTER, up=UP))
     ordered = angle.sort().values
     assert (ordered[1:] - ordered[:-1]).max() < math.radians(6 + 0.1)  # 360 / 60
 
@@ -70,7 +66,7 @@ def test_turning_the_world_turns_the_path():
     poses = source.world_from_camera.clone()
     poses[:, :3] = rotation @ poses[:, :3]
     turned = pinhole(poses, 300.0, width=320, height=240)
-    straight = turntable_cameras(source, CENTER, up=torch.tensor([0.0, 0, 1]))
+    straight = turntable_cameras(source, CENTER, up=UP)
     other = turntable_cameras(turned, rotation @ CENTER, up=rotation[:, 2])
     # a full circle may start elsewhere: sets of rings agree
     assert other.centers.mean(0).sub(rotation @ straight.centers.mean(0)).abs().max() < 0.02
@@ -78,6 +74,6 @@ def test_turning_the_world_turns_the_path():
 
 def test_zoom_multiplies_the_focal_length():
     options = TurntableOptions(frames=5, zoom=1.5)
-    path = turntable_cameras(captured(0, 345), CENTER, up=torch.tensor([0.0, 0, 1]), options=options)
+    path = turntable_cameras(captured(0, 345), CENTER, up=UP, options=options)
     assert float(path.intrinsics[0, 0, 0]) == pytest.approx(450)
     assert len(path) == 5

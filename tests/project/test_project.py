@@ -1,6 +1,5 @@
 """Staleness, replacement of results, locks and checkpoints, for runs that are killed, repeated or started twice."""
 
-import json
 import os
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -10,7 +9,6 @@ import pytest
 import torch
 from killing import Killed, killed_at_write
 
-from splatgraft.project.layout import Layout
 from splatgraft.project.record import Job, read_record, why_stale
 from splatgraft.project.step import FolderCheckpoint, job_of, locked, replacing
 from splatgraft.runtime.files import atomic_folder
@@ -98,14 +96,9 @@ def test_a_step_knows_the_defaults_of_its_options(tmp_path: Path) -> None:
 
 
 def test_fingerprint_moves_with_inputs_and_options(tmp_path: Path, image: Path) -> None:
-    names = {
-        job(tmp_path, (image,)).fingerprint,
-        job(tmp_path, (image,), a=1).fingerprint,
-        job(tmp_path).fingerprint,
-    }
+    names = {one.fingerprint for one in (job(tmp_path, (image,)), job(tmp_path, (image,), a=1), job(tmp_path))}
     image.write_text("changed")
-    names.add(job(tmp_path, (image,)).fingerprint)
-    assert len(names) == 4
+    assert len(names | {job(tmp_path, (image,)).fingerprint}) == 4
 
 
 def fail_in_the_middle(wanted: Job) -> None:
@@ -198,10 +191,3 @@ def test_checkpoint_lives_for_its_own_job_only(tmp_path: Path) -> None:
     assert torch.equal(state["means"], torch.arange(3.0))
     assert FolderCheckpoint(job(tmp_path / "scene", iterations=8)).load() is None
     assert FolderCheckpoint(wanted).load() is None
-
-
-def test_folders_follow_the_flow() -> None:
-    layout = Layout(Path("p"))
-    assert layout.capture("source") == Path("p/source/capture")
-    assert layout.scene("target") == Path("p/target/scene")
-    assert json.dumps([str(layout.result), str(layout.report)]) == '["p/result", "p/report"]'

@@ -54,8 +54,5 @@ def test_setting_and_removing_a_key_restores_the_values() -> None:
     changed = with_keys(with_keys(text, "relight", {"shade": 0.5}), "relight", {"shade": None})
     assert tomllib.loads(changed) == tomllib.loads(text) | {"relight": {}}
     assert with_keys(text, "relight", {"shade": None}) == text
-
-
-def test_unsupported_layouts_are_refused() -> None:
     with pytest.raises(ValueError, match="by hand"):
         with_keys("segment = {box = [1]}\n", "segment", {"keep": "all"})

@@ -17,21 +17,7 @@ def test_replaces_whole(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_a_kill_left_is_cleared(tmp_path):
-    path = tmp_path / "a.bin"
-    path.write_bytes(b"before")
-    # the partial file is opened, and its renaming never happens
-    with pytest.raises(Killed), killed_at_write(1), atomic_write(path) as stream:
-        stream.write(b"half")
-    assert path.read_bytes() == b"before"
-    assert len(list(tmp_path.iterdir())) == 2
-    with atomic_write(path) as stream:
-        stream.write(b"after")
-    assert path.read_bytes() == b"after"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_failure_keeps_what_was_there(tmp_path):
+def test_failure_keeps_what_was_there_and_what_a_kill_left_is_cleared(tmp_path):
     path = tmp_path / "a.bin"
     path.write_bytes(b"before")
 
@@ -43,6 +29,15 @@ def test_failure_keeps_what_was_there(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write_half()
     assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+    # the partial file is opened, and its renaming never happens
+    with pytest.raises(Killed), killed_at_write(1), atomic_write(path) as stream:
+        stream.write(b"half")
+    assert path.read_bytes() == b"before"
+    assert len(list(tmp_path.iterdir())) == 2
+    with atomic_write(path) as stream:
+        stream.write(b"after")
+    assert path.read_bytes() == b"after"
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -1,6 +1,7 @@
 """Child processes leave nothing behind; a process ends with threads at work; a page opens where there is a desktop."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from splatgraft.runtime.process import last_line, open_page, run_logged
+from splatgraft.runtime.process import interruption_held, last_line, open_page, run_logged
 
 
 def python(program: str) -> list[str]:
@@ -35,10 +36,8 @@ def test_lines_of_the_output_are_handed_over_and_stay_out_of_the_log(tmp_path):
 def test_a_line_arrives_while_the_process_runs(tmp_path):
     # the process ends only after the file exists that is made when its line arrives
     program = "import os, sys, time; print(1, flush=True)\nwhile not os.path.exists('seen'): time.sleep(0.01)"
-    code = run_logged(
-        python(program), tmp_path / "log", folder=tmp_path, on_line=lambda line: (tmp_path / "seen").touch()
-    )
-    assert code == 0
+    seen = tmp_path / "seen"
+    assert run_logged(python(program), tmp_path / "log", folder=tmp_path, on_line=lambda line: seen.touch()) == 0
 
 
 def test_standard_input_and_folder(tmp_path):
@@ -65,12 +64,30 @@ def test_a_failing_listener_kills_the_process(tmp_path):
 
 
 def test_a_program_that_does_not_exist_is_named(tmp_path):
+    assert last_line(tmp_path / "log") == ""
     with pytest.raises(ValueError, match=r"no-such-program: expected a program that starts, found No such file"):
         run_logged([str(tmp_path / "no-such-program")], tmp_path / "log")
 
 
-def test_a_log_without_lines(tmp_path):
-    assert last_line(tmp_path / "none") == ""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_interruption_is_held_and_the_second_acts_at_once(number: int):
+    def interrupted(times: int) -> list[bool]:
+        with interruption_held(terminate=True) as interrupted:
+            for _ in range(times):
+                signal.raise_signal(number)
+                held.append(interrupted())
+        return held
+
+    held: list[bool] = []
+    before = signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    try:
+        assert interrupted(0) == []
+        for times in (1, 2):
+            with pytest.raises(KeyboardInterrupt):
+                interrupted(times)
+        assert held == [True, True]
+    finally:
+        signal.signal(number, before)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="xdg-open is of Linux desktops")

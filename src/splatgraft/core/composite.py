@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 from torch import Tensor
 
 from splatgraft.core.contact import flatten_contact_layers
@@ -49,13 +49,11 @@ class Composite:
 
         What an object stands on is flattened around its foot, so that it does not cover it.
         """
-        gaussians = self._merged_gaussians()
+        kept = self.target.select(~self.erased) if bool(self.erased.any()) else self.target
+        # an empty object must not even widen the harmonics: it is the identity
+        parts = [placed.in_target() for placed in self.objects if placed.gaussians.count]
+        gaussians = concatenate([flatten_contact_layers(kept, parts), *parts]) if parts else kept
         return gaussians, torch.arange(gaussians.count, device=gaussians.device) >= self.kept_count
-
-    def object_index(self) -> Int[Tensor, "m"]:
-        """For every Gaussian of the merged scene the position of its object in `objects`, or -1 for the target."""
-        counts = [self.kept_count] + [placed.gaussians.count for placed in self.objects]
-        return torch.repeat_interleave(torch.arange(-1, len(self.objects)), torch.tensor(counts))
 
     @property
     def kept_count(self) -> int:
@@ -70,9 +68,3 @@ class Composite:
         """The composite with `recolored`, in the objects' own frames, in place of the objects' Gaussians."""
         pairs = zip(self.objects, recolored, strict=True)
         return replace(self, objects=tuple(replace(placed, gaussians=gaussians) for placed, gaussians in pairs))
-
-    def _merged_gaussians(self) -> Gaussians:
-        kept = self.target.select(~self.erased) if bool(self.erased.any()) else self.target
-        # an empty object must not even widen the harmonics: it is the identity
-        parts = [placed.in_target() for placed in self.objects if placed.gaussians.count]
-        return concatenate([flatten_contact_layers(kept, parts), *parts]) if parts else kept

@@ -86,6 +86,8 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 SMALLEST_REGION = 25
 """Pixels; smaller regions of a view are left out of the means. Set by hand."""
+_SHOWN = ("copy_paste", "result")
+"""The pictures of a view that are measured."""
 _SSIM_BORDER = 5
 """Pixels: SSIM's window reaches over the image border there."""
 
@@ -164,21 +166,20 @@ def measure(views: Sequence[ComparedView], perceptual: Perceptual | None = None)
 
 
 def _row(view: ComparedView, perceptual: Perceptual | None) -> dict:
-    regions = find_regions(view.truth)
     row: dict = {"view": view.name, "held_out": view.held_out}
-    for name in ("copy_paste", "result"):
-        row[name] = compare(
-            getattr(view, name).clamp(0, 1),
-            view.truth,
-            regions=regions,
-            background=view.background.clamp(0, 1),
-            perceptual=perceptual,
-        )
+    for name in _SHOWN:
+        row[name] = _compared(getattr(view, name), view.truth, view.background, perceptual)
     return row
 
 
+def _compared(image: Tensor, truth: Truth, background: Tensor, perceptual: Perceptual | None) -> dict[str, float]:
+    """`compare` of what may be outside of [0, 1], in the view's own regions."""
+    image, background = image.clamp(0, 1), background.clamp(0, 1)
+    return compare(image, truth, regions=find_regions(truth), background=background, perceptual=perceptual)
+
+
 def _means(rows: Sequence[dict]) -> dict[str, dict[str, float | None]]:
-    return {which: _mean_of([row[which] for row in rows]) for which in ("copy_paste", "result")}
+    return {which: _mean_of([row[which] for row in rows]) for which in _SHOWN}
 
 
 def _mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float | None]:
@@ -192,12 +193,8 @@ def _mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float | None]:
 
 
 def _without_nan(row: dict) -> dict:
-    clean = {which: {k: _finite(v) for k, v in row[which].items()} for which in ("copy_paste", "result")}
+    clean = {which: {k: v if math.isfinite(v) else None for k, v in row[which].items()} for which in _SHOWN}
     return {**row, **clean}
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def evaluate(
@@ -228,17 +225,8 @@ def evaluate(
     if not len(images) == len(truth) == len(backgrounds):
         found = f"{len(images)} images, {len(truth)} truths and {len(backgrounds)} backgrounds"
         raise ValueError(f"evaluate: expected one truth and one background per image, found {found}")
-    rows = [
-        compare(
-            image.clamp(0, 1),
-            true,
-            regions=find_regions(true),
-            background=background.clamp(0, 1),
-            perceptual=perceptual,
-        )
-        for image, true, background in zip(images, truth, backgrounds, strict=True)
-    ]
-    return _mean_of(rows)
+    given = zip(images, truth, backgrounds, strict=True)
+    return _mean_of([_compared(image, true, background, perceptual) for image, true, background in given])
 
 
 def true_views(truth: PosedImages, target: PosedImages) -> LazySequence[Truth]:

@@ -19,6 +19,7 @@ from splatgraft.runtime.files import atomic_folder, atomic_write, room_on_disk
 from splatgraft.runtime.note import Note
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 from splatgraft.runtime.progress import Progress
+from splatgraft.runtime.settings import default_of
 
 if TYPE_CHECKING:
     import torch  # takes seconds, which the editor's page does not wait for
@@ -80,8 +81,6 @@ class Context:
     """State that a killed run leaves to the next."""
     console: Console
     """For messages."""
-    earlier: Path
-    """The result's final folder; the earlier result stays there until this run is complete."""
 
 
 @runtime_checkable
@@ -105,24 +104,17 @@ class Step(Protocol):
         ...
 
 
-@runtime_checkable
-class RecordsOptions(Protocol):
-    """A step whose options in step.json are not just its fields."""
-
-    def recorded_options(self) -> dict[str, Any]:
-        """The options as plain JSON values."""
-        ...
-
-
 def job_of(step: Step) -> Job:
-    """The job of `step`: what its result depends on."""
-    options = step.recorded_options() if isinstance(step, RecordsOptions) else plain_options(vars(step))
+    """The job of `step`: what its result depends on; a step with `recorded_options` names its options itself."""
+    recorded = getattr(step, "recorded_options", None)
+    options: dict[str, Any] = plain_options(vars(step)) if recorded is None else recorded()
+    defaults = {one.name: default_of(one) for one in fields(type(step))}  # pyright: ignore[reportArgumentType]
     return Job(
         step=type(step).__name__.lower(),
         folder=step.out,
         inputs=step.inputs(),
         options=options,
-        defaults=plain_options(_defaults(type(step))),
+        defaults=plain_options({name: value for name, value in defaults.items() if value is not MISSING}),
     )
 
 
@@ -142,7 +134,7 @@ def perform(step: Step, console: Console, *, name: str = "") -> Path:
     with locked(job.folder), room_on_disk(job.folder), console.collecting() as warned:
         checkpoint = FolderCheckpoint(job)
         with console.bar(name or job.step) as progress, replacing(job, warned) as folder:
-            step.write(folder, Context(progress=progress, checkpoint=checkpoint, console=console, earlier=step.out))
+            step.write(folder, Context(progress=progress, checkpoint=checkpoint, console=console))
         checkpoint.drop()
     return job.folder
 
@@ -163,12 +155,6 @@ def choose_device(wanted: str, console: Console) -> "torch.device":
     reason = "no CUDA device found" if wanted == "auto" and not has_cuda else f"--device {wanted}"
     console.say(f"device: {device} ({reason})")
     return torch.device(device)
-
-
-def _defaults(kind: type) -> dict[str, Any]:
-    """The fields of a step that have a default."""
-    found = {one.name: one.default for one in fields(kind) if one.default is not MISSING}
-    return found | {one.name: one.default_factory() for one in fields(kind) if one.default_factory is not MISSING}
 
 
 def plain_options(values: Mapping[str, Any]) -> dict[str, Any]:

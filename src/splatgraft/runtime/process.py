@@ -129,9 +129,6 @@ def open_page(page: Path | str) -> bool:
 
     Text browsers, which would take over the terminal, are not used.
     """
-    if sys.platform == "win32":
-        os.startfile(page)
-        return True
     has_display = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     opener = _OPENERS.get(sys.platform)
     if not has_display or opener is None:

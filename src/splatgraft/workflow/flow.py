@@ -23,7 +23,6 @@ from splatgraft.project.layout import (
     OBJECT_FILE,
     PLACEMENT_FILE,
     PROJECT_FILE,
-    REPORT_FILE,
     SCENE_FILE,
     SURROUNDINGS_FILE,
     Layout,
@@ -69,13 +68,6 @@ class Flow:
             wanted |= set(self.before(other)) if other in wanted else set()
         return {other: step for other, step in self if other in wanted}
 
-    def results(self) -> list[tuple[str, Path]]:
-        """The files that a user opens in the end, by the step that writes them."""
-        return [
-            ("consolidate", self.layout.result / SCENE_FILE),
-            ("evaluate", self.layout.report / REPORT_FILE),
-        ]
-
 
 def read_flow(project: Path, out: Path | None = None) -> Flow:
     """Read the steps of a project, its file or folder; `out` is the root of the results where that is not its folder.
@@ -88,13 +80,14 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
     sides: tuple[Side, ...] = ("source", "target")
     steps: dict[str, Step] = {}
     for side in sides:
-        steps[f"{side}/capture"] = file.step(Capture, out=layout.capture(side), side=side)
+        steps[f"{side}/capture"] = capture = file.step(Capture, out=layout.capture(side), side=side)
         given = {"capture": layout.capture(side)}
-        # a trained scene replaces the reconstruction
-        trained = file.scene(side)
-        kind, given = (Reconstruct, given) if trained is None else (Adopt, given | {"scene": trained})
-        steps[f"{side}/reconstruct"] = file.step(kind, given, out=layout.scene(side), side=side)
-        steps[f"{side}/reconstruct"] = _with_axes_of(steps[f"{side}/capture"], steps[f"{side}/reconstruct"])
+        if (trained := file.scene(side)) is None:
+            made = file.step(Reconstruct, given, out=layout.scene(side), side=side)
+        else:  # a trained scene replaces the reconstruction, and is read with the axes that its capture names
+            made = file.step(Adopt, given | {"scene": trained}, out=layout.scene(side), side=side)
+            made = replace(made, axes=capture.axes if made.axes is None else made.axes)
+        steps[f"{side}/reconstruct"] = made
     flow = Flow(layout, steps | _joint_steps(file, layout), file.renamed)
     _require_order(path, flow)
     return flow
@@ -110,13 +103,6 @@ def _require_order(project: Path, flow: Flow) -> None:
                 raise ValueError(
                     f"{project}: expected inputs of {name} elsewhere than in the results of {other}, found {folder}"
                 )
-
-
-def _with_axes_of(capture: Step, scene: Step) -> Step:
-    """A trained scene is read with the axes that its capture names."""
-    if isinstance(capture, Capture) and isinstance(scene, Adopt) and scene.axes is None:
-        return replace(scene, axes=capture.axes)
-    return scene
 
 
 def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:

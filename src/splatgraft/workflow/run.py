@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from splatgraft.commands.steps.capture import Capture, doubt_about
+from splatgraft.project.layout import REPORT_FILE, SCENE_FILE
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import clear_leftovers, job_of, locked, perform
 from splatgraft.runtime.console import Console
@@ -44,7 +45,8 @@ def run_steps(
             if isinstance(step, Capture) and not accept_doubtful and (doubt := doubt_about(step)):
                 raise ValueError(doubt)
     console.say("results:")
-    for name, path in flow.results():
+    layout = flow.layout
+    for name, path in (("consolidate", layout.result / SCENE_FILE), ("evaluate", layout.report / REPORT_FILE)):
         if name in wanted:
             console.result(path)
 
