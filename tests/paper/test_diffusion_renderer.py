@@ -10,12 +10,7 @@ import pytest
 import torch
 import yaml
 
-from splatgraft_paper.training.relighters import (
-    DiffusionRenderer,
-    RelightingInput,
-    forward_arguments,
-    inverse_arguments,
-)
+from splatgraft_paper.training.relighters import DiffusionRenderer, forward_arguments, inverse_arguments
 
 TABLES = json.loads((Path(__file__).parent / "diffusion_renderer_options.json").read_text())
 INVERSE, FORWARD = Path("/data/in"), Path("/data/buffers")
@@ -112,9 +107,9 @@ def installation(folder, how=lambda text: text):
 
 
 def drafts(count):
+    """Smooth pictures with a mask each."""
     g = torch.Generator().manual_seed(0)
-    smooth = [torch.rand(1, 1, 3, generator=g).expand(48, 80, 3) for _ in range(count)]
-    return [RelightingInput(f"picture {i}", image, torch.ones(48, 80)) for i, image in enumerate(smooth)]
+    return [(torch.rand(1, 1, 3, generator=g).expand(48, 80, 3), torch.ones(48, 80)) for _ in range(count)]
 
 
 def maps(folder, count):
@@ -129,11 +124,11 @@ def test_many_pictures_and_lights_load_each_model_once(tmp_path, python):
     folder = installation(tmp_path / "code")
     renderer, lights = DiffusionRenderer(folder, python), maps(tmp_path / "maps", 3)
     for draft in drafts(3):
-        relit = renderer.relight(draft, lights)
+        relit = renderer.relight(*draft, lights)
         assert [picture.shape for picture in relit] == [(48, 80, 3)] * 3
         for number, picture in enumerate(relit):
             # 8 bits
-            assert (picture - draft.image / (number + 1)).abs().max() < 0.02
+            assert (picture - draft[0] / (number + 1)).abs().max() < 0.02
     assert sorted((folder / "loads.txt").read_text().split()) == ["forward", "inverse"]
     renderer.close()
 
@@ -146,9 +141,9 @@ def test_a_program_that_fails_is_one_line_and_the_next_picture_is_made(tmp_path,
     draft = drafts(1)[0]
     line = r"inference_svd_rgbx.py: expected it to succeed, found RuntimeError: CUDA out of memory in a kernel"
     with pytest.raises(ValueError, match=line) as error:
-        renderer.relight(draft, lights)
+        renderer.relight(*draft, lights)
     assert "\n" not in str(error.value)
-    assert len(renderer.relight(draft, lights)) == 1
+    assert len(renderer.relight(*draft, lights)) == 1
     renderer.close()
 
 
@@ -158,8 +153,8 @@ def test_a_process_that_dies_is_one_line_and_is_started_again(tmp_path, python):
     folder = installation(tmp_path / "code", lambda text: text.replace("def main():\n", once))
     renderer, lights = DiffusionRenderer(folder, python), maps(tmp_path / "maps", 1)
     with pytest.raises(ValueError, match=r"expected it to succeed, found its process ended \(Killed\)"):
-        renderer.relight(drafts(1)[0], lights)
-    assert len(renderer.relight(drafts(1)[0], lights)) == 1
+        renderer.relight(*drafts(1)[0], lights)
+    assert len(renderer.relight(*drafts(1)[0], lights)) == 1
     renderer.close()
 
 

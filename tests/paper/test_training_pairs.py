@@ -21,14 +21,13 @@ from splatgraft_paper.training.generate import (
     Lighting,
     Photograph,
     SamplePlan,
-    UnrelitSample,
     choose_balanced,
     generate,
     read_orida,
 )
-from splatgraft_paper.training.pairs import crop_to_size, open_relit, open_rendered, split_mixture
+from splatgraft_paper.training.pairs import RelitSample, crop_to_size, open_relit, open_rendered, split_mixture
 from splatgraft_paper.training.prompts import ANGLES, ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
-from splatgraft_paper.training.relighters import RelightingInput, StandInRelighter
+from splatgraft_paper.training.relighters import StandInRelighter
 
 
 def environment(folder: Path, name: str, bright: str) -> Path:
@@ -121,12 +120,12 @@ def test_the_choice_of_photographs_is_balanced():
 
 def test_the_stand_in_tints_the_object_alone_and_is_named_in_records(tmp_path):
     mask = torch.nn.functional.pad(torch.ones(20, 20), (10, 10, 10, 10))
-    draft = RelightingInput("box", torch.full((40, 40, 3), 0.5), mask)
+    image = torch.full((40, 40, 3), 0.5)
     red = np.full((16, 32, 3), (0.1, 0.1, 1.0), np.float32)  # in OpenCV's order
     assert cv2.imwrite(str(tmp_path / "red.hdr"), red)
-    (relit,) = StandInRelighter().relight(draft, [tmp_path / "red.hdr"])
+    (relit,) = StandInRelighter().relight(image, mask, [tmp_path / "red.hdr"])
     assert relit[20, 20, 0] > 0.5 > relit[20, 20, 2]
-    assert torch.equal(relit[mask == 0], draft.image[mask == 0])
+    assert torch.equal(relit[mask == 0], image[mask == 0])
     assert "not DiffusionRenderer" in StandInRelighter().name
 
 
@@ -142,7 +141,7 @@ def test_a_killed_generation_resumes_and_unsuitable_samples_are_recorded(tmp_pat
                 mask = torch.zeros_like(sample.mask) if name.endswith("24") else sample.mask
                 if name.endswith("25") and len(made) == 3:
                     raise KeyboardInterrupt
-                return UnrelitSample(sample.target, sample.background, mask)
+                return RelitSample(sample.target, sample.background, mask)
 
             yield SamplePlan(name, "scene", make, {"prompt": f"a {name}", "licence": "shipped"})
 

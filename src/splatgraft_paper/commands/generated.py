@@ -16,12 +16,12 @@ from splatgraft_paper.training.generate import (
     Photograph,
     RelightingOptions,
     SamplePlan,
-    UnrelitSample,
     choose_balanced,
     generate,
+    load_painter,
     read_orida,
 )
-from splatgraft_paper.training.pairs import crop_to_size
+from splatgraft_paper.training.pairs import RelitSample, crop_to_size
 from splatgraft_paper.training.prompts import prompt
 
 
@@ -50,21 +50,20 @@ class GeneratedPairs:
     def execute(self, console: Console) -> int:
         """Make the missing samples."""
         from splatgraft.segmentation.onnx_networks import BIREFNET_REPOSITORY, load_birefnet
-        from splatgraft_paper.training.generate import TextToImage, text_to_image_pipeline
         from splatgraft_paper.training.removal import ObjectRemover
 
-        width, height = parse_image_size(self.size, multiple_of=16)
+        size = parse_image_size(self.size, multiple_of=16)
         lighting = self.relighting.open(self.seed)
         device = choose_device(self.device, console)
         remover = ObjectRemover(self.removal, device, console.say, seed=self.seed)
         path = Path(self.masks or "")
         masks = load_birefnet(path if self.masks and path.is_file() else self.masks or BIREFNET_REPOSITORY)
-        painter = TextToImage(text_to_image_pipeline(self.base), device, (width, height), console.say)
+        paint = load_painter(self.base, device, size, console.say)
 
-        def make(text: str, number: int) -> UnrelitSample:
-            target = painter.generate(text, seed=self.seed * 1_000_003 + number)
+        def make(text: str, number: int) -> RelitSample:
+            target = paint(text, self.seed * 1_000_003 + number)
             mask = masks.mask(target).clamp(0, 1)
-            return UnrelitSample(target, remover.remove(target, mask), mask)
+            return RelitSample(target, remover.remove(target, mask), mask)
 
         with locked(self.out), console.bar("generate") as progress:
             made = generate(self.out, self._wanted(make), lighting, total=self.number, progress=progress)
@@ -119,7 +118,7 @@ def _wanted(chosen: list[Photograph], width: int, height: int, seed: int) -> Ite
         yield SamplePlan(photograph.name, photograph.scene, partial(_read, photograph, width, height), record)
 
 
-def _read(photograph: Photograph, width: int, height: int) -> UnrelitSample:
+def _read(photograph: Photograph, width: int, height: int) -> RelitSample:
     target, background = read_rgb(photograph.image), read_rgb(photograph.background)
     mask = read_mask(photograph.mask)
     for path, picture in ((photograph.background, background), (photograph.mask, mask)):
@@ -127,4 +126,4 @@ def _read(photograph: Photograph, width: int, height: int) -> UnrelitSample:
             wanted, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
             raise ValueError(f"{path}: expected {wanted} pixels as {photograph.image.name}, found {found}")
     images = (crop_to_size(image, width, height).clamp(0, 1) for image in (target, background, mask))
-    return UnrelitSample(*images)
+    return RelitSample(*images)

@@ -9,7 +9,7 @@ import random
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,21 +31,12 @@ from splatgraft_paper.training.pairs import (
     write_relit_manifest,
     write_sample,
 )
-from splatgraft_paper.training.relighters import DiffusionRenderer, Relighter, RelightingInput, StandInRelighter
+from splatgraft_paper.training.relighters import DiffusionRenderer, StandInRelighter
 
 SHEET_FILE = "sheet.png"
 _REJECTED = "rejected"
 _MIN_COVERED, _MAX_COVERED = 0.01, 0.6
 """Share of the image that an object may cover; set by hand."""
-
-
-@dataclass(frozen=True)
-class UnrelitSample:
-    """A target with its background and mask, before relighting."""
-
-    target: Float[Tensor, "h w 3"]
-    background: Float[Tensor, "h w 3"]
-    mask: Float[Tensor, "h w"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +47,8 @@ class SamplePlan:
     """Name of the sample's folder."""
     group: str
     """Samples of one group are held out together."""
-    make: Callable[[], UnrelitSample]
+    make: Callable[[], RelitSample]
+    """The sample before it is relit."""
     record: Mapping[str, Any]
     """Provenance: prompt, seed, models, licence."""
 
@@ -65,7 +57,7 @@ class SamplePlan:
 class Lighting:
     """The relighter and the environment maps of the samples."""
 
-    relighter: Relighter
+    relighter: DiffusionRenderer | StandInRelighter
     maps: Sequence[Path]
     """Environment maps to choose from."""
     each: int
@@ -126,7 +118,7 @@ def _generate_one(out: Path, plan: SamplePlan, lighting: Lighting) -> int:
             stream.write((json.dumps(note) + "\n").encode())
         return 0
     maps = lighting.choose(plan.name)
-    relit = lighting.relighter.relight(RelightingInput(plan.name, unrelit.target, unrelit.mask), maps)
+    relit = lighting.relighter.relight(unrelit.target, unrelit.mask, maps)
     record = {
         **plan.record,
         "group": plan.group,
@@ -134,7 +126,7 @@ def _generate_one(out: Path, plan: SamplePlan, lighting: Lighting) -> int:
         "relighter_licence": lighting.relighter.licence,
         "lights": [path.name for path in maps],
     }
-    write_sample(out / plan.name, RelitSample(unrelit.target, unrelit.background, unrelit.mask, relit), record)
+    write_sample(out / plan.name, replace(unrelit, relit=relit), record)
     return 1
 
 
@@ -158,16 +150,14 @@ class RelightingOptions:
         maps = sorted(self.lights.glob("*.hdr")) if self.lights.is_dir() else []
         if not maps:
             raise ValueError(f"{self.lights}: expected a folder with .hdr environment maps (--lights), found none")
-        return Lighting(self._relighter(), maps, self.each, seed)
-
-    def _relighter(self) -> Relighter:
         if self.relighter == "stand-in":
-            return StandInRelighter()
+            return Lighting(StandInRelighter(), maps, self.each, seed)
         if self.renderer is None:
             raise ValueError(
                 "--renderer: expected the folder of DiffusionRenderer's code, found none; or --relighter stand-in"
             )
-        return DiffusionRenderer(self.renderer, self.renderer_python or Path(sys.executable))
+        renderer = DiffusionRenderer(self.renderer, self.renderer_python or Path(sys.executable))
+        return Lighting(renderer, maps, self.each, seed)
 
 
 _PIPELINE_BYTES = 36 << 30
@@ -182,34 +172,32 @@ def text_to_image_pipeline(base: str) -> Any:
         raise ValueError(f"{base}: expected a FLUX pipeline with its text encoders, found {one_line(error)}") from error
 
 
-class TextToImage:
-    """A loaded text-to-image pipeline."""
+def load_painter(
+    base: str, device: torch.device, size: tuple[int, int], say: Callable[[str], None]
+) -> Callable[[str, int], Float[Tensor, "h w 3"]]:
+    """Load what paints a picture of a prompt and a seed, sRGB in [0, 1]; `size` is width and height.
 
-    def __init__(self, pipeline: Any, device: torch.device, size: tuple[int, int], say: Callable[[str], None]) -> None:
-        """Move a pipeline to a device.
+    Its parts stay on the CPU in turn where GPU memory does not suffice.
+    """
+    pipeline = text_to_image_pipeline(base)
+    if device.type == "cuda" and torch.cuda.mem_get_info(device)[0] < _PIPELINE_BYTES:
+        say("text to image: parts are fetched from the CPU in turn, since GPU memory does not hold all of them")
+        pipeline.enable_model_cpu_offload()
+    else:
+        pipeline.to(device)
 
-        Args:
-            device: where it runs; its parts stay on the CPU in turn where GPU memory does not suffice.
-        """
-        self._pipeline, self._size = pipeline, size
-        if device.type == "cuda" and torch.cuda.mem_get_info(device)[0] < _PIPELINE_BYTES:
-            say("text to image: parts are fetched from the CPU in turn, since GPU memory does not hold all of them")
-            pipeline.enable_model_cpu_offload()
-        else:
-            pipeline.to(device)
-
-    def generate(self, prompt: str, *, seed: int) -> Float[Tensor, "h w 3"]:
-        """Generate the image of a prompt and a seed, sRGB in [0, 1]."""
-        width, height = self._size
-        image = self._pipeline(
+    def paint(prompt: str, seed: int) -> Float[Tensor, "h w 3"]:
+        image = pipeline(
             prompt,
-            width=width,
-            height=height,
+            width=size[0],
+            height=size[1],
             num_inference_steps=4,
             guidance_scale=1.0,
             generator=torch.Generator().manual_seed(seed),
         ).images[0]
         return torch.from_numpy(np.array(image.convert("RGB"))).float() / 255
+
+    return paint
 
 
 INDEX_FILE = "index.csv"

@@ -157,7 +157,7 @@ class RelitSample:
     target: Float[Tensor, "h w 3"]
     background: Float[Tensor, "h w 3"]
     mask: Float[Tensor, "h w"]
-    relit: Sequence[Float[Tensor, "h w 3"]]
+    relit: Sequence[Float[Tensor, "h w 3"]] = ()
     """The whole target under other lights, one image per light."""
 
 

@@ -14,9 +14,8 @@ import subprocess
 import tempfile
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import cv2
 import torch
@@ -25,29 +24,6 @@ from torch import Tensor
 
 from splatgraft.core.images import linear_from_srgb, read_rgb, resize, srgb_from_linear, write_image
 from splatgraft.runtime.process import last_line
-
-
-@dataclass(frozen=True)
-class RelightingInput:
-    """An image to relight."""
-
-    name: str
-    image: Float[Tensor, "h w 3"]
-    mask: Float[Tensor, "h w"]
-    """Coverage by the object."""
-
-
-@runtime_checkable
-class Relighter(Protocol):
-    """Relights images by environment maps."""
-
-    name: str
-    """For the sample's record."""
-    licence: str
-
-    def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
-        """Relight the image by each environment map."""
-        ...
 
 
 class StandInRelighter:
@@ -59,16 +35,18 @@ class StandInRelighter:
     name = "stand-in of splatgraft (the map's mean colour; not DiffusionRenderer)"
     licence = "own"
 
-    def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
+    def relight(
+        self, image: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"], lights: Sequence[Path]
+    ) -> list[Float[Tensor, "h w 3"]]:
         """Relight the object; the other pixels stay."""
-        linear, pictures = linear_from_srgb(draft.image), []
+        linear, pictures = linear_from_srgb(image), []
         for path in lights:
             found = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)
             if found is None:
                 raise ValueError(f"{path}: expected an environment map (.hdr), found none that can be read")
             color = torch.from_numpy(found.reshape(-1, 3).mean(0)[::-1].copy()).float()
             tint = color / color.mean().clamp_min(1e-6)
-            pictures.append(srgb_from_linear(linear * (1 + draft.mask[..., None] * (tint - 1))).clamp(0, 1))
+            pictures.append(srgb_from_linear(linear * (1 + mask[..., None] * (tint - 1))).clamp(0, 1))
         return pictures
 
 
@@ -100,13 +78,11 @@ def _files(given: Path, out: Path, size: tuple[int, int]) -> list[str]:
 class DiffusionRenderer:
     """A relighter: inverse, then forward rendering by DiffusionRenderer's programs, in one long-lived process."""
 
+    name = "DiffusionRenderer"
     licence = "pictures by NVIDIA's DiffusionRenderer, see its licence"
 
-    name = "DiffusionRenderer"
-
     def __init__(self, checkout: Path, python: Path) -> None:
-        """Check an installation."""
-        self._checkout = checkout.resolve()
+        """Check an installation: its programs, and the interpreter that runs them."""
         for program in (_INVERSE, _FORWARD):
             if not (checkout / program).is_file():
                 raise ValueError(
@@ -117,50 +93,46 @@ class DiffusionRenderer:
             subprocess.run([str(python), "-c", "import torch"], check=True, capture_output=True, timeout=300)
         except (OSError, subprocess.SubprocessError) as error:
             raise ValueError(f"{python}: expected a Python that runs DiffusionRenderer, found {error}") from error
-        self._worker = _Worker(python, self._checkout)
-
-    def relight(self, draft: RelightingInput, lights: Sequence[Path]) -> list[Float[Tensor, "h w 3"]]:
-        """Relight the image by each environment map; results have its size."""
-        height, width = draft.mask.shape
-        size = (max(_MULTIPLE, height // _MULTIPLE * _MULTIPLE), max(_MULTIPLE, width // _MULTIPLE * _MULTIPLE))
-        maps = [light.resolve() for light in lights]
-        with tempfile.TemporaryDirectory() as name:
-            given, buffers, out = (Path(name) / part for part in ("input", "buffers", "relit"))
-            (given / "picture").mkdir(parents=True)
-            write_image(given / "picture" / "frame000.png", draft.image)
-            self._worker.run(_INVERSE, inverse_arguments(given, buffers, size))
-            self._worker.run(_FORWARD, forward_arguments(buffers, out, maps, size))
-            relit = []
-            for number in range(len(maps)):
-                found = sorted(out.rglob(f"*.env{number:04d}.png"))
-                if not found:
-                    raise ValueError(f"{self._checkout}: expected a relit picture of {draft.name}, found none")
-                relit.append(resize(read_rgb(found[0]), width, height).clamp(0, 1))
-            return relit
-
-    def close(self) -> None:
-        """End the process; it also ends with this one."""
-        self._worker.close()
-
-
-class _Worker:
-    """The process of `renderer_worker.py`, started at the first job."""
-
-    def __init__(self, python: Path, checkout: Path) -> None:
-        self._python, self._checkout = python, checkout
+        self._checkout, self._python = checkout.resolve(), python
         self._process: subprocess.Popen[bytes] | None = None
         folder = tempfile.mkdtemp()
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._log = Path(folder) / "log"
 
-    def run(self, program: str, arguments: Sequence[str]) -> None:
-        """Run one program to its end."""
+    def relight(
+        self, image: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"], lights: Sequence[Path]
+    ) -> list[Float[Tensor, "h w 3"]]:
+        """Relight the image by each environment map; results have its size."""
+        height, width = mask.shape
+        size = (max(_MULTIPLE, height // _MULTIPLE * _MULTIPLE), max(_MULTIPLE, width // _MULTIPLE * _MULTIPLE))
+        maps = [light.resolve() for light in lights]
+        with tempfile.TemporaryDirectory() as name:
+            given, buffers, out = (Path(name) / part for part in ("input", "buffers", "relit"))
+            (given / "picture").mkdir(parents=True)
+            write_image(given / "picture" / "frame000.png", image)
+            self._run(_INVERSE, inverse_arguments(given, buffers, size))
+            self._run(_FORWARD, forward_arguments(buffers, out, maps, size))
+            relit = []
+            for number, light in enumerate(maps):
+                found = sorted(out.rglob(f"*.env{number:04d}.png"))
+                if not found:
+                    raise ValueError(f"{self._checkout}: expected a picture relit by {light}, found none")
+                relit.append(resize(read_rgb(found[0]), width, height).clamp(0, 1))
+            return relit
+
+    def close(self) -> None:
+        """End the process, which the next picture starts again; it also ends with this one."""
+        if self._process is not None:
+            _end(self._process)
+            self._process = None
+
+    def _run(self, program: str, arguments: list[str]) -> None:
+        """Run one program to its end in the process of `renderer_worker.py`."""
         process = self._process if self._process is not None and self._process.poll() is None else self._start()
-        job = {"program": program, "arguments": list(arguments)}
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            process.stdin.write(json.dumps(job).encode() + b"\n")
+            process.stdin.write(json.dumps({"program": program, "arguments": arguments}).encode() + b"\n")
             process.stdin.flush()
             answer: dict[str, Any] = json.loads(process.stdout.readline())
         except (OSError, ValueError):
@@ -169,12 +141,6 @@ class _Worker:
             status = answer["error"].startswith("exit status")
             found = " ".join(((status and last_line(self._log)) or answer["error"]).split())[:200]
             raise ValueError(f"{self._checkout / program}: expected it to succeed, found {found}")
-
-    def close(self) -> None:
-        """End the process."""
-        if self._process is not None:
-            _end(self._process)
-            self._process = None
 
     def _start(self) -> subprocess.Popen[bytes]:
         self.close()

@@ -1,6 +1,6 @@
 """Runs DiffusionRenderer's own programs again and again in one process, with its models loaded once.
 
-Started by `diffusion_renderer.py` with DiffusionRenderer's Python, in the folder of its code: nothing of this package
+Started by `relighters.py` with DiffusionRenderer's Python, in the folder of its code: nothing of this package
 can be imported here. Standard input has one JSON object per line:
 
     {"program": "inference_svd_rgbx.py", "arguments": ["--config", ...]}
