@@ -63,8 +63,8 @@ def test_under_the_true_light_the_prior_removes_most_of_the_error(rendered, tmp_
         pasted, prior = region_errors(view.composite, truth, view), region_errors(view.prior(), truth, view)
         # what is left: normals with errors of 12 degrees, edges of a shadow a few pixels wide, and the light that
         # the ball reflects, which the closed form leaves out
-        assert prior.object < 0.4 * pasted.object
-        assert prior.shadow < 0.6 * pasted.shadow
+        assert prior["object"] < 0.4 * pasted["object"]
+        assert prior["shadow"] < 0.6 * pasted["shadow"]
 
 
 def test_perturbed_lights_stay_within_their_bounds_and_differ():
@@ -148,7 +148,7 @@ def test_it_learns_its_training_pairs(rendered, tmp_path):
             output = network(view.channels())
             _, found, prior = compact_loss(view, output, truth)
         assert apply_output(view, output).min() >= 0
-        before, after = before + float(prior.object), after + float(found.object)
+        before, after = before + float(prior["object"]), after + float(found["object"])
     # cuts and exposures are others than those trained on; a third of the error is far beyond chance
     assert after < 0.65 * before
 
@@ -202,8 +202,8 @@ def test_the_shipped_weights_are_those_of_a_training(shipped):
         with torch.no_grad():
             made = apply_output(view, network(view.resized(160, 240).channels()))
         assert made.isfinite().all()
-        before += float(region_errors(view.prior(), truth, view).object)
-        after += float(region_errors(made, truth, view).object)
+        before += float(region_errors(view.prior(), truth, view)["object"])
+        after += float(region_errors(made, truth, view)["object"])
     assert after < 0.9 * before
 
 

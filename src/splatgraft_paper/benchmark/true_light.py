@@ -7,7 +7,6 @@ patches of that become sources, too, the rest ambient light of degree 2.
 
 import json
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -44,8 +43,6 @@ _CUTS = 2
 
 _FACE = 64
 """Pixels; width of a face of the cube map."""
-
-
 _PEAK_OVER_MEAN, _PEAK_AROUND = 50.0, 5.0
 """Times the mean gray radiance: a pixel above the first makes a peak, and near it pixels above the second belong to it.
 Set by hand: suns and lamps of environment maps are 100 to 1000 times the mean; windows of rooms stay below."""
@@ -80,16 +77,7 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
         )
         for sun in suns
     ]
-    bright = [
-        LightSource(
-            direction=_triple(patch.direction.tolist()),
-            irradiance=_triple((patch.radiance * patch.solid_angle).tolist()),
-            angular_radius_deg=angular_radius_deg(patch.solid_angle),
-            name="bright patch",
-        )
-        for patch in patches
-    ]
-    ordered = sorted([*sources, *peaks, *bright], key=lambda source: -source.luminance)
+    ordered = sorted([*sources, *peaks, *patches], key=lambda source: -source.luminance)
     return Light(sources=tuple(ordered), ambient=ambient)
 
 
@@ -147,19 +135,7 @@ def _sampled(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, "6 s s 
     return values[0].permute(1, 2, 0).reshape(directions.shape).contiguous()
 
 
-@dataclass(frozen=True)
-class _Patch:
-    """A bright, connected part of a panorama."""
-
-    direction: Float[Tensor, "3"]
-    """Unit, towards its middle."""
-    radiance: Float[Tensor, "3"]
-    """Mean linear rgb."""
-    solid_angle: float
-    """Steradians."""
-
-
-def _bright_patches(panorama: Panorama) -> tuple[list[_Patch], Bool[Tensor, "6 s s"]]:
+def _bright_patches(panorama: Panorama) -> tuple[list[LightSource], Bool[Tensor, "6 s s"]]:
     """Connected parts of a panorama as bright as a camera records, brightest first, and the pixels they cover.
 
     Parts that an edge between faces separates are joined. Parts wider than 30 degrees are cut in half along their
@@ -174,13 +150,13 @@ def _bright_patches(panorama: Panorama) -> tuple[list[_Patch], Bool[Tensor, "6 s
         labels[face] = np.where(found > 0, found + count, 0)
         count += n
     covered = torch.zeros_like(bright)
-    patches = []
+    patches: list[tuple[float, LightSource]] = []
     for group in _joined([torch.from_numpy(labels == i) for i in range(1, count + 1)], panorama):
         if _SMALLEST <= float(panorama.solid_angles[group].sum()) <= _LARGEST:
             covered |= group
             patches += _cut(panorama, group)
-    patches.sort(key=lambda p: -float(p.radiance.sum()) * p.solid_angle)
-    return patches[:_MAX_PATCHES], covered
+    patches.sort(key=lambda patch: -patch[0])
+    return [source for _, source in patches[:_MAX_PATCHES]], covered
 
 
 def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Bool[Tensor, "6 s s"]]:
@@ -199,8 +175,8 @@ def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Boo
     return out
 
 
-def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], *, depth: int = 0) -> list[_Patch]:
-    """The group as one patch, or as several where it is long."""
+def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], *, depth: int = 0) -> list[tuple[float, LightSource]]:
+    """The group as one source with its power, or as several where it is long."""
     directions, angles = panorama.directions[group], panorama.solid_angles[group]
     radiance = panorama.radiance[group]
     weight = angles * radiance.mean(-1)
@@ -218,8 +194,14 @@ def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], *, depth: int = 0) ->
             if bool(part.any()):
                 halves += _cut(panorama, part, depth=depth + 1)
         return halves
-    mean = (angles[:, None] * radiance).sum(0) / angles.sum()
-    return [_Patch(direction=center, radiance=mean, solid_angle=float(angles.sum()))]
+    mean, solid_angle = (angles[:, None] * radiance).sum(0) / angles.sum(), float(angles.sum())
+    source = LightSource(
+        direction=_triple(center.tolist()),
+        irradiance=_triple((mean * solid_angle).tolist()),
+        angular_radius_deg=angular_radius_deg(solid_angle),
+        name="bright patch",
+    )
+    return [(float(mean.sum()) * solid_angle, source)]
 
 
 def _triple(values: list[float]) -> tuple[float, float, float]:

@@ -98,10 +98,9 @@ class CompactTask:
 
     def loss(self, network: Callable[..., Any], items: Sequence[tuple[CompactInput, Tensor]]) -> Float[Tensor, ""]:
         """The loss of a batch of views."""
-        view = batch_inputs([item[0] for item in items]).to(self._device)
-        return compact_loss(view, network(view.channels()).float(), torch.cat([t for _, t in items]).to(self._device))[
-            0
-        ]
+        view = batch_inputs([view for view, _ in items]).to(self._device)
+        truth = torch.cat([truth for _, truth in items]).to(self._device)
+        return compact_loss(view, network(view.channels()).float(), truth)[0]
 
     def name(self, position: int) -> str:
         """The position: pairs are held in memory."""
@@ -119,16 +118,14 @@ class CompactTask:
         totals: dict[str, float] = {}
         rows = []
         for number, index in enumerate(chosen):
-            view, truth = augment(
-                *pairs.read(index, number % pairs.variants), self._options.size, f"validation-{number}"
-            )
+            whole = pairs.read(index, number % pairs.variants)
+            view, truth = augment(*whole, self._options.size, f"validation-{number}")
             view, truth = view.to(self._device), truth.to(self._device)
             output = network(view.channels()).float()
             _, errors, prior_errors = compact_loss(view, output, truth)
-            for region in ("object", "shadow", "rest"):
-                for suffix, regions in (("", errors), ("_prior", prior_errors)):
-                    key = f"{region}{suffix}"
-                    totals[key] = totals.get(key, 0.0) + float(getattr(regions, region).mean()) / len(chosen)
+            for region, error in errors.items():
+                for key, value in ((region, error), (f"{region}_prior", prior_errors[region])):
+                    totals[key] = totals.get(key, 0.0) + float(value.mean()) / len(chosen)
             if number < _SHEET_ROWS:
                 pictures = (view.composite, view.prior(), apply_output(view, output), truth)
                 images = [srgb_from_linear(p[0].clamp(0, 1)).permute(1, 2, 0).cpu() for p in pictures]
@@ -174,29 +171,23 @@ class LossWeights:
 WEIGHTS = LossWeights()
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Mean error of each image of a batch, by region."""
-
-    object: Float[Tensor, "b"]
-    shadow: Float[Tensor, "b"]
-    rest: Float[Tensor, "b"]
+Errors = dict[str, Float[Tensor, "b"]]
+"""Mean error of each image of a batch, by region: object, shadow and rest."""
 
 
-def regions(view: CompactInput, truth: Float[Tensor, "b 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights (b 1 h w) of the object, of its shadow and of the rest."""
+def regions(view: CompactInput, truth: Float[Tensor, "b 3 h w"]) -> dict[str, Float[Tensor, "b 1 h w"]]:
+    """Weights of the object, of its shadow and of the rest."""
     offset = WEIGHTS.ratio_offset
     ratio = (truth.mean(1, keepdim=True) + offset) / (view.background.mean(1, keepdim=True) + offset)
     outside = (view.mask < WEIGHTS.max_outside_coverage).to(truth)
     shadow = outside * (ratio < WEIGHTS.shadow_ratio)
-    return view.mask, shadow, outside - shadow
+    return {"object": view.mask, "shadow": shadow, "rest": outside - shadow}
 
 
 def region_errors(image: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w"], view: CompactInput) -> Errors:
     """Average the sRGB and log errors of `image` over each region; images are linear light."""
     error = _absolute_error(image, truth)
-    object_, shadow, rest = regions(view, truth)
-    return Errors(_mean(error, object_), _mean(error, shadow), _mean(error, rest))
+    return {name: _mean(error, weight) for name, weight in regions(view, truth).items()}
 
 
 def compact_loss(
@@ -205,9 +196,9 @@ def compact_loss(
     """The loss against the truth in linear light, the errors of the harmonised view, and those of the prior."""
     image = apply_output(view, output)
     errors, prior_errors = region_errors(image, truth, view), region_errors(view.prior(), truth, view)
-    loss = WEIGHTS.object_and_shadow * (errors.object + errors.shadow) + WEIGHTS.rest * errors.rest
-    for name in ("object", "shadow", "rest"):
-        loss = loss + (getattr(errors, name) - getattr(prior_errors, name)).clamp_min(0)
+    loss = WEIGHTS.object_and_shadow * (errors["object"] + errors["shadow"]) + WEIGHTS.rest * errors["rest"]
+    for name, error in errors.items():
+        loss = loss + (error - prior_errors[name]).clamp_min(0)
     loss = loss + _squared_errors(image, truth, view) + WEIGHTS.gradients * _gradient_errors(image, truth, view)
     likelihood = _error_likelihood(image.detach(), truth, output)
     return loss.mean() + WEIGHTS.uncertainty * likelihood, errors, prior_errors
@@ -232,12 +223,11 @@ def _squared_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[T
     Their minimum is the mean of the possible results. That of absolute errors is the median, which is no shadow where a
     shadow is less likely than not.
     """
-    object_, shadow, _ = regions(view, truth)
-    clipped = _clipped(image, truth)
+    parts, clipped = regions(view, truth), _clipped(image, truth)
     srgb = (srgb_from_linear(clipped) - srgb_from_linear(truth.clamp(1e-6, 1))) ** 2
     ratio = ((clipped - truth) / (view.background + 2 * WEIGHTS.ratio_offset)).clamp(-2, 2) ** 2
-    on_object = WEIGHTS.squared_object * _mean(srgb.mean(1, keepdim=True), object_)
-    return on_object + WEIGHTS.squared_shadow * _mean(ratio.mean(1, keepdim=True), shadow)
+    on_object = WEIGHTS.squared_object * _mean(srgb.mean(1, keepdim=True), parts["object"])
+    return on_object + WEIGHTS.squared_shadow * _mean(ratio.mean(1, keepdim=True), parts["shadow"])
 
 
 def _mean(values: Tensor, weight: Tensor) -> Float[Tensor, "b"]:
@@ -251,8 +241,8 @@ def _gradient_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[
     """Differences of the log ratio between neighbouring pixels, on the object and in its shadow."""
     offset = WEIGHTS.ratio_offset
     ratio = ((_clipped(image, truth) + offset) / (truth + offset)).log().clamp(-2, 2)
-    object_, shadow, _ = regions(view, truth)
-    weight = (object_ + shadow).clamp_max(1)
+    parts = regions(view, truth)
+    weight = (parts["object"] + parts["shadow"]).clamp_max(1)
     across = _mean((ratio[..., 1:] - ratio[..., :-1]).abs().mean(1, keepdim=True), weight[..., 1:])
     down = _mean((ratio[..., 1:, :] - ratio[..., :-1, :]).abs().mean(1, keepdim=True), weight[..., 1:, :])
     return across + down
@@ -260,9 +250,7 @@ def _gradient_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[
 
 def _error_likelihood(image: Tensor, truth: Tensor, output: CompactOutput) -> Tensor:
     """Negative log likelihood of the error under a Laplace distribution; trains only the expected error."""
-    error = (
-        (srgb_from_linear(image.clamp(1e-6, 1)) - srgb_from_linear(truth.clamp(1e-6, 1))).abs().mean(1, keepdim=True)
-    )
-    size = output.log_error.shape[-2:]
-    error = torch.nn.functional.interpolate(error, size=size, mode="area")
+    image, truth = (srgb_from_linear(x.clamp(1e-6, 1)) for x in (image, truth))
+    error = (image - truth).abs().mean(1, keepdim=True)
+    error = torch.nn.functional.interpolate(error, size=output.log_error.shape[-2:], mode="area")
     return (error * (-output.log_error).exp() + output.log_error).mean()

@@ -3,8 +3,9 @@
 import json
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -36,14 +37,18 @@ class HeldOutOptions:
 
 
 @dataclass(frozen=True)
-class PairEntry:
-    """One pair: keys of its arrays."""
+class CompactPair:
+    """One pair, decoded; pairs share the arrays of one picture."""
 
     folder: str
-    object: str
     light: str
-    camera: int
     held_out: bool
+    arrays: Mapping[str, np.ndarray]
+    """target, background, relit (RGBA), mask: 8-bit sRGB; depth: float16; normal: int8, in the camera's frame."""
+    log_ratios: Sequence[Float[np.ndarray, "h w 3"]]
+    """Log ratio of the prior, one per variant of the perturbed lights, float16."""
+    confidences: Sequence[float]
+    """Confidence in each of these priors."""
 
 
 class CompactPairs:
@@ -52,16 +57,9 @@ class CompactPairs:
     def __init__(
         self, pairs: Path, priors: Sequence[Path], held_out: HeldOutOptions, progress: Progress = silent
     ) -> None:
-        """Read all pairs; about 0.6 MB each at 240x160.
-
-        Args:
-            pairs: folder that `splatgraft paper synth pairs` rendered.
-            priors: folders of `write_priors`, one per variant of the perturbed lights.
-        """
-        self._arrays: dict[tuple[str, str, int], np.ndarray] = {}
-        self._prior_confidence: dict[tuple[str, str], float] = {}
+        """Read all rendered pairs, about 0.6 MB each at 240x160, with a folder of `write_priors` per variant."""
         self.variants = len(priors)
-        self.entries: list[PairEntry] = []
+        self.entries: list[CompactPair] = []
         samples = read_manifest(pairs)
         folders = sorted({sample.folder for sample in samples})
         for number, folder in enumerate(folders):
@@ -69,9 +67,7 @@ class CompactPairs:
             paths = [found / f"{folder.name}.npz" for found in priors]
             if all(path.is_file() for path in paths):
                 own = [sample for sample in samples if sample.folder == folder]
-                for variant, path in enumerate(paths):
-                    self._read_priors(path, own, variant)
-                self._read_folder(folder, own, None if scene_held_out else held_out)
+                self.entries += _read_folder(folder, own, paths, None if scene_held_out else held_out)
             progress(number + 1, len(folders), folder.name)
         if not self.entries:
             raise ValueError(f"{', '.join(map(str, priors))}: expected priors of the pairs in {pairs}, found none")
@@ -83,76 +79,76 @@ class CompactPairs:
         return {"training": len(self.training), "validation": len(self.validation), "variants": self.variants}
 
     def read(self, index: int, variant: int = 0) -> tuple[CompactInput, Float[Tensor, "1 3 h w"]]:
-        """Read a pair at full size with one of its priors.
+        """A pair at full size with one of its priors, and the ground truth in linear light.
 
         The composite's object keeps the exposure of its own light; it is not normalised as in the paper.
-
-        Returns:
-            The network's input and the ground truth in linear light.
         """
         entry = self.entries[index]
-
-        def array(take: str) -> Tensor:
-            return torch.from_numpy(self._arrays[entry.folder, take, entry.camera])
-
-        target = _LINEAR[array(entry.object).int()]
-        background = _LINEAR[array("background").int()]
-        mask = array(f"{entry.object} mask").float() / 255
-        relit = array(f"{entry.object}_{entry.light}").float() / 255
+        arrays = {name: torch.from_numpy(array) for name, array in entry.arrays.items()}
+        background, relit = arrays["background"], arrays["relit"].float() / 255
+        mask = arrays["mask"].float() / 255
         covered = torch.minimum(mask, relit[..., 3])[..., None]
-        composite = linear_from_srgb(covered * relit[..., :3] + (1 - covered) * array("background").float() / 255)
-        depth = array(f"{entry.object} depth").float()
+        composite = linear_from_srgb(covered * relit[..., :3] + (1 - covered) * background.float() / 255)
         view = CompactInput(
             composite=_channels_first(composite),
-            background=_channels_first(background),
+            background=_channels_first(_LINEAR[background.int()]),
             mask=covered[..., 0][None, None],
-            log_ratio=_channels_first(array(f"{entry.object}_{entry.light} {variant}").float()),
-            depth=relative_depth(depth, mask)[None, None],
-            normal=_channels_first(array(f"{entry.object} normal").float() / 127),
-            prior_confidence=torch.tensor(
-                [self._prior_confidence[entry.folder, f"{entry.object}_{entry.light} {variant}"]]
-            ),
+            log_ratio=_channels_first(torch.from_numpy(entry.log_ratios[variant]).float()),
+            depth=relative_depth(arrays["depth"].float(), mask)[None, None],
+            normal=_channels_first(arrays["normal"].float() / 127),
+            prior_confidence=torch.tensor([entry.confidences[variant]]),
         )
-        return view, _channels_first(target)
+        return view, _channels_first(_LINEAR[arrays["target"].int()])
 
-    def _read_priors(self, path: Path, samples: Sequence[PairSample], variant: int) -> None:
-        with np.load(path, allow_pickle=False) as arrays:
-            found = {name: arrays[name] for name in arrays.files}
-        for sample in samples:
-            take = f"{sample.object}_{sample.light}"
+
+def _read_folder(
+    folder: Path, samples: Sequence[PairSample], priors: Sequence[Path], held_out: HeldOutOptions | None
+) -> list[CompactPair]:
+    """Read the pairs of a scene; `held_out` is None where the whole scene is held out."""
+    job = json.loads((folder / "job.json").read_text())
+    cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(len(job["cameras"]))))
+    worlds = {take["name"]: take["world"].get("path", "") for take in job["takes"] if take.get("world")}
+    picture = cache(_read_image)
+    variants = [_read_priors(path) for path in priors]
+    pairs = []
+
+    @cache
+    def geometry(path_of_depth: Path, path_of_normal: Path, camera: int) -> tuple[np.ndarray, np.ndarray]:
+        depth = np.load(path_of_depth, allow_pickle=False)
+        normal = picture(path_of_normal).astype(np.float32) / 127.5 - 1
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        unit = np.where((depth > 0)[..., None], normal / np.maximum(length, 1e-3), 0)
+        in_camera = unit @ cameras.camera_from_world[camera, :3, :3].numpy().T
+        return depth, np.round(127 * in_camera).astype(np.int8)
+
+    for sample in samples:
+        take = f"{sample.object}_{sample.light}"
+        for path, found in zip(priors, variants, strict=True):
             if take not in found:
                 raise ValueError(f"{path}: expected a prior of {take}, found none; remove the file to remake it")
-            key = f"{take} {variant}"
-            self._arrays[sample.folder.name, key, sample.camera] = found[take][sample.camera]
-            self._prior_confidence[sample.folder.name, key] = float(found[f"{take}_trust"])
+        patterns = {part["material"]["pattern"] for part in job["objects"][sample.object]}
+        is_held_out = held_out is None or bool(patterns & set(held_out.materials)) or worlds[take] in held_out.lights
+        mask = picture(sample.path(sample.object, "mask"))
+        depth, normal = geometry(
+            sample.path(sample.object, "depth"), sample.path(sample.object, "normal"), sample.camera
+        )
+        arrays = {
+            "target": picture(sample.path(sample.object)),
+            "background": picture(sample.path("background")),
+            "relit": picture(sample.path(take)),
+            "mask": mask if mask.ndim == 2 else mask[..., 0],
+            "depth": depth,
+            "normal": normal,
+        }
+        ratios = [found[take][sample.camera] for found in variants]
+        confidences = [float(found[f"{take}_trust"]) for found in variants]
+        pairs.append(CompactPair(folder.name, sample.light, is_held_out, arrays, ratios, confidences))
+    return pairs
 
-    def _read_folder(self, folder: Path, samples: Sequence[PairSample], held_out: HeldOutOptions | None) -> None:
-        """Read the images of a scene; `held_out` is None where the whole scene is held out."""
-        job = json.loads((folder / "job.json").read_text())
-        count = len(job["cameras"])
-        cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(count)))
-        worlds = {take["name"]: take["world"].get("path", "") for take in job["takes"] if take.get("world")}
-        for sample in samples:
-            patterns = {part["material"]["pattern"] for part in job["objects"][sample.object]}
-            light = worlds[f"{sample.object}_{sample.light}"]
-            pair_held_out = held_out is None or bool(patterns & set(held_out.materials)) or light in held_out.lights
-            self.entries.append(PairEntry(folder.name, sample.object, sample.light, sample.camera, pair_held_out))
-            self._read_images(sample, cameras.camera_from_world[sample.camera, :3, :3].numpy())
 
-    def _read_images(self, sample: PairSample, camera_from_world: np.ndarray) -> None:
-        name, i = sample.folder.name, sample.camera
-        for take in (sample.object, "background", f"{sample.object}_{sample.light}"):
-            self._arrays.setdefault((name, take, i), _read_image(sample.path(take)))
-        if (name, f"{sample.object} mask", i) in self._arrays:
-            return
-        mask = _read_image(sample.path(sample.object, "mask"))
-        self._arrays[name, f"{sample.object} mask", i] = mask if mask.ndim == 2 else mask[..., 0]
-        depth = np.load(sample.path(sample.object, "depth"), allow_pickle=False)
-        self._arrays[name, f"{sample.object} depth", i] = depth
-        normal = _read_image(sample.path(sample.object, "normal")).astype(np.float32) / 127.5 - 1
-        length = np.linalg.norm(normal, axis=-1, keepdims=True)
-        in_camera = np.where((depth > 0)[..., None], normal / np.maximum(length, 1e-3), 0) @ camera_from_world.T
-        self._arrays[name, f"{sample.object} normal", i] = np.round(127 * in_camera).astype(np.int8)
+def _read_priors(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
 
 
 def _channels_first(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 3 h w"]:
