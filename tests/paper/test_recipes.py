@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from splatgraft.cli import main
+from splatgraft_paper.training.loop import LoopOptions
 from splatgraft_paper.training.recipes import Recipe, TrainingCost
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
@@ -42,9 +43,9 @@ def test_an_ablation_is_the_paper_s_training_without_one_source(name, left_out):
 
 
 def test_the_estimate_of_hours_gives_the_paper_its_two_days():
-    cost = TrainingCost(50_000, 4, "704x496", 11_800_000_000, 11_800_000_000, 4)
-    assert cost.hours == pytest.approx(48)
-    assert replace(cost, size="352x248").hours == pytest.approx(12)
+    cost = TrainingCost(LoopOptions(steps=50_000, batch=4), "704x496", 11_800_000_000, 11_800_000_000)
+    assert cost.hours(4) == pytest.approx(48)
+    assert replace(cost, size="352x248").hours(4) == pytest.approx(12)
 
 
 def test_a_plan_says_what_will_run_and_loads_nothing(tmp_path, capsys):

@@ -54,7 +54,7 @@ def test_the_tiny_base_is_flux_of_three_million_weights(tmp_path):
     objective = FluxObjective(tmp_path / "base", FluxTrainingOptions(), lambda words: None)
     count = sum(p.numel() for p in objective.network.parameters())
     assert 2.5e6 < count < 4.5e6
-    latents = objective.encode(torch.stack(pictures))
+    latents = objective.autoencoder.encode(torch.stack(pictures))
     assert latents.shape == (6, 16, 12, 16)
     # the shift and scale are those of these very pictures
     assert abs(float(latents.mean())) < 0.01

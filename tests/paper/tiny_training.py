@@ -51,7 +51,9 @@ class Run:
 
 def run_of(objective, folders, loop, folder, *, held_out=0.5, progress=silent, say=silent):
     mixture, kept = split_mixture(folders, weights=(), held_out=held_out, seed=loop.seed)
-    cache = LatentCache(folder.parent / "latents", objective.encode, width=32, height=32, autoencoder="tiny")
+    cache = LatentCache(
+        folder.parent / "latents", objective.autoencoder.encode, width=32, height=32, autoencoder="tiny"
+    )
     task = ObjectiveTask(objective, TrainingData(mixture, kept, 32, 32), cache, loop)
     return Run(task, cache, loop, folder, progress, say)
 

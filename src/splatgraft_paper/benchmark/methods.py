@@ -9,14 +9,15 @@ from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
 from splatgraft.consolidation import ConsolidateOptions, consolidate
-from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import lpips_and_l1, lpips_vgg, windowed_fourier
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.harmonization import (
+    Harmonized,
     HarmonizerContext,
+    HarmonizerInputs,
     NoisyStartHarmonizer,
     make_harmonizer,
     render_views,
@@ -26,7 +27,6 @@ from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting import SourceScene, relight
 from splatgraft.relighting.light.light import light_to_json
 from splatgraft.runtime.console import Console
-from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft_paper.benchmark.scene import ComposedScene, perform_if_stale
 from splatgraft_paper.benchmark.transplat import relight_by_irradiance_ratio
 from splatgraft_paper.benchmark.true_light import read_true_light
@@ -169,9 +169,8 @@ class UpdateIteratively:
         """Make the updated scene."""
         device = choose_device(self.device, context.console)
         composite, prior = (read_gaussians(path).to(device) for path in (self.composite / SCENE_FILE, self.prior))
-        is_object = read_selection(self.composite / "is_object.npy", composite.count, self.composite / SCENE_FILE).to(
-            device
-        )
+        flags = read_selection(self.composite / "is_object.npy", composite.count, self.composite / SCENE_FILE)
+        is_object = flags.to(device)
         cameras = read_cameras(self.cameras).to(device)
         options = method_options(self.harmonizer, weights=self.model)
         strengths = STRENGTHS[self.schedule]
@@ -180,17 +179,15 @@ class UpdateIteratively:
         if not isinstance(harmonizer, NoisyStartHarmonizer):
             say(f"{self.harmonizer}: no noise; each of {len(strengths)} updates begins at renders of the scene so far")
 
-        def harmonize_at(scene: Gaussians, strength: float) -> LazySequence:
-            views = render_views(composite, is_object, cameras, prior=scene)
+        def harmonized(view: HarmonizerInputs, strength: float) -> Harmonized:
             if isinstance(harmonizer, NoisyStartHarmonizer):
-                images = [harmonizer.harmonize_from(view, strength).image.to(device) for view in views]
-            else:
-                images = [harmonizer.harmonize(view).image.to(device) for view in views]
-            return LazySequence(len(images), lambda index: images[index])
+                return harmonizer.harmonize_from(view, strength)
+            return harmonizer.harmonize(view)
 
         scene = prior
         for strength in strengths:
-            images = harmonize_at(scene, strength)
+            views = render_views(composite, is_object, cameras, prior=scene)
+            images = [harmonized(view, strength).image.to(device) for view in views]
             scene = consolidate(prior, cameras, images, self._consolidation(), progress=context.progress)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
 
@@ -279,13 +276,6 @@ def _relit_scene(prior: Prior, scene: ComposedScene, console: Console) -> tuple[
         )
         return out / SCENE_FILE, perform_if_stale(step, console)
     kind = "gain" if prior == "gain" else "transfer"
-    step = Relight(
-        scene.target,
-        placement,
-        scene.cameras,
-        out,
-        light=kind,
-        surroundings=scene.surroundings,
-        object_cameras=scene.source_cameras,
-    )
+    source = {"surroundings": scene.surroundings, "object_cameras": scene.source_cameras}
+    step = Relight(scene.target, placement, scene.cameras, out, light=kind, **source)
     return out / SCENE_FILE, perform_if_stale(step, console)

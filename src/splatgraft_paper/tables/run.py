@@ -1,12 +1,11 @@
 """One run on the authors' data set: their pictures are measured, our methods run, and what is missing is explained."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from splatgraft.core.flip import VERSION as FLIP_VERSION
 from splatgraft.core.images import read_rgb
@@ -78,34 +77,19 @@ class PaperResults:
         return [item for item in chosen if pose in ("", item.scene.pose)]
 
 
-def read_measured(scene: PaperScene, method: str, folder: Path, seconds: Mapping[str, float] | None = None) -> Measured:
-    """Read what `MeasurePictures` wrote."""
-    record = json.loads((folder / METRICS_FILE).read_text())
-    return Measured(scene, method, record["values"], record["protocol"], seconds or {})
-
-
 def pooled_distances(
     steps: Mapping[tuple[Kind, str, str], list[MeasurePictures]], features: Features
 ) -> dict[tuple[Kind, str, str], dict[str, float]]:
     """FID and KID of a method's pictures of all its scenes against the truth's."""
     out: dict[tuple[Kind, str, str], dict[str, float]] = {}
     for key, group in steps.items():
-        found, wanted = (_features(group, role, features) for role in ("pictures", "truth"))
-        if len(found) >= 2:
+        chosen = [views for step in group if "truth" in (views := step.views()).files]
+        paths = {role: [views.files[role][stem] for views in chosen for stem in views.matched]
+                 for role in ("pictures", "truth")}  # fmt: skip
+        if len(paths["truth"]) >= 2:
+            found, wanted = (np.concatenate([features([read_rgb(path)]) for path in one]) for one in paths.values())
             out[key] = {"fid": frechet_distance(found, wanted), "kid": kernel_distance(found, wanted)}
     return out
-
-
-def _features(group: list[MeasurePictures], role: str, features: Features) -> Float[np.ndarray, "n d"]:
-    rows = [features([read_rgb(path)])[0] for path in _paths(group, role)]
-    return np.stack(rows) if rows else np.zeros((0, 1))
-
-
-def _paths(group: list[MeasurePictures], role: str) -> Iterator[Path]:
-    for step in group:
-        chosen = step.views()
-        if "truth" in chosen.files:
-            yield from (chosen.files[role][stem] for stem in chosen.matched)
 
 
 COMPOSITE = "Composite"
@@ -164,25 +148,20 @@ def _run_ours(run: PaperRun, scene: PaperScene, method: Method, found: _Found) -
     """Run a method on a scene and measure it; a method that cannot run leaves its reason."""
     try:
         folder, seconds = our_pictures(scene, method, run.ours, found.console)
-        _measure(run, scene, method.name, folder, found)
-        last = found.measured[-1]
-        found.measured[-1] = Measured(last.scene, last.method, last.values, last.protocol, seconds)
+        _measure(run, scene, method.name, folder, found, seconds)
     except (ValueError, ModuleNotFoundError) as error:
         found.missing[scene.name, method.name] = " ".join(str(error).split())
 
 
-def _measure(run: PaperRun, scene: PaperScene, method: str, folder: Path, found: _Found) -> None:
+def _measure(
+    run: PaperRun, scene: PaperScene, method: str, folder: Path, found: _Found, seconds: Mapping[str, float] = {}
+) -> None:
     out = run.ours.out / "measured" / scene.name / method.replace("/", "-")
-    step = MeasurePictures(
-        folder,
-        out,
-        **scene.folders,
-        weights=run.ours.methods.weights,
-        lpips=found.lpips,
-        all_views=run.all_views,
-    )
+    weights = run.ours.methods.weights
+    step = MeasurePictures(folder, out, **scene.folders, weights=weights, lpips=found.lpips, all_views=run.all_views)
     perform_if_stale(step, found.console)
-    found.measured.append(read_measured(scene, method, out))
+    record = json.loads((out / METRICS_FILE).read_text())
+    found.measured.append(Measured(scene, method, record["values"], record["protocol"], seconds))
     if "truth" in scene.folders:
         for pose in {"", scene.pose}:
             found.pools.setdefault((scene.kind, pose, method), []).append(step)

@@ -1,7 +1,6 @@
 """Training of FLUX as a harmoniser: rectified flow matching on the velocity (paper, Sec. 5, Eq. 1)."""
 
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,22 +14,21 @@ from splatgraft.harmonization.flux.loading import (
     DESCRIPTION_FILE,
     FluxFolder,
     diffusers_library,
-    load_autoencoder,
     load_transformer,
     local_folder,
     widen_transformer,
 )
 from splatgraft.harmonization.flux.network import FirstLayer, Variant, velocity
-from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, read_prompt
+from splatgraft.harmonization.flux.prompt import find_prompt, read_prompt
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
 from splatgraft.harmonization.flux.tensor_file import write_tensors
 from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
 from splatgraft_paper.training.loop import LoopOptions, join_processes
-from splatgraft_paper.training.objective import Latents, Network, save_weights, train_objective
+from splatgraft_paper.training.objective import Latents, Network, Objective, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, TrainingData, crop_pair_to_size, open_training_data
-from splatgraft_paper.training.recipes import Recipe, TrainingCost, plan
+from splatgraft_paper.training.recipes import Recipe, TrainingCost, say_plan
 from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
 Times = Literal["uniform", "schnell"]
@@ -69,7 +67,7 @@ class FluxTrainingOptions:
     """Only print what would run: steps, hours, memory per device, disk, licences."""
 
 
-class FluxObjective:
+class FluxObjective(Objective):
     """A FLUX transformer conditioned on the composite and a second image."""
 
     output_role: Role = "target"
@@ -77,16 +75,14 @@ class FluxObjective:
     def __init__(self, folder: Path, options: FluxTrainingOptions, say: Callable[[str], None]) -> None:
         """Load the base model (transformer/, vae/, empty_prompt.safetensors) and widen its first layer where needed."""
         checked = FluxFolder.open(folder)
-        self._folder, self._options = folder, options
-        config = checked.config
+        super().__init__(folder)
+        self._options, config = options, checked.config
         self._prompt_path = find_prompt(options.base, folder)
         self.prompt = read_prompt(
             self._prompt_path,
             tokens_width=config.get("joint_attention_dim", 4096),
             pooled_width=config.get("pooled_projection_dim", 768),
         )
-        self.autoencoder = load_autoencoder(folder / "vae")
-        self.autoencoder.network.eval().requires_grad_(False)
         dtype = torch.bfloat16 if options.loop.precision == "bf16" and options.lora else torch.float32
         self.network = load_transformer(checked, dtype=dtype)
         if checked.is_harmonizer:
@@ -103,13 +99,9 @@ class FluxObjective:
         condition: Role = "mask" if options.condition == "image-mask" else "background"
         self.roles: tuple[Role, ...] = ("target", "composite", condition)
 
-    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
-        """Encode sRGB images in [0, 1] to latents."""
-        return self.autoencoder.encode(images)
-
     def to(self, device: Any) -> None:
         """Move autoencoder and prompt to a device."""
-        self.autoencoder.network.to(device)
+        super().to(device)
         self.prompt = self.prompt.to(torch.device(device), torch.float32)
 
     def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
@@ -139,19 +131,15 @@ class FluxObjective:
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
         """Write a folder for `harmonize --method flux --weights`, or lora.safetensors for its --lora."""
         folder.mkdir(parents=True, exist_ok=True)
-        description = {
-            "variant": self._options.condition,
-            "base": str(self._folder),
-            "first_layer": self._options.first_layer,
-        }
+        options, base = self._options, str(self.folder)
+        description = {"variant": options.condition, "base": base, "first_layer": options.first_layer}
         with atomic_write(folder / DESCRIPTION_FILE) as stream:
             stream.write((json.dumps(description, indent=1) + "\n").encode())
-        if self._options.lora:
-            write_lora(folder / "lora.safetensors", state, {"rank": str(self._options.lora), "base": str(self._folder)})
+        if options.lora:
+            write_lora(folder / "lora.safetensors", state, {"rank": str(options.lora), "base": base})
             return
-        save_weights(diffusers_library().FluxTransformer2DModel, self.network.config, state, folder / "transformer")
-        self.autoencoder.network.save_pretrained(folder / "vae")
-        shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
+        kind = diffusers_library().FluxTransformer2DModel
+        self.save_model(kind, state, folder / "transformer", self._prompt_path)
 
     def _conditions(self, latents: Latents) -> Float[Tensor, "b k h w"]:
         return torch.cat([latents[role] for role in self.roles[1:]], 1)
@@ -193,11 +181,7 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
     recipe = Recipe.read(options.recipe) if options.recipe else None
     processes = join_processes(options.loop)
     if options.plan or recipe:
-        count = processes.num_processes
-        count = recipe.processes if recipe and count == 1 else count  # a plan without a launcher is the recipe's
-        for line in _plan(recipe, options, _known_config(options.base), count):
-            if processes.is_main_process:
-                console.say(line)
+        say_plan(recipe, _cost(options, _known_config(options.base)), processes, console)
         if options.plan:
             return None
     data = open_training_data(options.data, options.loop.seed, recipe)
@@ -231,19 +215,10 @@ def _known_config(base: str) -> dict[str, Any]:
     return FluxFolder.open(Path(base)).config if Path(base).is_dir() else {}
 
 
-def _plan(recipe: Recipe | None, options: FluxTrainingOptions, config: dict[str, Any], processes: int) -> list[str]:
-    loop = options.loop
+def _cost(options: FluxTrainingOptions, config: dict[str, Any]) -> TrainingCost:
     width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
     doubles, singles = config.get("num_layers", 19), config.get("num_single_layers", 38)
     # with the modulations that inference bakes: 6 a stream of a double block, 3 a single one
     parameters = width**2 * (36 * doubles + 15 * singles)
-    cost = TrainingCost(
-        steps=loop.steps,
-        batch=loop.batch,
-        size=options.data.size,
-        parameters=parameters,
-        trained=options.lora * width * (36 * doubles + 20 * singles) if options.lora else parameters,
-        processes=processes,
-        ema=loop.ema > 0,
-    )
-    return plan(recipe, cost, loop.rate)
+    trained = options.lora * width * (36 * doubles + 20 * singles) if options.lora else parameters
+    return TrainingCost(options.loop, options.data.size, parameters, trained)

@@ -25,7 +25,7 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, Protocol, TextIO, runtime_checkable
+from typing import Any, Literal, Protocol, TextIO
 
 import torch
 from jaxtyping import Float
@@ -121,19 +121,13 @@ class Validation:
     """Pictures, a row for each pair, sRGB in [0, 1]."""
 
 
-@runtime_checkable
 class Task(Protocol):
-    """What is trained: a network, its items and its loss."""
+    """What is trained: a network, its items and its loss. Reading and validating raise ValueError for broken files."""
 
-    @property
-    def network(self) -> nn.Module:
-        """Frozen parameters have requires_grad off."""
-        ...
-
-    @property
-    def fingerprint(self) -> Mapping[str, Any]:
-        """Data and settings besides `LoopOptions` that must be equal for a state to be resumed; JSON values."""
-        ...
+    network: nn.Module
+    """Frozen parameters have requires_grad off."""
+    fingerprint: Mapping[str, Any]
+    """Data and settings besides `LoopOptions` that must be equal for a state to be resumed; JSON values."""
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Make the optimiser of the trained parameters."""
@@ -249,13 +243,11 @@ class _Loop:
         self.is_first: bool = self._processes.is_main_process
         self.step = 0
         self._network = task.network.train().to(self._processes.device)
-        self._trained = {name: p for name, p in self._network.named_parameters() if p.requires_grad}
-        if options.parallel == "shards" and self._processes.num_processes > 1:
+        is_split = options.parallel == "shards" and self._processes.num_processes > 1
+        if is_split:
             _shard(self._network, self._processes.device)
-            self._trained = {name: p for name, p in self._network.named_parameters() if p.requires_grad}
-            module: Any = self._network
-        else:
-            module = self._processes.prepare_model(self._network)
+        self._trained = {name: p for name, p in self._network.named_parameters() if p.requires_grad}
+        module: Any = self._network if is_split else self._processes.prepare_model(self._network)
         self._call = _Called(module, self._device, options.precision == "bf16")
         self._optimizer = task.optimizer()
         self._average = {name: p.detach().float().clone() for name, p in self._trained.items()} if options.ema else {}
@@ -432,9 +424,8 @@ class _Loop:
         if self.step == 0:
             return
         if not self._is_finite():
-            raise ValueError(
-                f"training: expected finite weights after step {self.step}, found others; {self._kept_state()}"
-            )
+            problem = f"expected finite weights after step {self.step}, found others"
+            raise ValueError(f"training: {problem}; {self._kept_state()}")
         path = self._folder / STATES / f"{self.step:08d}"
         partial = path.with_name(f".{path.name}.partial")
         if self.is_first:

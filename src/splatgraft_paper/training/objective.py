@@ -2,17 +2,21 @@
 
 import hashlib
 import os
+import shutil
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from splatgraft.core.image_metrics import psnr, ssim
+from splatgraft.harmonization.flux.loading import load_autoencoder
+from splatgraft.harmonization.flux.prompt import PROMPT_FILE
 from splatgraft.harmonization.flux.tensor_file import read_tensors, write_tensors
 from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
@@ -27,9 +31,8 @@ Network = Callable[..., Any]
 """The objective's network, as it is called: spread over processes, in 16 bits."""
 
 
-@runtime_checkable
-class Objective(Protocol):
-    """A network and the task that it is trained for."""
+class Objective(ABC):
+    """A network between latents of an autoencoder, and the task that it is trained for."""
 
     network: Any
     """A torch module; frozen parameters have requires_grad off."""
@@ -38,30 +41,43 @@ class Objective(Protocol):
     output_role: Role
     """The image that the network learns to generate."""
 
-    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
-        """Encode sRGB images in [0, 1] to latents."""
-        ...
+    def __init__(self, folder: Path) -> None:
+        """Load the frozen autoencoder of a model's folder."""
+        self.folder = folder
+        self.autoencoder = load_autoencoder(folder / "vae")
+        self.autoencoder.network.eval().requires_grad_(False)
 
+    @abstractmethod
     def to(self, device: Any) -> None:
         """Move the frozen parts to a device."""
-        ...
+        self.autoencoder.network.to(device)
 
+    @abstractmethod
     def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
-        """Compute the loss of a batch.
+        """The loss of a batch, with one seed of the noise per pair; `network` calls `self.network`."""
 
-        Args:
-            network: `self.network`, or what calls it.
-            seeds: of the noise, one per pair.
-        """
-        ...
-
+    @abstractmethod
     def predict(self, network: Network, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
         """Generate the images of a batch, sRGB in [0, 1]."""
-        ...
 
+    @abstractmethod
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
         """Write exactly the weights `state` in the format that inference loads."""
-        ...
+
+    def save_model(self, kind: Any, state: Mapping[str, Tensor], folder: Path, prompt: Path) -> None:
+        """Write the network, the autoencoder and the prompt's embeddings.
+
+        `save_pretrained` writes what a model holds and takes no other weights. So an empty model of the same config
+        receives them first: the network in training may be split over processes, and holds the last weights, not their
+        average.
+        """
+        with torch.device("meta"):
+            empty = kind.from_config(self.network.config)
+        empty.load_state_dict(state, strict=True, assign=True)
+        with atomic_folder(folder) as new:
+            empty.save_pretrained(new)
+        self.autoencoder.network.save_pretrained(folder.parent / "vae")
+        shutil.copyfile(prompt, folder.parent / PROMPT_FILE)
 
 
 @dataclass(frozen=True)
@@ -84,12 +100,7 @@ class LatentCache:
     def __init__(
         self, folder: Path, encode: Callable[[Tensor], Tensor], *, width: int, height: int, autoencoder: str
     ) -> None:
-        """Use the cache in `folder`.
-
-        Args:
-            encode: the autoencoder: images (b 3 h w), sRGB in [0, 1], to latents.
-            autoencoder: identifies its weights; part of the cache key.
-        """
+        """Use the cache in `folder`; `encode` is the autoencoder's, whose weights its name identifies."""
         self._folder, self._encode = folder, encode
         self._size, self._key_prefix = (width, height), f"{autoencoder}|{width}x{height}"
 
@@ -211,7 +222,9 @@ def train_objective(
         say(line)
     vae = base / "vae" / "diffusion_pytorch_model.safetensors"
     name = f"{vae.resolve()}|{vae.stat().st_size if vae.is_file() else 0}"
-    cache = LatentCache(out / "latents", objective.encode, width=data.width, height=data.height, autoencoder=name)
+    cache = LatentCache(
+        out / "latents", objective.autoencoder.encode, width=data.width, height=data.height, autoencoder=name
+    )
     task = ObjectiveTask(objective, data, cache, options)
     # the first of several processes locks the folder; the others write only latents, each file atomically
     with console.bar("train") as progress, locked(out) if first else nullcontext():
@@ -220,19 +233,6 @@ def train_objective(
             objective.save(state, out / MODEL_FOLDER)
     processes.wait_for_everyone()
     return out / MODEL_FOLDER if first else None
-
-
-def save_weights(model: Any, config: Mapping[str, Any], state: Mapping[str, Tensor], folder: Path) -> None:
-    """Write exactly these weights by the library's own `save_pretrained`.
-
-    It writes what a model holds and takes no other weights. So an empty model of the same config receives them first:
-    the network in training may be split over processes, and it holds the last weights, not their average.
-    """
-    with torch.device("meta"):
-        empty = model.from_config(config)
-    empty.load_state_dict(state, strict=True, assign=True)
-    with atomic_folder(folder) as new:
-        empty.save_pretrained(new)
 
 
 def _write_latents(path: Path, latents: Float[Tensor, "c h w"]) -> None:

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splatgraft.runtime.console import Console
 from splatgraft_paper.synthesis.jobs import parse_image_size
+from splatgraft_paper.training.loop import LoopOptions
 
 _FOLDER = Path(__file__).with_name("recipe_files")
 _GPU_SECONDS_PER_PAIR = 48 * 3600 * 4 / (50_000 * 4)
@@ -100,44 +102,48 @@ class Recipe:
 class TrainingCost:
     """What decides how long a training takes and how much disk it needs."""
 
-    steps: int
-    batch: int
-    """Pairs per step, over all processes."""
+    loop: LoopOptions
     size: str
     """Pixels, WIDTHxHEIGHT."""
     parameters: int
     trained: int
     """Parameters that are trained: fewer with a low-rank adaptation."""
-    processes: int
-    ema: bool = False
     removal: bool = False
     """Whether the object removal is trained, otherwise FLUX."""
 
-    @property
-    def hours(self) -> float:
-        """On H100 cards."""
+    def hours(self, processes: int) -> float:
+        """On so many H100 cards."""
         pixels = math.prod(parse_image_size(self.size))
         each = _REMOVAL_SECONDS_PER_PAIR if self.removal else _GPU_SECONDS_PER_PAIR * self.parameters / 11.8e9
-        return self.steps * self.batch * each * pixels / _PAPER_PIXELS / self.processes / 3600
+        return self.loop.steps * self.loop.batch * each * pixels / _PAPER_PIXELS / processes / 3600
 
     @property
     def state_bytes(self) -> int:
         """Bytes of two kept states and one that is being written: weights, Adam's moments, the average."""
-        return 3 * self.trained * (4 + 8 + 4 * self.ema)
+        return 3 * self.trained * (4 + 8 + 4 * (self.loop.ema > 0))
 
 
-def plan(recipe: Recipe | None, cost: TrainingCost, rate: float) -> list[str]:
-    """Say in lines what a training will run: steps, hours and disk; with a recipe, its data and licences."""
-    sources = recipe.sources if recipe else ()
+def say_plan(recipe: Recipe | None, cost: TrainingCost, processes: Any, console: Console) -> None:
+    """Say what a training will run: steps, hours and disk; with a recipe, its data and licences.
+
+    `processes` are accelerate's; a plan without a launcher is for those of the recipe.
+    """
+    count = recipe.processes if recipe and processes.num_processes == 1 else processes.num_processes
+    if processes.is_main_process:
+        for line in _plan(recipe, cost, count):
+            console.say(line)
+
+
+def _plan(recipe: Recipe | None, cost: TrainingCost, processes: int) -> list[str]:
+    loop, sources = cost.loop, recipe.sources if recipe else ()
     pictures = sum(2 * source.targets + source.composites for source in sources)
     latents = round(pictures * math.prod(parse_image_size(cost.size)) * _LATENT_BYTES_PER_PIXEL)
-    basis = (
-        "4 x 1.1 TFLOP a pair at 52 TFLOP/s" if cost.removal else "the paper's two days, by pairs, pixels and weights"
-    )
+    basis = "4 x 1.1 TFLOP a pair at 52 TFLOP/s"
+    basis = basis if cost.removal else "the paper's two days, by pairs, pixels and weights"
     disk = f"{_size(4 * cost.parameters)} for the model, {_size(cost.state_bytes)} for states"
     lines = [
-        f"plan: {cost.steps:,} steps of {cost.batch} pairs at {cost.size}, Adam at {rate:g}, on {cost.processes} GPUs",
-        f"hours: about {cost.hours:.2g} on as many H100 (an estimate: {basis})",
+        f"plan: {loop.steps:,} steps of {loop.batch} pairs at {cost.size}, Adam at {loop.rate:g}, on {processes} GPUs",
+        f"hours: about {cost.hours(processes):.2g} on as many H100 (an estimate: {basis})",
         f"disk: {disk}, {_size(latents) if sources else 'half a byte a pixel'} for latents",
     ]
     if recipe is None:

@@ -3,7 +3,6 @@
 The UNet's first layer takes the latents of image and mask beside the noisy latent; it predicts the velocity.
 """
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,16 +12,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.harmonization.flux.loading import diffusers_library, load_autoencoder, local_folder, read_config
+from splatgraft.harmonization.flux.loading import diffusers_library, local_folder, read_config
 from splatgraft.harmonization.flux.network import pad_by_reflection, widen_layer
-from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt
+from splatgraft.harmonization.flux.prompt import find_prompt
 from splatgraft.harmonization.flux.sampling import noise
 from splatgraft.harmonization.flux.tensor_file import read_tensors
 from splatgraft.runtime.console import Console
 from splatgraft_paper.training.loop import LoopOptions, join_processes
-from splatgraft_paper.training.objective import Latents, Network, save_weights, train_objective
+from splatgraft_paper.training.objective import Latents, Network, Objective, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, open_training_data
-from splatgraft_paper.training.recipes import Recipe, TrainingCost, plan
+from splatgraft_paper.training.recipes import Recipe, TrainingCost, say_plan
 
 CONDITIONS = 2
 """Images that condition the network: the image with the object, and the mask."""
@@ -50,7 +49,7 @@ class RemovalTrainingOptions:
     """Only print what would run: steps, hours, memory per device, disk, licences."""
 
 
-class RemovalObjective:
+class RemovalObjective(Objective):
     """A UNet that generates the image without the object from the image with it and the object's mask."""
 
     roles: tuple[Role, ...] = ("background", "target", "mask")
@@ -58,7 +57,7 @@ class RemovalObjective:
 
     def __init__(self, base: str, say: Callable[[str], None], *, checkpointing: bool = True) -> None:
         """Load Stable Diffusion 2, or a removal network to continue from: unet/, vae/ and empty_prompt.safetensors."""
-        self.folder = folder = local_folder(base, say, parts=("unet",))
+        folder = local_folder(base, say, parts=("unet",))
         config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
         self._prompt_path = find_prompt(base, folder)
         if not self._prompt_path.is_file():
@@ -67,8 +66,7 @@ class RemovalObjective:
                 f"train embed --kind stable-diffusion --base {base}` makes them once"
             )
         self.tokens = read_tensors(self._prompt_path)["tokens"]
-        self.autoencoder = load_autoencoder(folder / "vae")
-        self.autoencoder.network.eval().requires_grad_(False)
+        super().__init__(folder)
         channels = self.autoencoder.channels
         if config["in_channels"] not in (channels, channels * (CONDITIONS + 1)):
             raise ValueError(
@@ -95,13 +93,9 @@ class RemovalObjective:
             timestep_spacing="trailing",  # begins at pure noise
         )
 
-    def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
-        """Encode sRGB images in [0, 1] to latents."""
-        return self.autoencoder.encode(images)
-
     def to(self, device: Any) -> None:
         """Move autoencoder and prompt to a device."""
-        self.autoencoder.network.to(device)
+        super().to(device)
         self.tokens = self.tokens.to(device)
 
     def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
@@ -131,9 +125,7 @@ class RemovalObjective:
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
         """Write unet/, vae/ and the prompt embeddings."""
         folder.mkdir(parents=True, exist_ok=True)
-        save_weights(diffusers_library().UNet2DConditionModel, self.network.config, state, folder / "unet")
-        self.autoencoder.network.save_pretrained(folder / "vae")
-        shutil.copyfile(self._prompt_path, folder / PROMPT_FILE)
+        self.save_model(diffusers_library().UNet2DConditionModel, state, folder / "unet", self._prompt_path)
 
     def _velocity(
         self, network: Network, noisy: Float[Tensor, "b c h w"], latents: Latents, step: Tensor
@@ -162,7 +154,7 @@ class ObjectRemover:
         height, width = mask.shape
         binary = (mask > 0.5).float()[..., None].expand(-1, -1, 3)
         images = torch.stack([image, binary]).permute(0, 3, 1, 2)
-        latents = self._objective.encode(pad_by_reflection(images, _MULTIPLE).to(self._device))
+        latents = self._objective.autoencoder.encode(pad_by_reflection(images, _MULTIPLE).to(self._device))
         removed = self._objective.predict(
             self._objective.network, {"target": latents[:1], "mask": latents[1:]}, self._seed
         )
@@ -175,21 +167,8 @@ def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) 
     """Train the object removal; the first process gives its folder, others None, as where only the plan is printed."""
     loop, recipe = options.loop, Recipe.read(options.recipe) if options.recipe else None
     if options.plan or recipe:
-        processes = join_processes(loop)
-        count = recipe.processes if recipe and processes.num_processes == 1 else processes.num_processes
-        cost = TrainingCost(
-            steps=loop.steps,
-            batch=loop.batch,
-            size=options.data.size,
-            parameters=_PARAMETERS,
-            trained=_PARAMETERS,
-            processes=count,
-            ema=loop.ema > 0,
-            removal=True,
-        )
-        for line in plan(recipe, cost, loop.rate):
-            if processes.is_main_process:
-                console.say(line)
+        cost = TrainingCost(loop, options.data.size, _PARAMETERS, _PARAMETERS, removal=True)
+        say_plan(recipe, cost, join_processes(loop), console)
         if options.plan:
             return None
     data = open_training_data(options.data, loop.seed, recipe)
