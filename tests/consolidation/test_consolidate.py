@@ -112,21 +112,17 @@ def test_a_killed_descent_resumes_to_the_same_bits(relit, monkeypatch):
     assert torch.equal(resumed.sh, whole.sh)
 
 
-def test_missing_and_misshapen_images_are_named(relit):
-    with pytest.raises(ValueError, match="one image per camera, found 7 for 8"):
-        consolidate(relit.composite, relit.cameras, relit.images[:7])
-    with pytest.raises(ValueError, match="view_0000: expected image pixels 48x48, found 20x48"):
-        consolidate(relit.composite, relit.cameras, [image[:, :20] for image in relit.images])
-
-
-def test_numbers_that_are_not_finite_are_refused(relit):
-    images = [image.clone() for image in relit.images]
-    images[3][5, 5] = float("nan")
-    with pytest.raises(ValueError, match="view_0003: expected finite image pixels"):
-        consolidate(relit.composite, relit.cameras, images)
-
-
-def test_no_views_are_refused(relit):
+def test_images_that_do_not_fit_are_named(relit):
+    broken = [image.clone() for image in relit.images]
+    broken[3][5, 5] = float("nan")
+    cut = [image[:, :20] for image in relit.images]
+    for images, line in (
+        (relit.images[:7], "one image per camera, found 7 for 8"),
+        (cut, "view_0000: expected image pixels 48x48, found 20x48"),
+        (broken, "view_0003: expected finite image pixels"),
+    ):
+        with pytest.raises(ValueError, match=line):
+            consolidate(relit.composite, relit.cameras, images)
     with pytest.raises(ValueError, match="at least one view"):
         consolidate(relit.composite, relit.cameras[[]], [])
 

@@ -5,7 +5,7 @@ what the harmoniser changed, followed by a short descent.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,7 +15,6 @@ from splatgraft.consolidation.frozen_views import Views
 from splatgraft.consolidation.normal_equations import solve
 from splatgraft.consolidation.options import ConsolidateOptions, ImageSequence
 from splatgraft.consolidation.view_errors import CorrectedTargets
-from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras, Window
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import adam
@@ -89,17 +88,9 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
     _check_counts(cameras, images, weights)
     views = Views(composite, cameras, images, weights=weights, options=options)
     if options.method == "adam":
-        sh = optimize_colors(
-            drop_higher_bands(composite.sh),
-            CorrectedTargets(views, estimated=False),
-            _PAPER,
-            iterations=options.iterations,
-            loss=options.loss,
-            seed=options.seed,
-            progress=progress,
-            checkpoint=checkpoint,
-        )
-        return replace(composite, sh=sh)
+        begin, targets = drop_higher_bands(composite.sh), CorrectedTargets(views, estimated=False)
+        descent = _Descent(_PAPER, options.iterations, options.loss, options.seed, checkpoint)
+        return replace(composite, sh=optimize_colors(begin, targets, descent, progress))
     return _consolidate_fast(composite, restrict_to_changes(views, options.unchanged_below), options, progress)
 
 
@@ -112,10 +103,8 @@ def _consolidate_fast(composite: Gaussians, views: Views, options: ConsolidateOp
     sh = solve(prior, targets, progress=progress)
     targets.keep()
     if options.polish_passes:
-        steps = options.polish_passes * len(views)
-        sh = optimize_colors(
-            sh, targets, _POLISH, iterations=steps, loss=options.loss, seed=options.seed, progress=progress
-        )
+        descent = _Descent(_POLISH, options.polish_passes * len(views), options.loss, options.seed)
+        sh = optimize_colors(sh, targets, descent, progress)
     colors = composite.sh.clone()
     colors[active] = sh
     return replace(composite, sh=colors)
@@ -169,53 +158,50 @@ def _window(views: Views, index: int, active: Bool[Tensor, "n"]) -> Window | Non
 
 def drop_higher_bands(sh: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k 3"]:
     """Coefficients with bands above 0 set to zero (paper, section Multi-View Consolidation)."""
-    return spherical_harmonics.with_degree(
-        spherical_harmonics.with_degree(sh, 0), spherical_harmonics.degree_of(sh.shape[1])
-    )
+    return torch.cat([sh[:, :1], torch.zeros_like(sh[:, 1:])], 1)
 
 
-def optimize_colors(  # noqa: PLR0913 - with progress and checkpoint
-    sh: Float[Tensor, "m k 3"],
-    targets: CorrectedTargets,
-    learning_rates: _Rates,
-    *,
-    iterations: int,
-    loss: ImageLoss,
-    seed: int,
-    progress: Progress = silent,
-    checkpoint: Checkpoint = NoCheckpoint(),
+@dataclass(frozen=True)
+class _Descent:
+    """How colours descend."""
+
+    rates: _Rates
+    iterations: int
+    """Steps, one view each."""
+    loss: ImageLoss
+    seed: int
+    """Of the order of views."""
+    checkpoint: Checkpoint = field(default_factory=NoCheckpoint)
+    """Where the state is saved every 500 iterations."""
+
+
+def optimize_colors(
+    sh: Float[Tensor, "m k 3"], targets: CorrectedTargets, descent: _Descent, progress: Progress
 ) -> Float[Tensor, "m k 3"]:
-    """Colours after `iterations` steps of Adam over views in shuffled order; only visible Gaussians change."""
-    views, start = targets.views, 0
+    """Colours after steps of Adam over views in shuffled order; only visible Gaussians change."""
+    views, start, iterations, checkpoint = targets.views, 0, descent.iterations, descent.checkpoint
     sh = sh.clone().contiguous()
     moments = adam.no_moments({"sh": sh}, len(sh))
     saved = checkpoint.load()
     if saved is not None:
         start, sh = int(saved["iteration"]), saved["sh"].clone()
         moments = adam.Moments({"sh": saved["first"].clone()}, {"sh": saved["second"].clone()}, saved["steps"].clone())
-    shares = torch.full((3 * sh.shape[1],), learning_rates.rest_ratio, device=sh.device)
+    shares = torch.full((3 * sh.shape[1],), descent.rates.rest_ratio, device=sh.device)
     shares[:3] = 1.0
     for iteration in range(start, iterations):
-        index = _view_of(iteration, len(views), seed)
+        index = _view_of(iteration, len(views), descent.seed)
         view = views[index]
         colors = view.colors(sh).requires_grad_()
         picture = view.draw(colors)
         picture, target = _weighted_pair(picture, targets.target(index), views.weight(index))
-        value = loss(picture, target)
-        rates = learning_rates.first * _decay(iteration / iterations, learning_rates.final_ratio) * shares
+        value = descent.loss(picture, target)
+        rates = descent.rates.first * _decay(iteration / iterations, descent.rates.final_ratio) * shares
         if not view.expansion.descend(sh, torch.autograd.grad(value, colors)[0], moments=moments, rates=rates):
             name = views.cameras.names[index]
             raise ValueError(f"consolidate: expected finite gradients, found others in {name} at iteration {iteration}")
         if (iteration + 1) % _SAVE_EVERY == 0:
-            checkpoint.save(
-                {
-                    "iteration": iteration + 1,
-                    "sh": sh,
-                    "first": moments.first["sh"],
-                    "second": moments.second["sh"],
-                    "steps": moments.steps,
-                }
-            )
+            state = {"first": moments.first["sh"], "second": moments.second["sh"], "steps": moments.steps}
+            checkpoint.save({"iteration": iteration + 1, "sh": sh, **state})
         progress(iteration + 1, iterations, f"loss {float(value.detach()):.4f}")
     return sh
 

@@ -63,10 +63,7 @@ def refine(
     tinted = warped * _upsample(view_error.log_gain, h, w).exp()
     log_gain = _refine_tint(view_error.log_gain, tinted, render, confidence)
     tinted = warped * _upsample(log_gain, h, w).exp()
-    return ViewError(
-        flow=_refine_flow(view_error.flow, tinted, render, confidence),
-        log_gain=log_gain,
-    )
+    return ViewError(_refine_flow(view_error.flow, tinted, render, confidence), log_gain)
 
 
 class CorrectedTargets:
@@ -122,9 +119,8 @@ def _refine_tint(
     for channel in range(3):
         slope, knots = tinted[..., channel], log_gain[..., channel]
         ridge = (_RESIDUAL_SIGMA / _TINT_SIGMA) ** 2 * _observations_per_knot(robust, slope.numel(), knots.numel())
-        normal = _normal_matrix(robust * slope**2, rows, columns) + ridge * torch.eye(
-            knots.numel(), device=knots.device
-        )
+        normal = _normal_matrix(robust * slope**2, rows, columns)
+        normal += ridge * torch.eye(knots.numel(), device=knots.device)
         right = rows.T @ (robust * slope * residual[..., channel]) @ columns
         step = _solve(normal, right.flatten() - ridge * knots.flatten())
         channels.append(knots + step.reshape(knots.shape))
@@ -145,13 +141,8 @@ def _refine_flow(
     dx, dy = _slopes(0.5 * (smooth_image + smooth_render))
     xx, xy, yy = (_over_channels(a * b) * robust for a, b in ((dx, dx), (dx, dy), (dy, dy)))
     right = torch.stack([rows.T @ (robust * _over_channels(d * residual)) @ columns for d in (dx, dy)])
-    cross = _normal_matrix(xy, rows, columns)
-    normal = torch.cat(
-        [
-            torch.cat([_normal_matrix(xx, rows, columns), cross], 1),
-            torch.cat([cross, _normal_matrix(yy, rows, columns)], 1),
-        ]
-    )
+    first, cross, second = (_normal_matrix(weights, rows, columns) for weights in (xx, xy, yy))
+    normal = torch.cat([torch.cat([first, cross], 1), torch.cat([cross, second], 1)])
     knots = flow.permute(2, 0, 1).flatten()
     ridge = (_RESIDUAL_SIGMA / _FLOW_SIGMA_PX) ** 2 * _observations_per_knot(robust, xx.numel(), len(knots) // 2)
     step = _solve(normal + ridge * torch.eye(len(knots), device=knots.device), right.flatten() - ridge * knots)
@@ -192,9 +183,8 @@ def _knots(length: int, cell_px: float) -> int:
 def _grid_bases(
     grid: Float[Tensor, "a b c"], image: Float[Tensor, "h w 3"]
 ) -> tuple[Float[Tensor, "h a"], Float[Tensor, "w b"]]:
-    return _linear_weights(image.shape[0], grid.shape[0], like=grid), _linear_weights(
-        image.shape[1], grid.shape[1], like=grid
-    )
+    rows, columns = (_linear_weights(image.shape[axis], grid.shape[axis], like=grid) for axis in (0, 1))
+    return rows, columns
 
 
 def _linear_weights(length: int, knots: int, *, like: Tensor) -> Float[Tensor, "length knots"]:

@@ -43,10 +43,8 @@ class _Distance(torch.autograd.Function):
     def forward(ctx, image: Tensor, target: Tensor, window: Tensor) -> Tensor:
         pictures = [np.ascontiguousarray(x.detach().numpy()) for x in (image, target)]
         factors = np.ascontiguousarray(window.numpy() / SIZE).ravel()
-        channels, rows, columns = (
-            image.shape[0],
-            *((length - SIZE) // _HOP + 1 for length in image.shape[1:]),
-        )
+        channels = image.shape[0]
+        rows, columns = ((length - SIZE) // _HOP + 1 for length in image.shape[1:])
         gradient = np.zeros_like(pictures[0]) if ctx.needs_input_grad[0] else np.zeros((0, 0, 0), np.float32)
         sums = np.zeros((channels, rows), np.float32)
         _compare(*pictures, factors, (_COS, _SIN, _SHARES), gradient, sums)
