@@ -276,6 +276,6 @@ def _relit_scene(prior: Prior, scene: ComposedScene, console: Console) -> tuple[
         )
         return out / SCENE_FILE, perform_if_stale(step, console)
     kind = "gain" if prior == "gain" else "transfer"
-    source = {"surroundings": scene.surroundings, "object_cameras": scene.source_cameras}
-    step = Relight(scene.target, placement, scene.cameras, out, light=kind, **source)
+    step = Relight(scene.target, placement, scene.cameras, out, light=kind)
+    step = replace(step, surroundings=scene.surroundings, object_cameras=scene.source_cameras)
     return out / SCENE_FILE, perform_if_stale(step, console)
