@@ -30,6 +30,7 @@ def folder(tmp_path) -> Path:
     return tmp_path / "bench"
 
 
+@pytest.mark.long
 def test_one_reconstruction_is_compared_at_every_size_that_is_asked_for(folder):
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     words = [str(folder), "--quality", "draft", "--longest-px", "48", "96"]

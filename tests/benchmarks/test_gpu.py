@@ -11,7 +11,9 @@ import torch
 TOY = gpu.Setting(torch.device("cpu"), toy=True)
 
 
-@pytest.mark.parametrize("name", list(gpu.PARTS))
+@pytest.mark.parametrize(
+    "name", [pytest.param(part, marks=pytest.mark.long if part == "paper-size" else ()) for part in gpu.PARTS]
+)
 def test_every_part_runs_at_toy_size(name, tmp_path):
     if name.startswith("harmonize") or name == "lora":
         pytest.importorskip("diffusers")

@@ -125,5 +125,6 @@ def _read(photograph: Photograph, width: int, height: int) -> RelitSample:
         if picture.shape[:2] != target.shape[:2]:
             wanted, found = (f"{size[1]}x{size[0]}" for size in (target.shape, picture.shape))
             raise ValueError(f"{path}: expected {wanted} pixels as {photograph.image.name}, found {found}")
-    images = (crop_to_size(image, width, height).clamp(0, 1) for image in (target, background, mask))
-    return RelitSample(*images)
+    pictures = (target, background, mask)
+    target, background, mask = (crop_to_size(picture, width, height).clamp(0, 1) for picture in pictures)
+    return RelitSample(target, background, mask)
