@@ -24,8 +24,8 @@ from splatgraft.relighting.shadows.scene_ratio import (
 from splatgraft.relighting.shadows.view_fit import fit_to_views
 
 SHADOW_POWER = 1.3
-"""Exponent of shadows under a light that was estimated: an average over what is possible has less contrast than the
-light itself. Fitted by benchmarks/fit_shadows.py."""
+"""Exponent of shadows under an estimated light whose sun no shadow shows: an average over what is possible has less
+contrast than the light itself. Fitted by benchmarks/fit_shadows.py."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def cast_shadows(
         views: Cameras in which shadows are fitted to the surface that is seen; none for a quick draft.
         budget: Most Gaussians that splitting may add to the scene.
     """
-    power = 1.0 if scene.estimate is None else SHADOW_POWER
+    power = SHADOW_POWER if scene.estimate is not None and scene.estimate.sun is None else 1.0
     receivers, ratio = _on_scene(scene, objects, drawn, views, budget)
     visibility = tuple(
         scene_visibility(scene.maps, raised(one.gaussians, one.normals.vectors), one.normals.vectors) for one in objects

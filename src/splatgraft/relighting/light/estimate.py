@@ -1,6 +1,7 @@
 """The light at a place of a scene, from its panorama there and from shadows and highlights on the surfaces around.
 
-Peaks of the radiance that explains them become sources, the rest ambient light of degree 2. A source that is seen from
+Peaks of the radiance that explains them become sources, the rest ambient light of degree 2. Where shadows on the
+surface around the place show the sun (`sun.py`), it takes the place of the suns among them. A source that is seen from
 the place stands where the view towards it ends: nothing that the scene shows there blocks it, such as a window's pane.
 """
 
@@ -29,6 +30,7 @@ from splatgraft.relighting.light.panorama import (
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem, seen_sky
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
+from splatgraft.relighting.light.sun import Sun, find_sun, with_sun
 from splatgraft.relighting.normals import estimate_normals
 from splatgraft.rendering import render
 
@@ -78,7 +80,10 @@ _BLOCKERS_WITHIN = 0.7
 class EstimatedLight:
     """The light at a place of a scene, and what is needed to have it at places nearby."""
 
-    light: Light
+    mean: Light
+    """The mean over the posterior."""
+    sun: Sun | None
+    """Where shadows show it; it then stands for the suns of `mean`."""
     hidden: RadianceEstimate
     """What no camera recorded."""
     evidence: LightEvidence
@@ -87,6 +92,11 @@ class EstimatedLight:
     """Linear rgb of mean 1, of what was seen above the horizon; what no camera saw is taken to have it too."""
     place: BoundingSphere
     """Where the sources were estimated."""
+
+    @property
+    def light(self) -> Light:
+        """The estimate, with the sun that shadows show."""
+        return self.mean if self.sun is None else with_sun(self.mean, self.sun)
 
     def at(self, scene: Gaussians, cameras: Cameras, place: BoundingSphere) -> "EstimatedLight | NoLight":
         """At a place in the same region: the same sources, and ambient light with what is near there."""
@@ -98,8 +108,8 @@ class EstimatedLight:
             return panorama
         evidence = replace(self.evidence, around=place_surroundings(scene, cameras, place))
         _, rest = _split_peaks(self.hidden.radiance(evidence, self.tint), evidence, within=math.inf)
-        light = replace(self.light, ambient=_ambient_of(rest), **_seen_shares(evidence))
-        return replace(self, evidence=evidence, light=light)
+        mean = replace(self.mean, ambient=_ambient_of(rest), **_seen_shares(evidence))
+        return replace(self, evidence=evidence, mean=mean)
 
 
 def estimate_light(
@@ -137,12 +147,16 @@ def estimate_light(
         up=up,
     )
     hidden = search_radiance(radiance_problem(evidence))
-    mean = (surfaces.weights[:, None] * surfaces.colors).sum(0)
-    sky = seen_sky(evidence.far, up, mean.clamp_min(1e-3))
+    color = (surfaces.weights[:, None] * surfaces.colors).sum(0)
+    sky = seen_sky(evidence.far, up, color.clamp_min(1e-3))
     tint = sky / sky.mean().clamp_min(1e-6)
     sources, rest = _split_peaks(hidden.radiance(evidence, tint), evidence, within=region.radius)
-    light = with_source_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
-    return EstimatedLight(light, hidden, evidence, tint, place)
+    mean = with_source_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
+    sun = find_sun(whole, cameras, region, up)
+    if sun is not None:
+        placed = with_source_distances(with_sun(mean, sun), scene, place)
+        sun = replace(sun, blockers_within=placed.sources[0].blockers_within)
+    return EstimatedLight(mean, sun, hidden, evidence, tint, place)
 
 
 def _usable(scene: Gaussians) -> Gaussians:

@@ -1,0 +1,88 @@
+"""Compares the shadow of the bananas in a finished demo with the cup's beside it: darkness, and width of the edge.
+
+    splatgraft demo demo && python benchmarks/demo_shadow.py demo [demo-of-another-version ...]
+
+The table is rendered and its sun is known (data/render_table.py), so that it is known which texels of the table top
+each of the two shades. Darkness: the median of luminance in the core of a shadow over luminance without it, which is
+for the cup that of the lit table, and for the bananas the same texel without them. Width: the distance over which the
+mean profile of that ratio across the edge goes from a fifth to four fifths of the way.
+"""
+
+import argparse
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from splatgraft.core.bounds import BoundingSphere, bounding_sphere
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.images import LUMINANCE
+from splatgraft.folders.composite_folder import read_composite
+from splatgraft.formats import read_cameras, read_gaussians
+from splatgraft.relighting.light.sun import SurfacePicture, draw_surface, find_surface, standing_on
+from splatgraft.relighting.shadows.shadow_maps import occluders_of
+
+SUN = F.normalize(torch.tensor([-0.26938, 0.91658, 0.29548]), dim=0)
+"""Towards the sun of data/render_table.py."""
+_RADII = 6.4
+"""Object radii of the region around the table."""
+_CORE, _REACH = 3, 14
+"""Texels: distance from the edge from which on a shadow is at its darkest, and up to which the profile is taken."""
+
+
+def luminance(picture: SurfacePicture) -> Float[Tensor, "s s"]:
+    """Linear, nan where the surface is not seen."""
+    return torch.where(picture.valid, picture.log_rgb.exp() @ LUMINANCE, math.nan)
+
+
+def measured(
+    ratio: Float[Tensor, "s s"], visible: Float[Tensor, "s s"], apart: Bool[Tensor, "s s"]
+) -> tuple[float, float]:
+    """Darkness in the core, and the width of the edge in texels; `apart` is where another shadow is near."""
+    shaded = visible.numpy() < 0.5
+    away = distance_transform_edt(shaded) - distance_transform_edt(~shaded)
+    known = ~(ratio.isnan() | apart).numpy()
+    dark = float(np.median(ratio.numpy()[known & (away > _CORE)]))
+    bins = np.arange(-_REACH, _CORE + 2)
+    values = [ratio.numpy()[known & (np.floor(away) == b)] for b in bins]
+    bins, profile = bins[[v.size > 0 for v in values]], np.array([np.median(v) for v in values if v.size])
+    lit = float(profile[0])
+    share = np.maximum.accumulate(np.clip((lit - profile) / (lit - dark), 0, 1))
+    start, end = (float(np.interp(level, share, bins)) for level in (0.2, 0.8))
+    return dark, end - start
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("demos", type=Path, nargs="+", help="folders that `splatgraft demo` finished")
+    for demo in parser.parse_args().demos:
+        composite = read_composite(demo / "target" / "scene" / "scene.ply", demo / "composite" / "placement.json")
+        cameras = read_cameras(demo / "target" / "capture" / "transforms.json")
+        scene, placed = composite.target, composite.objects[0].in_target()
+        place = bounding_sphere(placed)
+        region = BoundingSphere(place.center, _RADII * place.radius)
+        surface = find_surface(scene, cameras, region, estimate_up(cameras))
+        assert surface is not None
+        cup = surface.shadows(standing_on(surface, scene, region), SUN[None])[0]
+        bananas = surface.shadows(occluders_of(placed), SUN[None])[0]
+        table = luminance(draw_surface(scene, cameras, surface))
+        lit = float(table[(cup > 0.99) & ~table.isnan()].median())
+        under = (surface.texels - place.center).norm(dim=-1) < place.radius
+        texel = 2000 * surface.half / len(cup)
+        rows = [("cup", table / lit, cup, bananas < 0.99)]
+        for folder in ("relit", "result"):
+            after = luminance(draw_surface(read_gaussians(demo / folder / "scene.ply"), cameras, surface))
+            rows.append((f"bananas, {folder}", after / table, bananas, (cup < 0.99) | under))
+        for name, ratio, visible, apart in rows:
+            dark, width = measured(ratio, visible, apart)
+            print(f"{demo.name:20} {name:18} darkness {dark:.2f}, edge {width * texel:.0f} mm wide", flush=True)
+
+
+if __name__ == "__main__":
+    main()

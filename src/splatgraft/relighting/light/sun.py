@@ -1,0 +1,406 @@
+"""The sun from the shadows that a scene shows on the level surface around a place: its direction and its strength.
+
+The surface is drawn as a picture from above: the median over the cameras of what they show of it. In sunlight the
+picture is darker, by one factor, wherever something that stands on the surface blocks the sun. For every direction the
+shadow of all that stands there is drawn the same way, and the differences of log luminance between texels a few apart
+are compared with those that the shadow predicts. Texels differ by their material, too (Cauchy density), and may be
+shaded by what no camera saw, one by one or a whole tile of the picture.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from splatgraft.core.bounds import BoundingSphere
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.directions import even_directions, frames_along, tangents, vogel_offsets
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import LUMINANCE, linear_from_srgb
+from splatgraft.core.planes import LevelPlane, LevelPlaneOptions, dominant_level_plane
+from splatgraft.relighting.light.light import Light, LightSource
+from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occluders_of, splat_depth_maps, thinned
+from splatgraft.rendering import render
+
+# the picture of the surface; set by hand
+_VIEWS, _VIEW_PX = 16, 480
+"""Cameras, spread over the list, and the longest side of what they show, pixels."""
+_GLANCES, _GLANCE_PX = 8, 160
+"""The same for the search of the surface."""
+_SIZE = 192
+"""Texels, a multiple of 16: width of the picture and of the shadow maps."""
+_MAX_POINTS = 6000
+"""Points among which the plane is looked for."""
+_PLANE = LevelPlaneOptions(inlier_share=0.2, thickness=0.035)
+"""What counts as a surface around the place."""
+_SOLID = 0.9
+"""Alpha from which a pixel shows a surface."""
+_FLATTEST = 0.12
+"""Cosine between a ray and the normal below which a view is too flat to count."""
+_MIN_VIEWS = 2
+"""Views that must show a texel."""
+_MIN_TEXELS = 1500
+"""With fewer there is no evidence."""
+_WHITE, _BLACK = 0.93, 0.01
+"""Linear; texels with a brighter channel may be clipped, darker ones are noise."""
+
+# differences between texels; set by hand
+_COARSE, _FINE, _ACROSS = 6, 3, 14
+"""Texels between those that are compared: in the search, in its refinement, and for the ratio of lit to shaded."""
+_MAX_GREEN, _MAX_RED = 0.15, 1.2
+"""Largest difference of log(green / sqrt(red blue)) and of log(red / blue); sun and sky differ along the latter."""
+_NOISE = 0.12
+"""Scale of differences of log luminance within a material."""
+_SHADED_TEXEL, _SHADED_TILE = 0.15, 0.5
+"""Probability that something unseen shades a texel, and a whole tile."""
+_EDGE = 0.9
+"""Least difference of visibility between texels on both sides of a shadow's edge."""
+_TILES = 8
+"""Tiles along a side of the picture."""
+
+# the search
+_DIRECTIONS = even_directions(1600)
+"""5 degrees apart."""
+_STANDING_WITHIN = 1.4
+"""Radii of the region within which things cast shadows."""
+_LOWEST = math.sin(math.radians(2.0))
+"""Least sine of the sun's height over the surface."""
+_AT_ONCE = 64
+"""Directions at a time; bounds memory."""
+_STRENGTHS = (1.0, 2.0, 4.0, 8.0)
+"""Irradiance of the sun over that of all other light on the surface, in the search."""
+_FINE_STRENGTHS = (0.5, 1.0, 1.8, 3.0, 5.0, 10.0)
+_MODES = 4
+"""Local maxima that are refined."""
+_APART = math.cos(math.radians(8.0))
+"""Cosine of the smallest angle between two."""
+_SPANS = ((3.0, 1.0), (1.0, 0.33))
+"""Half width and step of the grids around a maximum, degrees."""
+_PROMISING, _DECISIVE = 10.0, 60.0
+"""Log likelihood over that of no sun from which a direction of the search is refined, and from which there is a sun."""
+_MIN_RATIO = 0.6
+"""Least irradiance of a sun over that of all other light, with less it is none."""
+_RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12
+"""Angular radii that are tried, and the directions that stand for each."""
+_BLURS = 5
+"""Widths of the reconstruction's blur that are tried beside each radius."""
+_SOFTER = 3.0
+"""Log likelihood over that of a smaller radius from which a larger one is taken: 20 to 1."""
+_ERROR_DEG = 1.0
+"""Standard error of a direction that was found."""
+
+
+@dataclass(frozen=True)
+class Sun:
+    """A sun, as shadows on a surface show it."""
+
+    direction: Float[Tensor, "3"]
+    """Unit, towards the sun, world frame."""
+    radius_deg: float
+    """Angular radius; a window's is larger than the sun's."""
+    normal: Float[Tensor, "3"]
+    """Unit, of the surface."""
+    ratio: Float[Tensor, "3"]
+    """Irradiance of the sun over that of all other light on the surface, per channel."""
+    evidence: float
+    """Log likelihood over that of no sun."""
+    blockers_within: float = math.inf
+    """World units; occluders farther away do not block it."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A square of a level plane, divided into s x s texels."""
+
+    plane: LevelPlane
+    """With its normal upwards."""
+    center: Float[Tensor, "3"]
+    """On the plane, world units."""
+    half: float
+    """Half the width of the square, world units."""
+
+    @property
+    def texels(self) -> Float[Tensor, "s s 3"]:
+        """The middles of the texels, world units."""
+        right, down = tangents(self.plane.normal)
+        x = ((torch.arange(_SIZE) + 0.5) / _SIZE * 2 - 1) * self.half
+        v, u = torch.meshgrid(x, x, indexing="ij")
+        return self.center + u[..., None] * right + v[..., None] * down
+
+    def shadows(self, occluders: Occluders, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k s s"]:
+        """Share of the light from each of some directions that reaches the texels past occluders above the plane."""
+        radius = 1.05 * self.half
+        window = Window(center=self.center, radius=radius, frames=frames_along(directions))
+        alpha = splat_depth_maps(occluders, window, size=_SIZE, with_color=False).alpha
+        at = torch.einsum("kij,stj->ksti", window.frames[:, :2], self.texels - self.center) / radius
+        return 1 - F.grid_sample(alpha[:, None], at, align_corners=False)[:, 0]
+
+
+@dataclass(frozen=True)
+class SurfacePicture:
+    """What the views of a capture show of a surface."""
+
+    surface: Surface
+    """Of s x s texels."""
+    log_rgb: Float[Tensor, "s s 3"]
+    """Logarithm of linear rgb, the median over the views."""
+    valid: Bool[Tensor, "s s"]
+    """Where enough views show the surface, neither clipped nor black."""
+
+
+def find_surface(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Float[Tensor, "3"]) -> Surface | None:
+    """The level surface that most of a region shows; None where there is none.
+
+    Args:
+        scene: All Gaussians.
+        cameras: Of its capture.
+        region: The surface lies within.
+        up: Unit.
+    """
+    seen = []
+    for camera in cameras.spread(_GLANCES).limited(_GLANCE_PX):
+        drawn = render(scene, camera, outputs=frozenset({"depth"}))
+        points = _unprojected(camera, drawn.depth[0])
+        seen.append(points[(drawn.alpha[0] > _SOLID) & ((points - region.center).norm(dim=-1) < region.radius)])
+    points = torch.cat(seen)
+    points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:_MAX_POINTS]]
+    plane = dominant_level_plane(points, up, options=_PLANE)
+    if plane is None:
+        return None
+    on_it = points[plane.height(points).abs() < plane.thickness]
+    center = on_it.median(0).values
+    center = center - plane.height(center) * plane.normal
+    return Surface(plane, center, float((on_it - center).norm(dim=1).quantile(0.95)))
+
+
+def draw_surface(scene: Gaussians, cameras: Cameras, surface: Surface) -> SurfacePicture:
+    """Draw a surface as the cameras of a capture show it."""
+    views = []
+    for camera in cameras.spread(_VIEWS).limited(_VIEW_PX):
+        drawn = render(scene, camera, outputs=frozenset({"color", "depth"}))
+        views.append(_seen_texels(surface, camera, linear_from_srgb(drawn.color[0].clamp(0, 1)), drawn.depth[0]))
+    colors = torch.stack(views)
+    enough = (~colors[..., 0].isnan()).sum(0) >= _MIN_VIEWS
+    log_rgb = colors.nanmedian(0).values.nan_to_num()
+    linear = log_rgb.exp()
+    return SurfacePicture(surface, log_rgb, enough & (linear.amax(-1) < _WHITE) & (linear @ LUMINANCE > _BLACK))
+
+
+def standing_on(surface: Surface, scene: Gaussians, region: BoundingSphere) -> Occluders:
+    """What stands on a surface or hangs above it, in a region or a little outside."""
+    near = (scene.means - region.center).norm(dim=1) < _STANDING_WITHIN * region.radius
+    above = scene.select(near & (surface.plane.height(scene.means) > surface.plane.thickness))
+    return occluders_of(thinned(above, width=2 * surface.half / _SIZE))
+
+
+def _unprojected(camera: Cameras, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+    """The points that the pixels of one camera show, world units."""
+    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    rays = torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(camera.intrinsics[0]).T
+    return (rays * depth[..., None]) @ camera.world_from_camera[0, :3, :3].T + camera.centers[0]
+
+
+def _seen_texels(
+    surface: Surface, camera: Cameras, color: Float[Tensor, "h w 3"], depth: Float[Tensor, "h w"]
+) -> Float[Tensor, "s s 3"]:
+    """Logarithm of the linear rgb that one view shows of the texels; nan where it does not show the surface there."""
+    texels, pose = surface.texels, camera.camera_from_world[0]
+    local = texels @ pose[:3, :3].T + pose[:3, 3]
+    away = local[..., 2].clamp_min(1e-6)
+    at = (local @ camera.intrinsics[0].T)[..., :2] / away[..., None] / camera.sizes[0].to(texels) * 2 - 1
+    picture = torch.cat([color, depth[..., None]], -1).permute(2, 0, 1)
+    sampled = F.grid_sample(picture[None], at[None], align_corners=False)[0]
+    rays = texels - camera.centers[0]
+    distance = rays.norm(dim=-1)
+    steepness = -(rays @ surface.plane.normal) / distance
+    # height over the plane of what the view shows along the ray to a texel
+    height = (1 - sampled[3] / away) * distance * steepness
+    shown = (local[..., 2] > 0) & (at.abs().amax(-1) < 1) & (height.abs() < surface.plane.thickness)
+    shown &= steepness > _FLATTEST
+    return torch.where(shown[..., None], sampled[:3].permute(1, 2, 0).clamp_min(1e-3).log(), math.nan)
+
+
+@dataclass(frozen=True)
+class _Differences:
+    """p pairs of texels along one axis of a picture."""
+
+    first: tuple[slice, slice]
+    second: tuple[slice, slice]
+    chosen: Bool[Tensor, "a b"]
+    """Which pairs are compared."""
+    luminance: Float[Tensor, "p"]
+    """Difference of the logarithms of luminance, second less first."""
+    tile: Int[Tensor, "p"]
+    """Tile of each pair."""
+
+    def of(self, values: Float[Tensor, "k s s"]) -> Float[Tensor, "k p"]:
+        """Differences of other values."""
+        return (values[:, *self.second] - values[:, *self.first])[:, self.chosen]
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """The differences of a picture between texels that are `apart`, along both axes."""
+
+    apart: int
+    step: int
+    """Texels between one pair and the next; about `apart` squared pairs tell the same."""
+    axes: tuple[_Differences, _Differences]
+
+    @staticmethod
+    def of(picture: SurfacePicture, apart: int) -> "_Comparison":
+        """Compare what may be of one material in sun and shade."""
+        log_luminance = (picture.log_rgb.exp() @ LUMINANCE).log()
+        red, green, blue = picture.log_rgb.unbind(-1)
+        chroma = torch.stack([(green - 0.5 * (red + blue)) / _MAX_GREEN, (red - blue) / _MAX_RED], -1)
+        tile = torch.arange(_SIZE) * _TILES // _SIZE
+        tile = tile[:, None] * _TILES + tile
+        step = max(2, apart // 2)
+        whole, low, high = slice(None, None, step), slice(0, _SIZE - apart, step), slice(apart, _SIZE, step)
+
+        def along(first: tuple[slice, slice], second: tuple[slice, slice]) -> _Differences:
+            same = (chroma[second] - chroma[first]).abs().amax(-1) < 1
+            chosen = picture.valid[first] & picture.valid[second] & same
+            change = (log_luminance[second] - log_luminance[first])[chosen]
+            return _Differences(first, second, chosen, change, tile[first][chosen])
+
+        return _Comparison(apart, step, (along((whole, low), (whole, high)), along((low, whole), (high, whole))))
+
+    def log_likelihoods(self, visible: Float[Tensor, "k s s"], strengths: tuple[float, ...]) -> Float[Tensor, "k"]:
+        """Log likelihood of a sun over that of none, at the best strength.
+
+        Args:
+            visible: Share of a sun's light that reaches the texels, for k suns.
+            strengths: Irradiance of the sun over that of all other light on the surface.
+        """
+        found = []
+        for strength in strengths:
+            brightness = torch.log1p(strength * visible)
+            by_tile = torch.zeros(len(visible), _TILES**2)
+            for one in self.axes:
+                without = 1 / (1 + (one.luminance / _NOISE) ** 2)
+                sunlit = 1 / (1 + ((one.luminance - one.of(brightness)) / _NOISE) ** 2)
+                mixed = (1 - _SHADED_TEXEL) * sunlit + _SHADED_TEXEL * without
+                by_tile.index_add_(1, one.tile, (mixed / without).log())
+            lit = by_tile * (self.step / self.apart) ** 2 + math.log(1 - _SHADED_TILE)
+            found.append(torch.logaddexp(lit, torch.tensor(math.log(_SHADED_TILE))).sum(1))
+        return torch.stack(found).amax(0)
+
+
+def find_sun(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Float[Tensor, "3"]) -> Sun | None:
+    """Find the sun whose shadows a level surface shows; None where none is decisively better than no sun.
+
+    Args:
+        scene: All Gaussians, with everything that cast shadows when the scene was captured.
+        cameras: Of its capture.
+        region: Around the place; the surface and what stands on it lie within.
+        up: Unit.
+    """
+    surface = find_surface(scene, cameras, region, up)
+    if surface is None:
+        return None
+    standing, picture = standing_on(surface, scene, region), draw_surface(scene, cameras, surface)
+    if not len(standing.means) or int(picture.valid.sum()) < _MIN_TEXELS:
+        return None
+    coarse, fine = _Comparison.of(picture, _COARSE), _Comparison.of(picture, _FINE)
+    normal = surface.plane.normal
+
+    def scored(directions: Float[Tensor, "k 3"], by: _Comparison, strengths: tuple[float, ...]) -> Float[Tensor, "k"]:
+        parts = directions.split(_AT_ONCE)
+        return torch.cat([by.log_likelihoods(_blurred(surface.shadows(standing, part)), strengths) for part in parts])
+
+    directions = _DIRECTIONS[_DIRECTIONS @ normal > _LOWEST]
+    score = scored(directions, coarse, _STRENGTHS)
+    best, evidence = directions[0], -math.inf
+    for _ in range(_MODES):
+        if float(score.max()) < _PROMISING:
+            break
+        mode = directions[score.argmax()]
+        score = torch.where(directions @ mode > _APART, -math.inf, score)
+        for span, step in _SPANS:
+            near = _around(mode, span, step)
+            near = near[near @ normal > _LOWEST]
+            found = scored(near, fine, _FINE_STRENGTHS)
+            mode = near[found.argmax()]
+            if float(found.max()) > evidence:
+                best, evidence = mode, float(found.max())
+    if evidence < _DECISIVE:
+        return None
+    softened = torch.stack([surface.shadows(standing, _cone(best, radius)).mean(0) for radius in _RADII_DEG])
+    by_radius = torch.full((len(_RADII_DEG),), -math.inf)
+    blurred = softened
+    for _ in range(_BLURS):
+        by_radius = torch.maximum(by_radius, fine.log_likelihoods(blurred, _FINE_STRENGTHS))
+        blurred = _blurred(blurred)
+    radius = _RADII_DEG[int((by_radius > by_radius.max() - _SOFTER).int().argmax())]
+    ratio = lit_over_shaded(picture, softened[0])
+    if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
+        return None
+    return Sun(best, radius, normal, ratio, evidence)
+
+
+def _blurred(visible: Float[Tensor, "k s s"]) -> Float[Tensor, "k s s"]:
+    """Shadows as a reconstruction shows them: edges are a few texels wide."""
+    for _ in range(2):
+        visible = F.avg_pool2d(visible[:, None], 3, 1, 1, count_include_pad=False)[:, 0]
+    return visible
+
+
+def _around(direction: Float[Tensor, "3"], span: float, step: float) -> Float[Tensor, "k 3"]:
+    """A grid of directions, its half width and step in degrees."""
+    right, down = tangents(direction)
+    count = round(span / step)
+    offsets = torch.arange(-count, count + 1) * math.radians(step)
+    u, v = (grid.reshape(-1, 1) for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
+    return F.normalize(direction + u * right + v * down, dim=1)
+
+
+def _cone(direction: Float[Tensor, "3"], radius_deg: float) -> Float[Tensor, "k 3"]:
+    """Even directions over a disc."""
+    index = torch.arange(_CONE)
+    radii = ((index + 0.5) / _CONE).sqrt() * math.tan(math.radians(radius_deg))
+    return F.normalize(direction + vogel_offsets(direction, radii, index), dim=1)
+
+
+def lit_over_shaded(picture: SurfacePicture, visible: Float[Tensor, "s s"]) -> Float[Tensor, "3"] | None:
+    """Irradiance of the sun over that of all other light, from texels on both sides of a shadow's edge.
+
+    Args:
+        picture: The surface.
+        visible: Share of the sun's light that reaches each texel.
+
+    Returns:
+        Per channel, at least 0; None where no edge is seen.
+    """
+    changes = []
+    for one in _Comparison.of(picture, _ACROSS).axes:
+        edge = one.of(visible[None])[0]
+        change = (picture.log_rgb[one.second] - picture.log_rgb[one.first])[one.chosen]
+        across = edge.abs() > _EDGE
+        changes.append(change[across] * edge[across].sign()[:, None])
+    found = torch.cat(changes)
+    return (found.median(0).values.exp() - 1).clamp_min(0) if len(found) else None
+
+
+def with_sun(light: Light, sun: Sun) -> Light:
+    """A light whose sun is the one that shadows show; the irradiance on the surface stays.
+
+    Args:
+        light: Estimated; its own suns are left out, its windows and lamps stay.
+        sun: Of the same place.
+    """
+    others = replace(light, sources=tuple(source for source in light.sources if source.name != "sun"))
+    before = float(light.irradiance(sun.normal[None])[0] @ LUMINANCE)
+    shaded = others.irradiance(sun.normal[None])[0]
+    scale = before / float((shaded * (1 + sun.ratio)) @ LUMINANCE)
+    dimmed = tuple(replace(s, irradiance=tuple(scale * v for v in s.irradiance)) for s in others.sources)
+    irradiance = scale * shaded * sun.ratio / float(sun.direction @ sun.normal)
+    x, y, z = sun.direction.tolist()
+    r, g, b = irradiance.tolist()
+    found = LightSource(
+        (x, y, z), (r, g, b), sun.radius_deg, _ERROR_DEG, name="sun", blockers_within=sun.blockers_within
+    )
+    return replace(others, sources=(found, *dimmed), ambient=scale * others.ambient)
