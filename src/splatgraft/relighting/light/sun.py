@@ -70,7 +70,7 @@ _LOWEST = math.sin(math.radians(2.0))
 """Least sine of the sun's height over the surface."""
 _AT_ONCE = 64
 """Directions at a time; bounds memory."""
-_STRENGTHS = (1.0, 2.0, 4.0, 8.0)
+_STRENGTHS = (1.0, 3.0, 9.0)
 """Irradiance of the sun over that of all other light on the surface, in the search."""
 _FINE_STRENGTHS = (0.5, 1.0, 1.8, 3.0, 5.0, 10.0)
 _MODES = 4
@@ -308,12 +308,9 @@ def find_sun(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Flo
     coarse, fine = _Comparison.of(picture, _COARSE), _Comparison.of(picture, _FINE)
     normal = surface.plane.normal
 
-    def scored(directions: Float[Tensor, "k 3"], by: _Comparison, strengths: tuple[float, ...]) -> Float[Tensor, "k"]:
-        parts = directions.split(_AT_ONCE)
-        return torch.cat([by.log_likelihoods(_blurred(surface.shadows(standing, part)), strengths) for part in parts])
-
     directions = _DIRECTIONS[_DIRECTIONS @ normal > _LOWEST]
-    score = scored(directions, coarse, _STRENGTHS)
+    parts = directions.split(_AT_ONCE)
+    score = torch.cat([coarse.log_likelihoods(surface.shadows(standing, part), _STRENGTHS) for part in parts])
     best, evidence = directions[0], -math.inf
     for _ in range(_MODES):
         if float(score.max()) < _PROMISING:
@@ -323,7 +320,7 @@ def find_sun(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Flo
         for span, step in _SPANS:
             near = _around(mode, span, step)
             near = near[near @ normal > _LOWEST]
-            found = scored(near, fine, _FINE_STRENGTHS)
+            found = fine.log_likelihoods(_blurred(surface.shadows(standing, near)), _FINE_STRENGTHS)
             mode = near[found.argmax()]
             if float(found.max()) > evidence:
                 best, evidence = mode, float(found.max())
