@@ -45,7 +45,7 @@ def measured(
 ) -> tuple[float, float]:
     """Darkness in the core, and the width of the edge in texels; `apart` is where another shadow is near."""
     shaded = visible.numpy() < 0.5
-    away = distance_transform_edt(shaded) - distance_transform_edt(~shaded)
+    away = np.asarray(distance_transform_edt(shaded)) - np.asarray(distance_transform_edt(~shaded))
     known = ~(ratio.isnan() | apart).numpy()
     dark = float(np.median(ratio.numpy()[known & (away > _CORE)]))
     bins = np.arange(-_REACH, _CORE + 2)

@@ -243,7 +243,7 @@ def _find_group(
     radius: float,
     support: LevelPlane | None,
     pointed_at: Float[Tensor, "k 3"] | None,
-) -> tuple[Float[Tensor, "k 3"], float, bool] | None:
+) -> tuple[Float[Tensor, "p 3"], float, bool] | None:
     """The group of points around the middle and above the support, from the smallest sphere that holds all of it.
 
     With the radius of the sphere, and whether the points end within it; where no sphere holds all of it, the group of

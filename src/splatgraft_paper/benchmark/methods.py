@@ -1,11 +1,11 @@
 """Methods of the benchmark: a light transfer, a harmoniser and a consolidation, or pictures of another program."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
+from splatgraft.commands.steps import harmonize
 from splatgraft.commands.steps.consolidate import Consolidate
-from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
 from splatgraft.consolidation import ConsolidateOptions, consolidate
@@ -18,7 +18,9 @@ from splatgraft.harmonization import (
     Harmonized,
     HarmonizerContext,
     HarmonizerInputs,
+    HarmonizerOptions,
     NoisyStartHarmonizer,
+    NoneOptions,
     make_harmonizer,
     render_views,
 )
@@ -42,6 +44,14 @@ STRENGTHS = {
 """Noise of five updates from 1 to 0.1, with equal differences or ratios (paper: Iterative Dataset Update)."""
 _NAMES = {"copy-paste": "off", "reinhard": "off+reinhard", "flux": "off+flux"}
 _GRAMMAR = "PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], NAME=FOLDER, or " + ", ".join(_NAMES)
+
+
+@dataclass(frozen=True)
+class Harmonize(harmonize.Harmonize):
+    """The step with the methods of other projects too, which the command line does not offer."""
+
+    method: HarmonizerOptions = field(default_factory=NoneOptions)  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Any method's options."""
 
 
 @dataclass(frozen=True)
@@ -252,8 +262,7 @@ def run_method(
     )
     seconds["render"] = perform_if_stale(render, console)
     harmonized = scene.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
-    # the step takes the methods of other projects too, which the command line does not offer
-    step = Harmonize(views, harmonized, options, device=settings.device)  # pyright: ignore[reportArgumentType]
+    step = Harmonize(views, harmonized, options, device=settings.device)
     seconds["harmonize"] = perform_if_stale(step, console)
     step = Consolidate(prior, views, harmonized, result, lpips_weights=settings.weights, device=settings.device)
     if method.loss == "paper":

@@ -25,7 +25,7 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, Protocol, TextIO
+from typing import Any, Literal, Protocol, TextIO, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -121,6 +121,7 @@ class Validation:
     """Pictures, a row for each pair, sRGB in [0, 1]."""
 
 
+@runtime_checkable
 class Task(Protocol):
     """What is trained: a network, its items and its loss. Reading and validating raise ValueError for broken files."""
 

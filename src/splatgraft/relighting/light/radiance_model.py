@@ -153,7 +153,7 @@ class RadianceProblem:
     """Log radiance expected of unseen directions."""
     connected: Bool[Tensor, "x x"]
     """Which clipped directions are of one patch."""
-    patches: tuple[Int[Tensor, "p"], ...]
+    patches: tuple[Int[Tensor, "_"], ...]
     """Positions in `clipped` of connected parts that may be sources: those above the horizon, largest first."""
 
     def split(self, x: Float[Tensor, "s"]) -> tuple[Tensor, Tensor, Tensor]:
