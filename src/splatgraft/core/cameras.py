@@ -104,6 +104,11 @@ class Cameras:
         sizes = (edges[:, 2:] - edges[:, :2]).to(self.sizes.dtype)
         return replace(self, intrinsics=intrinsics, sizes=sizes)
 
+    def rays(self) -> Float[Tensor, "h w 3"]:
+        """Directions to the pixel centres of the first camera, in its axes, of depth 1."""
+        v, u = torch.meshgrid(torch.arange(self.height) + 0.5, torch.arange(self.width) + 0.5, indexing="ij")
+        return torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(self.intrinsics[0]).T
+
     def spread(self, count: int) -> "Cameras":
         """At most `count` of the cameras, evenly spaced in their order, the first and the last among them."""
         return self[torch.linspace(0, len(self) - 1, min(count, len(self))).round().long()]

@@ -198,9 +198,7 @@ def standing_on(surface: Surface, scene: Gaussians, region: BoundingSphere) -> O
 
 def _unprojected(camera: Cameras, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
     """The points that the pixels of one camera show, world units."""
-    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    rays = torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(camera.intrinsics[0]).T
-    return (rays * depth[..., None]) @ camera.world_from_camera[0, :3, :3].T + camera.centers[0]
+    return (camera.rays() * depth[..., None]) @ camera.world_from_camera[0, :3, :3].T + camera.centers[0]
 
 
 def _seen_texels(
@@ -276,12 +274,11 @@ class _Comparison:
             visible: Share of a sun's light that reaches the texels, for k suns.
             strengths: Irradiance of the sun over that of all other light on the surface.
         """
-        found = []
+        found, densities = [], [1 / (1 + (one.luminance / _NOISE) ** 2) for one in self.axes]
         for strength in strengths:
             brightness = torch.log1p(strength * visible)
             by_tile = torch.zeros(len(visible), _TILES**2)
-            for one in self.axes:
-                without = 1 / (1 + (one.luminance / _NOISE) ** 2)
+            for one, without in zip(self.axes, densities, strict=True):
                 sunlit = 1 / (1 + ((one.luminance - one.of(brightness)) / _NOISE) ** 2)
                 mixed = (1 - _SHADED_TEXEL) * sunlit + _SHADED_TEXEL * without
                 by_tile.index_add_(1, one.tile, (mixed / without).log())
@@ -307,7 +304,6 @@ def find_sun(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Flo
         return None
     coarse, fine = _Comparison.of(picture, _COARSE), _Comparison.of(picture, _FINE)
     normal = surface.plane.normal
-
     directions = _DIRECTIONS[_DIRECTIONS @ normal > _LOWEST]
     parts = directions.split(_AT_ONCE)
     score = torch.cat([coarse.log_likelihoods(surface.shadows(standing, part), _STRENGTHS) for part in parts])

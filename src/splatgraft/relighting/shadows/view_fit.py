@@ -232,10 +232,8 @@ def _view(
 
 
 def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
-    """Unit directions of the pixels' rays."""
-    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    rays = torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(camera.intrinsics[0]).T
-    return F.normalize(rays @ camera.world_from_camera[0, :3, :3].T, dim=-1)
+    """Unit directions of the pixels' rays, in the world."""
+    return F.normalize(camera.rays() @ camera.world_from_camera[0, :3, :3].T, dim=-1)
 
 
 _REACH = np.float32(3)
