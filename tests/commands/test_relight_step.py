@@ -155,3 +155,15 @@ def test_relight_compares_the_levels_of_both_captures(tmp_path: Path):
 
 def test_relight_says_nothing_of_exposure_where_one_capture_has_no_metadata(tmp_path: Path):
     assert exposure_lines(tmp_path, {"target": [fixed(1 / 800)]}) == []
+
+
+def test_a_sun_through_a_point_and_its_shadow_is_the_light_and_the_report_says_so(tmp_path: Path) -> None:
+    points = ["--sun-through", "0.5", "0", "0.4", "0.1", "0", "0", "0.5", "0.02", "0.4", "0.1", "0.02", "0"]
+    out = relit(tmp_path, (room(0.5), room(0.5)), {"own.ply": (ball(), [at(0, 0)])}, *points)
+    sources = json.loads((out / "light.json").read_text())["sources"]
+    # the floor of the room shows no shadow whose edge would tell its strength
+    assert [source["name"] for source in sources if "sun" in source["name"]] == [
+        "sun set by hand, its strength estimated"
+    ]
+    assert sources[0]["direction"] == pytest.approx([math.sqrt(0.5), 0, math.sqrt(0.5)], abs=1e-3)
+    assert "sun set by hand, its strength estimated 45 +- 1 degrees high" in (out / "light.txt").read_text()

@@ -28,7 +28,7 @@ from splatgraft.relighting.light.panorama import (
     render_panorama,
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
-from splatgraft.relighting.light.sun import find_sun
+from splatgraft.relighting.light.sun import SET_BY_HAND, find_sun, set_sun, with_sun
 from splatgraft.relighting.normals import estimate_normals
 
 
@@ -347,6 +347,30 @@ def painted(scene, gray):
 
 def sun_of(scene):
     return find_sun(scene, views(), BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.4), UP)
+
+
+def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s_edge_shows():
+    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    scene, tops = sunlit_scene(sun, 3.0), torch.tensor([[1.0, 0.2, 0.5], [-0.6, 0.9, 0.5]])
+    # named a little beside where they are
+    off = torch.tensor([0.02, -0.01, 0.0])
+    points = [tuple(at.tolist()) for top in tops for at in (top + off, top - sun * top[2] / sun[2])]
+    found = set_sun(points, scene, views(), UP)
+    assert degrees_apart(found.direction, sun) < 3
+    assert found.name == SET_BY_HAND
+    assert found.ratio is not None
+    assert found.ratio.tolist() == pytest.approx([3 * float(sun[2])] * 3, rel=0.2)
+    light = with_sun(Light((), fit_ambient(torch.ones(3))), found)
+    # the sun and the rest share the irradiance on the floor as measured
+    assert light.irradiance(UP[None])[0].tolist() == pytest.approx([math.pi] * 3, rel=0.02)
+    assert light.sources[0].direction == pytest.approx(tuple(found.direction.tolist()))
+    with pytest.raises(ValueError, match="then its shadow below it"):
+        set_sun(points[::-1], scene, views(), UP)
+    with pytest.raises(ValueError, match="expected pairs"):
+        set_sun(points[:3], scene, views(), UP)
+    # far from all surfaces there is no edge: only the direction is taken from the points
+    away = [(20.0 + x, y, z) for x, y, z in points]
+    assert set_sun(away, scene, views(), UP).ratio is None
 
 
 def test_shadows_show_the_sun_on_a_floor_of_two_materials():

@@ -94,9 +94,9 @@ class _TransferValues:
     def __init__(self) -> None:
         self._memo = Memo()
 
-    def is_moved(self, composite: Composite, cameras: Cameras, light: Light | None, reach: float) -> bool:
+    def is_moved(self, composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions) -> bool:
         """Whether objects were moved since the light of the scene was found."""
-        kept = self._memo.peek(_kind(light), (composite.target, composite.erased, cameras, light, reach))
+        kept = self._memo.peek(_kind(light), _light_inputs(composite, cameras, light, options))
         return kept is not None and kept[0] != _poses(composite)
 
     def relight(
@@ -114,7 +114,7 @@ class _TransferValues:
         placed = [(number, one, source) for number, (one, source) in pairs if one.gaussians.count]
         if not placed:
             return pasted(composite, "No object is placed: nothing to light.")
-        scene = self._scene_light(composite, cameras, light, options.reach, exact=exact)
+        scene = self._scene_light(composite, cameras, light, options, exact=exact)
         if isinstance(scene, NoLight):
             return pasted(composite, f"{scene.reason} The object is pasted as it is.")
         objects = [self._object(number, one, source, scene, exact=exact) for number, one, source in placed]
@@ -124,9 +124,9 @@ class _TransferValues:
         return assemble_layers(merged, scene, objects, shadows)
 
     def _scene_light(
-        self, composite: Composite, cameras: Cameras, light: Light | None, reach: float, *, exact: bool
+        self, composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions, *, exact: bool
     ) -> SceneLight | NoLight:
-        kind, inputs = _kind(light), (composite.target, composite.erased, cameras, light, reach)
+        kind, inputs = _kind(light), _light_inputs(composite, cameras, light, options)
         poses, kept = _poses(composite), self._memo.peek(kind, inputs)
         if kept is not None and kept[0] == poses:
             return kept[1]
@@ -139,7 +139,9 @@ class _TransferValues:
             if moved is not None:
                 return moved
         target = composite.target.select(~composite.erased)
-        found = find_scene_light(target, cameras, spheres, light=light, reach=reach)
+        found = find_scene_light(
+            target, cameras, spheres, light=light, reach=options.reach, sun_through=options.sun_through
+        )
         if isinstance(found, SceneLight):
             self._memo.put(kind, inputs, (poses, found))
         return found
@@ -202,8 +204,8 @@ class RelitPreview:
 
         Takes less time than `relit`. False where nothing was moved, or these layers are there already.
         """
-        reach, composite = self._scenes.files.relight_options.reach, self._scenes.composite(state)
-        is_moved = self._full_values.is_moved(composite, self._cameras(), state.light, reach)
+        options, composite = self._scenes.files.relight_options, self._scenes.composite(state)
+        is_moved = self._full_values.is_moved(composite, self._cameras(), state.light, options)
         if not is_moved or self._memo.peek("refined", self._inputs(state)) is not None:
             return False
         self._make_once("refined", state, lambda: self._transfer(state, exact=False), lock=self._full_lock)
@@ -324,6 +326,13 @@ def _poses(composite: Composite) -> bytes:
     return b"".join(
         part.numpy().tobytes() for m in moves for part in (torch.tensor(m.scale), m.rotation, m.translation)
     )
+
+
+def _light_inputs(
+    composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions
+) -> tuple[Any, ...]:
+    """What the light of a scene is found from, but for the objects' places."""
+    return (composite.target, composite.erased, cameras, light, options.reach, repr(options.sun_through))
 
 
 def _kind(light: Light | None) -> str:

@@ -15,6 +15,7 @@ from splatgraft.relighting.cast_shadows import cast_shadows
 from splatgraft.relighting.layers import Relit, assemble_layers, pasted
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import NoLight
+from splatgraft.relighting.light.sun import Point
 from splatgraft.relighting.prepared_object import SourceLight, SourceScene, find_source_light, prepare_object
 from splatgraft.relighting.scene_light import find_scene_light
 
@@ -33,6 +34,9 @@ class RelightOptions:
     """At most this share of the composite's Gaussians is added by splitting, or 40,000 where that is more; 0: none."""
     fitted_views: int = 8
     """Views of the target in which shadows are fitted to the surface that is seen; 0: none, for a quick draft."""
+    sun_through: tuple[Point, ...] = ()
+    """Points of the target in pairs, world units: one that casts a shadow, then the same point of its shadow. The
+    estimated light gets the sun that goes through them; several pairs are averaged. Of no effect on a given light."""
 
     def budget(self, count: int) -> int:
         """Gaussians that splitting may add to a composite of `count`."""
@@ -74,7 +78,9 @@ def relight(
         return pasted(composite, "No object is placed: nothing to light.")
     target = composite.target.select(~composite.erased)
     spheres = [bounding_sphere(one.in_target()) for _, one, _ in placed]
-    scene = find_scene_light(target, cameras, spheres, light=light, reach=options.reach)
+    scene = find_scene_light(
+        target, cameras, spheres, light=light, reach=options.reach, sun_through=options.sun_through
+    )
     if isinstance(scene, NoLight):
         return pasted(composite, f"{scene.reason} The object is pasted as it is.")
     objects, old_lights = [], dict[tuple[int, int], SourceLight]()

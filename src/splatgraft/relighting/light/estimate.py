@@ -98,6 +98,11 @@ class EstimatedLight:
         """The estimate, with the sun that shadows show."""
         return self.mean if self.sun is None else with_sun(self.mean, self.sun)
 
+    def with_sun(self, sun: Sun, scene: Gaussians) -> "EstimatedLight":
+        """With another sun, which nothing blocks that `scene` shows where the view from the place towards it ends."""
+        placed = with_source_distances(with_sun(self.mean, sun), scene, self.place)
+        return replace(self, sun=replace(sun, blockers_within=placed.sources[0].blockers_within))
+
     def at(self, scene: Gaussians, cameras: Cameras, place: BoundingSphere) -> "EstimatedLight | NoLight":
         """At a place in the same region: the same sources, and ambient light with what is near there."""
         if place.radius == self.place.radius and torch.equal(place.center, self.place.center):
@@ -152,11 +157,9 @@ def estimate_light(
     tint = sky / sky.mean().clamp_min(1e-6)
     sources, rest = _split_peaks(hidden.radiance(evidence, tint), evidence, within=region.radius)
     mean = with_source_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
+    found = EstimatedLight(mean, None, hidden, evidence, tint, place)
     sun = find_sun(whole, cameras, region, up)
-    if sun is not None:
-        placed = with_source_distances(with_sun(mean, sun), scene, place)
-        sun = replace(sun, blockers_within=placed.sources[0].blockers_within)
-    return EstimatedLight(mean, sun, hidden, evidence, tint, place)
+    return found if sun is None else found.with_sun(sun, scene)
 
 
 def _usable(scene: Gaussians) -> Gaussians:

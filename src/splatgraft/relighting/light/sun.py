@@ -1,5 +1,7 @@
 """The sun from the shadows that a scene shows on the level surface around a place: its direction and its strength.
 
+It is found by itself (`find_sun`), or goes through points that someone names with their shadows (`set_sun`).
+
 The surface is drawn as a picture from above: the median over the cameras of what they show of it. In sunlight the
 picture is darker, by one factor, wherever something that stands on the surface blocks the sun. For every direction the
 shadow of all that stands there is drawn the same way, and the differences of log luminance between texels a few apart
@@ -8,6 +10,7 @@ shaded by what no camera saw, one by one or a whole tile of the picture.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -87,10 +90,20 @@ _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12
 """Angular radii that are tried, and the directions that stand for each."""
 _BLURS = 5
 """Widths of the reconstruction's blur that are tried beside each radius."""
+_UNSEEN_RADIUS_DEG = 1.0
+"""Angular radius of a sun set by hand where no edge of a shadow shows it."""
 _SOFTER = 3.0
 """Log likelihood over that of a smaller radius from which a larger one is taken: 20 to 1."""
 _ERROR_DEG = 1.0
-"""Standard error of a direction that was found."""
+"""Standard error of a direction that was found, and the least of one that was set by hand."""
+_AROUND_SHADOW = 2.5
+"""Distances from a point to its shadow: radius of the region in which the strength of a sun set by hand is measured."""
+
+SET_BY_HAND = "sun set by hand"
+"""Name of such a sun in reports."""
+
+Point = tuple[float, float, float]
+"""World units."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +116,14 @@ class Sun:
     """Angular radius; a window's is larger than the sun's."""
     normal: Float[Tensor, "3"]
     """Unit, of the surface."""
-    ratio: Float[Tensor, "3"]
-    """Irradiance of the sun over that of all other light on the surface, per channel."""
+    ratio: Float[Tensor, "3"] | None
+    """Irradiance of the sun over that of all other light on the surface, per channel; None where none was measured."""
     evidence: float
-    """Log likelihood over that of no sun."""
+    """Log likelihood over that of no sun; infinite where it was set by hand."""
+    error_deg: float = _ERROR_DEG
+    """Standard error of the direction."""
+    name: str = "sun"
+    """As in `LightSource`."""
     blockers_within: float = math.inf
     """World units; occluders farther away do not block it."""
 
@@ -322,17 +339,67 @@ def find_sun(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Flo
                 best, evidence = mode, float(found.max())
     if evidence < _DECISIVE:
         return None
-    softened = torch.stack([surface.shadows(standing, _cone(best, radius)).mean(0) for radius in _RADII_DEG])
+    radius, ratio = _radius_and_ratio(picture, standing, best)
+    if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
+        return None
+    return Sun(best, radius, normal, ratio, evidence)
+
+
+def set_sun(points: Sequence[Point], scene: Gaussians, cameras: Cameras, up: Float[Tensor, "3"]) -> Sun:
+    """The sun that throws the shadows of some points where someone says that they lie.
+
+    Its direction is the mean over the pairs, its error their spread. Radius and strength are measured at the edges of
+    the shadows around the first pair where a level surface shows such edges.
+
+    Args:
+        points: Pairs, world units: a point of what casts a shadow, then the same point of its shadow.
+        scene: All Gaussians, with what casts the shadows.
+        cameras: Of its capture.
+        up: Unit.
+
+    Raises:
+        ValueError: The points are no pairs, or a shadow lies higher than what casts it.
+    """
+    pairs = torch.tensor(points).reshape(-1, 3)
+    if len(pairs) % 2 or not len(pairs):
+        raise ValueError(f"sun_through: expected pairs of a point and its shadow, found {len(pairs)} points")
+    casters, shadows = pairs[::2], pairs[1::2]
+    towards = F.normalize(casters - shadows, dim=1)
+    if float((towards @ up).min()) < _LOWEST:
+        i = int((towards @ up).argmin())
+        height = float((casters[i] - shadows[i]) @ up)
+        raise ValueError(
+            f"sun_through: expected a point that casts a shadow, then its shadow below it; found the first "
+            f"{height:.3g} above the second in pair {i + 1}"
+        )
+    direction = F.normalize(towards.mean(0), dim=0)
+    spread = torch.rad2deg((towards @ direction).clamp(-1, 1).acos()).square().mean().sqrt()
+    by_hand = Sun(direction, _UNSEEN_RADIUS_DEG, up, None, math.inf, max(_ERROR_DEG, float(spread)), SET_BY_HAND)
+    for caster, shadow in zip(casters, shadows, strict=True):
+        region = BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm()))
+        surface = find_surface(scene, cameras, region, up)
+        if surface is None or float(direction @ surface.plane.normal) < _LOWEST:
+            continue
+        standing, picture = standing_on(surface, scene, region), draw_surface(scene, cameras, surface)
+        radius, ratio = _radius_and_ratio(picture, standing, direction)
+        if ratio is not None and float(ratio @ LUMINANCE) > 0:
+            return replace(by_hand, radius_deg=radius, normal=surface.plane.normal, ratio=ratio)
+    return replace(by_hand, name=f"{SET_BY_HAND}, its strength estimated")
+
+
+def _radius_and_ratio(
+    picture: SurfacePicture, standing: Occluders, direction: Float[Tensor, "3"]
+) -> tuple[float, Float[Tensor, "3"] | None]:
+    """Angular radius of a sun, degrees, and its irradiance over that of all other light; None where no edge is seen."""
+    fine, surface = _Comparison.of(picture, _FINE), picture.surface
+    softened = torch.stack([surface.shadows(standing, _cone(direction, radius)).mean(0) for radius in _RADII_DEG])
     by_radius = torch.full((len(_RADII_DEG),), -math.inf)
     blurred = softened
     for _ in range(_BLURS):
         by_radius = torch.maximum(by_radius, fine.log_likelihoods(blurred, _FINE_STRENGTHS))
         blurred = _blurred(blurred)
     radius = _RADII_DEG[int((by_radius > by_radius.max() - _SOFTER).int().argmax())]
-    ratio = lit_over_shaded(picture, softened[0])
-    if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
-        return None
-    return Sun(best, radius, normal, ratio, evidence)
+    return radius, lit_over_shaded(picture, softened[0])
 
 
 def _blurred(visible: Float[Tensor, "k s s"]) -> Float[Tensor, "k s s"]:
@@ -383,17 +450,17 @@ def with_sun(light: Light, sun: Sun) -> Light:
 
     Args:
         light: Estimated; its own suns are left out, its windows and lamps stay.
-        sun: Of the same place.
+        sun: Of the same place; where its ratio is None it is as strong as the suns that it replaces.
     """
-    others = replace(light, sources=tuple(source for source in light.sources if source.name != "sun"))
-    before = float(light.irradiance(sun.normal[None])[0] @ LUMINANCE)
-    shaded = others.irradiance(sun.normal[None])[0]
-    scale = before / float((shaded * (1 + sun.ratio)) @ LUMINANCE)
+    others = replace(light, sources=tuple(one for one in light.sources if not one.name.startswith("sun")))
+    before, shaded = (one.irradiance(sun.normal[None])[0] for one in (light, others))
+    ratio = (before / shaded - 1).clamp_min(_MIN_RATIO) if sun.ratio is None else sun.ratio
+    scale = float(before @ LUMINANCE) / float((shaded * (1 + ratio)) @ LUMINANCE)
     dimmed = tuple(replace(s, irradiance=tuple(scale * v for v in s.irradiance)) for s in others.sources)
-    irradiance = scale * shaded * sun.ratio / float(sun.direction @ sun.normal)
+    irradiance = scale * shaded * ratio / float(sun.direction @ sun.normal)
     x, y, z = sun.direction.tolist()
     r, g, b = irradiance.tolist()
     found = LightSource(
-        (x, y, z), (r, g, b), sun.radius_deg, _ERROR_DEG, name="sun", blockers_within=sun.blockers_within
+        (x, y, z), (r, g, b), sun.radius_deg, sun.error_deg, name=sun.name, blockers_within=sun.blockers_within
     )
     return replace(others, sources=(found, *dimmed), ambient=scale * others.ambient)
