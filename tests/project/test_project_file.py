@@ -117,6 +117,7 @@ def test_init_full_writes_a_project_with_every_key(tmp_path: Path, capsys: pytes
     assert main(["init", str(tmp_path / "p"), "--source", str(tmp_path), "--target", str(tmp_path), "--full"]) == 0
     text = (tmp_path / "p" / "project.toml").read_text()
     assert "#sampling_steps = 4" in text
+    assert "#sun_through = []" in text
     assert max(map(len, text.splitlines())) <= 120
     assert set(tomllib.loads(text)) == {table.name for table in project_keys()}
 

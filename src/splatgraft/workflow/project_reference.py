@@ -112,7 +112,9 @@ def type_words(hint: Any) -> str:
         return " or ".join(json.dumps(value) for value in arguments)
     if origin is tuple:
         count = "" if arguments[-1] is ... else f"{len(arguments)} "
-        return f"list of {count}{_TYPE_NAMES[arguments[0]]}s"
+        one = type_words(arguments[0])
+        # lists of 3 numbers have their plural inside
+        return f"list of {count}" + (one.replace("list", "lists", 1) if one.startswith("list") else f"{one}s")
     return _TYPE_NAMES[hint]
 
 
