@@ -134,7 +134,7 @@ def find_scene_light(
         spheres: Of the objects, at least one.
         light: At the objects' place, its sources seen from there; None to estimate it.
         reach: Object radii to which shadows are computed.
-        sun_through: Points and their shadows, as for `light.sun.sun_through`: the estimate then has this sun.
+        sun_through: Points and their shadows, as for `light.sun.set_sun`: the estimate then has this sun.
     """
     place = _place(spheres)
     estimate = None

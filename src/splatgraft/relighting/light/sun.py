@@ -450,7 +450,8 @@ def with_sun(light: Light, sun: Sun) -> Light:
 
     Args:
         light: Estimated; its own suns are left out, its windows and lamps stay.
-        sun: Of the same place; where its ratio is None it is as strong as the suns that it replaces.
+        sun: Of the same place; where its ratio is None it is as strong as the suns that it replaces, and not below
+            `_MIN_RATIO`.
     """
     others = replace(light, sources=tuple(one for one in light.sources if not one.name.startswith("sun")))
     before, shaded = (one.irradiance(sun.normal[None])[0] for one in (light, others))
