@@ -10,6 +10,7 @@ mean profile of that ratio across the edge goes from a fifth to four fifths of t
 
 import argparse
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -57,31 +58,37 @@ def measured(
     return dark, end - start
 
 
+def shadows_of(demo: Path, folders: tuple[str, ...]) -> Iterator[tuple[str, float, float]]:
+    """Name, darkness and width of the edge in mm of the cup's shadow, and of the bananas' in results of a demo."""
+    composite = read_composite(demo / "target" / "scene" / "scene.ply", demo / "composite" / "placement.json")
+    cameras = read_cameras(demo / "target" / "capture" / "transforms.json")
+    scene, placed = composite.target, composite.objects[0].in_target()
+    place = bounding_sphere(placed)
+    region = BoundingSphere(place.center, _RADII * place.radius)
+    surface = find_surface(scene, cameras, region, estimate_up(cameras))
+    assert surface is not None
+    cup = surface.shadows(standing_on(surface, scene, region), SUN[None])[0]
+    bananas = surface.shadows(occluders_of(placed), SUN[None])[0]
+    table = luminance(draw_surface(scene, cameras, surface))
+    lit = float(table[(cup > 0.99) & ~table.isnan()].median())
+    under = (surface.texels - place.center).norm(dim=-1) < place.radius
+    texel = 2000 * surface.half / len(cup)
+    rows = [("cup", table / lit, cup, bananas < 0.99)]
+    for folder in folders:
+        after = luminance(draw_surface(read_gaussians(demo / folder / "scene.ply"), cameras, surface))
+        rows.append((f"bananas, {folder}", after / table, bananas, (cup < 0.99) | under))
+    for name, ratio, visible, apart in rows:
+        dark, width = measured(ratio, visible, apart)
+        yield name, dark, width * texel
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("demos", type=Path, nargs="+", help="folders that `splatgraft demo` finished")
     for demo in parser.parse_args().demos:
-        composite = read_composite(demo / "target" / "scene" / "scene.ply", demo / "composite" / "placement.json")
-        cameras = read_cameras(demo / "target" / "capture" / "transforms.json")
-        scene, placed = composite.target, composite.objects[0].in_target()
-        place = bounding_sphere(placed)
-        region = BoundingSphere(place.center, _RADII * place.radius)
-        surface = find_surface(scene, cameras, region, estimate_up(cameras))
-        assert surface is not None
-        cup = surface.shadows(standing_on(surface, scene, region), SUN[None])[0]
-        bananas = surface.shadows(occluders_of(placed), SUN[None])[0]
-        table = luminance(draw_surface(scene, cameras, surface))
-        lit = float(table[(cup > 0.99) & ~table.isnan()].median())
-        under = (surface.texels - place.center).norm(dim=-1) < place.radius
-        texel = 2000 * surface.half / len(cup)
-        rows = [("cup", table / lit, cup, bananas < 0.99)]
-        for folder in ("relit", "result"):
-            after = luminance(draw_surface(read_gaussians(demo / folder / "scene.ply"), cameras, surface))
-            rows.append((f"bananas, {folder}", after / table, bananas, (cup < 0.99) | under))
-        for name, ratio, visible, apart in rows:
-            dark, width = measured(ratio, visible, apart)
-            print(f"{demo.name:20} {name:18} darkness {dark:.2f}, edge {width * texel:.0f} mm wide", flush=True)
+        for name, dark, width in shadows_of(demo, ("relit", "result")):
+            print(f"{demo.name:20} {name:18} darkness {dark:.2f}, edge {width:.0f} mm wide", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
-from splatgraft.core.directions import frames_along
+from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import srgb_from_linear
 from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 
@@ -70,3 +71,27 @@ def camera_inside(width: int = 37, height: int = 29) -> Cameras:
     """A camera in `random_scene`, some Gaussians behind it; sizes that no tile divides."""
     pose = look_at(torch.tensor([[0.5, 0.3, -2.2]]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
     return pinhole(pose, 40.0, width=width, height=height)
+
+
+def sunlit_scene(sun: Tensor, strength: float) -> Gaussians:
+    """Balls on a floor of one material, lit by `sun` and an even sky; shadows by exact ray casting."""
+    generator = torch.Generator().manual_seed(1)
+    centers = torch.tensor([[1.0, 0.2, 0.25], [-0.6, 0.9, 0.25], [-0.7, -0.8, 0.25], [0.5, -1.1, 0.25]])
+    grid = (torch.rand(12000, 2, generator=generator) - 0.5) * 5
+    points = [torch.cat([grid, torch.zeros(len(grid), 1)], 1)]
+    normals = [UP.repeat(len(grid), 1)]
+    for center in centers:
+        around = even_directions(900)
+        points.append(center + 0.25 * around)
+        normals.append(around)
+    point, normal = torch.cat(points), torch.cat(normals)
+    lit = (normal @ sun).clamp_min(0)
+    for center in centers:
+        away = center - point - 1e-3 * normal
+        along = away @ sun
+        hit = (along > 0) & ((away**2).sum(1) - along**2 < 0.25**2)
+        lit = torch.where(hit & ((point - center).norm(dim=1) > 0.26), 0, lit)
+    gray = 0.15 * (1 + strength * lit)
+    keep = (point[:, None, :2] - centers[:, :2]).norm(dim=-1).min(1).values > 0.05
+    keep |= point[:, 2] > 0.01
+    return surfels(point[keep], normal[keep], width=0.03, srgb=srgb_from_linear(gray)[keep, None].repeat(1, 3))

@@ -22,9 +22,9 @@ AROUND_THE_BALL = [-0.35, -0.35, 0.03, 0.35, 0.35, 0.65]
 TOKEN = "secret"
 
 
-def scene_project(root: Path, *, suffix: str = ".ply", **segment: object) -> Path:
-    """Write two scene files and a project of them; returns project.toml."""
-    scenes = [concatenate([plane((0.3, 0.5, 0.3)), ball()]), plane((0.5, 0.45, 0.6))]
+def scene_project(root: Path, *, suffix: str = ".ply", target: Gaussians | None = None, **segment: object) -> Path:
+    """Write two scene files and a project of them; returns project.toml. The target is a plane unless it is given."""
+    scenes = [concatenate([plane((0.3, 0.5, 0.3)), ball()]), plane((0.5, 0.45, 0.6)) if target is None else target]
     paths = [root / f"{name}{suffix}" for name in ("source", "target")]
     for path, scene in zip(paths, scenes, strict=True):
         write_gaussians(path, scene)

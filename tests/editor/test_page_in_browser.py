@@ -1,10 +1,12 @@
 """What only a browser shows: canvas, gizmos, strokes, photos, sizes of windows; and the whole way to the result."""
 
 import io
+import math
 import os
 import random
 import shutil
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -15,8 +17,9 @@ import pytest
 import torch
 from editor_driver import Editor, Window, history_of, jobs_of, state_of, wait_for_job
 from editor_fixtures import address_of
-from editor_pages import AROUND_THE_BALL, opened_page
+from editor_pages import AROUND_THE_BALL, opened_page, scene_project
 from PIL import Image
+from shapes import sunlit_scene
 from test_state import LIGHT
 from tiny_project import ball, plane
 
@@ -24,13 +27,17 @@ from splatgraft.cli import main
 from splatgraft.core.gaussians import concatenate
 from splatgraft.editor.page.page import Page
 from splatgraft.editor.page.photo_clicks import PhotoView
+from splatgraft.editor.page.scene_view import camera_from_viser
 from splatgraft.editor.placement import rescale
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import light_to_json
+from splatgraft.relighting import LightSource, light_to_json
+from splatgraft.relighting.light.sun import SET_BY_HAND
+
+pytestmark = pytest.mark.first
 
 PANEL_PX = 372
 PHASES = ("Open", "Select", "Place", "Light", "Run")
@@ -130,6 +137,64 @@ def test_an_arrow_of_the_light_is_dragged_under_drafts(browser: Any, project: Pa
 
         window.act_until(drag_and_release, lambda: height_of_the_sun() > 0.82, what="a higher sun in light.json")
         wait_for_the_full_light(window)
+        window.page.close()
+
+
+def click_at(window: Window, page: Page, point: torch.Tensor) -> None:
+    """Click where the canvas shows a point of the scene."""
+    canvas, client = window.page.locator("canvas").first.bounding_box(), page.context.guarded.editing()
+    assert client is not None
+    camera = camera_from_viser(client.camera, width=round(canvas["width"]))
+    pose = camera.camera_from_world[0]
+    seen = camera.intrinsics[0] @ (pose[:3, :3] @ point + pose[:3, 3])
+    x, y = (seen[:2] / seen[2]).tolist()
+    window.page.mouse.click(canvas["x"] + x, canvas["y"] + y)
+
+
+def set_the_sun(window: Window, page: Page, pairs: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> LightSource:
+    """Set the sun by clicks on points and their shadows; gives it as it is saved."""
+    window.show_phase("Light")
+    wait_for_the_full_light(window)
+    window.check("Set the sun by two clicks")
+    window.says("click what casts a shadow")
+    wanted = ("one pair of points", "2 pairs", "3 pairs")
+    for (caster, shadow), said in zip(pairs, wanted, strict=False):
+        click_at(window, page, caster)
+        window.says("now click the same point of its shadow")
+        click_at(window, page, shadow)
+        window.says(f"the sun by {said}")
+    light = page.context.require_session().state.light
+    assert light is not None
+    return light.sources[0]
+
+
+def test_two_clicks_set_the_sun_and_undo_takes_it_back(browser: Any, tmp_path: Path) -> None:
+    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    project = scene_project(tmp_path, target=sunlit_scene(sun, 3.0))
+    (project.parent / "light.json").write_text(light_to_json(LIGHT))
+    project.write_text(with_keys(project.read_text(), "relight", {"given_light": "light.json"}))
+    assert main(["run", str(project), "--to", "compose"]) == 0
+    tops = torch.tensor([[1.0, 0.2, 0.5], [-0.7, -0.8, 0.5]])
+    with opened_page(project) as page:
+        window = Window.opened(browser, address_of(page))
+        found = set_the_sun(window, page, [(top, top - sun * top[2] / sun[2]) for top in tops])
+        assert math.degrees(math.acos(float(torch.tensor(found.direction) @ sun))) < 3
+        assert found.name == SET_BY_HAND
+        # by the shadows the sun has 3 times its cosine of the sky's light on the floor
+        light = page.context.require_session().state.light
+        assert light is not None
+        share = found.irradiance[0] * found.direction[2] / float(light.irradiance(torch.tensor([[0.0, 0, 1]]))[0, 0])
+        assert share == pytest.approx(3 * float(sun[2]) / (1 + 3 * float(sun[2])), abs=0.08)
+        wait_for_the_full_light(window)
+        window.undo_until(
+            project, lambda: (now := state_of(project).light) is not None and now.sources == LIGHT.sources
+        )
+        # a point on the shadow first, which is refused
+        click_at(window, page, tops[0] - sun * 1.0)
+        window.says("now click the same point of its shadow")
+        click_at(window, page, tops[0])
+        window.says("expected a point that casts a shadow, then its shadow below it")
+        assert window.unknown_errors() == []
         window.page.close()
 
 

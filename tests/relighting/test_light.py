@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from shapes import UP, ring, surfels
+from shapes import UP, ring, sunlit_scene, surfels
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.bounds import BoundingSphere
@@ -283,30 +283,6 @@ def views(levels=(0.0,)):
     eyes = ring().centers
     poses = torch.cat([look_at(eyes, torch.tensor([0.0, 0.0, level]), UP) for level in levels])
     return pinhole(poses, 100.0, width=128, height=96)
-
-
-def sunlit_scene(sun, strength):
-    """Balls on a floor of one material, lit by `sun` and an even sky; shadows by exact ray casting."""
-    generator = torch.Generator().manual_seed(1)
-    centers = torch.tensor([[1.0, 0.2, 0.25], [-0.6, 0.9, 0.25], [-0.7, -0.8, 0.25], [0.5, -1.1, 0.25]])
-    grid = (torch.rand(12000, 2, generator=generator) - 0.5) * 5
-    points = [torch.cat([grid, torch.zeros(len(grid), 1)], 1)]
-    normals = [UP.repeat(len(grid), 1)]
-    for center in centers:
-        around = even_directions(900)
-        points.append(center + 0.25 * around)
-        normals.append(around)
-    point, normal = torch.cat(points), torch.cat(normals)
-    lit = (normal @ sun).clamp_min(0)
-    for center in centers:
-        away = center - point - 1e-3 * normal
-        along = away @ sun
-        hit = (along > 0) & ((away**2).sum(1) - along**2 < 0.25**2)
-        lit = torch.where(hit & ((point - center).norm(dim=1) > 0.26), 0, lit)
-    gray = 0.15 * (1 + strength * lit)
-    keep = (point[:, None, :2] - centers[:, :2]).norm(dim=-1).min(1).values > 0.05
-    keep |= point[:, 2] > 0.01
-    return surfels(point[keep], normal[keep], width=0.03, srgb=srgb_from_linear(gray)[keep, None].repeat(1, 3))
 
 
 def estimated(scene, cameras=None) -> Light:

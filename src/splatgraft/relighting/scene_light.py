@@ -16,7 +16,6 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.spherical_harmonics import rgb_from_dc
@@ -25,7 +24,7 @@ from splatgraft.relighting.light.evidence import group_materials
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.light.samples import LightSamples, main_source_samples, sample_light
-from splatgraft.relighting.light.sun import Point, set_sun
+from splatgraft.relighting.light.sun import Point
 from splatgraft.relighting.nearest_neighbours import nearest_neighbours
 from splatgraft.relighting.normals import Normals, estimate_normals
 from splatgraft.relighting.shading import irradiance
@@ -134,16 +133,14 @@ def find_scene_light(
         spheres: Of the objects, at least one.
         light: At the objects' place, its sources seen from there; None to estimate it.
         reach: Object radii to which shadows are computed.
-        sun_through: Points and their shadows, as for `light.sun.set_sun`: the estimate then has this sun.
+        sun_through: Points and their shadows, as for `light.sun.set_sun`: an estimate has this sun.
     """
     place = _place(spheres)
     estimate = None
     if light is None:
-        found = estimate_light(scene, place, cameras)
+        found = estimate_light(scene, place, cameras, sun_through=sun_through)
         if isinstance(found, NoLight):
             return found
-        if sun_through:
-            found = found.with_sun(set_sun(sun_through, scene, cameras, estimate_up(cameras)), scene)
         estimate, light = found, found.light
     else:
         light = with_source_distances(light, scene, place)

@@ -1,7 +1,10 @@
-"""The phase `Light`: light sources as draggable arrows, and the strength of each layer of the light transfer."""
+"""The phase `Light`: light sources as draggable arrows, a sun set by two clicks, and the strength of each layer of the
+light transfer.
+"""
 
 import html
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +17,11 @@ from splatgraft.core.directions import tangents
 from splatgraft.editor.page.context import PageContext, Phase, note
 from splatgraft.editor.page.handles import add_handle
 from splatgraft.editor.page.preview_panel import PreviewPanel
+from splatgraft.editor.page.scene_view import ray_from_viser
+from splatgraft.editor.picking import first_surface_hit
 from splatgraft.editor.session import Session
 from splatgraft.relighting import LayerWeights, Light, LightSource
+from splatgraft.relighting.light.sun import SET_BY_HAND, Point, set_sun, with_sun
 
 _LAYERS = (
     ("shade", "Shade", (0.0, 2.0), "Light and dark sides of the object; 1 is as computed"),
@@ -31,6 +37,8 @@ _MAX_SOURCES = 4
 _HANDLE_PX = 70.0
 """Length of the handle's arrows on the screen, pixels."""
 _RING_SEGMENTS = 48
+_MARK = (255, 200, 60)
+"""Color of the points that set the sun."""
 
 
 class LightPhase(Phase):
@@ -41,6 +49,7 @@ class LightPhase(Phase):
         self._context, self._preview, gui = context, preview, context.gui
         self._text = gui.add_html("")
         self._estimate_button = gui.add_button("Estimate the light", icon=viser.Icon.SUN)
+        self._sun_clicks = SunClicks(context, self._light)
         self._source_choice = context.on(gui.add_dropdown("Source", _NO_NAMES, visible=False), self._remove_handle)
         self._strength = context.on(gui.add_slider("Strength", 0.0, 3.0, 0.05, 1.0, visible=False), self._scale_source)
         usual = LayerWeights()
@@ -59,6 +68,7 @@ class LightPhase(Phase):
         """Hide the light sources."""
         self._remove_handle()
         self._hide_arrows()
+        self._sun_clicks.leave()
 
     def refresh(self) -> None:
         """Update the target, the arrows, description and strengths."""
@@ -73,6 +83,7 @@ class LightPhase(Phase):
         light = self._light(session) if objects and session.scenes.at_hand(session.scenes.base_files(objects)) else None
         self._estimate_button.visible = session.files.transfers_light and light is None and bool(objects)
         self._reset.disabled = session.state.light is None
+        self._sun_clicks.refresh(light)
         self._source_choice.visible = self._strength.visible = light is not None and bool(light.sources)
         if light is None:
             self._text.content = note(html.escape(_missing_reason(session)), kind="light")
@@ -80,8 +91,9 @@ class LightPhase(Phase):
         names = tuple(f"{i + 1}: {s.name}" for i, s in enumerate(light.sources[:_MAX_SOURCES]))
         if names and tuple(self._source_choice.options) != names:
             self._source_choice.options = names
-        by = "Set by hand: " if session.state.light is not None else "Estimated: "
-        self._text.content = note(html.escape(by + light.describe(session.up())), kind="light")
+        described = light.describe(session.up())
+        by = "Estimated: " if session.state.light is None else "" if SET_BY_HAND in described else "Set by hand: "
+        self._text.content = note(html.escape(by + described), kind="light")
         self._draw(session, light)
 
     def _light(self, session: Session) -> Light | None:
@@ -183,6 +195,91 @@ class LightPhase(Phase):
             self._dragged_light = None
             self._context.callback(lambda _: session.change(edited))(None)
         self._preview.set_dragged_state(None if ended else edited)
+
+
+class SunClicks:
+    """While active, two clicks set the sun: on what casts a shadow, then on the same point of its shadow."""
+
+    def __init__(self, context: PageContext, light_of: Callable[[Session], Light | None]) -> None:
+        """Start inactive; `light_of` gives the light whose sun is replaced."""
+        self._context, self._light_of = context, light_of
+        self._is_active = context.on(
+            context.gui.add_checkbox(
+                "Set the sun by two clicks",
+                False,
+                visible=False,
+                hint="Click what casts a shadow in the scene, then the same point of its shadow",
+            ),
+            self._toggle,
+        )
+        self._points: tuple[Point, ...] = ()
+        self._set_light: Light | None = None
+        """The light when the last point was added; under another one, as after undo, pairs begin anew."""
+        self._is_listening = False
+
+    def refresh(self, light: Light | None) -> None:
+        """Take clicks while it is active and there is a light, and show the points."""
+        self._is_active.visible = light is not None
+        self._listen(self._is_active.value and light is not None)
+        points, scene = self._kept() if self._is_listening else (), self._context.server.scene
+        for name in ("points", "pairs"):
+            self._context.view.remove(f"/light/{name}")
+        if points:
+            at, size = np.array(points, np.float32), 0.012 * self._context.scene_scale()
+            scene.add_point_cloud("/light/points", at, _MARK, point_size=size, point_shape="circle")
+            pairs = at[: len(at) // 2 * 2].reshape(-1, 2, 3)
+            scene.add_line_segments("/light/pairs", points=pairs, colors=_MARK)
+
+    def leave(self) -> None:
+        """Take no more clicks, and hide the points."""
+        self._is_active.value = False
+        self.refresh(None)
+
+    def _kept(self) -> tuple[Point, ...]:
+        """The points that still hold."""
+        return self._points if self._context.require_session().state.light is self._set_light else ()
+
+    def _listen(self, wanted: bool) -> None:
+        if wanted and not self._is_listening:
+            self._context.server.scene.on_click()(self._clicked)
+        elif self._is_listening and not wanted:
+            self._context.server.scene.remove_click_callback(self._clicked)
+        self._is_listening = wanted
+
+    def _toggle(self) -> None:
+        self._listen(self._is_active.value)
+        if self._is_active.value:
+            self._context.say("click what casts a shadow in the scene, such as the corner of a table")
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        self._context.callback(self._add)(event)
+
+    def _add(self, event: viser.SceneClickEvent) -> None:
+        session, ray = self._context.require_session(), ray_from_viser(event)
+        state, files = session.placed_state(), session.files
+        scene = session.scenes.gaussians(files.target_scene)
+        if state.erased is not None:
+            scene = scene.select(~state.erased)
+        hit = first_surface_hit(scene, ray.origin, ray.direction)
+        if hit is None:
+            raise ValueError("click: expected a surface of the scene under the pointer, found none")
+        x, y, z = hit.tolist()
+        points = (*self._kept(), (x, y, z))
+        if len(points) % 2:
+            self._points, self._set_light = points, session.state.light
+            self._context.say("now click the same point of its shadow")
+            return
+        self._points, light = points[:-2], self._light_of(session)
+        assert light is not None
+        sun = set_sun(points, scene, session.scenes.cameras(files.target_cameras), session.up())
+        session.change(replace(state, light=with_sun(light, sun)))
+        self._points, self._set_light = points, session.state.light
+        pairs = len(points) // 2
+        agree = f"{pairs} pairs, which agree to {sun.error_deg:.0f} degrees" if pairs > 1 else "one pair of points"
+        strength = (
+            "as the shadow's edge shows" if sun.ratio is not None else "estimated, as no edge of the shadow is seen"
+        )
+        self._context.say(f"the sun by {agree}; its strength is {strength}; another pair makes it more exact")
 
 
 def arrow_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "2 3"]:

@@ -19,6 +19,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import C0
 from splatgraft.editor.memo import same_inputs
 from splatgraft.editor.page.opening import COARSE_NODE, add_coarse
+from splatgraft.editor.picking import Ray
 from splatgraft.editor.placement import gizmo_from_similarity
 from splatgraft.editor.relit_preview import largest_coverage_indices
 from splatgraft.editor.scene_sample import SceneSample
@@ -239,3 +240,10 @@ def camera_from_viser(camera: viser.CameraHandle, *, width: int, min_aspect: flo
     focal = height / (2 * np.tan(camera.fov / 2))
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
     return Cameras(pose[None], intrinsics[None], torch.tensor([[width, height]]), ("window",))
+
+
+def ray_from_viser(event: viser.SceneClickEvent) -> Ray:
+    """The ray through a click."""
+    assert event.ray_origin is not None
+    assert event.ray_direction is not None
+    return Ray(torch.tensor(event.ray_origin).float(), torch.tensor(event.ray_direction).float())

@@ -13,7 +13,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.page.context import PageContext, Phase, note
 from splatgraft.editor.page.handles import BoxHandles
 from splatgraft.editor.page.photo_clicks import PhotoClicks
-from splatgraft.editor.page.scene_view import TINT, Color, camera_from_viser
+from splatgraft.editor.page.scene_view import TINT, Color, camera_from_viser, ray_from_viser
 from splatgraft.editor.picking import Ray, Rectangle, brush_selection, in_rectangle, interpolate_rays
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import BoxNumbers
@@ -272,7 +272,7 @@ class Brush:
             self._canvas = None
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
-        self._rays, self._rays_done = (Ray(_vector(event.ray_origin), _vector(event.ray_direction)),), 0
+        self._rays, self._rays_done = (ray_from_viser(event),), 0
         self._worker.submit(True)
 
     async def _dragged(self, event: viser.SceneNodeDragEvent[viser.IcosphereHandle]) -> None:

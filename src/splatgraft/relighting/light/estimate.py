@@ -6,6 +6,7 @@ the place stands where the view towards it ends: nothing that the scene shows th
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -30,7 +31,7 @@ from splatgraft.relighting.light.panorama import (
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem, seen_sky
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
-from splatgraft.relighting.light.sun import Sun, find_sun, with_sun
+from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, with_sun
 from splatgraft.relighting.normals import estimate_normals
 from splatgraft.rendering import render
 
@@ -118,7 +119,12 @@ class EstimatedLight:
 
 
 def estimate_light(
-    scene: Gaussians, place: BoundingSphere, cameras: Cameras, *, object_gaussians: Gaussians | None = None
+    scene: Gaussians,
+    place: BoundingSphere,
+    cameras: Cameras,
+    *,
+    object_gaussians: Gaussians | None = None,
+    sun_through: Sequence[Point] = (),
 ) -> EstimatedLight | NoLight:
     """Estimate the light in the middle of `place`.
 
@@ -128,6 +134,7 @@ def estimate_light(
         cameras: Of the scene's capture.
         object_gaussians: The object itself, if it stands there: its shading and its shadow are evidence, but it is not
             part of the surroundings.
+        sun_through: Points and their shadows, as for `light.sun.set_sun`: the estimate then has this sun.
     """
     scene = _usable(scene)
     panorama = panorama_at(scene, place)
@@ -158,7 +165,7 @@ def estimate_light(
     sources, rest = _split_peaks(hidden.radiance(evidence, tint), evidence, within=region.radius)
     mean = with_source_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, tint, place)
-    sun = find_sun(whole, cameras, region, up)
+    sun = set_sun(sun_through, whole, cameras, up) if sun_through else find_sun(whole, cameras, region, up)
     return found if sun is None else found.with_sun(sun, scene)
 
 
