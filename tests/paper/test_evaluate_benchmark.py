@@ -13,8 +13,6 @@ from splatgraft.runtime.console import Console
 from splatgraft_paper.benchmark.methods import Method
 from splatgraft_paper.commands.benchmark import EvaluateBenchmark
 
-pytestmark = pytest.mark.first
-
 SCENES = Path(__file__).parents[2] / "data" / "benchmark"
 QUICK = ReconstructOptions(quality="draft", device="cpu", iterations=30, budget=1500)
 BETTER = replace(QUICK, iterations=300, budget=8000)
