@@ -266,14 +266,14 @@ class _Comparison:
     axes: tuple[_Differences, _Differences]
 
     @staticmethod
-    def of(picture: SurfacePicture, apart: int) -> "_Comparison":
-        """Compare what may be of one material in sun and shade."""
+    def of(picture: SurfacePicture, apart: int, step: int | None = None) -> "_Comparison":
+        """Compare what may be of one material in sun and shade, at every `step`; None: half of `apart`."""
         log_luminance = (picture.log_rgb.exp() @ LUMINANCE).log()
         red, green, blue = picture.log_rgb.unbind(-1)
         chroma = torch.stack([(green - 0.5 * (red + blue)) / _MAX_GREEN, (red - blue) / _MAX_RED], -1)
         tile = torch.arange(_SIZE) * _TILES // _SIZE
         tile = tile[:, None] * _TILES + tile
-        step = max(2, apart // 2)
+        step = step or max(2, apart // 2)
         whole, low, high = slice(None, None, step), slice(0, _SIZE - apart, step), slice(apart, _SIZE, step)
 
         def along(first: tuple[slice, slice], second: tuple[slice, slice]) -> _Differences:
@@ -436,7 +436,7 @@ def lit_over_shaded(picture: SurfacePicture, visible: Float[Tensor, "s s"]) -> F
         Per channel, at least 0; None where no edge is seen.
     """
     changes = []
-    for one in _Comparison.of(picture, _ACROSS).axes:
+    for one in _Comparison.of(picture, _ACROSS, 1).axes:
         edge = one.of(visible[None])[0]
         change = (picture.log_rgb[one.second] - picture.log_rgb[one.first])[one.chosen]
         across = edge.abs() > _EDGE
