@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from demo_shadow import SUN, shadows_of
 from editor_driver import Editor, Window, history_of, jobs_of, state_of, wait_for_job
 from editor_fixtures import address_of
 from editor_pages import AROUND_THE_BALL, opened_page, scene_project
@@ -195,6 +196,28 @@ def test_two_clicks_set_the_sun_and_undo_takes_it_back(browser: Any, tmp_path: P
         window.says("expected a point that casts a shadow, then its shadow below it")
         assert window.unknown_errors() == []
         window.page.close()
+
+
+@pytest.mark.long
+def test_two_clicks_on_the_demo_s_table_give_its_known_sun_and_a_shadow_as_dark_as_the_cup_s(
+    browser: Any, tmp_path: Path
+) -> None:
+    demo = tmp_path / "demo"
+    assert main(["demo", str(demo)]) == 0
+    # the cup's rim and the end of its shadow, as clicked by eye
+    rim, shadow = torch.tensor([-0.35, -0.08, 0.90]), torch.tensor([-0.26, -0.36, 0.80])
+    with opened_page(demo / "project.toml") as page:
+        window = Window.opened(browser, address_of(page))
+        window.show_phase("Light")
+        # both are in view there
+        window.write("Camera", "24")
+        found = set_the_sun(window, page, [(rim, shadow)])
+        window.page.close()
+    assert found.name == SET_BY_HAND
+    assert math.degrees(math.acos(float(torch.tensor(found.direction) @ SUN))) < 3
+    assert main(["run", str(demo / "project.toml"), "--to", "relight"]) == 0
+    (_, cup, _), (_, bananas, _) = shadows_of(demo, ("relit",))
+    assert bananas == pytest.approx(cup, rel=0.2)
 
 
 def test_strokes_and_clicks_in_a_photo_select_the_object(window: Window, project: Path) -> None:

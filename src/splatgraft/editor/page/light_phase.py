@@ -275,7 +275,7 @@ class SunClicks:
         session.change(replace(state, light=with_sun(light, sun)))
         self._points, self._set_light = points, session.state.light
         pairs = len(points) // 2
-        agree = f"{pairs} pairs, which agree to {sun.error_deg:.0f} degrees" if pairs > 1 else "one pair of points"
+        agree = f"{pairs} pairs, which agree to {sun.error_deg:.0f}°" if pairs > 1 else "one pair of points"
         strength = (
             "as the shadow's edge shows" if sun.ratio is not None else "estimated, as no edge of the shadow is seen"
         )
