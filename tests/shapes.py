@@ -74,7 +74,7 @@ def camera_inside(width: int = 37, height: int = 29) -> Cameras:
 
 
 def sunlit_scene(sun: Tensor, strength: float) -> Gaussians:
-    """Balls on a floor of one material, lit by `sun` and an even sky; shadows by exact ray casting."""
+    """Balls on a floor of one material, lit by `sun` and an even sky; both of their shadows are exact."""
     generator = torch.Generator().manual_seed(1)
     centers = torch.tensor([[1.0, 0.2, 0.25], [-0.6, 0.9, 0.25], [-0.7, -0.8, 0.25], [0.5, -1.1, 0.25]])
     grid = (torch.rand(12000, 2, generator=generator) - 0.5) * 5
@@ -91,7 +91,10 @@ def sunlit_scene(sun: Tensor, strength: float) -> Gaussians:
         along = away @ sun
         hit = (along > 0) & ((away**2).sum(1) - along**2 < 0.25**2)
         lit = torch.where(hit & ((point - center).norm(dim=1) > 0.26), 0, lit)
-    gray = 0.15 * (1 + strength * lit)
+    # of a floor's sky a ball takes its form factor
+    distance = (point[:, None] - centers).norm(dim=-1)
+    sky = torch.where(point[:, 2] > 0, 1, 1 - (0.25**3 / distance**3).sum(1))
+    gray = 0.15 * (sky + strength * lit)
     keep = (point[:, None, :2] - centers[:, :2]).norm(dim=-1).min(1).values > 0.05
     keep |= point[:, 2] > 0.01
     return surfels(point[keep], normal[keep], width=0.03, srgb=srgb_from_linear(gray)[keep, None].repeat(1, 3))

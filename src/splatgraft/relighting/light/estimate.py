@@ -140,9 +140,7 @@ def estimate_light(
     panorama = panorama_at(scene, place)
     if isinstance(panorama, NoLight):
         return panorama
-    up = estimate_up(cameras)
-    distance = float((cameras.centers - place.center).norm(dim=1).median())
-    region = BoundingSphere(place.center, max(_MIN_RADII * place.radius, min(distance, _MAX_RADII * place.radius)))
+    up, region = estimate_up(cameras), region_around(place, cameras)
     whole = scene
     if object_gaussians is not None:
         degree = max(scene.sh_degree, object_gaussians.sh_degree)
@@ -167,6 +165,12 @@ def estimate_light(
     found = EstimatedLight(mean, None, hidden, evidence, tint, place)
     sun = set_sun(sun_through, whole, cameras, up) if sun_through else find_sun(whole, cameras, region, up)
     return found if sun is None else found.with_sun(sun, scene)
+
+
+def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:
+    """What is looked at for the light at a place, from about the distance of the cameras."""
+    distance = float((cameras.centers - place.center).norm(dim=1).median())
+    return BoundingSphere(place.center, max(_MIN_RADII * place.radius, min(distance, _MAX_RADII * place.radius)))
 
 
 def _usable(scene: Gaussians) -> Gaussians:

@@ -3,10 +3,11 @@
 It is found by itself (`find_sun`), or goes through points that someone names with their shadows (`set_sun`).
 
 The surface is drawn as a picture from above: the median over the cameras of what they show of it. In sunlight the
-picture is darker, by one factor, wherever something that stands on the surface blocks the sun. For every direction the
-shadow of all that stands there is drawn the same way, and the differences of log luminance between texels a few apart
-are compared with those that the shadow predicts. Texels differ by their material, too (Cauchy density), and may be
-shaded by what no camera saw, one by one or a whole tile of the picture.
+picture is darker wherever something that stands on the surface blocks the sun, and a little at the foot of what stands
+there, which blocks the other light. For every direction the shadow of all that stands there is drawn the same way, and
+the differences of log luminance between texels a few apart are compared with those that sun and other light predict.
+Texels differ by their material, too (Cauchy density), and may be shaded by what no camera saw, one by one or a whole
+tile of the picture.
 """
 
 import math
@@ -67,6 +68,10 @@ _TILES = 8
 # the search
 _DIRECTIONS = even_directions(1600)
 """5 degrees apart."""
+_AMBIENT_DIRECTIONS = even_directions(200)
+"""From which all other light comes, on both sides of the surface."""
+_DARKEST = 0.02
+"""Least share of that light at a texel, since some of it is reflected by what blocks the rest."""
 _STANDING_WITHIN = 1.4
 """Radii of the region within which things cast shadows."""
 _LOWEST = math.sin(math.radians(2.0))
@@ -82,10 +87,14 @@ _APART = math.cos(math.radians(8.0))
 """Cosine of the smallest angle between two."""
 _SPANS = ((3.0, 1.0), (1.0, 0.33))
 """Half width and step of the grids around a maximum, degrees."""
-_PROMISING, _DECISIVE = 10.0, 60.0
-"""Log likelihood over that of no sun from which a direction of the search is refined, and from which there is a sun."""
-_MIN_RATIO = 0.6
+_PROMISING = 10.0
+"""Log likelihood over that of even light from which a direction of the search is refined."""
+DECISIVE = 40.0
+"""Log likelihood over that of all other light from which there is a sun; of benchmarks/fit_sun.py."""
+_MIN_RATIO = 0.3
 """Least irradiance of a sun over that of all other light, with less it is none."""
+_MIN_RATIO_BY_HAND = 0.6
+"""The same of a sun set by hand where no edge of a shadow shows its strength."""
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12
 """Angular radii that are tried, and the directions that stand for each."""
 _BLURS = 5
@@ -119,7 +128,7 @@ class Sun:
     ratio: Float[Tensor, "3"] | None
     """Irradiance of the sun over that of all other light on the surface, per channel; None where none was measured."""
     evidence: float
-    """Log likelihood over that of no sun; infinite where it was set by hand."""
+    """Log likelihood over that of all other light alone; infinite where it was set by hand."""
     error_deg: float = _ERROR_DEG
     """Standard error of the direction."""
     name: str = "sun"
@@ -154,6 +163,14 @@ class Surface:
         alpha = splat_depth_maps(occluders, window, size=_SIZE, with_color=False).alpha
         at = torch.einsum("kij,stj->ksti", window.frames[:, :2], self.texels - self.center) / radius
         return 1 - F.grid_sample(alpha[:, None], at, align_corners=False)[:, 0]
+
+    def ambient(self, occluders: Occluders) -> Float[Tensor, "s s"]:
+        """Share of an even sky's irradiance that reaches the texels past occluders above the plane."""
+        cosines = _AMBIENT_DIRECTIONS @ self.plane.normal
+        above = cosines > _LOWEST
+        parts = _AMBIENT_DIRECTIONS[above].split(_AT_ONCE), cosines[above].split(_AT_ONCE)
+        received = sum(torch.einsum("k,kst->st", w, self.shadows(occluders, d)) for d, w in zip(*parts, strict=True))
+        return (received / cosines[above].sum()).clamp_min(_DARKEST)
 
 
 @dataclass(frozen=True)
@@ -284,27 +301,33 @@ class _Comparison:
 
         return _Comparison(apart, step, (along((whole, low), (whole, high)), along((low, whole), (high, whole))))
 
-    def log_likelihoods(self, visible: Float[Tensor, "k s s"], strengths: tuple[float, ...]) -> Float[Tensor, "k"]:
-        """Log likelihood of a sun over that of none, at the best strength.
+    def log_likelihoods(self, irradiance: Float[Tensor, "k s s"]) -> Float[Tensor, "k"]:
+        """Log likelihood of k patterns of light on the surface, in any unit, over that of even light."""
+        brightness, by_tile = irradiance.log(), torch.zeros(len(irradiance), _TILES**2)
+        for one in self.axes:
+            even = 1 / (1 + (one.luminance / _NOISE) ** 2)
+            lit = 1 / (1 + ((one.luminance - one.of(brightness)) / _NOISE) ** 2)
+            mixed = (1 - _SHADED_TEXEL) * lit + _SHADED_TEXEL * even
+            by_tile.index_add_(1, one.tile, (mixed / even).log())
+        shown = by_tile * (self.step / self.apart) ** 2 + math.log(1 - _SHADED_TILE)
+        return torch.logaddexp(shown, torch.tensor(math.log(_SHADED_TILE))).sum(1)
+
+    def of_suns(
+        self, visible: Float[Tensor, "k s s"], ambient: Float[Tensor, "s s"], strengths: tuple[float, ...]
+    ) -> Float[Tensor, "k"]:
+        """The same of k suns, each at its best strength.
 
         Args:
-            visible: Share of a sun's light that reaches the texels, for k suns.
-            strengths: Irradiance of the sun over that of all other light on the surface.
+            visible: Share of each sun's light that reaches the texels.
+            ambient: Share of all other light that reaches them.
+            strengths: Irradiance of the sun over that of all other light on the surface, where nothing blocks them.
         """
-        found, densities = [], [1 / (1 + (one.luminance / _NOISE) ** 2) for one in self.axes]
-        for strength in strengths:
-            brightness = torch.log1p(strength * visible)
-            by_tile = torch.zeros(len(visible), _TILES**2)
-            for one, without in zip(self.axes, densities, strict=True):
-                sunlit = 1 / (1 + ((one.luminance - one.of(brightness)) / _NOISE) ** 2)
-                mixed = (1 - _SHADED_TEXEL) * sunlit + _SHADED_TEXEL * without
-                by_tile.index_add_(1, one.tile, (mixed / without).log())
-            lit = by_tile * (self.step / self.apart) ** 2 + math.log(1 - _SHADED_TILE)
-            found.append(torch.logaddexp(lit, torch.tensor(math.log(_SHADED_TILE))).sum(1))
-        return torch.stack(found).amax(0)
+        return torch.stack([self.log_likelihoods(ambient + s * visible) for s in strengths]).amax(0)
 
 
-def find_sun(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Float[Tensor, "3"]) -> Sun | None:
+def find_sun(
+    scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Float[Tensor, "3"], *, decisive: float = DECISIVE
+) -> Sun | None:
     """Find the sun whose shadows a level surface shows; None where none is decisively better than no sun.
 
     Args:
@@ -312,6 +335,7 @@ def find_sun(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Flo
         cameras: Of its capture.
         region: Around the place; the surface and what stands on it lie within.
         up: Unit.
+        decisive: Least evidence.
     """
     surface = find_surface(scene, cameras, region, up)
     if surface is None:
@@ -320,10 +344,12 @@ def find_sun(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Flo
     if not len(standing.means) or int(picture.valid.sum()) < _MIN_TEXELS:
         return None
     coarse, fine = _Comparison.of(picture, _COARSE), _Comparison.of(picture, _FINE)
-    normal = surface.plane.normal
+    ambient, normal = surface.ambient(standing), surface.plane.normal
+    blurred_ambient = _blurred(ambient[None])
+    without = max(0.0, float(fine.log_likelihoods(blurred_ambient)))
     directions = _DIRECTIONS[_DIRECTIONS @ normal > _LOWEST]
     parts = directions.split(_AT_ONCE)
-    score = torch.cat([coarse.log_likelihoods(surface.shadows(standing, part), _STRENGTHS) for part in parts])
+    score = torch.cat([coarse.of_suns(surface.shadows(standing, part), ambient, _STRENGTHS) for part in parts])
     best, evidence = directions[0], -math.inf
     for _ in range(_MODES):
         if float(score.max()) < _PROMISING:
@@ -333,11 +359,12 @@ def find_sun(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Flo
         for span, step in _SPANS:
             near = _around(mode, span, step)
             near = near[near @ normal > _LOWEST]
-            found = fine.log_likelihoods(_blurred(surface.shadows(standing, near)), _FINE_STRENGTHS)
+            shadows = _blurred(surface.shadows(standing, near))
+            found = fine.of_suns(shadows, blurred_ambient[0], _FINE_STRENGTHS) - without
             mode = near[found.argmax()]
             if float(found.max()) > evidence:
                 best, evidence = mode, float(found.max())
-    if evidence < _DECISIVE:
+    if evidence < decisive:
         return None
     radius, ratio = _radius_and_ratio(picture, standing, best)
     if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
@@ -394,12 +421,13 @@ def _radius_and_ratio(
     fine, surface = _Comparison.of(picture, _FINE), picture.surface
     softened = torch.stack([surface.shadows(standing, _cone(direction, radius)).mean(0) for radius in _RADII_DEG])
     by_radius = torch.full((len(_RADII_DEG),), -math.inf)
-    blurred = softened
+    ambient = surface.ambient(standing)
+    blurred = torch.cat([softened, ambient[None]])
     for _ in range(_BLURS):
-        by_radius = torch.maximum(by_radius, fine.log_likelihoods(blurred, _FINE_STRENGTHS))
+        by_radius = torch.maximum(by_radius, fine.of_suns(blurred[:-1], blurred[-1], _FINE_STRENGTHS))
         blurred = _blurred(blurred)
     radius = _RADII_DEG[int((by_radius > by_radius.max() - _SOFTER).int().argmax())]
-    return radius, lit_over_shaded(picture, softened[0])
+    return radius, lit_over_shaded(picture, softened[0], ambient)
 
 
 def _blurred(visible: Float[Tensor, "k s s"]) -> Float[Tensor, "k s s"]:
@@ -425,24 +453,30 @@ def _cone(direction: Float[Tensor, "3"], radius_deg: float) -> Float[Tensor, "k 
     return F.normalize(direction + vogel_offsets(direction, radii, index), dim=1)
 
 
-def lit_over_shaded(picture: SurfacePicture, visible: Float[Tensor, "s s"]) -> Float[Tensor, "3"] | None:
+def lit_over_shaded(
+    picture: SurfacePicture, visible: Float[Tensor, "s s"], ambient: Float[Tensor, "s s"]
+) -> Float[Tensor, "3"] | None:
     """Irradiance of the sun over that of all other light, from texels on both sides of a shadow's edge.
 
     Args:
         picture: The surface.
         visible: Share of the sun's light that reaches each texel.
+        ambient: Share of all other light that reaches it.
 
     Returns:
         Per channel, at least 0; None where no edge is seen.
     """
-    changes = []
+    ratios = []
     for one in _Comparison.of(picture, _ACROSS, 1).axes:
         edge = one.of(visible[None])[0]
-        change = (picture.log_rgb[one.second] - picture.log_rgb[one.first])[one.chosen]
         across = edge.abs() > _EDGE
-        changes.append(change[across] * edge[across].sign()[:, None])
-    found = torch.cat(changes)
-    return (found.median(0).values.exp() - 1).clamp_min(0) if len(found) else None
+        sign = edge[across].sign()
+        change = (picture.log_rgb[one.second] - picture.log_rgb[one.first])[one.chosen][across] * sign[:, None]
+        first, second = (ambient[side][one.chosen][across] for side in (one.first, one.second))
+        lit, shaded = torch.where(sign > 0, second, first), torch.where(sign > 0, first, second)
+        ratios.append(change.exp() * shaded[:, None] - lit[:, None])
+    found = torch.cat(ratios)
+    return found.median(0).values.clamp_min(0) if len(found) else None
 
 
 def with_sun(light: Light, sun: Sun) -> Light:
@@ -451,11 +485,11 @@ def with_sun(light: Light, sun: Sun) -> Light:
     Args:
         light: Estimated; its own suns are left out, its windows and lamps stay.
         sun: Of the same place; where its ratio is None it is as strong as the suns that it replaces, and not below
-            `_MIN_RATIO`.
+            `_MIN_RATIO_BY_HAND`.
     """
     others = replace(light, sources=tuple(one for one in light.sources if not one.name.startswith("sun")))
     before, shaded = (one.irradiance(sun.normal[None])[0] for one in (light, others))
-    ratio = (before / shaded - 1).clamp_min(_MIN_RATIO) if sun.ratio is None else sun.ratio
+    ratio = (before / shaded - 1).clamp_min(_MIN_RATIO_BY_HAND) if sun.ratio is None else sun.ratio
     scale = float(before @ LUMINANCE) / float((shaded * (1 + ratio)) @ LUMINANCE)
     dimmed = tuple(replace(s, irradiance=tuple(scale * v for v in s.irradiance)) for s in others.sources)
     irradiance = scale * shaded * ratio / float(sun.direction @ sun.normal)
