@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -298,6 +299,10 @@ class Window:
                 lambda count=count: len(history_of(project)["past"]) < count,
                 what="a step back in the history",
             )
+            # the other files are written after the history
+            settled = time.monotonic() + 2
+            while time.monotonic() < settled and not condition():
+                self._pause(0.1)
 
     # the 3D view
 
