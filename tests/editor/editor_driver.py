@@ -290,19 +290,28 @@ class Window:
 
     def undo_until(self, project: Path, condition: Callable[[], bool]) -> None:
         """Undo step by step until `condition` holds."""
+
+        # the history and the other files of a step are written one after the other
+        def past() -> int:
+            return len(history_of(project)["past"])
+
         while not condition():
-            count = len(history_of(project)["past"])
+            self._settled(lambda: past() > 0)
+            count = past()
             assert count, "no step is left to undo"
             # viser's page may drop a click that follows the last one at once
             self.act_until(
                 lambda: self.click("Undo"),
-                lambda count=count: len(history_of(project)["past"]) < count,
+                lambda count=count: past() < count,
                 what="a step back in the history",
             )
-            # the other files are written after the history
-            settled = time.monotonic() + 2
-            while time.monotonic() < settled and not condition():
-                self._pause(0.1)
+            self._settled(condition)
+
+    def _settled(self, condition: Callable[[], bool]) -> None:
+        """Wait for a moment for what may hold or not."""
+        end = time.monotonic() + 3
+        while time.monotonic() < end and not condition():
+            self._pause(0.1)
 
     # the 3D view
 
