@@ -7,6 +7,7 @@ lies within 5 degrees of the disc of a true source that gives a fifth of the irr
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -20,6 +21,7 @@ from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.light.estimate import region_around
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.sun import Sun, find_sun
+from splatgraft_paper.exam.scenes import ExamScene
 
 _BARS = (15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0)
 _NEAR_DEG = 5.0
@@ -62,29 +64,28 @@ def judge(sun: Sun, truth: Light) -> Judged:
     return Judged(sun, off, near / (1 - near))
 
 
+def places_of(scene: ExamScene) -> Iterator[tuple[str, Gaussians, Cameras, BoundingSphere, Light]]:
+    """Of both places: end of the name, all that casts shadows, the cameras, the place, the true light."""
+    placed, source = scene.composite.objects[0], scene.source
+    yield "", scene.composite.target, scene.cameras, bounding_sphere(placed.in_target()), scene.new_light
+    whole = concatenate([source.gaussians, placed.gaussians])
+    yield ", old place", whole, source.cameras, bounding_sphere(placed.gaussians), scene.old_light
+
+
 def main() -> None:
     """Judge and print."""
     found: list[Judged] = []
     places = 0
-
-    def look(name: str, scene: Gaussians, cameras: Cameras, place: BoundingSphere, truth: Light) -> None:
-        nonlocal places
-        places += 1
-        sun = find_sun(scene, cameras, region_around(place, cameras), estimate_up(cameras), decisive=min(_BARS))
-        if sun is None:
-            return
-        one = judge(sun, truth)
-        found.append(one)
-        strength = f"strength {one.ratio:.2f} (true {one.true_ratio:.2f})"
-        print(f"{name:28s} evidence {sun.evidence:4.0f}   off {one.off_deg:5.1f} degrees   {strength}", flush=True)
-
     for name, read in scenes_in(scene_arguments(__doc__).parse_args()):
-        scene = read()
-        placed, source = scene.composite.objects[0], scene.source
-        look(name, scene.composite.target, scene.cameras, bounding_sphere(placed.in_target()), scene.new_light)
-        degree = max(source.gaussians.sh_degree, placed.gaussians.sh_degree)
-        whole = concatenate([one.with_sh_degree(degree) for one in (source.gaussians, placed.gaussians)])
-        look(f"{name}, old place", whole, source.cameras, bounding_sphere(placed.gaussians), scene.old_light)
+        for suffix, whole, cameras, place, truth in places_of(read()):
+            places += 1
+            sun = find_sun(whole, cameras, region_around(place, cameras), estimate_up(cameras), decisive=min(_BARS))
+            if sun is None:
+                continue
+            one = judge(sun, truth)
+            found.append(one)
+            where = f"{name + suffix:28s} evidence {sun.evidence:4.0f}   off {one.off_deg:5.1f} degrees"
+            print(f"{where}   strength {one.ratio:.2f} (true {one.true_ratio:.2f})", flush=True)
     print(f"{places} places")
     for bar in _BARS:
         over = [one for one in found if one.sun.evidence >= bar]

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +19,7 @@ import pytest
 from PIL import Image
 from waiting import HANG_LIMIT, act_until, wait_until
 
+from splatgraft.editor.history import StateStore
 from splatgraft.editor.jobs import Jobs
 from splatgraft.editor.state import EditState
 from splatgraft.editor.state_files import read_state
@@ -291,27 +291,22 @@ class Window:
     def undo_until(self, project: Path, condition: Callable[[], bool]) -> None:
         """Undo step by step until `condition` holds."""
 
-        # the history and the other files of a step are written one after the other
-        def past() -> int:
-            return len(history_of(project)["past"])
+        store = StateStore(project.parent, project_folder=project.parent)
+
+        def is_in_history() -> bool:
+            return store.save(state_of(project)) == history_of(project)["present"]
 
         while not condition():
-            self._settled(lambda: past() > 0)
-            count = past()
+            # the history is written after the files
+            self.until(is_in_history, what="the files' state in the history")
+            count = len(history_of(project)["past"])
             assert count, "no step is left to undo"
             # viser's page may drop a click that follows the last one at once
             self.act_until(
                 lambda: self.click("Undo"),
-                lambda count=count: past() < count,
+                lambda count=count: len(history_of(project)["past"]) < count,
                 what="a step back in the history",
             )
-            self._settled(condition)
-
-    def _settled(self, condition: Callable[[], bool]) -> None:
-        """Wait for a moment for what may hold or not."""
-        end = time.monotonic() + 3
-        while time.monotonic() < end and not condition():
-            self._pause(0.1)
 
     # the 3D view
 

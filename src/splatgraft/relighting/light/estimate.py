@@ -141,10 +141,7 @@ def estimate_light(
     if isinstance(panorama, NoLight):
         return panorama
     up, region = estimate_up(cameras), region_around(place, cameras)
-    whole = scene
-    if object_gaussians is not None:
-        degree = max(scene.sh_degree, object_gaussians.sh_degree)
-        whole = concatenate([scene.with_sh_degree(degree), object_gaussians.with_sh_degree(degree)])
+    whole = scene if object_gaussians is None else concatenate([scene, object_gaussians])
     part = whole.select((whole.means - region.center).norm(dim=1) < _SCENE_WITHIN * region.radius)
     normals = estimate_normals(part, cameras)
     surfaces = find_shading_evidence(part, normals, region=region)

@@ -89,8 +89,8 @@ _SPANS = ((3.0, 1.0), (1.0, 0.33))
 """Half width and step of the grids around a maximum, degrees."""
 _PROMISING = 10.0
 """Log likelihood over that of even light from which a direction of the search is refined."""
-DECISIVE = 40.0
-"""Log likelihood over that of all other light from which there is a sun; of benchmarks/fit_sun.py."""
+_DECISIVE = 40.0
+"""Log likelihood over that of all other light from which there is a sun; chosen with benchmarks/fit_sun.py."""
 _MIN_RATIO = 0.3
 """Least irradiance of a sun over that of all other light, with less it is none."""
 _MIN_RATIO_BY_HAND = 0.6
@@ -168,9 +168,8 @@ class Surface:
         """Share of an even sky's irradiance that reaches the texels past occluders above the plane."""
         cosines = _AMBIENT_DIRECTIONS @ self.plane.normal
         above = cosines > _LOWEST
-        parts = _AMBIENT_DIRECTIONS[above].split(_AT_ONCE), cosines[above].split(_AT_ONCE)
-        received = sum(torch.einsum("k,kst->st", w, self.shadows(occluders, d)) for d, w in zip(*parts, strict=True))
-        return (received / cosines[above].sum()).clamp_min(_DARKEST)
+        visible = self.shadows(occluders, _AMBIENT_DIRECTIONS[above])
+        return torch.einsum("k,kst->st", cosines[above] / cosines[above].sum(), visible).clamp_min(_DARKEST)
 
 
 @dataclass(frozen=True)
@@ -326,7 +325,7 @@ class _Comparison:
 
 
 def find_sun(
-    scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Float[Tensor, "3"], *, decisive: float = DECISIVE
+    scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Float[Tensor, "3"], *, decisive: float = _DECISIVE
 ) -> Sun | None:
     """Find the sun whose shadows a level surface shows; None where none is decisively better than no sun.
 
@@ -366,7 +365,7 @@ def find_sun(
                 best, evidence = mode, float(found.max())
     if evidence < decisive:
         return None
-    radius, ratio = _radius_and_ratio(picture, standing, best)
+    radius, ratio = _radius_and_ratio(picture, standing, ambient, best)
     if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
         return None
     return Sun(best, radius, normal, ratio, evidence)
@@ -408,20 +407,19 @@ def set_sun(points: Sequence[Point], scene: Gaussians, cameras: Cameras, up: Flo
         if surface is None or float(direction @ surface.plane.normal) < _LOWEST:
             continue
         standing, picture = standing_on(surface, scene, region), draw_surface(scene, cameras, surface)
-        radius, ratio = _radius_and_ratio(picture, standing, direction)
+        radius, ratio = _radius_and_ratio(picture, standing, surface.ambient(standing), direction)
         if ratio is not None and float(ratio @ LUMINANCE) > 0:
             return replace(by_hand, radius_deg=radius, normal=surface.plane.normal, ratio=ratio)
     return replace(by_hand, name=f"{SET_BY_HAND}, its strength estimated")
 
 
 def _radius_and_ratio(
-    picture: SurfacePicture, standing: Occluders, direction: Float[Tensor, "3"]
+    picture: SurfacePicture, standing: Occluders, ambient: Float[Tensor, "s s"], direction: Float[Tensor, "3"]
 ) -> tuple[float, Float[Tensor, "3"] | None]:
     """Angular radius of a sun, degrees, and its irradiance over that of all other light; None where no edge is seen."""
     fine, surface = _Comparison.of(picture, _FINE), picture.surface
     softened = torch.stack([surface.shadows(standing, _cone(direction, radius)).mean(0) for radius in _RADII_DEG])
     by_radius = torch.full((len(_RADII_DEG),), -math.inf)
-    ambient = surface.ambient(standing)
     blurred = torch.cat([softened, ambient[None]])
     for _ in range(_BLURS):
         by_radius = torch.maximum(by_radius, fine.of_suns(blurred[:-1], blurred[-1], _FINE_STRENGTHS))
