@@ -19,12 +19,13 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting import Light, LightSource, RelightOptions, relight
-from splatgraft.relighting.layers import pasted
+from splatgraft.relighting.layers import LayerWeights, pasted
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.light.samples import sample_light
 from splatgraft.relighting.shadows import view_fit
-from splatgraft.relighting.shadows.scene_ratio import object_shadow_maps, scene_ratio
-from splatgraft.relighting.shadows.view_fit import _FittedView, _solved, gaussians_in_view
+from splatgraft.relighting.shadows.scene_ratio import DARKEST, object_shadow_maps, scene_ratio
+from splatgraft.relighting.shadows.surface_views import GAMMA, gaussians_in_view
+from splatgraft.relighting.shadows.view_fit import _FittedView, _solved
 from splatgraft.rendering import render, view_operator
 
 IDENTITY = Similarity(1.0, torch.eye(3), torch.zeros(3))
@@ -147,6 +148,30 @@ def test_shadows_fitted_to_views_stand_where_the_surface_is_seen():
         errors.append(float(((after / before.clamp_min(1e-3) - truth)[near] ** 2).mean().sqrt()))
     # what the layer hides and blurs is not all undone: a quarter of the error at least is
     assert errors[1] < 0.75 * errors[0]
+
+
+def test_a_shadow_shades_what_is_seen_through_a_translucent_floor_too():
+    x = torch.linspace(-12, 12, 25)
+    at = torch.cat([torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2), torch.full((625, 1), -6.0)], 1)
+    below = surfels(at, torch.tensor([[0.0, 0.0, 1.0]]).repeat(625, 1), width=1.0)
+    # at most half of a pixel is of the floor
+    thin = replace(floor(), opacity_logits=torch.full((22_500,), -3.0))
+    target = concatenate([thin, below])
+    light = from_above(x=1.0)
+    relit = relit_ball(light, target=target, options=RelightOptions())
+    camera = cameras()[[5]]
+    before, after, plain = (
+        linear_from_srgb(render(g, camera).color[0].clamp(0, 1)).mean(-1)
+        for g in (target, *(relit.shaded(LayerWeights(shadow=w)).select(~relit.is_object) for w in (1.0, 0.0)))
+    )
+    points, _ = ground_points(camera)
+    to_center = CENTER - points
+    aside = ((to_center**2).sum(-1) - (to_center @ torch.tensor(light.sources[0].direction)) ** 2).clamp_min(0).sqrt()
+    near = points[..., :2].norm(dim=-1) < 1.2
+    core, lit = near & (aside < 0.8 * RADIUS), near & (aside > 1.2 * RADIUS)
+    assert float((after / before)[core].median()) < 0.15
+    assert float((after / before)[lit].median()) > 0.97
+    assert torch.allclose(plain, before, atol=2e-3)
 
 
 def test_the_shadow_is_darkest_at_the_foot():
@@ -330,6 +355,7 @@ def test_the_solver_equals_sirt_with_dense_matrices():
     scene, cameras = cloud(120, seed=1), views_around(3)
     generator = torch.Generator().manual_seed(2)
     receivers, values = 80, 0.5 + 0.5 * torch.rand(80, generator=generator)
+    others = torch.rand(40, generator=generator)
     views, matrices = [], []
     for camera in cameras:
         which, drawn = gaussians_in_view(scene.means, scene.scales.max(1).values, camera)
@@ -338,14 +364,15 @@ def test_the_solver_equals_sirt_with_dense_matrices():
         target = operator.alpha * (0.3 + 0.7 * torch.rand(operator.alpha.shape, generator=generator))
         directions = torch.nn.functional.normalize(scene.means[which[:first]] - camera.centers[0], dim=1)
         wide = drawn[:first] > view_fit._NARROWEST_PX
-        views.append(_FittedView(which[:first], len(which), operator, target, directions, wide))
+        fixed = others[which[first:] - receivers]
+        views.append(_FittedView(which[:first], fixed, operator, target, directions, wide))
         dense = torch.zeros(target.numel(), 120)
         dense[:, which] = operator.blend(torch.eye(len(which))).reshape(-1, len(which))
         matrices.append(dense.double())
     found = _solved(values, views)
 
-    least = view_fit._DARKEST ** (1 / view_fit._GAMMA)
-    value, slope = torch.cat([values, torch.ones(40)]).double(), torch.zeros(120, 3).double()
+    least = DARKEST ** (1 / GAMMA)
+    value, slope = torch.cat([values, others]).double(), torch.zeros(120, 3).double()
     weight = sum(dense.sum(0) for dense in matrices)
     step = torch.where(weight > view_fit._MIN_WEIGHT, 1 / weight, 0)
     step[receivers:] = 0

@@ -8,10 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.normals import raised
 from splatgraft.relighting.prepared_object import PreparedObject
 from splatgraft.relighting.scene_light import SceneLight
+from splatgraft.relighting.shadows.catchers import ShadowCatchers, find_catchers
 from splatgraft.relighting.shadows.receivers import RIM, Receivers, shade_receivers
 from splatgraft.relighting.shadows.scene_ratio import (
     SceneRatio,
@@ -21,11 +22,14 @@ from splatgraft.relighting.shadows.scene_ratio import (
     scene_ratio,
     scene_visibility,
 )
+from splatgraft.relighting.shadows.surface_views import views_of_surface
 from splatgraft.relighting.shadows.view_fit import fit_to_views
 
 SHADOW_POWER = 1.3
 """Exponent of shadows under an estimated light whose sun no shadow shows: an average over what is possible has less
 contrast than the light itself. Fitted by benchmarks/fit_shadows.py."""
+_CATCHER_SPACING = 0.05
+"""Object radii between two shadow catchers; set by hand."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,8 @@ class Shadows:
     """The Gaussians of the scene that some object reaches, wide ones split at shadow edges."""
     on_scene: SceneRatio
     """Ratios of the receivers, by all objects together."""
+    catchers: ShadowCatchers
+    """What shades what is seen behind the receivers."""
     scene_visibility: tuple[Float[Tensor, "n k"], ...]
     """Per object the share of every light sample that reaches its Gaussians past the scene, in [0, 1]."""
     on_objects: tuple[SceneRatio, ...]
@@ -55,13 +61,14 @@ def cast_shadows(
         budget: Most Gaussians that splitting may add to the scene.
     """
     power = SHADOW_POWER if scene.estimate is not None and scene.estimate.sun is None else 1.0
-    receivers, ratio = _on_scene(scene, objects, drawn, views, budget)
+    receivers, ratio, catchers = _on_scene(scene, objects, drawn, views, budget)
     visibility = tuple(
         scene_visibility(scene.maps, raised(one.gaussians, one.normals.vectors), one.normals.vectors) for one in objects
     )
     return Shadows(
         receivers=receivers,
         on_scene=ratio.strengthened(power),
+        catchers=replace(catchers, depth=power * catchers.depth),
         scene_visibility=visibility,
         on_objects=tuple(
             _on_object(one, [other for other in objects if other is not one], shares).strengthened(power)
@@ -72,14 +79,14 @@ def cast_shadows(
 
 def _on_scene(
     scene: SceneLight, objects: Sequence[PreparedObject], drawn: Gaussians, views: Cameras, budget: int
-) -> tuple[Receivers, SceneRatio]:
-    """The receivers that some object reaches, split where needed, and the product of all objects' ratios on them."""
-    whole = scene.receivers
-    points, rims = whole.gaussians.means, RIM * whole.gaussians.scales.max(1).values
+) -> tuple[Receivers, SceneRatio, ShadowCatchers]:
+    """The receivers that some object reaches, split where needed; all objects' ratios on them; catchers."""
+    all_receivers = scene.receivers
+    points, rims = all_receivers.gaussians.means, RIM * all_receivers.gaussians.scales.max(1).values
     reached = torch.zeros(len(points), dtype=torch.bool)
     for one in objects:
         reached |= reachable(points, one.sphere, scene.samples, farthest=scene.maps.region.radius, rims=rims)
-    receivers = whole.select(reached)
+    receivers = all_receivers.select(reached)
     receivers = replace(receivers, gaussians=drawn.select(receivers.origin))
     total: SceneRatio | None = None
     ambient_sums: list[Float[Tensor, "3 m 3"]] = []
@@ -107,7 +114,11 @@ def _on_scene(
 
     rest = torch.ones(drawn.count, dtype=torch.bool)
     rest[receivers.origin] = False
-    return receivers, fit_to_views(receivers, total, drawn.select(rest), views, ratio_at=ratio_at)
+    whole = concatenate([receivers.gaussians, drawn.select(rest).with_sh_degree(receivers.gaussians.sh_degree)])
+    shown = views_of_surface(receivers, total, whole, views, ratio_at=ratio_at)
+    spacing = _CATCHER_SPACING * min(one.sphere.radius for one in objects)
+    catchers = find_catchers(receivers, shown, spacing=spacing)
+    return receivers, fit_to_views(total, whole, shown, catchers.visible), catchers
 
 
 def _on_object(one: PreparedObject, others: Sequence[PreparedObject], visibility: Float[Tensor, "n k"]) -> SceneRatio:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -28,6 +29,7 @@ from splatgraft.relighting.shading import (
     shade_ratio,
     unknown_origin_ratio,
 )
+from splatgraft.relighting.shadows.catchers import with_depth
 from splatgraft.runtime.note import Note
 
 _MAX_VIEW_CHANGE = 0.9
@@ -61,11 +63,12 @@ class Relit:
     """A composite of m Gaussians with its light transfer in layers."""
 
     gaussians: Gaussians
-    """The plain composite: the target's Gaussians, then the objects'; large ones in a shadow are split."""
+    """The plain composite: the target's Gaussians, then the objects'; large ones in a shadow are split, and invisible
+    shadow catchers added."""
     is_object: Bool[Tensor, "m"]
     """Which Gaussians belong to an object."""
     origin: Int[Tensor, "m"]
-    """Position in `Composite.merged()` of the Gaussian that each one is, or is a piece of."""
+    """Position in `Composite.merged()` of the Gaussian that each one is, is a piece of, or catches the shadow at."""
     shade: Float[Tensor, "m 3"]
     """Factor on linear rgb; 1 outside the objects."""
     shadow: Float[Tensor, "m 3"]
@@ -74,6 +77,8 @@ class Relit:
     """Added to `shadow`, at least 0: light that an object reflects, as a share of the light without it."""
     slope: Float[Tensor, "m 3"]
     """View dependence, world axes: its product with the unit vector from the camera is added to shadow and bounce."""
+    catcher_depth: Float[Tensor, "m"]
+    """Optical depth of the shadow catchers, which are invisible without it; 0 for all other Gaussians."""
     gloss: Float[Tensor, "m k 3"]
     """Coefficients that are added to the harmonics after shading."""
     bands_replaced: Bool[Tensor, "m"]
@@ -125,7 +130,14 @@ class Relit:
             sh[sloped, 1:4] += spherical_harmonics.band_from_slope(slope)
         sh[self.bands_replaced, 1:] *= 1 - weights.gloss
         sh[glossy, : self.gloss.shape[1]] += weights.gloss * self.gloss[glossy]
-        return replace(self.gaussians, sh=sh)
+        changed = replace(self.gaussians, sh=sh)
+        catchers = (self.catcher_depth > 0).nonzero()[:, 0]
+        if not len(catchers):
+            return changed
+        logits = changed.opacity_logits.clone()
+        visible = with_depth(changed.select(catchers), weights.shadow * self.catcher_depth[catchers])
+        logits[catchers] = visible.opacity_logits
+        return replace(changed, opacity_logits=logits)
 
     def ratio(self, weights: LayerWeights = LayerWeights()) -> Float[Tensor, "m 3"]:
         """Factor on linear rgb that shade, tint, exposure, shadow and bounce make together."""
@@ -184,16 +196,18 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
         shadows: Of that light.
     """
     shadings = [_shading(one, scene, shares) for one, shares in zip(objects, shadows.scene_visibility, strict=True)]
-    receivers, on_scene = shadows.receivers, shadows.on_scene
+    receivers, on_scene, catchers = shadows.receivers, shadows.on_scene, shadows.catchers
     rest = torch.ones(scene.scene.count, dtype=torch.bool)
     rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
     object_rows = torch.arange(scene.scene.count, merged.count)
-    gaussians = concatenate([merged.select(rest_index), receivers.gaussians, merged.select(object_rows)])
+    black = catchers.clear.with_sh_degree(merged.sh_degree)
+    gaussians = concatenate([black, merged.select(rest_index), receivers.gaussians, merged.select(object_rows)])
     count = gaussians.count - len(object_rows)
-    ones, zeros = torch.ones(len(rest_index), 3), torch.zeros(len(rest_index), 3)
+    others = black.count + len(rest_index)
+    ones, zeros = torch.ones(others, 3), torch.zeros(others, 3)
     replaced = [torch.full((one.gaussians.count,), one.source_lighting is not None) for one in objects]
-    origin = torch.cat([rest_index, receivers.origin, object_rows])
+    origin = torch.cat([receivers.origin[catchers.receiver], rest_index, receivers.origin, object_rows])
     order = origin.argsort(stable=True)
     return Relit(
         gaussians=gaussians.select(order),
@@ -203,6 +217,7 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
         shadow=torch.cat([ones, on_scene.shadow, *[ratio.shadow for ratio in shadows.on_objects]])[order],
         bounce=torch.cat([zeros, on_scene.bounce, *[ratio.bounce for ratio in shadows.on_objects]])[order],
         slope=torch.cat([zeros, on_scene.slope, *[ratio.slope for ratio in shadows.on_objects]])[order],
+        catcher_depth=F.pad(catchers.depth, (0, gaussians.count - black.count))[order],
         gloss=_gloss_layer(gaussians, shadings)[order],
         bands_replaced=torch.cat([torch.zeros(count, dtype=torch.bool), *replaced])[order],
         objects=tuple(one.gaussians for one in objects),
@@ -268,6 +283,7 @@ def pasted(composite: Composite, reason: str) -> Relit:
         shadow=ones,
         bounce=torch.zeros_like(ones),
         slope=torch.zeros_like(ones),
+        catcher_depth=torch.zeros(gaussians.count),
         gloss=torch.zeros_like(gaussians.sh),
         bands_replaced=torch.zeros(gaussians.count, dtype=torch.bool),
         objects=tuple(placed.in_target() for placed in composite.objects if placed.gaussians.count),

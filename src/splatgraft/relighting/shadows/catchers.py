@@ -1,0 +1,104 @@
+"""Shadow catchers: black Gaussians in a surface that lets light through, which shade what is seen behind it.
+
+Fits often draw a plain floor by thin Gaussians before wide ones far behind it, so that a shadow in the colours of the
+surface changes a part of each pixel alone, and is pale. Black Gaussians whose transmittance is the ratio of light with
+the object to that without it do the same to the rest. Where the surface is opaque there are none.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from splatgraft.core.directions import frames_along
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.rotations import quaternion_from_rotation
+from splatgraft.core.spherical_harmonics import dc_from_rgb
+from splatgraft.relighting.shadows.receivers import Receivers
+from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView
+
+# set by hand
+_OPAQUE = 0.8
+"""Share of a pixel from which on colours of the surface alone make its shadow."""
+_FAINTEST = 0.03
+"""Share of light; where less is lost there are no catchers."""
+_WIDTH = 0.6
+"""Standard deviation over the spacing: a square lattice of them is even to a percent."""
+_FLAT = 0.1
+"""Standard deviation along the normal over that across it."""
+_REACH = 3.0
+"""Standard deviations within which catchers overlap."""
+_CLEAREST = 1e-6
+"""Opacity of those without any depth."""
+
+
+@dataclass(frozen=True)
+class ShadowCatchers:
+    """k black Gaussians."""
+
+    clear: Gaussians
+    """Without their depth: invisible; world frame."""
+    depth: Float[Tensor, "k"]
+    """Optical depth in the middle of each, -log(1 - opacity), in sRGB."""
+    receiver: Int[Tensor, "k"]
+    """Position of the receiver that each is at."""
+
+    @property
+    def visible(self) -> Gaussians:
+        """With their depth."""
+        return with_depth(self.clear, self.depth)
+
+
+def with_depth(gaussians: Gaussians, depth: Float[Tensor, "n"]) -> Gaussians:
+    """Gaussians of some optical depth in their middle, instead of their opacity."""
+    opacity = (1 - torch.exp(-depth)).clamp(_CLEAREST, 1 - _CLEAREST)
+    return Gaussians(gaussians.means, gaussians.log_scales, gaussians.quaternions, opacity.logit(), gaussians.sh)
+
+
+def find_catchers(receivers: Receivers, views: Sequence[SurfaceView], *, spacing: float) -> ShadowCatchers:
+    """The catchers in a surface, where views show its shadow and something behind it.
+
+    Args:
+        receivers: Gaussians of the surface.
+        views: What they show of it.
+        spacing: World units between two catchers.
+    """
+    points, receiver, ratio = [torch.zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0)]
+    for view in views:
+        opaque = (view.mass > _OPAQUE * view.weights.alpha)[view.shown]
+        wanted = ~opaque & (view.ratio < 1 - _FAINTEST)
+        points.append(view.points[wanted])
+        receiver.append(view.nearest[wanted])
+        ratio.append(view.ratio[wanted])
+    at, of, left = torch.cat(points), torch.cat(receiver), torch.cat(ratio)
+    cells, cell = torch.unique((at / spacing).floor().long(), dim=0, return_inverse=True)
+    count = torch.bincount(cell, minlength=len(cells))[:, None]
+    values = torch.cat([at, receivers.normals[of], left[:, None]], 1)
+    means = torch.zeros(len(cells), 7).index_add_(0, cell, values) / count
+    middle, normals = means[:, :3], F.normalize(means[:, 3:6], dim=1)
+    width = _WIDTH * spacing
+    clear = Gaussians(
+        means=middle,
+        log_scales=torch.tensor([width, width, _FLAT * width]).log().repeat(len(cells), 1),
+        quaternions=quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
+        opacity_logits=torch.zeros(len(cells)),
+        sh=dc_from_rgb(torch.zeros(len(cells), 3))[:, None],
+    )
+    depth = -means[:, 6].log() / GAMMA / _overlapping(middle, width)
+    first = torch.full((len(cells),), len(receivers.origin)).scatter_reduce(0, cell, of, "amin")
+    return ShadowCatchers(with_depth(clear, torch.zeros(len(cells))), depth, first)
+
+
+def _overlapping(points: Float[Tensor, "k 3"], width: float) -> Float[Tensor, "k"]:
+    """How many Gaussians of a width overlap at each one's middle, itself included, by their values there."""
+    if not len(points):
+        return torch.ones(0)
+    tree = KDTree(points.numpy())
+    near = tree.sparse_distance_matrix(tree, _REACH * width, output_type="coo_matrix")
+    value = torch.from_numpy(np.exp(-0.5 * (near.data / width) ** 2)).float()
+    return torch.zeros(len(points)).index_add_(0, torch.from_numpy(near.row.astype(np.int64)), value)
