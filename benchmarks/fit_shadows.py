@@ -34,17 +34,23 @@ def ratio_error(result: Gaussians, scene: ExamScene) -> float:
     return sum(errors) / len(errors)
 
 
-def shares(scene: ExamScene) -> tuple[list[float], list[float]]:
-    """For each power the share of the error that is removed: beside the object, and in the band of the true shadow."""
+def shares(scene: ExamScene) -> tuple[list[float], list[float]] | None:
+    """For each power the share of the error that is removed: beside the object, and in the band of the true shadow.
+
+    None where shadows show the sun: its shadows stay as computed.
+    """
+    relit = relight(scene.composite, scene.cameras, sources=[scene.source])
+    if relit.estimate is not None and relit.estimate.sun is not None:
+        return None
     pasted = make_row("paste", scene)[0]
     before, band_before = ratio_error(pasted, scene), measure_row(pasted, scene.views)["shadow"]
-    relit = relight(scene.composite, scene.cameras, sources=[scene.source])
     everywhere, band = [], []
     for power in POWERS:
         # the transfer has today's power in its layers
         factor = power / SHADOW_POWER
         ratio = SceneRatio(relit.shadow, relit.bounce, relit.slope).strengthened(factor)
-        result = replace(relit, shadow=ratio.shadow, slope=ratio.slope).bake()[0]
+        depth = factor * relit.catcher_depth
+        result = replace(relit, shadow=ratio.shadow, slope=ratio.slope, catcher_depth=depth).bake()[0]
         everywhere.append(1 - ratio_error(result, scene) / before)
         found = measure_row(result, scene.views)["shadow"]
         assert found is not None
@@ -58,7 +64,11 @@ def main() -> None:
     options = scene_arguments(__doc__).parse_args()
     rows, bands = [], []
     for name, read in scenes_in(options):
-        everywhere, band = shares(read())
+        found = shares(read())
+        if found is None:
+            print(f"{name}: the sun is known", flush=True)
+            continue
+        everywhere, band = found
         rows.append(everywhere)
         bands.append(band)
         best = POWERS[max(range(len(POWERS)), key=everywhere.__getitem__)]

@@ -47,7 +47,7 @@ _KEPT_SHIFT = 0.5
 """Radii of a region by which the objects' place may be off its centre."""
 
 # when brightness shows whether the main light arrives; set by hand
-_SMOOTHED = 24
+_SMOOTHED = 64
 """Gaussians over which the median is taken."""
 _CONTRAST = 0.5
 """Irradiance of the light over that of the rest; with less, brightness shows nothing."""

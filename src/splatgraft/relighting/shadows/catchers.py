@@ -6,7 +6,7 @@ the object to that without it do the same to the rest. Where the surface is opaq
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,8 +23,10 @@ from splatgraft.relighting.shadows.receivers import Receivers
 from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView
 
 # set by hand
-_OPAQUE = 0.8
+_OPAQUE = 0.97
 """Share of a pixel from which on colours of the surface alone make its shadow."""
+_AROUND, _UNDER = 16, 1.0
+"""Receivers around a point; how many standard deviations of their height a catcher lies under their mean."""
 _FAINTEST = 0.03
 """Share of light; where less is lost there are no catchers."""
 _WIDTH = 0.6
@@ -56,8 +58,7 @@ class ShadowCatchers:
 
 def with_depth(gaussians: Gaussians, depth: Float[Tensor, "n"]) -> Gaussians:
     """Gaussians of some optical depth in their middle, instead of their opacity."""
-    opacity = (1 - torch.exp(-depth)).clamp(_CLEAREST, 1 - _CLEAREST)
-    return Gaussians(gaussians.means, gaussians.log_scales, gaussians.quaternions, opacity.logit(), gaussians.sh)
+    return replace(gaussians, opacity_logits=(1 - torch.exp(-depth)).clamp(_CLEAREST, 1 - _CLEAREST).logit())
 
 
 def find_catchers(receivers: Receivers, views: Sequence[SurfaceView], *, spacing: float) -> ShadowCatchers:
@@ -68,30 +69,45 @@ def find_catchers(receivers: Receivers, views: Sequence[SurfaceView], *, spacing
         views: What they show of it.
         spacing: World units between two catchers.
     """
-    points, receiver, ratio = [torch.zeros(0, 3)], [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0)]
-    for view in views:
-        opaque = (view.mass > _OPAQUE * view.weights.alpha)[view.shown]
-        wanted = ~opaque & (view.ratio < 1 - _FAINTEST)
-        points.append(view.points[wanted])
-        receiver.append(view.nearest[wanted])
-        ratio.append(view.ratio[wanted])
-    at, of, left = torch.cat(points), torch.cat(receiver), torch.cat(ratio)
-    cells, cell = torch.unique((at / spacing).floor().long(), dim=0, return_inverse=True)
+    values = [
+        torch.cat([v.points, receivers.normals[v.nearest], v.ratio[:, None], v.opaque[:, None]], 1) for v in views
+    ]
+    seen, of = torch.cat([torch.zeros(0, 8), *values]), torch.cat([torch.zeros(0).long(), *[v.nearest for v in views]])
+    shaded = seen[:, 6] < 1 - _FAINTEST
+    cells, cell = torch.unique((seen[shaded, :3] / spacing).floor().long(), dim=0, return_inverse=True)
     count = torch.bincount(cell, minlength=len(cells))[:, None]
-    values = torch.cat([at, receivers.normals[of], left[:, None]], 1)
-    means = torch.zeros(len(cells), 7).index_add_(0, cell, values) / count
-    middle, normals = means[:, :3], F.normalize(means[:, 3:6], dim=1)
-    width = _WIDTH * spacing
+    means = torch.zeros(len(cells), 8).index_add_(0, cell, seen[shaded]) / count
+    receiver = torch.full((len(cells),), len(receivers.origin)).scatter_reduce(0, cell, of[shaded], "amin")
+    through = means[:, 7] < _OPAQUE
+    points, normals, ratio, _ = means[through].split([3, 3, 1, 1], 1)
+    normals, width = F.normalize(normals, dim=1), _WIDTH * spacing
+    middle = points - _under(points, normals, receivers)[:, None] * normals
     clear = Gaussians(
         means=middle,
-        log_scales=torch.tensor([width, width, _FLAT * width]).log().repeat(len(cells), 1),
+        log_scales=torch.tensor([width, width, _FLAT * width]).log().repeat(len(points), 1),
         quaternions=quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
-        opacity_logits=torch.zeros(len(cells)),
-        sh=dc_from_rgb(torch.zeros(len(cells), 3))[:, None],
+        opacity_logits=torch.zeros(len(points)),
+        sh=dc_from_rgb(torch.zeros(len(points), 3))[:, None],
     )
-    depth = -means[:, 6].log() / GAMMA / _overlapping(middle, width)
-    first = torch.full((len(cells),), len(receivers.origin)).scatter_reduce(0, cell, of, "amin")
-    return ShadowCatchers(with_depth(clear, torch.zeros(len(cells))), depth, first)
+    depth = -ratio[:, 0].log() / GAMMA / _overlapping(middle, width)
+    return ShadowCatchers(with_depth(clear, torch.zeros(len(points))), depth, receiver[through])
+
+
+def _under(points: Float[Tensor, "k 3"], normals: Float[Tensor, "k 3"], receivers: Receivers) -> Float[Tensor, "k"]:
+    """How far under points of the surface most receivers around them are, world units; smooth over the points."""
+    if not len(points):
+        return torch.zeros(0)
+
+    def heights(of: Float[Tensor, "r 3"]) -> tuple[Float[Tensor, "k a"], Int[Tensor, "k a"]]:
+        """Those of the nearest over the points' planes, and which they are."""
+        count = min(_AROUND, len(of))
+        near = torch.from_numpy(KDTree(of.numpy()).query(points.numpy(), k=range(1, count + 1))[1].astype(np.int64))
+        return ((of[near] - points[:, None]) * normals[:, None]).sum(-1), near
+
+    around, _ = heights(receivers.gaussians.means)
+    lowest = around.mean(1) - _UNDER * around.std(1, correction=0)
+    level, beside = heights(points)
+    return -(level + lowest[beside]).mean(1)
 
 
 def _overlapping(points: Float[Tensor, "k 3"], width: float) -> Float[Tensor, "k"]:

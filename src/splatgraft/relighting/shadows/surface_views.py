@@ -106,6 +106,11 @@ class SurfaceView:
     ratio: Float[Tensor, "p"]
     """Grey ratio of light at the points."""
 
+    @property
+    def opaque(self) -> Float[Tensor, "p"]:
+        """Share of the pixels of the points that receivers make up."""
+        return (self.mass / self.weights.alpha.clamp_min(1e-6))[self.shown]
+
 
 def views_of_surface(
     receivers: Receivers, ratio: SceneRatio, gaussians: Gaussians, cameras: Cameras, *, ratio_at: RatioAt
