@@ -33,7 +33,7 @@ class RelightOptions:
     most_added: float = 0.3
     """At most this share of the composite's Gaussians is added by splitting, or 40,000 where that is more; 0: none."""
     fitted_views: int = 8
-    """Views of the target in which shadows are fitted to the surface that is seen, and what is seen behind it is shaded;
+    """Views of the target in which shadows are fitted to the surface that is seen, and what is behind it is shaded;
     0: none, for a quick draft."""
     sun_through: tuple[Point, ...] = ()
     """Points of the target in pairs, world units: one that casts a shadow, then the same point of its shadow. The
