@@ -101,7 +101,9 @@ def _under(points: Float[Tensor, "k 3"], normals: Float[Tensor, "k 3"], receiver
     def heights(of: Float[Tensor, "r 3"]) -> tuple[Float[Tensor, "k a"], Int[Tensor, "k a"]]:
         """Those of the nearest over the points' planes, and which they are."""
         count = min(_AROUND, len(of))
-        near = torch.from_numpy(KDTree(of.numpy()).query(points.numpy(), k=range(1, count + 1))[1].astype(np.int64))
+        near = torch.from_numpy(KDTree(of.numpy()).query(points.numpy(), k=count)[1].astype(np.int64)).reshape(
+            -1, count
+        )
         return ((of[near] - points[:, None]) * normals[:, None]).sum(-1), near
 
     around, _ = heights(receivers.gaussians.means)
