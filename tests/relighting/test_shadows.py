@@ -169,7 +169,8 @@ def test_a_shadow_shades_what_is_seen_through_a_translucent_floor_too():
     aside = ((to_center**2).sum(-1) - (to_center @ torch.tensor(light.sources[0].direction)) ** 2).clamp_min(0).sqrt()
     near = points[..., :2].norm(dim=-1) < 1.2
     core, lit = near & (aside < 0.8 * RADIUS), near & (aside > 1.2 * RADIUS)
-    assert float((after / before)[core].median()) < 0.15
+    # a shadow leaves .04; catchers that do not know the floor's own shadow leave half of that
+    assert 0.025 < float((after / before)[core].median()) < 0.15
     assert float((after / before)[lit].median()) > 0.97
     assert torch.allclose(plain, before, atol=2e-3)
 

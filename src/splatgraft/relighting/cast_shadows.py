@@ -117,7 +117,7 @@ def _on_scene(
     whole = concatenate([receivers.gaussians, drawn.select(rest).with_sh_degree(receivers.gaussians.sh_degree)])
     shown = views_of_surface(receivers, total, whole, views, ratio_at=ratio_at)
     spacing = _CATCHER_SPACING * min(one.sphere.radius for one in objects)
-    catchers = find_catchers(receivers, shown, spacing=spacing)
+    catchers = find_catchers(receivers, total, whole, shown, spacing=spacing)
     return receivers, fit_to_views(total, whole, shown, catchers.visible), catchers
 
 

@@ -16,11 +16,13 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.directions import frames_along
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.relighting.shadows.receivers import Receivers
+from splatgraft.relighting.shadows.scene_ratio import DARKEST, SceneRatio
 from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView
+from splatgraft.rendering import view_operator
 
 # set by hand
 _OPAQUE = 0.97
@@ -37,6 +39,8 @@ _REACH = 3.0
 """Standard deviations within which catchers overlap."""
 _CLEAREST = 1e-6
 """Opacity of those without any depth."""
+_ROUNDS, _MOST = 2, 1.5
+"""How often depths are corrected by what the views show, and the largest factor."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +65,52 @@ def with_depth(gaussians: Gaussians, depth: Float[Tensor, "n"]) -> Gaussians:
     return replace(gaussians, opacity_logits=(1 - torch.exp(-depth)).clamp(_CLEAREST, 1 - _CLEAREST).logit())
 
 
-def find_catchers(receivers: Receivers, views: Sequence[SurfaceView], *, spacing: float) -> ShadowCatchers:
-    """The catchers in a surface, where views show its shadow and something behind it.
+def find_catchers(
+    receivers: Receivers, ratio: SceneRatio, gaussians: Gaussians, views: Sequence[SurfaceView], *, spacing: float
+) -> ShadowCatchers:
+    """The catchers under a surface, where views show its shadow and something behind it.
 
     Args:
         receivers: Gaussians of the surface.
+        ratio: Their ratios, at their centres.
+        gaussians: The scene, receivers first.
         views: What they show of it.
         spacing: World units between two catchers.
     """
+    catchers = _under_surface(receivers, views, spacing=spacing)
+    for _ in range(_ROUNDS if len(catchers.depth) else 0):
+        catchers = _weighed(catchers, ratio, gaussians, views)
+    seen = catchers.depth > _CLEAREST
+    return ShadowCatchers(catchers.clear.select(seen), catchers.depth[seen], catchers.receiver[seen])
+
+
+def _weighed(
+    catchers: ShadowCatchers, ratio: SceneRatio, gaussians: Gaussians, views: Sequence[SurfaceView]
+) -> ShadowCatchers:
+    """Catchers with the part of their depth with which the pixels that they cover are as dark as they must be.
+
+    Some lie before Gaussians of the surface, which have the shadow in their colours already. The mean logarithms of a
+    pixel without the catchers, with them, and as it must be give the part, by the secant.
+    """
+    values = (ratio.shadow + ratio.bounce).mean(1).clamp_min(DARKEST) ** (1 / GAMMA)
+    black = torch.zeros(len(catchers.depth))
+    sums = torch.zeros(len(black), 3)
+    for view in views:
+        weights = view_operator(concatenate([gaussians.select(view.which), catchers.visible]), view.camera)
+        rest = torch.ones(len(view.which) - len(view.receivers))
+        shaded = weights.blend(torch.cat([values[view.receivers], rest, black])[:, None])[..., 0]
+        wanted = view.value.clone()
+        wanted[view.shown] = view.weights.alpha[view.shown] * view.ratio ** (1 / GAMMA)
+        known = view.shown[..., None].float()
+        pixels = torch.stack([view.value, shaded, wanted], -1).clamp_min(DARKEST).log() * known
+        sums += weights.blend_transpose(pixels)[len(view.which) :]
+    without, with_them, wanted = sums.unbind(1)
+    part = ((without - wanted) / (without - with_them).clamp_min(1e-6)).clamp(0, _MOST)
+    return replace(catchers, depth=part * catchers.depth)
+
+
+def _under_surface(receivers: Receivers, views: Sequence[SurfaceView], *, spacing: float) -> ShadowCatchers:
+    """Catchers as deep as the shadow of the points that the views show, wherever some show something behind them."""
     values = [
         torch.cat([v.points, receivers.normals[v.nearest], v.ratio[:, None], v.opaque[:, None]], 1) for v in views
     ]
