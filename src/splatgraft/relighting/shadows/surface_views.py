@@ -43,7 +43,7 @@ _RECEIVING = 0.1
 
 
 @dataclass(frozen=True)
-class Surfaces:
+class _Surfaces:
     """The surfaces that m receivers form."""
 
     points: Float[Tensor, "m 3"]
@@ -56,12 +56,12 @@ class Surfaces:
     """Search tree of the points."""
 
     @staticmethod
-    def of(receivers: Receivers) -> "Surfaces":
+    def of(receivers: Receivers) -> "_Surfaces":
         """The surfaces in the middle of the receivers' layers."""
         off = ((receivers.gaussians.means - receivers.surface) * receivers.normals).sum(1, keepdim=True)
         points = receivers.gaussians.means - off * receivers.normals
         extents = 3 * receivers.gaussians.scales.max(1).values
-        return Surfaces(points, receivers.normals, extents, KDTree(points.numpy()))
+        return _Surfaces(points, receivers.normals, extents, KDTree(points.numpy()))
 
     def hit(
         self, origin: Float[Tensor, "3"], rays: Float[Tensor, "p 3"], near: Float[Tensor, "p 3"]
@@ -128,7 +128,7 @@ def views_of_surface(
     shadowed = (1 - grey).abs() > _CHANGED
     if not bool(shadowed.any()):
         return []
-    surfaces, widths = Surfaces.of(receivers), gaussians.log_scales.max(1).values.exp()
+    surfaces, widths = _Surfaces.of(receivers), gaussians.log_scales.max(1).values.exp()
     values = grey.clamp_min(DARKEST) ** (1 / GAMMA)
     views = []
     for camera in cameras:
@@ -165,7 +165,7 @@ def _view(
     scene: Gaussians,
     widths: Float[Tensor, "n"],
     values: Float[Tensor, "r"],
-    surfaces: Surfaces,
+    surfaces: _Surfaces,
     camera: Cameras,
     *,
     ratio_at: RatioAt,
