@@ -112,9 +112,11 @@ def _on_scene(
             grey = grey * (found.shadow + found.bounce).mean(1)
         return grey
 
+    if not len(views):
+        return receivers, total, ShadowCatchers.none()
     rest = torch.ones(drawn.count, dtype=torch.bool)
     rest[receivers.origin] = False
-    whole = concatenate([receivers.gaussians, drawn.select(rest).with_sh_degree(receivers.gaussians.sh_degree)])
+    whole = concatenate([receivers.gaussians, drawn.select(rest)])
     shown = views_of_surface(receivers, total, whole, views, ratio_at=ratio_at)
     spacing = _CATCHER_SPACING * min(one.sphere.radius for one in objects)
     catchers = find_catchers(receivers, total, whole, shown, spacing=spacing)

@@ -201,7 +201,7 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
     rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
     object_rows = torch.arange(scene.scene.count, merged.count)
-    black = catchers.clear.with_sh_degree(merged.sh_degree)
+    black = catchers.clear
     gaussians = concatenate([black, merged.select(rest_index), receivers.gaussians, merged.select(object_rows)])
     count = gaussians.count - len(object_rows)
     others = black.count + len(rest_index)

@@ -16,13 +16,12 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.directions import frames_along
-from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.gaussians import Gaussians, empty
 from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.relighting.shadows.receivers import Receivers
 from splatgraft.relighting.shadows.scene_ratio import DARKEST, SceneRatio
-from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView
-from splatgraft.rendering import view_operator
+from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView, blended_values
 
 # set by hand
 _OPAQUE = 0.97
@@ -53,6 +52,11 @@ class ShadowCatchers:
     """Optical depth in the middle of each, -log(1 - opacity), in sRGB."""
     receiver: Int[Tensor, "k"]
     """Position of the receiver that each is at."""
+
+    @staticmethod
+    def none() -> "ShadowCatchers":
+        """No catchers."""
+        return ShadowCatchers(empty(), torch.zeros(0), torch.zeros(0, dtype=torch.int64))
 
     @property
     def visible(self) -> Gaussians:
@@ -92,13 +96,10 @@ def _weighed(
     Some lie before Gaussians of the surface, which have the shadow in their colours already. The mean logarithms of a
     pixel without the catchers, with them, and as it must be give the part, by the secant.
     """
-    values = (ratio.shadow + ratio.bounce).mean(1).clamp_min(DARKEST) ** (1 / GAMMA)
-    black = torch.zeros(len(catchers.depth))
-    sums = torch.zeros(len(black), 3)
+    values, black = blended_values(ratio), catchers.visible
+    sums = torch.zeros(black.count, 3)
     for view in views:
-        weights = view_operator(concatenate([gaussians.select(view.which), catchers.visible]), view.camera)
-        rest = torch.ones(len(view.which) - len(view.receivers))
-        shaded = weights.blend(torch.cat([values[view.receivers], rest, black])[:, None])[..., 0]
+        weights, _, shaded = view.with_catchers(gaussians, black, values)
         wanted = view.value.clone()
         wanted[view.shown] = view.weights.alpha[view.shown] * view.ratio ** (1 / GAMMA)
         known = view.shown[..., None].float()

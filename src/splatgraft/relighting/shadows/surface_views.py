@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.shadows.receivers import Receivers
 from splatgraft.relighting.shadows.scene_ratio import DARKEST, SceneRatio
 from splatgraft.rendering import ViewOperator, view_operator
@@ -106,10 +106,32 @@ class SurfaceView:
     ratio: Float[Tensor, "p"]
     """Grey ratio of light at the points."""
 
+    def with_catchers(
+        self, gaussians: Gaussians, catchers: Gaussians, values: Float[Tensor, "r"]
+    ) -> tuple[ViewOperator, Float[Tensor, "k"], Float[Tensor, "h w"]]:
+        """The view with black Gaussians behind those of the scene in the list.
+
+        Args:
+            gaussians: The scene, receivers first.
+            catchers: The black ones.
+            values: Of the receivers.
+
+        Returns:
+            From values of all to pixels; the values of all but the receivers; what all values blend to.
+        """
+        weights = view_operator(concatenate([gaussians.select(self.which), catchers]), self.camera)
+        fixed = torch.cat([torch.ones(len(self.which) - len(self.receivers)), torch.zeros(catchers.count)])
+        return weights, fixed, weights.blend(torch.cat([values[self.receivers], fixed])[:, None])[..., 0]
+
     @property
     def opaque(self) -> Float[Tensor, "p"]:
         """Share of the pixels of the points that receivers make up."""
         return (self.mass / self.weights.alpha.clamp_min(1e-6))[self.shown]
+
+
+def blended_values(ratio: SceneRatio) -> Float[Tensor, "m"]:
+    """What receivers are multiplied by where they are blended: their grey ratios in sRGB."""
+    return (ratio.shadow + ratio.bounce).mean(1).clamp_min(DARKEST) ** (1 / GAMMA)
 
 
 def views_of_surface(
@@ -129,7 +151,7 @@ def views_of_surface(
     if not bool(shadowed.any()):
         return []
     surfaces, widths = _Surfaces.of(receivers), gaussians.log_scales.max(1).values.exp()
-    values = grey.clamp_min(DARKEST) ** (1 / GAMMA)
+    values = blended_values(ratio)
     views = []
     for camera in cameras:
         cut = _cut_to(camera, receivers.gaussians.means[shadowed])

@@ -14,10 +14,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.shadows.scene_ratio import DARKEST, SceneRatio
-from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView
-from splatgraft.rendering import ViewOperator, view_operator
+from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView, blended_values
+from splatgraft.rendering import ViewOperator
 
 # the solver; set by hand
 _ROUNDS = 5
@@ -64,7 +64,7 @@ def fit_to_views(
     """
     if not views:
         return ratio
-    values = (ratio.shadow + ratio.bounce).mean(1).clamp_min(DARKEST) ** (1 / GAMMA)
+    values = blended_values(ratio)
     value, slope, known = _solved(values, [_fitted(view, values, gaussians, catchers) for view in views])
     wanted, before = value**GAMMA, ratio.shadow.mean(1).clamp_min(1e-6)
     factor = ((wanted - ratio.bounce.mean(1)) / before).clamp_min(0)
@@ -79,17 +79,15 @@ def fit_to_views(
 
 def _fitted(view: SurfaceView, values: Float[Tensor, "m"], gaussians: Gaussians, catchers: Gaussians) -> _FittedView:
     """A view with what its pixels must show past the catchers."""
-    seen, count = gaussians.select(view.which), len(view.receivers)
+    count = len(view.receivers)
     fixed, weights, target = torch.ones(len(view.which) - count), view.weights, view.value.clone()
     if catchers.count:
-        weights = view_operator(concatenate([seen, catchers]), view.camera)
-        fixed = torch.cat([fixed, torch.zeros(catchers.count)])
-        target = weights.blend(torch.cat([values[view.receivers], fixed])[:, None])[..., 0]
+        weights, fixed, target = view.with_catchers(gaussians, catchers, values)
     pixels = view.mass[view.shown] > _RECEIVING
     wanted = view.shown.clone()
     wanted[view.shown] = pixels
     target[wanted] = weights.alpha[wanted] * view.ratio[pixels] ** (1 / GAMMA)
-    directions = F.normalize(seen.means[:count] - view.camera.centers[0], dim=1)
+    directions = F.normalize(gaussians.means[view.receivers] - view.camera.centers[0], dim=1)
     return _FittedView(view.receivers, fixed, weights, target, directions, view.drawn_px[:count] > _NARROWEST_PX)
 
 
