@@ -398,6 +398,17 @@ def test_a_clipped_window_is_a_source_where_it_was_photographed(radius_deg, whit
         assert main.distance == pytest.approx(20, rel=0.05)
 
 
+@pytest.mark.parametrize("strength", [0.0, 1.0])
+def test_a_white_floor_is_no_source(strength):
+    bright = painted(sunlit_scene(UP, strength), lambda at: torch.where(at[:, 0] > 1, 8.0, 0.3))
+    found = estimate_light(bright, BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.1), views((0.0, 1.5)))
+    assert isinstance(found, EstimatedLight)
+    assert all(source.direction[2] > 0 for source in found.mean.sources)
+    # its light still arrives: more on what faces it than on what faces away
+    towards, away = found.mean.irradiance(torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])).mean(1)
+    assert float(towards) > 1.5 * float(away)
+
+
 def test_without_surfaces_to_compare_the_light_is_what_was_photographed():
     shell = even_directions(6000)
     light = estimated(surfels(20 * shell, -shell, width=0.6, srgb=torch.full((6000, 3), 0.5)), views((0.0, 1.5)))

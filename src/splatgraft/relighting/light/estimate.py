@@ -187,15 +187,17 @@ def _seen_shares(evidence: LightEvidence) -> dict[str, float]:
 def _split_peaks(
     radiance: Float[Tensor, "k 3"], evidence: LightEvidence, *, within: float
 ) -> tuple[tuple[LightSource, ...], Float[Tensor, "k 3"]]:
-    """The brightest of all `DIRECTIONS` as sources, brightest first, and the radiance without them.
+    """The brightest of the `DIRECTIONS` above the horizon as sources, brightest first, and the radiance without them.
 
-    Occluders farther away than `within` do not block sources that no camera saw.
+    What is bright below the horizon is a surface, and stays ambient light. Occluders farther away than `within` do not
+    block sources that no camera saw.
     """
     luminance = radiance @ LUMINANCE
     is_peak = luminance > _OVER_MEDIAN * luminance.median()
     is_peak &= luminance > _MIN_SHARE * luminance.sum()
     near = _NEIGHBOUR_COSINE < DIRECTIONS @ DIRECTIONS.T
-    left, rest, sources = is_peak.clone(), radiance.clone(), []
+    is_above = torch.minimum(DIRECTIONS @ evidence.up, evidence.around.clipped_direction @ evidence.up) > 0
+    left, rest, sources = is_peak & is_above, radiance.clone(), []
     while bool(left.any()) and len(sources) < _MAX_SOURCES:
         i = int((luminance * left).argmax())
         group, ring = near[i] & left, near[i] & ~is_peak

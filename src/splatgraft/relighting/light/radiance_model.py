@@ -140,6 +140,8 @@ class RadianceProblem:
     """Those shares, as seen from the surfaces around."""
     shares_at_object: Float[Tensor, "n"]
     """The same as seen from the object."""
+    may_shine: Bool[Tensor, "n"]
+    """Where a lamp may be: above the horizon. What is bright below it is a surface."""
     known: Float[Tensor, "m"]
     """Radiance of white surfaces under what was captured."""
     log_color: Float[Tensor, "m"]
@@ -240,6 +242,7 @@ def radiance_problem(found: LightEvidence, *, settings: RadianceSettings = Radia
         transport=transport[:, torch.cat([unseen, clipped])] * shares,
         shares=shares,
         shares_at_object=torch.cat([1 - around.seen[unseen], found.visible_sources[clipped]]).clamp_min(0).double(),
+        may_shine=DIRECTIONS[torch.cat([unseen, clipped])] @ up > 0,
         known=transport @ far.radiance.mean(1).double() + blocked * float(mean_color),
         log_color=evidence.colors.mean(1).double().log(),
         weights=weights,

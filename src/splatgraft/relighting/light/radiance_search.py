@@ -162,7 +162,7 @@ def _lamp_costs(
         if p.highlights is not None:
             explained = p.highlights.explained_with_more(light, index, p.shares_at_object * (lamp - now))
             value += s.highlights * torch.log1p(-explained).double()
-        value[p.shares < _MIN_SHARE] = math.inf
+        value[(p.shares < _MIN_SHARE) | ~p.may_shine] = math.inf
         columns.append(torch.stack([value, lamp.log(), shift.double()]))
     return torch.stack(columns, 2)
 
@@ -212,7 +212,8 @@ def _hidden_radiance(problem: RadianceProblem, maximum: Maximum) -> Float[Tensor
     out[0, problem.unseen], out[1, problem.clipped] = radiances[:count].exp(), radiances[count:].exp()
     towards, shares = DIRECTIONS[problem.unseen], problem.shares[:count].clamp_min(_MIN_SHARE)
     prior = problem.with_prior(maximum.sources)
-    for i in (radiances[:count] - level > math.log(_STRENGTHS[0])).nonzero()[:, 0].tolist():
+    is_lamp = (radiances[:count] - level > math.log(_STRENGTHS[0])) & problem.may_shine[:count]
+    for i in is_lamp.nonzero()[:, 0].tolist():
         without = maximum.state.clone()
         without[1 + i] = level
         strengths = tuple((float(radiances[i] - level) + torch.linspace(-1, 1, 5)).exp().tolist())
