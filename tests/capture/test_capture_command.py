@@ -223,7 +223,28 @@ def test_given_poses_and_masks_come_together_and_what_has_no_partner_is_named(tm
     shutil.rmtree(tmp_path / "c")
     (tmp_path / "c").touch()
     said = capture("--poses", str(poses), status=2)
-    assert "expected a folder of photos beside --poses" in said
+    assert "expected a folder or a .zip of photos beside --poses" in said
+
+
+def test_a_zip_is_the_photos_and_masks_in_it(tmp_path: Path) -> None:
+    write_posed(tmp_path / "c", 10, masks=True)
+    (tmp_path / "given").mkdir()
+    for name in ("points.ply", "transforms.json"):
+        poses = (tmp_path / "c" / name).rename(tmp_path / "given" / name)
+    shutil.make_archive(str(tmp_path / "c"), "zip", tmp_path / "c")
+    found = []
+    for name in ("c", "c.zip"):
+        out = tmp_path / f"out_{name}"
+        assert main(["capture", str(tmp_path / name), "--poses", str(poses), "--out", str(out)]) == 0
+        found.append(read_capture(out))
+    folder, archive = found
+    assert archive.cameras.names == folder.cameras.names
+    assert torch.equal(archive.cameras.world_from_camera, folder.cameras.world_from_camera)
+    assert [path.read_bytes() for path in archive.image_paths] == [path.read_bytes() for path in folder.image_paths]
+    for index in range(10):
+        mask = folder.mask(index)
+        assert mask is not None
+        assert torch.equal(archive.mask(index), mask)
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from tiny_project import ball, photograph, plane
 
 from splatgraft.cli import main
@@ -97,3 +98,24 @@ def test_a_project_of_other_captures_is_not_replaced_and_what_does_not_exist_lea
     assert main(["try", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "out")]) == 2
     assert f"{tmp_path / 'a'}: expected photos, a video" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be_used_and_a_folder_of_the_same_name_are_left_alone(
+    captures: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target = captures
+    monkeypatch.chdir(tmp_path)
+    few = tmp_path / "few"
+    few.mkdir()
+    Image.new("RGB", (30, 20)).save(few / "only.jpg")
+    assert main(["try", str(few), target]) == 2
+    assert f"{few}: expected at least 8 photos, found 1" in capsys.readouterr().err
+    assert not (tmp_path / "few_into_room").exists()
+    (tmp_path / "images__into_room").mkdir()
+    (tmp_path / "images__into_room" / "letter.txt").write_text("mine")
+    began: list[Path] = []
+    monkeypatch.setattr(first_try, "run_steps", lambda project, *_, **__: began.append(project))
+    for _ in range(2):  # a second time the same project goes on
+        assert main(["try", source, target, "--keep-closed"]) == 0
+    assert began == [Path("images__into_room_2") / "project.toml"] * 2
+    assert [path.name for path in (tmp_path / "images__into_room").iterdir()] == ["letter.txt"]

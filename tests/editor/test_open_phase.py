@@ -1,5 +1,7 @@
 """The phase Open: what a path is before anything is made of it, and how scenes are viewed."""
 
+import shutil
+import zipfile
 from pathlib import Path
 from typing import Any, cast
 
@@ -32,6 +34,17 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer.release()
     (root / "letter.pdf").write_bytes(b"%PDF-1.4 no capture")
     (root / "broken.ply").write_bytes(b"ply\nnonsense")
+    shutil.copytree(root / "photos", root / "card" / "DCIM" / "100APPLE")
+    (root / "card" / "MISC").mkdir()
+    shutil.make_archive(str(root / "phone"), "zip", root / "card")
+    for name in ("monday", "tuesday"):
+        shutil.copytree(root / "photos", root / "days" / name)
+    (root / "damaged.zip").write_bytes((root / "phone.zip").read_bytes()[:500])
+    with zipfile.ZipFile(root / "outside.zip", "w") as archive:
+        archive.writestr("../../evil.png", b"")
+    with zipfile.ZipFile(root / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for index in range(9):
+            archive.writestr(f"{index}.png", bytes(40 << 20))
     (root / "results").mkdir()
     write_gaussians(root / "results" / "scene.ply", ball())
     return root
@@ -45,10 +58,18 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("photos", "photos", "8 photos, no masks"),
         ("walk.avi", "video", "a video of 2 s, 64 x 48"),
         ("one", "nothing", "expected at least 8 photos, found 1"),
-        ("empty", "nothing", "expected photos"),
+        ("empty", "nothing", "found an empty folder"),
         ("letter.pdf", "nothing", "expected a video that OpenCV can read"),
         ("broken.ply", "nothing", "broken.ply"),
         ("nowhere", "nothing", "found nothing there"),
+        ("fotos", "nothing", "did you mean {inputs}/photos?"),
+        ("photos/0.png", "nothing", "found a single photo"),
+        ("card", "photos", "8 photos, no masks"),
+        ("phone.zip", "photos", "8 photos, unpacked first"),
+        ("days", "nothing", "monday/ (8 photos), tuesday/ (8 photos): name one of these"),
+        ("damaged.zip", "nothing", "one that cannot be read"),
+        ("outside.zip", "nothing", "one that writes outside of its folder"),
+        ("bomb.zip", "nothing", "one that unpacks to 9 files of 0.4 GB"),
         ("results", "nothing", "name the scene in it"),
     ],
 )
@@ -56,7 +77,7 @@ def test_what_a_path_is(inputs: Path, name: str, kind: str, text: str) -> None:
     before = sorted(inputs.rglob("*"))
     found = describe_input(inputs / name)
     assert found.kind == kind, found.text
-    assert text in found.text
+    assert text.format(inputs=inputs) in found.text
     assert "\n" not in found.text
     assert found.is_usable == (kind != "nothing")
     assert sorted(inputs.rglob("*")) == before

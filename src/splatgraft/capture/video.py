@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from splatgraft.core.images import IMAGE_SUFFIXES
 from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress, silent
 
@@ -223,13 +224,13 @@ def _notes(path: np.ndarray, cuts: np.ndarray, rate: float, chosen: int, step: f
 def _opened(video: Path) -> Iterator[cv2.VideoCapture]:
     if not video.is_file() or video.stat().st_size == 0:
         raise ValueError(f"{video}: expected a video file, found {'an empty one' if video.is_file() else 'none'}")
+    if video.suffix.lower() in IMAGE_SUFFIXES:
+        raise ValueError(f"{video}: expected a folder of photos from all sides, or a video, found a single photo")
     capture = cv2.VideoCapture(str(video))
     try:
         if not capture.isOpened():
-            raise ValueError(
-                f"{video}: expected a video that OpenCV can read (mp4, mov, avi, mkv), "
-                f"found another file, a truncated one, or sound alone"
-            )
+            found = "another file, a truncated one, or sound alone"
+            raise ValueError(f"{video}: expected a video that OpenCV can read (mp4, mov, avi, mkv), found {found}")
         yield capture
     finally:
         capture.release()

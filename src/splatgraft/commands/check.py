@@ -2,8 +2,9 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from splatgraft.capture import predict_pose_seconds
 from splatgraft.capture.photo_inspection import (
@@ -19,9 +20,11 @@ from splatgraft.capture.usable_views import find_odd_photos
 from splatgraft.capture.video import grey_frames
 from splatgraft.core.images import read_exif, read_grey, stored_size
 from splatgraft.folders.capture_files import has_poses
+from splatgraft.folders.input_description import require_input
 from splatgraft.formats import is_scene, read_capture, read_gaussians
 from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.formats.captures.masks import PhotoFiles, find_photos
+from splatgraft.formats.captures.photo_archive import is_archive, unpack_photos
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 
@@ -37,7 +40,7 @@ class Check:
     """Look at a capture in seconds, before time is spent on it. Exit status: 0 usable, 1 not usable as it is."""
 
     capture: Positional
-    """A folder of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene."""
+    """A folder or a .zip of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene."""
     json: bool = False
     """Print the findings as JSON on standard output."""
 
@@ -55,8 +58,12 @@ class Check:
         return 1 if verdict == "unusable" else 0
 
     def _findings(self, console: Console) -> Iterator[Finding]:
-        if not self.capture.exists():
-            raise ValueError(f"{self.capture}: expected photos, a video, a posed capture or a scene, found nothing")
+        require_input(self.capture)
+        if is_archive(self.capture):
+            with TemporaryDirectory() as folder:
+                unpacked = unpack_photos(self.capture, Path(folder) / self.capture.stem)
+                yield from replace(self, capture=unpacked)._findings(console)
+            return
         if is_scene(self.capture):
             count = read_gaussians(self.capture).count
             yield Finding("scene", "good", f"a trained scene of {count:,} Gaussians: no photos to look at")

@@ -4,10 +4,12 @@ import re
 import shlex
 import tomllib
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from splatgraft.commands.init import Init
 from splatgraft.commands.steps.segment import Segment
+from splatgraft.folders.input_description import describe_input, require_input
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
 from splatgraft.project.record import read_record
 from splatgraft.project.step import DEFAULT_REMEDIES, Positional, Step
@@ -29,18 +31,18 @@ class Try:
     an interruption. Poses that are not plausible are used and said to be so."""
 
     object: Positional
-    """The capture with the object: photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene
-    (.ply, .spz, .splat)."""
+    """The capture with the object: photos (a folder or a .zip), a video, a COLMAP folder, a folder with
+    transforms.json, or a trained scene (.ply, .spz, .splat)."""
     place: Positional
     """The capture or the scene that receives it."""
     out: Path | None = None
-    """Folder of the project; OBJECT_into_PLACE here where not given."""
+    """Folder of the project; where not given, OBJECT_into_PLACE here, or with a number where that is taken."""
     keep_closed: bool = False
     """Only print the report's path, where there is a desktop to open it on."""
 
     def execute(self, console: Console) -> int:
         """Write the project, run it, and say what was unsure and what helps."""
-        folder = self.out or Path(f"{_name(self.object)}_into_{_name(self.place)}")
+        folder = self.out or self._free_folder()
         self._write_project(folder, console)
         project = folder / PROJECT_FILE
         run_steps(project, console, accept_doubtful=True)
@@ -52,6 +54,16 @@ class Try:
             console.say(f"{page}: opened in the browser")
         return 0
 
+    def _free_folder(self) -> Path:
+        """OBJECT_into_PLACE: the folder of an earlier try of these captures, or one that does not exist yet."""
+        name = f"{_name(self.object)}_into_{_name(self.place)}"
+        for folder in (Path(name if i == 1 else f"{name}_{i}") for i in count(1)):
+            project = folder / PROJECT_FILE
+            sides = Init(folder, source=self.object, target=self.place).sides()
+            if not folder.exists() or (project.is_file() and _same_captures(project, sides)):
+                return folder
+        raise AssertionError
+
     def _write_project(self, folder: Path, console: Console) -> None:
         """A project at draft quality; one that this command wrote earlier, and that may be refined, is kept."""
         project = folder / PROJECT_FILE
@@ -61,6 +73,14 @@ class Try:
                 raise ValueError(f"{project}: expected a project of these captures, found others; name --out FOLDER")
             console.say(f"{project}: goes on with what is there")
             return
+        for capture in (self.object, self.place):
+            require_input(capture)
+            found = describe_input(capture)
+            if not found.is_usable:
+                known = found.text.startswith(str(capture))
+                raise ValueError(
+                    found.text if known else f"{capture}: expected a capture or a scene, found {found.text}"
+                )
         text = with_keys(init.text(), "reconstruct", DRAFT)
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(project) as stream:

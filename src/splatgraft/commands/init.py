@@ -5,6 +5,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatgraft.folders.input_description import require_input
 from splatgraft.formats import is_scene
 from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.project_file import TEMPLATE
@@ -22,8 +23,8 @@ class Init:
     folder: Positional
     """The project's folder; made where it does not exist."""
     source: Path
-    """The capture with the object: photos, a video, a COLMAP folder or a folder with transforms.json; or a trained
-    scene (.ply, .spz, .splat, .sog, .glb, .ksplat) without photographs."""
+    """The capture with the object: photos (a folder or a .zip), a video, a COLMAP folder or a folder with
+    transforms.json; or a trained scene (.ply, .spz, .splat, .sog, .glb, .ksplat) without photographs."""
     target: Path
     """The capture or the scene that receives it."""
     full: bool = False
@@ -44,8 +45,7 @@ class Init:
     def text(self) -> str:
         """The content of project.toml; a ValueError where a capture does not exist."""
         for capture in (self.source, self.target):
-            if not capture.exists():
-                raise ValueError(f"{capture}: expected photos, a video, a posed capture or a scene, found nothing")
+            require_input(capture)
         source, target = self.sides()
         if self.full:
             text = full_project_text(source=source, target=target)

@@ -1,6 +1,7 @@
-"""What a path is, in one line, before a project is made of it: photos, a video, a posed capture or a trained scene."""
+"""What is at a path that a user names, before a project is made of it: photos, a video, a posed capture or a scene."""
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
 
@@ -8,6 +9,7 @@ from splatgraft.capture import MIN_VIEWS, describe_video
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture, read_gaussians
 from splatgraft.formats.captures.masks import describe_masks, find_photos
+from splatgraft.formats.captures.photo_archive import count_archived_photos, is_archive
 from splatgraft.project.layout import PROJECT_FILE, SCENE_FILE
 
 InputKind = Literal["photos", "video", "posed capture", "scene", "project", "nothing"]
@@ -32,6 +34,16 @@ class InputDescription:
         return self.kind not in ("project", "nothing")
 
 
+def require_input(path: Path) -> None:
+    """Raise where nothing is at a path that a user named, with the name beside it that was likely meant."""
+    if path.exists():
+        return
+    expected = f"{path}: expected photos, a video, a posed capture or a scene, found nothing there"
+    inside = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
+    meant = get_close_matches(path.name, inside, 1)
+    raise ValueError(f"{expected}; did you mean {path.parent / meant[0]}?" if meant else expected)
+
+
 def describe_input(path: Path) -> InputDescription:
     """Look at a path, which need not exist, without changing anything."""
     try:
@@ -41,8 +53,7 @@ def describe_input(path: Path) -> InputDescription:
 
 
 def _described(path: Path) -> InputDescription:
-    if not path.exists():
-        raise ValueError(f"{path}: expected a file or a folder, found nothing there")
+    require_input(path)
     if path.name == PROJECT_FILE or (path / PROJECT_FILE).is_file():
         folder = path.parent if path.is_file() else path
         return InputDescription("project", f"a project of its own: splatgraft edit {folder}")
@@ -54,6 +65,8 @@ def _described(path: Path) -> InputDescription:
         posed = read_capture(path)
         masks = describe_masks(posed.image_paths, posed.mask_paths)
         return InputDescription("posed capture", f"a capture of {len(posed)} images with poses, {masks}: it is trained")
+    if is_archive(path):
+        return _photos(path, count_archived_photos(path), "unpacked first")
     if path.is_file():
         return InputDescription(
             "video", f"{describe_video(path)}: frames are taken, poses are found, and it is trained"
@@ -66,7 +79,10 @@ def _folder_of_photos(path: Path) -> InputDescription:
     if result is not None:
         return InputDescription("nothing", f"a folder of results; name the scene in it: {result}")
     photos = find_photos(path)
-    if len(photos.paths) < MIN_VIEWS:
-        raise ValueError(f"{path}: expected at least {MIN_VIEWS} photos, found {len(photos.paths)}")
-    masks = describe_masks(photos.paths, photos.masks)
-    return InputDescription("photos", f"{len(photos.paths)} photos, {masks}: poses are found, and it is trained")
+    return _photos(path, len(photos.paths), describe_masks(photos.paths, photos.masks))
+
+
+def _photos(path: Path, count: int, more: str) -> InputDescription:
+    if count < MIN_VIEWS:
+        raise ValueError(f"{path}: expected at least {MIN_VIEWS} photos, found {count}")
+    return InputDescription("photos", f"{count} photos, {more}: poses are found, and it is trained")

@@ -13,6 +13,7 @@ from splatgraft.editor.jobs import PlannedStep
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture
 from splatgraft.formats.captures.masks import find_photos
+from splatgraft.formats.captures.photo_archive import count_archived_photos, is_archive
 from splatgraft.project.record import read_record
 from splatgraft.project.step import Step
 from splatgraft.reconstruction import predict_cpu_seconds
@@ -80,6 +81,8 @@ def _typical_seconds(step: Step, flow: Flow) -> float:
 def _photos_to_pose(step: Capture) -> int:
     if step.poses is not None or is_scene(step.capture) or has_poses(step.capture):
         return 0
+    if is_archive(step.capture):
+        return count_archived_photos(step.capture)
     return len(find_photos(step.capture).paths) if step.capture.is_dir() else VIDEO_FRAMES
 
 

@@ -30,6 +30,7 @@ from splatgraft.folders.capture_files import (
 from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, write_capture
 from splatgraft.formats.captures import read_given_poses
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
+from splatgraft.formats.captures.photo_archive import is_archive, unpack_photos
 from splatgraft.project.step import Context, Inputs, Positional
 from splatgraft.rendering import render
 from splatgraft.runtime.note import Note
@@ -41,8 +42,8 @@ class Capture:
     trained scene without photographs, pictures are made from all around."""
 
     capture: Positional
-    """A folder of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene (.ply, .spz,
-    .splat, .sog, .glb, .ksplat)."""
+    """A folder or a .zip of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene (.ply,
+    .spz, .splat, .sog, .glb, .ksplat)."""
     out: Path = Path("capture")
     """Folder for transforms.json and points.ply."""
     poses: Path | None = None
@@ -65,18 +66,18 @@ class Capture:
             return {"photos": scene_files(self.capture)}
         if self.poses is None and has_poses(self.capture):
             return capture_inputs(self.capture, read_capture(self.capture), masks=True)
-        if not self.capture.is_dir():
-            if self.poses is not None:
-                raise ValueError(f"{self.capture}: expected a folder of photos beside --poses, found none")
-            return {"photos": (self.capture,)}
-        photos = find_photos(self.capture)
-        files = {"photos": photos.paths, "masks": tuple(mask for mask in photos.masks if mask is not None)}
+        files = {"photos": (self.capture,)}
+        if self.capture.is_dir():
+            photos = find_photos(self.capture)
+            files = {"photos": photos.paths, "masks": tuple(mask for mask in photos.masks if mask is not None)}
+        elif self.poses is not None and not is_archive(self.capture):
+            raise ValueError(f"{self.capture}: expected a folder or a .zip of photos beside --poses, found neither")
         return files if self.poses is None else files | {"poses": description_files(self.poses)}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make the posed capture."""
         if self.poses is not None:
-            posed = self._with_given_poses(self.poses, context)
+            posed = self._with_given_poses(self.poses, folder, context)
         elif is_scene(self.capture):
             posed = self._pictures(folder, context)
         elif has_poses(self.capture):
@@ -111,9 +112,9 @@ class Capture:
         context.console.tell(*left_out_notes(self.capture, len(posed), posed.left_out))
         return posed
 
-    def _with_given_poses(self, poses: Path, context: Context) -> PosedImages:
+    def _with_given_poses(self, poses: Path, folder: Path, context: Context) -> PosedImages:
         """Photos with the poses of another program."""
-        photos = self._photos(self.out, context)
+        photos = self._photos(folder, context)
         context.console.tell(*exposure_notes(self.capture, photos.paths))
         posed, without_pose, without_photo = read_given_poses(poses, photos)
         say = context.console.say
@@ -139,11 +140,15 @@ class Capture:
         return replace(found, image_paths=paths)
 
     def _photos(self, folder: Path, context: Context) -> PhotoFiles:
-        if not self.capture.is_dir():
+        if is_archive(self.capture):
+            given = unpack_photos(self.capture, folder / "unpacked")
+        elif self.capture.is_dir():
+            given = self.capture
+        else:
             frames, notes = extract_frames(self.capture, folder / "frames", progress=context.progress)
             context.console.tell(*(replace(note, text=f"{self.capture}: {note.text}") for note in notes))
             return PhotoFiles(tuple(frames))
-        found = find_photos(self.capture)
+        found = find_photos(given)
         kept, odd = usable_photos(found.paths, str(self.capture), keep_odd=self.keep_odd, progress=context.progress)
         photos, empty = usable_masks(found.only(kept))
         for left_out in (odd, empty):

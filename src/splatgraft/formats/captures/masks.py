@@ -32,7 +32,8 @@ class PhotoFiles:
 
 
 def find_photos(folder: Path) -> PhotoFiles:
-    """The photos in `folder`, or else in its images/, photos/, input/ or rgb/, with their masks.
+    """The photos in `folder`, or else in its images/, photos/, input/ or rgb/, with their masks; or in the DCIM/ of a
+    camera's card, or in the only folder in it.
 
     Masks are looked for beside the photos and beside their folder; a file NAME_mask is a mask and no photo where
     there is a photo NAME.
@@ -42,8 +43,22 @@ def find_photos(folder: Path) -> PhotoFiles:
             roots = [folder, place, *([place.parent] if place.name in PHOTO_FOLDERS else [])]
             masks = masks_of({path: path.name for path in paths}, roots)
             return PhotoFiles(tuple(paths), tuple(masks.get(path) for path in paths) if masks else ())
-    inside = sorted(entry.name for entry in folder.iterdir())[:6]
-    raise ValueError(f"{folder}: expected photos, in the folder itself or in images/, found {inside}")
+    inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and _holds_photos(entry)]
+    inner = [entry for entry in inner if entry.name == "DCIM"] or inner
+    if len(inner) == 1:
+        return find_photos(inner[0])
+    expected = f"{folder}: expected photos, in the folder itself or in images/"
+    counts = [f"{entry.name}/ ({len(photos)} photos)" for entry in inner if (photos := _photos(entry))]
+    if counts:
+        raise ValueError(f"{expected}, found {', '.join(counts[:6])}: name one of these")
+    inside = ", ".join(sorted(entry.name for entry in folder.iterdir())[:6])
+    raise ValueError(f"{expected}, found {inside or 'an empty folder'}")
+
+
+def _holds_photos(folder: Path) -> bool:
+    if folder.name in _MASK_FOLDERS or folder.name.startswith((".", "__MACOSX")):
+        return False
+    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.rglob("*"))
 
 
 def describe_masks(images: Sequence[Path], masks: Sequence[Path | None]) -> str:
