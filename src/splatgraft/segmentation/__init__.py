@@ -22,11 +22,13 @@ from splatgraft.segmentation.selection import (
     select_object,
 )
 from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
+from splatgraft.segmentation.unseen_side import ClosedObject, close_unseen_side, widest_gap
 
 __all__ = [
     "MIN_AGREEMENT",
     "Agreement",
     "Box",
+    "ClosedObject",
     "CutViews",
     "Keep",
     "LiftOptions",
@@ -37,6 +39,7 @@ __all__ = [
     "ViewCutter",
     "add_correction",
     "apply_corrections",
+    "close_unseen_side",
     "cut_object",
     "default_box",
     "grabcut_mask",
@@ -48,4 +51,5 @@ __all__ = [
     "segment",
     "select_object",
     "solidify_object",
+    "widest_gap",
 ]

@@ -1,4 +1,4 @@
-"""Segmentation of a scene by the object masks of its capture: lifted to the Gaussians, selected, made solid."""
+"""Segmentation of a scene by the object masks of its capture: lifted to the Gaussians, selected, made solid, closed."""
 
 from dataclasses import dataclass
 
@@ -12,6 +12,7 @@ from splatgraft.runtime.progress import Progress, silent
 from splatgraft.segmentation.lift import LiftOptions, lift_masks
 from splatgraft.segmentation.selection import SelectOptions, select_object
 from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
+from splatgraft.segmentation.unseen_side import close_unseen_side
 
 
 @dataclass(frozen=True)
@@ -19,13 +20,15 @@ class Segmentation:
     """A scene of n Gaussians divided into an object and its surroundings."""
 
     object: Gaussians
-    """The object's Gaussians, made solid where that was asked for."""
+    """The object's Gaussians, made solid where that was asked for, and closed where no photograph shows it."""
     surroundings: Gaussians
     """All other Gaussians of the scene, unchanged."""
     selection: Bool[Tensor, "n"]
     """Which Gaussians of the scene are the object's."""
     feature: Float[Tensor, "n"]
     """Share of each Gaussian's blending weight that falls inside the masks, in [0, 1]."""
+    is_guessed: Bool[Tensor, "k"]
+    """Which Gaussians of the object close its unseen side."""
 
 
 def segment(
@@ -39,8 +42,9 @@ def segment(
 ) -> Segmentation:
     """Divide a scene into the object that the masks of its capture show and everything else.
 
-    Lifts the masks (`lift_masks`), selects Gaussians by threshold, box and connected piece (`select_object`), and fits
-    the object alone to its masked images, so that it is opaque without its surroundings (`solidify_object`).
+    Lifts the masks (`lift_masks`), selects Gaussians by threshold, box and connected piece (`select_object`), fits the
+    object alone to its masked images, so that it is opaque without its surroundings (`solidify_object`), and closes the
+    side that none of them shows (`close_unseen_side`).
 
     Args:
         scene: n Gaussians reconstructed from `capture`.
@@ -61,7 +65,10 @@ def segment(
     if solidify is not None and solidify.iterations:
         photographs = LazySequence(len(masked), lambda index: (masked.image(index), masks[index]))
         chosen = solidify_object(scene, selection, cameras, photographs, options=solidify, progress=progress)
-    return Segmentation(chosen, scene.select(~selection), selection, feature)
+    closed = close_unseen_side(chosen, cameras, masks)
+    return Segmentation(
+        closed.gaussians.to(scene.device), scene.select(~selection), selection, feature, closed.is_guessed
+    )
 
 
 def _mask(capture: PosedImages, index: int) -> Float[Tensor, "h w"]:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import resize
 from splatgraft.core.posed_images import PosedImages
@@ -45,12 +46,14 @@ from splatgraft.segmentation import (
     SolidifyOptions,
     ViewCutter,
     apply_corrections,
+    close_unseen_side,
     grabcut_mask,
     lift_masks,
     load_sam2,
     measure_agreement,
     select_object,
     solidify_object,
+    widest_gap,
 )
 
 SHEET_FILE = "views.png"
@@ -59,6 +62,10 @@ _SOLID_SIDE_PX = 960
 """Longest side at which the object is made solid: time and memory go with the area."""
 _PICTURED = 8
 """Photographs on the sheet."""
+_MUCH_GUESSED = 0.1
+"""Share of the surface that no photograph shows, from which on that is a warning."""
+_WIDE_GAP_DEG = 60.0
+"""Turn without photographs that is named."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +77,8 @@ class Segment:
     capture: Path
     """The posed images that it was made of."""
     out: Path = Path("object")
-    """Folder for object.ply, surroundings.ply (the scene without it), selection.npy, feature.npy, agreement.json and
-    views.png (how well the masks agree); masks/ where made."""
+    """Folder for object.ply, is_guessed.npy (what closes its unseen side), surroundings.ply (the scene without it),
+    selection.npy, feature.npy, agreement.json and views.png (how well the masks agree); masks/ where made."""
     mask_source: MaskSource = "auto"
     """files: masks/ beside the images, or --masks. grabcut, sam2: cut from the images, guided by the scene, --prompts
     and --box. birefnet: from a network. box: no masks, all Gaussians whose centre is in the box (of a scene that is the
@@ -96,6 +103,8 @@ class Segment:
     """A .npy with one int8 per Gaussian of the scene, as the editor writes it: 1 adds it to the object, -1 removes."""
     solidify: int = SolidifyOptions.iterations
     """Optimisation steps that make the object opaque when it is rendered alone; 0 keeps its Gaussians unchanged."""
+    keep_open: bool = False
+    """Leave the side of the object open that no photograph shows; without it, it is closed."""
     device: Device = "auto"
     """Where to compute."""
     options: LiftOptions = field(default_factory=LiftOptions)
@@ -145,7 +154,11 @@ class Segment:
             options, cameras = SolidifyOptions(iterations=self.solidify), views.cameras.to(device)
             chosen = solidify_object(scene, selection, cameras, photographs, options=options, progress=context.progress)
             context.console.say(f"object, made solid: {chosen.count:,} Gaussians")
+        is_guessed = torch.zeros(chosen.count, dtype=torch.bool)
+        if not self.keep_open and masked is not None:
+            chosen, is_guessed = self._closed(chosen, masked, context)
         write_gaussians(folder / OBJECT_FILE, chosen.to("cpu"))
+        write_flags(folder / "is_guessed.npy", is_guessed)
         write_gaussians(folder / SURROUNDINGS_FILE, scene.select(~selection).to("cpu"))
         write_flags(folder / SELECTION_FILE, selection)
         with atomic_write(folder / "feature.npy") as stream:
@@ -190,22 +203,42 @@ class Segment:
             raise ValueError("--mask-source sam2: expected --sam2-encoder and --sam2-decoder beside it, found not both")
         return load_sam2(self.sam2_encoder, self.sam2_decoder).cut
 
+    def _closed(self, object_: Gaussians, masked: MaskedViews, context: Context) -> tuple[Gaussians, Bool[Tensor, "k"]]:
+        """The object with its unseen side closed, and which of its Gaussians do that."""
+        views, small = _small_masks(masked)
+        closed = close_unseen_side(object_, views, small)
+        share = closed.guessed_share
+        if share > 0:
+            gap, (first, last) = widest_gap(views, closed.gaussians.means.median(0).values)
+            text = (
+                f"{share:.0%} of the object's surface was never photographed: its shape and colour there are a guess."
+            )
+            if gap > _WIDE_GAP_DEG:
+                text += f" No photo was taken over {gap:.0f} degrees around it, between {first} and {last}."
+            remedy = "Photograph it from there too, or turn that side away (compose: yaw_deg)"
+            context.console.tell(Note(text, "warning" if share > _MUCH_GUESSED else "minor", remedy))
+        return closed.gaussians, closed.is_guessed
+
     def _compare(
         self, masked: MaskedViews, scene: Gaussians, selection: Bool[Tensor, "n"], folder: Path, context: Context
     ) -> None:
         """Measure how well the masks agree, and write it with a picture."""
-        factor = min(1.0, CUT_SIDE_PX / int(masked.views.cameras.sizes.max()))
-        cameras = masked.views.cameras.resized(factor).to(scene.device)
-        sizes = cameras.sizes.tolist()
-        small = LazySequence(len(sizes), lambda index: resize(masked.masks[index], *sizes[index]))
-        agreement = measure_agreement(small, scene, cameras, selection, progress=context.progress)
+        cameras, small = _small_masks(masked)
+        agreement = measure_agreement(small, scene, cameras.to(scene.device), selection, progress=context.progress)
         with atomic_write(folder / AGREEMENT_FILE) as stream:
             stream.write((json.dumps(agreement.as_json(), indent=1) + "\n").encode())
         doubtful = agreement.doubtful
-        others = [round(i) for i in torch.linspace(0, len(sizes) - 1, min(_PICTURED, len(sizes))).tolist()]
+        others = [round(i) for i in torch.linspace(0, len(small) - 1, min(_PICTURED, len(small))).tolist()]
         chosen = [*doubtful, *(i for i in dict.fromkeys(others) if i not in doubtful)][:_PICTURED]
         write_mask_sheet(folder / SHEET_FILE, masked, chosen, scene=scene, selection=selection)
         context.console.tell(*_agreement_notes(agreement, self.out / SHEET_FILE, folder / SHEET_FILE))
+
+
+def _small_masks(masked: MaskedViews) -> tuple[Cameras, Sequence[Tensor]]:
+    """The views at the size at which masks are cut, and their masks, read when asked for."""
+    cameras = masked.views.cameras.resized(min(1.0, CUT_SIDE_PX / int(masked.views.cameras.sizes.max())))
+    sizes = cameras.sizes.tolist()
+    return cameras, LazySequence(len(sizes), lambda index: resize(masked.masks[index], *sizes[index]))
 
 
 def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tensor, Tensor]]]:

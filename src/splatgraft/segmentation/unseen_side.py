@@ -1,0 +1,277 @@
+"""Closes the side of an object that no photograph shows: an opaque back, on the hull of its masks.
+
+The hull is carved out of a grid of voxels by the masks (visual hull; Laurentini 1994): silhouettes from one side give
+the outline from the other, too. Where no camera sees the hull's surface, and the object has no surface behind it, flat
+Gaussians are put there. Their colours continue those at the border of what was seen (Laplace's equation on the
+surface). None of them shows in the photographs.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.directions import frames_along, tangents
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
+from splatgraft.rendering import RenderOptions, view_operator
+
+# all set by hand
+_GRID = 96
+"""Voxels along each axis."""
+_ROOM = 1.0
+"""Room around the object's Gaussians in which its unseen side may lie, over their extent."""
+_TRIMMED = 0.005
+"""Share of the Gaussians beyond either end of that extent."""
+_AGREEING = 0.94
+"""Share of the masks inside of which a voxel of the hull must lie: one of sixteen may be wrong."""
+_MIN_VIEWS = 3
+"""Fewer views of a voxel leave it empty."""
+_FACING = 0.2
+"""Cosine between a surface's normal and a camera, below which the camera does not see it."""
+_MAX_VIEWS = 40
+"""Photographs that are asked, spread over the list."""
+_BIAS = 2.5
+"""Voxels from which on the hull hides a point of its surface."""
+_OPAQUE = 0.3
+"""Opacity from which a Gaussian is a surface, and has a colour to continue."""
+_INSET = 2.0
+"""Voxels by which they lie inside of the hull: it is wider than the object where no camera saw its outline."""
+_OVERLAP = 4.0
+"""Voxels by which they reach under what was seen, so that no gap shows between."""
+_HIDDEN = 0.005
+"""Share of a Gaussian's area that may show in a photograph."""
+_RIM_PX = 1
+"""Pixels of a mask's rim in which none of them may lie."""
+_WIDTH, _THICKNESS = 0.7, 0.15
+"""Standard deviations of the Gaussians, over a voxel's side."""
+_LOGIT = 4.0
+"""Opacity .98."""
+_UNDERSIDE = -0.3
+"""Height of a normal below which a surface belongs to the underside, which nobody photographs."""
+_NEIGHBOURS = 8
+_ROUNDS = 400
+"""Steps of Jacobi's method; a step carries colours one neighbour further."""
+_LEAST = 0.02
+"""Share of the surface below which an object counts as seen from all sides."""
+
+
+@dataclass(frozen=True)
+class ClosedObject:
+    """An object whose unseen side is closed."""
+
+    gaussians: Gaussians
+    """Those of the object, unchanged, then those of its unseen side."""
+    is_guessed: Bool[Tensor, "n"]
+    """Which are of the unseen side."""
+    guessed_share: float
+    """Share of the object's surface that no photograph shows, without its underside, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class _Hull:
+    """Voxels of an object and m points on their surface."""
+
+    occupied: Bool[Tensor, "g g g"]
+    low: Float[Tensor, "3"]
+    """Corner of the grid."""
+    voxel: Float[Tensor, "3"]
+    """Sides of a voxel, world units."""
+    points: Float[Tensor, "m 3"]
+    normals: Float[Tensor, "m 3"]
+    """Unit, outwards."""
+
+
+def close_unseen_side(object_: Gaussians, cameras: Cameras, masks: Sequence[Float[Tensor, "_ _"]]) -> ClosedObject:
+    """Close the side of an object that no photograph shows, its underside included.
+
+    Args:
+        object_: The object's Gaussians.
+        cameras: Of the photographs with masks.
+        masks: White where the object is, one per camera, at its size.
+
+    Returns:
+        On the CPU; the object as it was where all of it was seen, and where its masks have no common hull.
+    """
+    object_, cameras = object_.to("cpu"), cameras.to("cpu")
+    up = estimate_up(cameras).to(object_.means)
+    asked = torch.linspace(0, len(cameras) - 1, min(_MAX_VIEWS, len(cameras))).round().long()
+    cameras, masks = cameras[asked], [masks[i].cpu() for i in asked.tolist()]
+    nothing = ClosedObject(object_, torch.zeros(object_.count, dtype=torch.bool), 0.0)
+    hull = _carved(object_, cameras, masks, up)
+    if hull is None:
+        return nothing
+    seen = _seen(hull, cameras)
+    below = hull.normals @ up < _UNDERSIDE
+    share = float((~seen & ~below).sum() / (~below).sum().clamp_min(1))
+    opaque = object_.opacities > _OPAQUE
+    side = float(hull.voxel.max())
+    bare = ~seen & _is_bare(hull, object_.select(opaque))
+    if share < _LEAST or not bool(bare.any()) or not bool(seen.any()):
+        return nothing
+    distance, _ = KDTree(hull.points[bare].numpy()).query(hull.points.numpy())
+    within = hull.points - _INSET * side * hull.normals
+    back = (torch.from_numpy(distance) < _OVERLAP * side) & _inside_masks(within, cameras, [_eroded(m) for m in masks])
+    colors = _continued(hull, seen, object_.select(opaque))[back]
+    count, width = int(back.sum()), torch.tensor([_WIDTH, _WIDTH, _THICKNESS]) * side
+    sh = torch.zeros(count, *object_.sh.shape[1:])
+    sh[:, 0] = colors
+    closing = Gaussians(
+        means=within[back],
+        log_scales=width.log().repeat(count, 1),
+        quaternions=quaternion_from_rotation(frames_along(-hull.normals[back]).transpose(1, 2)),
+        opacity_logits=torch.full((count,), _LOGIT),
+        sh=sh,
+    )
+    closing = closing.select(~_shows(closing, object_, cameras))
+    is_guessed = torch.cat([nothing.is_guessed, torch.ones(closing.count, dtype=torch.bool)])
+    return ClosedObject(concatenate([object_, closing]), is_guessed, share)
+
+
+def widest_gap(cameras: Cameras, middle: Float[Tensor, "3"]) -> tuple[float, tuple[str, str]]:
+    """The widest turn about a point, seen from above, from which no photograph was taken.
+
+    Args:
+        cameras: Of the photographs.
+        middle: World units.
+
+    Returns:
+        Degrees, and the names of the photographs on either side of it.
+    """
+    tangent, bitangent = tangents(estimate_up(cameras))
+    away = cameras.centers - middle
+    turns = torch.atan2(away @ bitangent, away @ tangent)
+    order = turns.argsort()
+    gaps = torch.remainder(turns[order].roll(-1) - turns[order], 2 * math.pi)
+    if len(cameras) == 1:
+        gaps += 2 * math.pi
+    first = int(gaps.argmax())
+    ends = order[first], order[(first + 1) % len(order)]
+    return math.degrees(float(gaps[first])), (cameras.names[int(ends[0])], cameras.names[int(ends[1])])
+
+
+def _carved(
+    object_: Gaussians, cameras: Cameras, masks: Sequence[Float[Tensor, "_ _"]], up: Float[Tensor, "3"]
+) -> _Hull | None:
+    """The hull of the masks around an object, which ends at the object's lowest level; None where there is none."""
+    ends = object_.means.quantile(torch.tensor([_TRIMMED, 1 - _TRIMMED]), dim=0)
+    lowest = float((object_.means @ up).quantile(_TRIMMED))
+    room = _ROOM * float((ends[1] - ends[0]).max())
+    low, high = ends[0] - room, ends[1] + room
+    # once for its extent, then finely there
+    for _ in range(2):
+        voxel = (high - low) / _GRID
+        index = torch.arange(_GRID) + 0.5
+        centers = torch.stack(torch.meshgrid(*(low[i] + index * voxel[i] for i in range(3)), indexing="ij"), -1)
+        inside = _inside_masks(centers.reshape(-1, 3), cameras, masks).reshape(_GRID, _GRID, _GRID)
+        occupied = inside & (centers @ up >= lowest)
+        if not bool(occupied.any()):
+            return None
+        found = centers[occupied]
+        low, high = found.amin(0) - 2.5 * voxel, found.amax(0) + 2.5 * voxel
+    corner = centers[0, 0, 0] - 0.5 * voxel
+    filled = torch.nn.functional.pad(occupied.float(), (2,) * 6)[None, None]
+    smooth = torch.nn.functional.avg_pool3d(filled, 5, stride=1)[0, 0]
+    gradient = torch.stack(torch.gradient(smooth), -1) / voxel
+    around = torch.nn.functional.max_pool3d(1 - torch.nn.functional.pad(filled, (-1,) * 6), 3, stride=1)[0, 0]
+    surface = occupied & (around > 0) & (gradient.norm(dim=-1) > 1e-6)
+    normals = -torch.nn.functional.normalize(gradient[surface], dim=1)
+    return _Hull(occupied, corner, voxel, centers[surface], normals)
+
+
+def _inside_masks(
+    points: Float[Tensor, "p 3"], cameras: Cameras, masks: Sequence[Float[Tensor, "_ _"]]
+) -> Bool[Tensor, "p"]:
+    """Which points lie inside nearly all masks that could show them."""
+    inside, shown = torch.zeros(len(points)), torch.zeros(len(points))
+    for camera, mask in zip(cameras, masks, strict=True):
+        pose, k = camera.camera_from_world[0].to(points), camera.intrinsics[0].to(points)
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        pixels = (local @ k.T)[:, :2] / local[:, 2:].clamp_min(1e-6)
+        height, width = mask.shape
+        framed = (local[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([width, height])).all(1)
+        column, row = pixels.nan_to_num(0).clamp(-1, 1e6).long().unbind(1)
+        inside += framed & (mask[row.clamp(0, height - 1), column.clamp(0, width - 1)] > 0.5)
+        shown += framed
+    return (shown >= _MIN_VIEWS) & (inside >= _AGREEING * shown)
+
+
+def _eroded(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """A mask without the pixels at its rim: what lies there would show beside the object."""
+    size = 2 * _RIM_PX + 1
+    return -torch.nn.functional.max_pool2d(-mask[None, None], size, stride=1, padding=_RIM_PX)[0, 0]
+
+
+def _seen(hull: _Hull, cameras: Cameras) -> Bool[Tensor, "m"]:
+    """Which points of a hull's surface some camera sees: they face it, and the hull does not hide them."""
+    seen = torch.zeros(len(hull.points), dtype=torch.bool)
+    side = float(hull.voxel.min())
+    steps = torch.arange(_BIAS, 3**0.5 * _GRID * float(hull.voxel.max()) / side)
+    for camera in cameras:
+        away = camera.centers[0].to(hull.points) - hull.points
+        towards = torch.nn.functional.normalize(away, dim=1)
+        asked = (~seen & ((towards * hull.normals).sum(1) > _FACING)).nonzero()[:, 0]
+        for part in asked.split(4096):
+            path = hull.points[part, None] + (side * steps)[:, None] * towards[part, None]
+            seen[part] = ~hull.occupied[_cells(hull, path)].any(1)
+    return seen
+
+
+def _is_bare(hull: _Hull, object_: Gaussians) -> Bool[Tensor, "m"]:
+    """Behind which points of a hull the object has no surface in the nearer half of the hull.
+
+    What lies in the farther half is the inside of the opposite side.
+    """
+    axes = rotation_from_quaternion(object_.quaternions) * object_.scales[:, None]
+    flat = axes.gather(2, object_.log_scales.topk(2).indices[:, None].expand(-1, 3, -1))
+    steps = torch.cartesian_prod(torch.tensor([-1.0, 0.0, 1.0]), torch.tensor([-1.0, 0.0, 1.0]))
+    spots = object_.means[:, None] + torch.einsum("nij,sj->nsi", flat, steps)
+    surface = torch.zeros_like(hull.occupied)
+    surface[_cells(hull, spots)] = True
+    surface = torch.nn.functional.max_pool3d(surface[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
+    away = torch.arange(0, 3**0.5 * _GRID) * float(hull.voxel.min())
+    bare = []
+    for points, normals in zip(hull.points.split(4096), hull.normals.split(4096), strict=True):
+        cells = _cells(hull, points[:, None] - away[:, None] * normals[:, None])
+        depth = hull.occupied[cells].long().cumprod(1).sum(1)
+        is_nearer = torch.arange(len(away)) < (0.5 * depth)[:, None]
+        bare.append(~(surface[cells] & is_nearer).any(1))
+    return torch.cat(bare)
+
+
+def _cells(hull: _Hull, points: Float[Tensor, "p s 3"]) -> tuple[Int[Tensor, "p s"], ...]:
+    """Indices of the voxels at points; those at the grid's border are empty."""
+    return ((points - hull.low) / hull.voxel).long().clamp(0, _GRID - 1).unbind(-1)
+
+
+def _shows(closing: Gaussians, object_: Gaussians, cameras: Cameras) -> Bool[Tensor, "n"]:
+    """Which Gaussians some photograph would show beside the object or through it, where it must stay as it is."""
+    both = concatenate([object_, closing])
+    shows = torch.zeros(closing.count, dtype=torch.bool)
+    area = 2 * math.pi * closing.scales.topk(2).values.prod(1)
+    for camera in cameras:
+        width, height = camera.sizes[0].tolist()
+        ones = torch.ones(height, width, 1)
+        pixels = view_operator(both, camera, RenderOptions()).blend_transpose(ones)[object_.count :, 0]
+        pose, focal = camera.camera_from_world[0], camera.intrinsics[0, 0, 0]
+        depth = (closing.means @ pose[2, :3] + pose[2, 3]).clamp_min(1e-6)
+        shows |= pixels > _HIDDEN * area * (focal / depth) ** 2
+    return shows
+
+
+def _continued(hull: _Hull, seen: Bool[Tensor, "m"], object_: Gaussians) -> Float[Tensor, "m 3"]:
+    """Band 0 at the points of a hull: that of the object where it was seen, and a smooth continuation elsewhere."""
+    _, nearest = KDTree(object_.means.numpy()).query(hull.points.numpy(), k=min(_NEIGHBOURS, object_.count))
+    known = object_.sh[:, 0][torch.from_numpy(nearest).reshape(len(hull.points), -1)].mean(1)
+    _, around = KDTree(hull.points.numpy()).query(hull.points.numpy(), k=min(_NEIGHBOURS, len(hull.points)))
+    around = torch.from_numpy(around).reshape(len(hull.points), -1)
+    colors = torch.where(seen[:, None], known, known[seen].mean(0))
+    for _ in range(_ROUNDS):
+        colors = torch.where(seen[:, None], known, colors[around].mean(1))
+    return colors
