@@ -213,7 +213,7 @@ def find_in_sizes(sizes: Sequence[tuple[int, int]], names: Sequence[str]) -> Fin
     if not odd:
         return Finding("sizes", "good", f"all {len(sizes)} photos have {width} x {height} px")
     text = f"{most} of {len(sizes)} photos have {width} x {height} px, {len(odd)} another: {_named(odd)}"
-    return Finding("sizes", "doubtful", text, "leave out those of another camera, zoom or orientation", odd)
+    return Finding("sizes", "doubtful", text, "one camera and one zoom are best; capture uses all that fit", odd)
 
 
 def find_in_exposures(exposures: Sequence[Exposure]) -> Finding:
@@ -275,8 +275,9 @@ def _overlap(found: Mapping[tuple[int, int], _Link | None], names: Sequence[str]
         sizes = ", ".join(str(len(group)) for group in groups[:4])
         remedy = "take photos a step apart that share two thirds of the picture, with texture in view, of one place"
         return Finding("overlap", "unusable", text + sizes, remedy, apart)
-    text = f"{len(apart)} of {n} photos show nothing in common with the rest: {_named(apart)}"
-    return Finding("overlap", "doubtful", text, "leave them out, or take photos between them and the rest", apart)
+    text = f"{len(apart)} of {n} photos share little with those taken before and after them: {_named(apart)}"
+    # photos that neighbours do not hold are often held by others: without them fewer of the rest get a pose
+    return Finding("overlap", "doubtful", text, "keep them, and take photos between them and the rest", apart)
 
 
 def _exposure(links: Sequence[_Link], names: Sequence[str]) -> Finding:
@@ -296,5 +297,5 @@ def _exposure(links: Sequence[_Link], names: Sequence[str]) -> Finding:
     odd = tuple(names[i] for i in largest_first if jumps[i] > _JUMP_STOPS)
     if odd:
         text = f"{len(odd)} photos are up to {max(jumps):.1f} stops off their neighbours in brightness: {_named(odd)}"
-        return Finding("exposure", "doubtful", text, "lock exposure and white balance, or leave them out", odd)
+        return Finding("exposure", "doubtful", text, "lock exposure and white balance next time", odd)
     return Finding("exposure", "good", f"neighbours agree in brightness within {max(jumps):.2f} stops")
