@@ -33,6 +33,8 @@ _ADVICE = (
 )
 _EXHAUSTIVE = 80
 """Most photos of which all pairs are compared unless asked for."""
+_ENOUGH = 0.5
+"""Share of the photos that need a pose; the rest is named and left out."""
 _THOROUGH_COST = 20
 """Time of a thorough attempt over that of a quick one: features of affine shape, more of them, guided matching."""
 _SECONDS_PER_PHOTO = 2.5
@@ -46,7 +48,8 @@ class PoseOptions:
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """Which pairs are compared first: all, or neighbours in name order; `auto` is exhaustive for up to 80 photos."""
     effort: Literal["auto", "quick", "thorough"] = "auto"
-    """`thorough` finds and matches more features at about 20 times the cost; `auto` does so where quick is doubtful."""
+    """`thorough` finds and matches more features at about 20 times the cost; `auto` does so where quick poses
+    less than half of the photos."""
     lens: Literal["shared", "each"] = "shared"
     """Whether photos of equal size and EXIF (maker, model, focal length) share a camera, or each has its own."""
     max_size_px: int = 1600
@@ -106,18 +109,21 @@ def pose_photos(
         seconds, cpu = (sum(model[name].values()) for name in ("seconds", "cpu_seconds"))
         parts = ", ".join(f"{phase} {took:.0f}" for phase, took in model["seconds"].items())
         say(f"structure from motion took {seconds:.0f} s ({parts}), {cpu:.0f} CPU-s")
-        doubts = "; ".join(map(str, found[-1][1].doubts))
-        if not doubts:
+        latest = found[-1][1]
+        minutes = max(1, round(_THOROUGH_COST * seconds / 60))
+        if latest.registered >= _ENOUGH * len(copies):
+            if latest.doubts and effort == "quick":
+                doubts = "; ".join(map(str, latest.doubts))
+                say(f'doubtful ({doubts}); effort = "thorough" finds more features, which takes about {minutes} min')
             break
         if effort != efforts[-1]:
-            minutes = max(1, round(_THOROUGH_COST * seconds / 60))
             say(
-                f"doubtful ({doubts}): all is done once more with more features, which takes about {minutes} min; "
-                "Ctrl-C ends it, and effort = quick goes on without it"
+                f"only {latest.registered} of {len(copies)} photos got a pose: all is done once more with more "
+                f"features, which takes about {minutes} min"
             )
     # by the score of colmap_process/scores.py, where the number of photos is the same for both
     model, report = max(found, key=lambda pair: pair[1].explained * pair[1].registered)
-    if report.registered < 0.5 * len(copies):
+    if report.registered < _ENOUGH * len(copies):
         raise ValueError(
             f"{photos.paths[0].parent}: expected at least half of {len(copies)} photos to register, "
             f"found {report.registered}; {_ADVICE}; without a pose: {', '.join(map(str, report.missing))}"
