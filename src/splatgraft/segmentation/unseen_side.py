@@ -8,7 +8,7 @@ surface). None of them shows in the photographs.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -104,17 +104,19 @@ def close_unseen_side(object_: Gaussians, cameras: Cameras, masks: Sequence[Floa
     asked = torch.linspace(0, len(cameras) - 1, min(_MAX_VIEWS, len(cameras))).round().long()
     cameras, masks = cameras[asked], [masks[i].cpu() for i in asked.tolist()]
     nothing = ClosedObject(object_, torch.zeros(object_.count, dtype=torch.bool), 0.0)
-    hull = _carved(object_, cameras, masks, up)
+    opaque = object_.opacities > _OPAQUE
+    hull = _carved(object_, cameras, masks, up) if bool(opaque.any()) else None
     if hull is None:
         return nothing
     seen = _seen(hull, cameras)
     below = hull.normals @ up < _UNDERSIDE
     share = float((~seen & ~below).sum() / (~below).sum().clamp_min(1))
-    opaque = object_.opacities > _OPAQUE
+    if share < _LEAST:
+        return nothing
     side = float(hull.voxel.max())
     bare = ~seen & _is_bare(hull, object_.select(opaque))
-    if share < _LEAST or not bool(bare.any()) or not bool(seen.any()):
-        return nothing
+    if not bool(bare.any()) or not bool(seen.any()):
+        return replace(nothing, guessed_share=share)
     distance, _ = KDTree(hull.points[bare].numpy()).query(hull.points.numpy())
     within = hull.points - _INSET * side * hull.normals
     back = (torch.from_numpy(distance) < _OVERLAP * side) & _inside_masks(within, cameras, [_eroded(m) for m in masks])
