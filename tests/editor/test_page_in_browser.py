@@ -419,7 +419,7 @@ def open_scenes(window: Window, browser: Any, editor: Editor, root: Path) -> Win
     window.upload("Upload a video or a scene", root / "target.ply")
     window.says("target.ply: stored as")
     # it says what a path is before anything is made of it
-    window.says("expected a file or a folder, found nothing there")
+    window.says("expected photos, a video, a posed capture or a scene, found nothing there")
     assert window.page.get_by_role("button", name="Start the project").is_disabled()
     window.write("Object from", str(root / "source.ply"))
     window.says("a trained scene of 224 Gaussians")
