@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import zipfile
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from splatgraft.core import images
 from splatgraft.core.exposure import Exposure
 from splatgraft.formats import read_capture
 from splatgraft.formats.captures.exif import exif_of, read_exposure
+from splatgraft.formats.captures.photo_archive import unpack_photos
 
 LARGE = (SIZE[0] * 8, SIZE[1] * 8)
 
@@ -245,6 +247,18 @@ def test_a_zip_is_the_photos_and_masks_in_it(tmp_path: Path) -> None:
         mask = folder.mask(index)
         assert mask is not None
         assert torch.equal(archive.mask(index), mask)
+
+
+def test_a_zip_whose_photos_are_damaged_inside_leaves_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "c.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("0.png", bytes(range(256)) * 400)
+    content = bytearray(path.read_bytes())
+    content[40:200] = b"\xff" * 160
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"c\.zip: expected a \.zip of photos, found one that cannot be read"):
+        unpack_photos(path, tmp_path / "photos")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["c.zip"]
 
 
 @pytest.fixture

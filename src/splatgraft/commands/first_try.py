@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splatgraft.commands.init import Init
 from splatgraft.commands.steps.segment import Segment
-from splatgraft.folders.input_description import describe_input, require_input
+from splatgraft.folders.input_description import describe_input
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
 from splatgraft.project.record import read_record
 from splatgraft.project.step import DEFAULT_REMEDIES, Positional, Step
@@ -74,7 +74,6 @@ class Try:
             console.say(f"{project}: goes on with what is there")
             return
         for capture in (self.object, self.place):
-            require_input(capture)
             found = describe_input(capture)
             if not found.is_usable:
                 known = found.text.startswith(str(capture))

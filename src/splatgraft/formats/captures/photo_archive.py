@@ -2,6 +2,7 @@
 
 import shutil
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -75,7 +76,7 @@ def _opened(archive: Path) -> Iterator[tuple[zipfile.ZipFile, list[tuple[zipfile
             if not members:
                 raise ValueError(f"{expected} no photo in it")
             yield opened, members
-    except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError) as error:
+    except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, zlib.error) as error:
         # RuntimeError is what zipfile raises for a password
         raise ValueError(f"{expected} one that cannot be read ({error})") from None
 
