@@ -27,6 +27,9 @@ settings.load_profile("any machine")
 _THREAD_SECONDS = 60.0
 """Longest wait for all threads: that of a page which no test closed never ends."""
 
+_STORY_SECONDS = 600
+"""Seconds after which a test in a browser is taken for a hang; pytest-timeout then shows what each thread does."""
+
 
 @pytest.fixture(scope="session")
 def finished_project(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -77,7 +80,9 @@ def pytest_sessionfinish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that use a browser."""
+    """Mark the tests that use a browser, and end one that hangs in a call without a limit of its own."""
     for item in items:
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.browser)
+            if item.get_closest_marker("long") is None:
+                item.add_marker(pytest.mark.timeout(_STORY_SECONDS))

@@ -120,6 +120,8 @@ class Editor:
     def _close(self) -> None:
         assert self.process.stdout is not None
         self.process.stdout.close()
+        # pytest shows it where the test fails
+        print(self.log.read_text()[-2000:])
 
 
 class Window:
@@ -157,7 +159,11 @@ class Window:
 
     def until(self, condition: Callable[[], bool], *, what: str) -> None:
         """Poll until `condition` holds; the browser's events are processed meanwhile."""
-        wait_until(condition, what=what, pause=self._pause)
+        try:
+            wait_until(condition, what=what, pause=self._pause)
+        except AssertionError as error:
+            error.add_note(f"the preview is called {self.caption()!r}; the browser's last errors: {self.errors[-3:]}")
+            raise
 
     def act_until(self, action: Callable[[], object], effect: Callable[[], bool], *, what: str) -> None:
         """Repeat an action until its effect is seen; an action that times out counts as not done."""

@@ -6,8 +6,8 @@ Neither depends on the machine's speed: the only limit ends a test that hangs.
 import time
 from collections.abc import Callable
 
-HANG_LIMIT = 900.0
-"""Seconds after which a wait is taken for a hang; hundreds of times what the slowest wait takes on an idle machine."""
+HANG_LIMIT = 120.0
+"""Seconds after which a wait is taken for a hang; more than ten times the slowest wait on an idle machine."""
 
 
 def wait_until(

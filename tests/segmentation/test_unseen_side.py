@@ -33,7 +33,10 @@ def ring(first_deg: float, last_deg: float, count: int = 10) -> Cameras:
     turns = torch.deg2rad(torch.linspace(first_deg, last_deg, count)).repeat(2)
     heights = torch.tensor([0.3, 0.9]).repeat_interleave(count)
     flat = heights.cos()
-    eyes = CENTER + 2.5 * torch.stack([flat * turns.cos(), flat * turns.sin(), heights.sin()], 1)
+    return looking_from(CENTER + 2.5 * torch.stack([flat * turns.cos(), flat * turns.sin(), heights.sin()], 1))
+
+
+def looking_from(eyes: torch.Tensor) -> Cameras:
     return pinhole(look_at(eyes, CENTER, UP), 150.0, width=120, height=90)
 
 
@@ -83,6 +86,16 @@ def test_what_was_photographed_from_all_sides_stays_as_it_is() -> None:
     assert closed.gaussians.count == seen.count
     assert not bool(closed.is_guessed.any())
     assert closed.guessed_share == 0
+
+
+def test_nothing_floats_where_only_a_few_photographs_reach() -> None:
+    # three from above; the others' frames end below what stands between those and the object
+    above = CENTER + torch.tensor([[0.1, 0.0, 2.5], [0.0, 0.1, 2.6], [-0.1, 0.0, 2.4]])
+    whole, cameras = egg(90), looking_from(torch.cat([ring(0, 180).centers, above]))
+    closed = close_unseen_side(photographed(whole, cameras), cameras, masks_of(whole, cameras))
+    assert bool(closed.is_guessed.any())
+    guessed = closed.gaussians.select(closed.is_guessed).means
+    assert float(torch.cdist(guessed, whole.means).amin(1).max()) < 0.3
 
 
 def test_masks_that_have_nothing_in_common_close_nothing() -> None:

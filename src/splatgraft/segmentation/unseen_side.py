@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -31,8 +32,10 @@ _TRIMMED = 0.005
 """Share of the Gaussians beyond either end of that extent."""
 _AGREEING = 0.94
 """Share of the masks inside of which a voxel of the hull must lie: one of sixteen may be wrong."""
-_MIN_VIEWS = 3
-"""Fewer views of a voxel leave it empty."""
+_SHOWN = 0.25
+"""Share of the masks that must show a voxel of the hull: close-ups show parts."""
+_PIECE = 0.02
+"""Share of the object's surface that a piece of the hull must hold: others are only where few masks reach."""
 _FACING = 0.2
 """Cosine between a surface's normal and a camera, below which the camera does not see it."""
 _MAX_VIEWS = 40
@@ -166,13 +169,14 @@ def _carved(
     lowest = float((object_.means @ up).quantile(_TRIMMED))
     room = _ROOM * float((ends[1] - ends[0]).max())
     low, high = ends[0] - room, ends[1] + room
+    surface = object_.means[object_.opacities > _OPAQUE]
     # once for its extent, then finely there
     for _ in range(2):
         voxel = (high - low) / _GRID
         index = torch.arange(_GRID) + 0.5
         centers = torch.stack(torch.meshgrid(*(low[i] + index * voxel[i] for i in range(3)), indexing="ij"), -1)
         inside = _inside_masks(centers.reshape(-1, 3), cameras, masks).reshape(_GRID, _GRID, _GRID)
-        occupied = inside & (centers @ up >= lowest)
+        occupied = _pieces_around(surface, inside & (centers @ up >= lowest), low, voxel)
         if not bool(occupied.any()):
             return None
         found = centers[occupied]
@@ -185,6 +189,19 @@ def _carved(
     surface = occupied & (around > 0) & (gradient.norm(dim=-1) > 1e-6)
     normals = -torch.nn.functional.normalize(gradient[surface], dim=1)
     return _Hull(occupied, corner, voxel, centers[surface], normals)
+
+
+def _pieces_around(
+    surface: Float[Tensor, "p 3"], occupied: Bool[Tensor, "g g g"], low: Float[Tensor, "3"], voxel: Float[Tensor, "3"]
+) -> Bool[Tensor, "g g g"]:
+    """The connected pieces of a hull that hold a part of a surface."""
+    pieces, count = ndimage.label(occupied.numpy(), ndimage.generate_binary_structure(3, 3))
+    cells = ((surface - low) / voxel).long()
+    x, y, z = cells[((cells >= 0) & (cells < _GRID)).all(1)].unbind(1)
+    held = torch.from_numpy(pieces).long()[x, y, z].bincount(minlength=count + 1)
+    is_part = held >= _PIECE * len(surface)
+    is_part[0] = False
+    return is_part[torch.from_numpy(pieces).long()]
 
 
 def _inside_masks(
@@ -203,7 +220,7 @@ def _inside_masks(
         shown[left] += framed
         # most of a grid is soon outside of more masks than may be wrong
         left = left[shown[left] - inside[left] <= (1 - _AGREEING) * len(cameras)]
-    return (shown >= _MIN_VIEWS) & (inside >= _AGREEING * shown)
+    return (shown >= _SHOWN * len(cameras)) & (inside >= _AGREEING * shown)
 
 
 def _eroded(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
