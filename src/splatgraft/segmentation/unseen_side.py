@@ -195,7 +195,7 @@ def _pieces_around(
     surface: Float[Tensor, "p 3"], occupied: Bool[Tensor, "g g g"], low: Float[Tensor, "3"], voxel: Float[Tensor, "3"]
 ) -> Bool[Tensor, "g g g"]:
     """The connected pieces of a hull that hold a part of a surface."""
-    pieces, count = ndimage.label(occupied.numpy(), ndimage.generate_binary_structure(3, 3))
+    pieces, count = ndimage.label(occupied.numpy(), ndimage.generate_binary_structure(3, 3))  # pyright: ignore[reportGeneralTypeIssues]
     cells = ((surface - low) / voxel).long()
     x, y, z = cells[((cells >= 0) & (cells < _GRID)).all(1)].unbind(1)
     held = torch.from_numpy(pieces).long()[x, y, z].bincount(minlength=count + 1)
