@@ -359,11 +359,30 @@ def orbit(first, last, *, count):
     return pinhole(look_at(eyes, torch.tensor([0.0, 0.0, TABLE]), UP), 200.0, width=240, height=180)
 
 
-def test_corners_do_not_reach_over_the_table_s_edge():
-    # cameras that look at the table's edge
+def cameras_that_look_at_the_edge():
     angle = torch.arange(12) / 12 * 2 * math.pi
     eyes = torch.stack([0.55 + 1.6 * angle.cos(), 1.6 * angle.sin(), torch.full_like(angle, TABLE + 0.8)], 1)
-    cameras = pinhole(look_at(eyes, torch.tensor([0.55, 0.0, TABLE]), UP), 200.0, width=240, height=180)
+    return pinhole(look_at(eyes, torch.tensor([0.55, 0.0, TABLE]), UP), 200.0, width=240, height=180)
+
+
+def test_a_place_is_away_from_the_table_s_edge_and_a_warning_says_where_none_is():
+    cameras = cameras_that_look_at_the_edge()
+
+    def placed(half):
+        thing = box((0.0, 0.0, half), (half, half, half), spacing=0.015)
+        table = sheet((0, 0, TABLE), (0.6, 0, 0), (0, 0.4, 0), spacing=0.03)
+        return place_object(table, thing, cameras=(cameras, cameras), options=PlaceOptions(scale=1.0))
+
+    found = placed(0.07)
+    # of three times its radius of .07 to .1, which would keep .3 from the edge at .6, most is kept
+    assert found.support.point[0] < 0.4
+    assert found.support.point[1].abs() < 0.2
+    assert not any("edge" in note.text for note in found.warnings)
+    assert any("near the edge" in note.text for note in placed(0.2).warnings)
+
+
+def test_corners_do_not_reach_over_the_table_s_edge():
+    cameras = cameras_that_look_at_the_edge()
     # a bar that is too little of the object to count in its radius
     bar = sheet((0, 0, 0.02), (0.165, 0, 0), (0, 0.005, 0), spacing=0.02)
     thing = concatenate([box((0.0, 0.0, 0.1), (0.1, 0.1, 0.1), spacing=0.015), bar])

@@ -29,10 +29,17 @@ _CENTER_SPREAD = 0.5
 _MARGIN = 1.25
 """Radius of the ground that is wanted level over the object's, which leaves out its outermost parts: corners must not
 reach over the edge of a table."""
+_ROOM = 3.0
+"""Radius of the ground that should not fall away, over the object's: its rim is as far from an edge as it is wide."""
+_NEAR_THE_EDGE = 0.7
+"""Share of that ground below which the object stands near an edge; on a straight edge it is a half."""
 _FLAT_ENOUGH = 0.8
 """Share of level ground at which the object is not made smaller."""
 _SHRINK, _ROUNDS = 0.8, 8
 """Factor on the scale where no place is level enough, and scales tried."""
+_EDGE = (
+    "It stands near the edge of what carries it: no free place in view has more room. Name another (--on), or --scale."
+)
 _MIN_SCORE = 0.01
 """Below it no place is level and in view."""
 _MAX_PLACES = 6
@@ -90,8 +97,9 @@ def suggest_places(
     wanted = size = scale if scale is not None else scale_in_view(base, focus, cameras=cameras)
     for _ in range(_ROUNDS):
         wide = max(_MARGIN * size * base.radius, 2 * ground.pixel)
-        flat = _flatness(ground, radius=wide, slope=_FLAT_SLOPE)
-        score = flat**2 * visible * central
+        flat = _level_share(ground, radius=wide, tolerance=_FLAT_SLOPE * wide)
+        carried = _level_share(ground, radius=_ROOM / _MARGIN * wide, tolerance=_FLAT_SLOPE * wide, or_higher=True)
+        score = flat**2 * carried**2 * visible * central
         if float(flat.flatten()[int(score.argmax())]) > _FLAT_ENOUGH or scale is not None:
             break
         size *= _SHRINK
@@ -107,7 +115,10 @@ def suggest_places(
     while len(found) < _MAX_PLACES and float(score.max()) > 0:
         best = int(score.argmax())
         shares = float(flat.flatten()[best]), float(visible.flatten()[best])
-        found.append(Suggestion(points[best], size, *shares, tuple(reasons)))
+        said = reasons
+        if float(carried.flatten()[best]) < _NEAR_THE_EDGE:
+            said = [*reasons, "It stands near the edge of what carries it: no free place in view has more room."]
+        found.append(Suggestion(points[best], size, *shares, tuple(said)))
         score[(points - points[best]).norm(dim=-1) < apart] = 0
     return found
 
@@ -139,22 +150,29 @@ def scale_in_view(
     return _IMAGE_SHARE * float(image_height.median()) / max(base.height, 2 * base.radius)
 
 
-def _flatness(ground: HeightMap, *, radius: float, slope: float) -> Float[Tensor, "s s"]:
-    """Share of the disc of `radius` around each pixel that lies at that pixel's level; 0 where nothing is solid."""
+def _level_share(
+    ground: HeightMap, *, radius: float, tolerance: float, or_higher: bool = False
+) -> Float[Tensor, "s s"]:
+    """Share of the disc of `radius` around each pixel that lies at that pixel's level; 0 where nothing is solid.
+
+    With `or_higher` what stands there counts, too: the share that does not fall away.
+    """
     solid = ground.alpha > 0.5
     pixels = max(1, round(radius / ground.pixel))
     steps = torch.arange(-pixels, pixels + 1)
     stride = max(1, pixels // 6)
     v, u = torch.meshgrid(steps[::stride], steps[::stride], indexing="ij")
     inside = u**2 + v**2 <= pixels**2
-    padded_height = torch.nn.functional.pad(ground.heights, (pixels,) * 4)
-    padded_solid = torch.nn.functional.pad(solid, (pixels,) * 4)
+    # beyond the map it goes on as at its border
+    both = torch.stack([ground.heights, solid.float()])
+    padded_height, padded_solid = torch.nn.functional.pad(both, (pixels,) * 4, mode="replicate")
     size = len(ground.heights)
-    level = torch.zeros_like(ground.heights)
+    level, bound = torch.zeros_like(ground.heights), tolerance + 0.5 * ground.pixel
     for dv, du in zip(v[inside].tolist(), u[inside].tolist(), strict=True):
         rows, columns = slice(pixels + dv, pixels + dv + size), slice(pixels + du, pixels + du + size)
-        same = (padded_height[rows, columns] - ground.heights).abs() < slope * radius + 0.5 * ground.pixel
-        level += same & padded_solid[rows, columns]
+        rise = padded_height[rows, columns] - ground.heights
+        same = (rise > -bound) & ((rise < bound) | or_higher)
+        level += same * padded_solid[rows, columns]
     return level / float(inside.sum()) * solid
 
 
