@@ -71,3 +71,5 @@ def test_a_view_of_the_whole_object_is_shown_before_a_larger_one_that_is_cut() -
     assert max((cut, whole, small), key=lambda p: p.prominence) is whole
     # one that hardly shows it is not
     assert max((cut, tiny), key=lambda p: p.prominence) is cut
+    # nor one of the side that no photograph shows
+    assert max((replace(whole, guessed_share=0.5), small), key=lambda p: p.prominence) is small

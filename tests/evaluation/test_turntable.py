@@ -72,6 +72,14 @@ def test_turning_the_world_turns_the_path():
     assert other.centers.mean(0).sub(rotation @ straight.centers.mean(0)).abs().max() < 0.02
 
 
+@pytest.mark.parametrize("span", [(0, 345), (20, 140)])
+def test_it_starts_where_it_is_told_to(span):
+    start = torch.tensor([math.cos(math.radians(100)), math.sin(math.radians(100)), 0.0])
+    path = turntable_cameras(captured(*span), CENTER, up=UP, options=TurntableOptions(frames=36, start=start))
+    # frames of a full circle are 10 degrees apart, of an arc of 120 degrees back and forth at most so
+    assert math.degrees(float(angles_and_rings(path)[0][0])) == pytest.approx(100, abs=6)
+
+
 def test_zoom_multiplies_the_focal_length():
     options = TurntableOptions(frames=5, zoom=1.5)
     path = turntable_cameras(captured(0, 345), CENTER, up=UP, options=options)

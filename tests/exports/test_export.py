@@ -15,6 +15,7 @@ from small_transfer import parts, write_transfer
 
 from splatgraft.cli import main
 from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.similarity import Similarity
 from splatgraft.evaluation import Report, ReportView, write_report
 from splatgraft.exports.export import ExportOptions, export_scene, layer_of
 from splatgraft.exports.export_source import ExportSource, first_view, path_around, upright
@@ -22,6 +23,7 @@ from splatgraft.exports.pictures import write_video
 from splatgraft.exports.shadow_layer import shadow_layer
 from splatgraft.folders.export_source import read_export_source
 from splatgraft.formats import SceneMetadata, read_gaussians, read_scene, write_gaussians
+from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.rendering import render
 
 
@@ -85,6 +87,25 @@ def test_the_first_view_is_a_captured_one_of_the_object(source):
     torch.testing.assert_close(torch.tensor(view.eye), source.cameras.centers[nearest])
     # the median of 80 points on a sphere of radius 0.25 around (0, 0, 0.3)
     assert (torch.tensor(view.center) - torch.tensor([0, 0, 0.3])).norm() < 0.1
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_first_view_and_the_path_begin_on_the_side_that_was_photographed(tmp_path, side):
+    project = write_transfer(tmp_path)
+    (project / "object").mkdir()
+    ball = parts()["object"]
+    write_gaussians(project / "object/object.ply", ball)
+    np.save(project / "object/is_guessed.npy", (side * ball.means[:, 0] < 0).numpy())
+    item = ObjectPlacement(target_from_object=Similarity.identity(), object_path=project / "object/object.ply")
+    write_placement(project / "composite/placement.json", Placement(objects=(item,)))
+    source = read_export_source(project)
+    view, _ = first_view(source)
+    assert side * (view.eye[0] - view.center[0]) > 0.3
+    first = path_around(source, view, frames=6, width=160).centers[0]
+    assert side * (first[0] - view.center[0]) > 0.3
+    # flags of another scene are not taken
+    np.save(project / "object/is_guessed.npy", np.ones(3, bool))
+    assert read_export_source(project).photographed_side is None
 
 
 def test_a_scene_without_cameras_says_what_it_assumes(tmp_path, capsys):

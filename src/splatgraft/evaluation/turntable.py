@@ -24,6 +24,8 @@ class TurntableOptions:
     """Frames in one loop."""
     zoom: float = 1.25
     """Focal length over the median of the captured cameras."""
+    start: Float[Tensor, "3"] | None = None
+    """Direction from the centre of the first frame's camera, as near as the path comes to it; None: any."""
 
 
 def turntable_cameras(
@@ -44,6 +46,10 @@ def turntable_cameras(
     x, y, height = offset @ across, offset @ along, offset @ up
     distance, azimuth = torch.hypot(x, y), torch.atan2(y, x)
     path = _loop_of_angles(azimuth, options.frames)
+    if options.start is not None:
+        start = options.start.to(up)
+        turned = torch.cos(path - torch.atan2(start @ along, start @ across))
+        path = path.roll(-int(turned.argmax()))
     difference = torch.remainder(path[:, None] - azimuth[None] + math.pi, 2 * math.pi) - math.pi
     # softmax of log weights: no underflow far from all cameras, where the nearest one decides
     weights = torch.softmax(-0.5 * (difference / math.radians(_SMOOTHING_DEG)) ** 2, dim=1)

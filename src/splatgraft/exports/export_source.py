@@ -24,6 +24,8 @@ _ASPECT = 4 / 3
 _DISTANCE = 2.2
 """From the middle of a scene without cameras, in its radii."""
 _ELEVATION_DEG = 20.0
+_IN_FRONT = 0.5
+"""Cosine of the angle between a camera that may be the first one and the side that was photographed."""
 _CENTRAL = 0.6
 """Half of the picture's sides within which the object's middle lies in a view that may be the first one."""
 
@@ -46,6 +48,8 @@ class ExportSource:
     """The target without object and shadow."""
     cameras: Cameras | None = None
     """Those of the capture that the scene was made from."""
+    photographed_side: Float[Tensor, "3"] | None = None
+    """Horizontal direction from the object to the side that its photographs show; None where they show all."""
     metadata: SceneMetadata = field(default_factory=SceneMetadata)
     """Up direction and size of a world unit, where they are known."""
 
@@ -77,7 +81,8 @@ def first_view(source: ExportSource) -> tuple[FirstView, tuple[str, ...]]:
     """The view, and sentences on what was assumed.
 
     With cameras: from the one that is nearest to the object's middle among those that have it near the middle of their
-    picture. Without: from a little above, towards the middle of the dense part.
+    picture, on the side that was photographed where that is one. Without: from a little above, towards the middle of
+    the dense part.
     """
     center = middle_of(source)
     up, said = up_of(source)
@@ -87,7 +92,7 @@ def first_view(source: ExportSource) -> tuple[FirstView, tuple[str, ...]]:
         angle = math.radians(_ELEVATION_DEG)
         eye = center + _DISTANCE * sphere.radius * (math.cos(angle) * level + math.sin(angle) * up)
         return FirstView(_point(eye), _point(center), _point(up), _FOV_DEG, _ASPECT), said
-    camera = source.cameras[_nearest(source.cameras, center)]
+    camera = source.cameras[_nearest(source, center)]
     width, height = camera.sizes[0].tolist()
     fov = 2 * math.degrees(math.atan(height / 2 / float(camera.intrinsics[0, 1, 1])))
     return FirstView(_point(camera.centers[0]), _point(center), _point(up), fov, width / height), said
@@ -112,13 +117,17 @@ def up_of(source: ExportSource) -> tuple[Float[Tensor, "3"], tuple[str, ...]]:
     return torch.tensor(_DOWN_Y), ("up is not known and taken to be -y, as of a level camera; --cameras says it",)
 
 
-def _nearest(cameras: Cameras, center: Float[Tensor, "3"]) -> int:
+def _nearest(source: ExportSource, center: Float[Tensor, "3"]) -> int:
+    cameras = source.cameras
+    assert cameras is not None
     in_camera = torch.einsum("vij,j->vi", cameras.camera_from_world[:, :3], torch.cat([center, torch.ones(1)]))
     projected = torch.einsum("vij,vj->vi", cameras.intrinsics, in_camera)
     half = cameras.sizes / 2
     off = ((projected[:, :2] / projected[:, 2:].clamp_min(1e-6) - half) / half).abs().amax(1)
     seen = (in_camera[:, 2] > 0) & (off < _CENTRAL)
     distance = in_camera.norm(dim=1)
+    if source.photographed_side is not None:
+        seen &= torch.nn.functional.normalize(cameras.centers - center, dim=1) @ source.photographed_side > _IN_FRONT
     return int(torch.where(seen, distance, distance + 1e6).argmin())
 
 
@@ -137,7 +146,7 @@ def path_around(source: ExportSource, view: FirstView, *, frames: int, width: in
         raise ValueError(f"--frames: expected 2 or more, found {frames}")
     if source.cameras is not None:
         center, up = torch.tensor(view.center), torch.tensor(view.up)
-        options = TurntableOptions(frames=frames)
+        options = TurntableOptions(frames=frames, start=source.photographed_side)
         cameras = turntable_cameras(source.cameras, center, up=up, options=options)
         cameras = cameras.resized(width / float(cameras.sizes[0, 0]))
         wide, high = cameras.sizes[0].tolist()

@@ -8,12 +8,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
 from splatgraft.composition import Composite, compose
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats import read_gaussians, write_gaussians
-from splatgraft.formats.gaussian_flags import write_flags
+from splatgraft.formats.gaussian_flags import read_flags, write_flags
 from splatgraft.formats.placement import Placement, read_placement, write_placement
-from splatgraft.project.layout import IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
+from splatgraft.project.layout import IS_GUESSED_FILE, IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
+
+_ONE_SIDED = 0.25
+"""Distance of what was guessed from the object's middle, over its radius, from which on one side is it; set by hand."""
 
 
 def placement_files(path: Path) -> tuple[Path, ...]:
@@ -47,6 +54,38 @@ def composite_of(
         objects.append(read[item.object_path])
     moves = [item.target_from_object for item in placement.objects]
     return compose(target, objects, target_from_objects=moves, erased=placement.erased)
+
+
+def guessed_gaussians(folder: Path, is_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    """Which Gaussians of a composite's scene close the side of an object that no photograph shows.
+
+    Args:
+        folder: The composite's; its placement.json names the objects, and is_guessed.npy beside an object says it.
+        is_object: Which Gaussians of its scene are the objects'.
+
+    Returns:
+        None of them for an object without that file, and where the files are not of this composite.
+    """
+    guessed = torch.zeros_like(is_object)
+    if (folder / PLACEMENT_FILE).is_file():
+        paths = [item.object_path for item in read_placement(folder / PLACEMENT_FILE).objects]
+        files = [path.parent / IS_GUESSED_FILE for path in paths if path is not None]
+        flags = [read_flags(file) for file in files if file.is_file()]
+        if flags and len(flags) == len(paths) and sum(map(len, flags)) == int(is_object.sum()):
+            guessed[is_object] = torch.cat(flags)
+    return guessed
+
+
+def photographed_side(
+    scene: Gaussians, is_object: Bool[Tensor, "n"], is_guessed: Bool[Tensor, "n"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "3"] | None:
+    """Horizontal unit vector from what was guessed of an object to its middle; None where it is seen from all sides."""
+    if not bool(is_guessed.any()):
+        return None
+    middle = scene.means[is_object].median(0).values
+    away = middle - scene.means[is_guessed].mean(0)
+    level, radius = away - (away @ up) * up, (scene.means[is_object] - middle).norm(dim=1).quantile(0.9)
+    return torch.nn.functional.normalize(level, dim=0) if float(level.norm()) > _ONE_SIDED * float(radius) else None
 
 
 def write_composite(folder: Path, composite: Composite, placement: Placement) -> None:

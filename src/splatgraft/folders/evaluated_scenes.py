@@ -9,10 +9,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.evaluation import ComparedView, Truth
 from splatgraft.folders.capture_files import capture_inputs
+from splatgraft.folders.composite_folder import guessed_gaussians, photographed_side
 from splatgraft.formats import read_cameras, read_gaussians, read_images
 from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.project.layout import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
@@ -41,12 +43,16 @@ class Pictures:
     """The image with the object really there; None where there is no ground truth."""
     held_out: bool = False
     """Whether the consolidation used no image of this view."""
+    guessed_share: float = 0.0
+    """Of the object's coverage, how much is of what no photograph shows, in [0, 1]."""
 
     @property
     def prominence(self) -> float:
-        """How well the view shows the object: its coverage, pixels; a quarter of it where the picture's rim cuts it."""
+        """How well the view shows the object: its coverage as photographed, pixels; a quarter of it where the picture's
+        rim cuts it."""
         rim = torch.cat([self.mask[0], self.mask[-1], self.mask[:, 0], self.mask[:, -1]])
-        return float(self.mask.sum()) * (_CUT_OBJECT if bool((rim > 0.5).any()) else 1.0)
+        cut = _CUT_OBJECT if bool((rim > 0.5).any()) else 1.0
+        return float(self.mask.sum()) * (1 - self.guessed_share) * cut
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,8 @@ class EvaluatedScenes:
     """The object as it was captured, in the target."""
     is_object: Bool[Tensor, "n"]
     """Which Gaussians of the composite are the object's."""
+    is_guessed: Bool[Tensor, "n"]
+    """Which of these close the side that no photograph shows."""
     cameras: Cameras
     """The target's."""
 
@@ -71,6 +79,7 @@ class EvaluatedScenes:
             result=read_gaussians(result).to(device),
             composite=scene.to(device),
             is_object=is_object.to(device),
+            is_guessed=guessed_gaussians(composite, is_object).to(device),
             cameras=read_cameras(cameras).to(device),
         )
 
@@ -86,6 +95,12 @@ class EvaluatedScenes:
         chosen = self.composite.select(self.is_object) if bool(self.is_object.any()) else self.composite
         return chosen.means.median(0).values
 
+    @property
+    def photographed_side(self) -> Float[Tensor, "3"] | None:
+        """Horizontal direction from the object to the side that was photographed; None where all were."""
+        up = estimate_up(self.cameras).to(self.composite.means)
+        return photographed_side(self.composite, self.is_object, self.is_guessed, up)
+
     def picture(self, scene: Gaussians, camera: Cameras) -> Float[Tensor, "h w 3"]:
         """One view of one scene, clamped to [0, 1], on the CPU."""
         color = render(scene, camera).color
@@ -93,13 +108,15 @@ class EvaluatedScenes:
 
     def pictures_from(self, camera: Cameras) -> Pictures:
         """One view from any camera."""
-        coverage = render(self.composite, camera, features=self.is_object[:, None].float()).features
+        flags = torch.stack([self.is_object, self.is_guessed], 1).float()
+        object_, guessed = render(self.composite, camera, features=flags).features[0].cpu().clamp(0, 1).unbind(-1)
         return Pictures(
             name=camera.names[0],
             before=self.picture(self.composite.select(~self.is_object), camera),
             copy_paste=self.picture(self.composite, camera),
             result=self.picture(self.result, camera),
-            mask=coverage[0, ..., 0].cpu().clamp(0, 1),
+            mask=object_,
+            guessed_share=float(guessed.sum() / object_.sum().clamp_min(1e-6)),
         )
 
 

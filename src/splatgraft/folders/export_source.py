@@ -3,10 +3,14 @@
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.exports.export_source import ExportSource
+from splatgraft.folders.composite_folder import guessed_gaussians, photographed_side
 from splatgraft.formats import is_scene, read_cameras, read_gaussians, read_scene
 from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.formats.metric_scale import read_scale
@@ -86,15 +90,22 @@ def _of_project(layout: Layout, last: Path, capture: Path | None) -> ExportSourc
         erased = read_placement(layout.composite / PLACEMENT_FILE).erased
         target = target if erased is None else target.select(~torch.as_tensor(erased))
     up = None if cameras is None else _up(cameras)
+    pasted = read_gaussians(layout.composite / SCENE_FILE)
     return ExportSource(
         scene=scene,
         title=_title(layout.root.resolve()),
         is_object=is_object,
-        pasted=read_gaussians(layout.composite / SCENE_FILE),
+        pasted=pasted,
         place=target,
         cameras=cameras,
+        photographed_side=None if up is None else _photographed_side(layout.composite, pasted, torch.tensor(up)),
         metadata=SceneMetadata(up, None if metres is None else metres.metres_per_unit),
     )
+
+
+def _photographed_side(composite: Path, pasted: Gaussians, up: Float[Tensor, "3"]) -> Float[Tensor, "3"] | None:
+    is_object = read_selection(composite / IS_OBJECT_FILE, pasted.count, composite / SCENE_FILE)
+    return photographed_side(pasted, is_object, guessed_gaussians(composite, is_object), up)
 
 
 def _up(cameras: Cameras) -> tuple[float, float, float]:

@@ -102,6 +102,8 @@ class Evaluate:
             pictures = [sized.pictures_from(sized.cameras[i]) for i in _spread(len(sized.cameras), self.pictured)]
         changes = [describe_change(p.result, p.copy_paste, p.mask) for p in pictures]
         best = max(pictures, key=lambda p: p.prominence)
+        # the page begins with it
+        pictures = [best, *(p for p in pictures if p is not best)]
         self._write_pictures(folder, best)
         turntable = _turntable(scenes, self.frames, context) if self.frames else []
         if turntable:
@@ -160,7 +162,10 @@ def _report_view(pictures: Pictures) -> ReportView:
 
 def _turntable(scenes: EvaluatedScenes, frames: int, context: Context) -> list[torch.Tensor]:
     cameras = turntable_cameras(
-        scenes.cameras, scenes.object_center, up=estimate_up(scenes.cameras), options=TurntableOptions(frames=frames)
+        scenes.cameras,
+        scenes.object_center,
+        up=estimate_up(scenes.cameras),
+        options=TurntableOptions(frames=frames, start=scenes.photographed_side),
     )
     pictures: list[torch.Tensor] = []
     for index, camera in enumerate(cameras):

@@ -31,7 +31,7 @@ from splatgraft.folders.picture_points import prompts_by_view
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.formats.gaussian_flags import read_corrections, write_flags
 from splatgraft.formats.prompts import read_prompts
-from splatgraft.project.layout import OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
+from splatgraft.project.layout import IS_GUESSED_FILE, OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.lazy_sequence import LazySequence
@@ -158,7 +158,7 @@ class Segment:
         if not self.keep_open and masked is not None:
             chosen, is_guessed = self._closed(chosen, masked, context)
         write_gaussians(folder / OBJECT_FILE, chosen.to("cpu"))
-        write_flags(folder / "is_guessed.npy", is_guessed)
+        write_flags(folder / IS_GUESSED_FILE, is_guessed)
         write_gaussians(folder / SURROUNDINGS_FILE, scene.select(~selection).to("cpu"))
         write_flags(folder / SELECTION_FILE, selection)
         with atomic_write(folder / "feature.npy") as stream:
