@@ -1,5 +1,6 @@
 """Every warning of a run stands in step.json of its step and, with its picture, at the top of the report."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
@@ -9,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 from test_relight_step import exposed, fixed
-from tiny_project import write_project
+from tiny_project import ball, photograph, plane, write_project
 
 from splatgraft.cli import main
 from splatgraft.core.similarity import Similarity
@@ -93,6 +94,22 @@ def test_the_report_begins_with_all_warnings_of_the_run(
     assert main(["status", str(warned)]) == 0
     stale = [line for line in capsys.readouterr().out.splitlines() if "stale" in line]
     assert [line.split()[0] for line in stale] == ["evaluate"]
+
+
+def test_a_side_without_photos_is_warned_of_with_a_picture_of_the_directions(tmp_path: Path) -> None:
+    path = write_project(tmp_path)
+    shutil.rmtree(tmp_path / "photos" / "source")
+    photograph(tmp_path / "photos" / "source", plane((0.3, 0.5, 0.3)), ball(), around_deg=150.0)
+    assert main(["run", str(path), "--to", "compose"]) == 0
+    layout = read_flow(path).layout
+    for folder, said in ((layout.object, "was never photographed"), (layout.composite, "none of its photos shows")):
+        record = read_record(folder)
+        assert record is not None
+        (warning,) = (warning for warning in record.warnings if said in warning.text)
+        assert warning.in_doubt
+        assert warning.picture is not None
+        with Image.open(folder / warning.picture) as picture:
+            assert picture.size == (320, 320)
 
 
 def test_exposures_are_warned_of_once_in_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

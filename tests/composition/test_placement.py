@@ -8,6 +8,7 @@ import torch
 from shapes import UP
 
 from splatgraft.composition import (
+    Coverage,
     PlaceOptions,
     compose,
     hidden_fraction,
@@ -16,7 +17,7 @@ from splatgraft.composition import (
     rest_on_surface,
     support_below,
 )
-from splatgraft.composition.placement import facing_yaw_deg, unseen_share
+from splatgraft.composition.placement import facing_yaw_deg
 from splatgraft.composition.support_surface import height_map
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.capture_orientation import estimate_up, focus_point
@@ -340,17 +341,22 @@ def test_the_photographed_side_is_turned_to_the_cameras():
 
 def test_sides_that_no_photo_shows_are_measured_and_said():
     front, around = directions(-40.0, 0.0, 40.0), directions(*[15.0 * i for i in range(24)])
-    assert unseen_share(front, front) == 0
-    assert unseen_share(around, front) == 0
+    assert Coverage.of(front, front, UP).unseen_share == 0
+    assert Coverage.of(around, front, UP).unseen_share == 0
     # 180 degrees are photographed: 80 between the outermost photos and 50 beyond each; 26.6 degrees of height less
-    assert unseen_share(front, around) == pytest.approx(0.45, abs=0.1)
+    half = Coverage.of(front, around, UP)
+    assert half.unseen_share == pytest.approx(0.45, abs=0.1)
+    # the picture from above, y up: green towards the photographs, red on the other side
+    x, y = torch.nn.functional.normalize(half.photographs.mean(0)[:2], dim=0).tolist()
+    picture = half.draw()
+    there, behind = (picture[round(160 - side * 110 * y), round(160 + side * 110 * x)] for side in (1, -1))
+    assert there[1] > there[0]
+    assert behind[0] > behind[1]
     thing = box((0.0, 0.0, 0.1), (0.05, 0.05, 0.1))
     target = orbit(0.0, 2 * math.pi, count=12)
     half = orbit(0.0, 0.6, count=6)
-    told = place_object(room(), thing, cameras=(target, half)).warnings
-    assert any("none of its photos shows" in note.text for note in told)
-    told = place_object(room(), thing, cameras=(target, target)).warnings
-    assert not any("none of its photos shows" in note.text for note in told)
+    assert place_object(room(), thing, cameras=(target, half)).coverage.unseen_share > 0.2
+    assert place_object(room(), thing, cameras=(target, target)).coverage.unseen_share == 0
 
 
 def orbit(first, last, *, count):

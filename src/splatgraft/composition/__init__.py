@@ -1,5 +1,6 @@
 """Compose: place objects in a target scene, by given transforms or on a surface found for them."""
 
+from splatgraft.composition.coverage import Coverage
 from splatgraft.composition.object_base import ObjectBase, object_base, rest_on_surface
 from splatgraft.composition.placement import Placed, PlaceOptions, compose, place_object
 from splatgraft.composition.places import Suggestion, hidden_fraction, suggest_places
@@ -9,6 +10,7 @@ from splatgraft.core.composite import Composite, PlacedObject
 
 __all__ = [
     "Composite",
+    "Coverage",
     "ObjectBase",
     "PlaceOptions",
     "Placed",

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatgraft.composition.coverage import Coverage
 from splatgraft.composition.object_base import ObjectBase, object_base, rest_on_surface
 from splatgraft.composition.places import Suggestion, hidden_fraction, scale_in_view, suggest_places
 from splatgraft.composition.support_surface import Support, support_below
@@ -28,8 +29,6 @@ _YAW_SPREAD_DEG, _YAW_STEP_DEG = 30.0, 5
 """Standard deviation of the azimuth that a photograph covers around its own, and distance of the yaws tried."""
 _GOOD_YAW = 0.98
 """Coverage over the best one above which the smallest turn is preferred."""
-_PHOTOGRAPHED_DEG = 50.0
-"""Largest angle to a photograph's direction from which a side of the object was seen well enough."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +57,8 @@ class Placed:
     """The surface under it."""
     hidden_fraction: float
     """Share of the object that no target camera can see, in [0, 1]."""
+    coverage: Coverage
+    """From where it was photographed, and from where the target's cameras look at it."""
     warnings: tuple[Note, ...] = ()
     """Problems that a user should look at."""
 
@@ -99,13 +100,14 @@ def place_object(
         move, support = place(yaw_deg=yaw)
     move = replace(move, translation=move.translation + torch.tensor(options.offset).to(move.translation))
     hidden = hidden_fraction(target, move.gaussians(object_), cameras=target_cameras)
-    unseen = unseen_share(_towards(source_cameras, base, move), target_cameras.centers - support.point)
+    photographs, views = _towards(source_cameras, base, move), target_cameras.centers - support.point
     return Placed(
         target_from_object=move,
         base=base,
         support=support,
         hidden_fraction=hidden,
-        warnings=tuple(Note(reason, "warning") for reason in found.reasons) + _warnings(support, hidden, unseen),
+        coverage=Coverage.of(photographs, views, support.normal),
+        warnings=tuple(Note(reason, "warning") for reason in found.reasons) + _warnings(support, hidden),
     )
 
 
@@ -135,12 +137,8 @@ def _best_place(
     return best
 
 
-def _warnings(support: Support, hidden: float, unseen: float) -> tuple[Note, ...]:
+def _warnings(support: Support, hidden: float) -> tuple[Note, ...]:
     found = []
-    if unseen > 0.2:
-        text = f"{unseen:.0%} of the target's images show a side of the object that none of its photos shows."
-        remedy = "Turn it (--yaw-deg), place it before a wall, or photograph it from there too."
-        found.append(Note(text, "warning", remedy))
     # the underside is always hidden: a sixth of a cube
     if hidden > 0.25:
         text = f"{hidden:.0%} of the object is hidden from every camera: it may stick in a wall or in furniture."
@@ -172,13 +170,6 @@ def facing_yaw_deg(
     covered = torch.exp(-0.5 * (miss / math.radians(_YAW_SPREAD_DEG)) ** 2).amax(2).mean(1)
     good = covered >= _GOOD_YAW * covered.max()
     return float(yaw[good][yaw[good].abs().argmin()])
-
-
-def unseen_share(to_source_cameras: Float[Tensor, "s 3"], to_target_cameras: Float[Tensor, "t 3"]) -> float:
-    """Share of the target's cameras, in [0, 1], that see the object from where no photograph of it was taken."""
-    source, target = (torch.nn.functional.normalize(x.double(), dim=1) for x in (to_source_cameras, to_target_cameras))
-    nearest = (target @ source.T).amax(1)
-    return float((nearest < math.cos(math.radians(_PHOTOGRAPHED_DEG))).double().mean())
 
 
 def _azimuth(directions: Float[Tensor, "n 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "n"]:

@@ -6,13 +6,19 @@ from pathlib import Path
 
 from splatgraft.composition import Placed, PlaceOptions, place_object
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import write_image
 from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.composite_folder import composite_of, placement_files, write_composite
 from splatgraft.folders.picture_points import point_in_world
 from splatgraft.formats import read_cameras, read_gaussians, read_images
 from splatgraft.formats.metric_scale import MetricScale, read_scale, scale_path
 from splatgraft.formats.placement import ObjectPlacement, Placement, read_placement
+from splatgraft.project.layout import COVERAGE_FILE
 from splatgraft.project.step import Context, Inputs
+from splatgraft.runtime.note import Note
+
+_MUCH_UNSEEN = 0.2
+"""Share of the target's images that show an unphotographed side, from which on that is a warning."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +58,14 @@ class Compose:
     def write(self, folder: Path, context: Context) -> None:
         """Compose and write the scene."""
         target, object_ = read_gaussians(self.target), read_gaussians(self.object)
-        placement = self._found(target, object_, context) if self.placement is None else read_placement(self.placement)
+        placement = (
+            self._found(target, object_, folder, context) if self.placement is None else read_placement(self.placement)
+        )
         named = tuple(replace(item, object_path=item.object_path or self.object) for item in placement.objects)
         placement = replace(placement, objects=named)
         write_composite(folder, composite_of(target, placement, known={self.object: object_}), placement)
 
-    def _found(self, target: Gaussians, object_: Gaussians, context: Context) -> Placement:
+    def _found(self, target: Gaussians, object_: Gaussians, folder: Path, context: Context) -> Placement:
         """The placement on a level surface of the target."""
         if self.cameras is None or self.object_cameras is None:
             raise ValueError(
@@ -79,6 +87,14 @@ class Compose:
         context.console.say(f"placed at ({where}), scale {placed.target_from_object.scale:.3f}")
         context.console.say(_size(placed, self.options.scale, in_metres[0], in_metres[1]))
         context.console.tell(*placed.warnings)
+        if (unseen := placed.coverage.unseen_share) > _MUCH_UNSEEN:
+            write_image(folder / COVERAGE_FILE, placed.coverage.draw())
+            text = (
+                f"{unseen:.0%} of the target's images show a side of the object that none of its photos shows: red in "
+                "the picture, seen from above; dark dots are its photos, blue ones the target's images."
+            )
+            remedy = "Turn it (--yaw-deg), place it before a wall, or photograph it from there too."
+            context.console.tell(Note(text, "warning", remedy, picture=folder / COVERAGE_FILE))
         return Placement(objects=(ObjectPlacement(target_from_object=placed.target_from_object),))
 
 

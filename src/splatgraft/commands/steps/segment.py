@@ -11,9 +11,11 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from splatgraft.composition import Coverage
 from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import resize
+from splatgraft.core.images import resize, write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs
 from splatgraft.folders.object_masks import (
@@ -31,7 +33,7 @@ from splatgraft.folders.picture_points import prompts_by_view
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.formats.gaussian_flags import read_corrections, write_flags
 from splatgraft.formats.prompts import read_prompts
-from splatgraft.project.layout import IS_GUESSED_FILE, OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
+from splatgraft.project.layout import COVERAGE_FILE, IS_GUESSED_FILE, OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.lazy_sequence import LazySequence
@@ -156,7 +158,7 @@ class Segment:
             context.console.say(f"object, made solid: {chosen.count:,} Gaussians")
         is_guessed = torch.zeros(chosen.count, dtype=torch.bool)
         if not self.keep_open and masked is not None:
-            chosen, is_guessed = self._closed(chosen, masked, context)
+            chosen, is_guessed = self._closed(chosen, masked, folder, context)
         write_gaussians(folder / OBJECT_FILE, chosen.to("cpu"))
         write_flags(folder / IS_GUESSED_FILE, is_guessed)
         write_gaussians(folder / SURROUNDINGS_FILE, scene.select(~selection).to("cpu"))
@@ -203,20 +205,27 @@ class Segment:
             raise ValueError("--mask-source sam2: expected --sam2-encoder and --sam2-decoder beside it, found not both")
         return load_sam2(self.sam2_encoder, self.sam2_decoder).cut
 
-    def _closed(self, object_: Gaussians, masked: MaskedViews, context: Context) -> tuple[Gaussians, Bool[Tensor, "k"]]:
+    def _closed(
+        self, object_: Gaussians, masked: MaskedViews, folder: Path, context: Context
+    ) -> tuple[Gaussians, Bool[Tensor, "k"]]:
         """The object with its unseen side closed, and which of its Gaussians do that."""
         views, small = _small_masks(masked)
         closed = close_unseen_side(object_, views, small)
         share = closed.guessed_share
         if share > 0:
-            gap, (first, last) = widest_gap(views, closed.gaussians.means.median(0).values)
+            middle = closed.gaussians.means.median(0).values
+            gap, (first, last) = widest_gap(views, middle)
+            away = views.centers - middle
+            write_image(folder / COVERAGE_FILE, Coverage.of(away, away[:0], estimate_up(views)).draw())
             text = (
-                f"{share:.0%} of the object's surface was never photographed: its shape and colour there are a guess."
+                f"{share:.0%} of the object's surface was never photographed: its shape and colour there are a guess. "
+                "The picture shows the directions around it from above, with its photos as dark dots."
             )
             if gap > _WIDE_GAP_DEG:
                 text += f" No photo was taken over {gap:.0f} degrees around it, between {first} and {last}."
             remedy = "Photograph it from there too, or turn that side away (compose: yaw_deg)"
-            context.console.tell(Note(text, "warning" if share > _MUCH_GUESSED else "minor", remedy))
+            level = "warning" if share > _MUCH_GUESSED else "minor"
+            context.console.tell(Note(text, level, remedy, picture=folder / COVERAGE_FILE))
         return closed.gaussians, closed.is_guessed
 
     def _compare(
