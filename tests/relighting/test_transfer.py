@@ -337,13 +337,29 @@ def test_places_without_light_or_object_give_the_plain_composite_and_a_reason():
         assert torch.equal(relit.shaded().sh, composite.merged()[0].sh)
 
 
+def test_under_an_even_sky_an_object_darkens_its_foot_and_one_in_the_air_is_warned_of():
+    overcast = Light(sources=(), ambient=SKY)
+
+    def under_the_sky(height: float) -> tuple[Relit, bool]:
+        relit = relight(placed((ball(), at(0.0, 0.0, height))), cameras(), light=overcast, options=WHOLE)
+        return relit, any("Hardly any shadow" in note.text for note in relit.report)
+
+    relit, warned = under_the_sky(0.3)
+    assert not warned
+    lost, place = darkness(relit)
+    foot = place[:, :2].norm(dim=1) < 0.1
+    # a point below a sphere on a plane sees hardly any sky
+    assert float(lost[foot].mean()) > 0.5
+    assert under_the_sky(1.5)[1]
+
+
 def test_most_of_a_light_that_hardly_any_photo_shows_is_said_to_be_a_guess():
     assert not standard(-1, 0).report[0].in_doubt
     light = replace(sun_from(-1, 0, 1), coverage=0.2)
     (note, unknown) = relight(STANDARD, cameras(), light=light, options=WHOLE).report
     assert note.in_doubt
     assert "a guess (20%" in note.remedy
-    assert "20% of the surroundings seen, as given." in note.text
+    assert "20% of the surroundings were photographed, as given." in note.text
     assert unknown.in_doubt
     assert unknown.text == "The light that object 1 had is not known: it keeps its mean brightness."
 

@@ -38,6 +38,8 @@ _MIN_SLOPE = 1e-6
 """Smallest slope of a ratio over view directions; below it nothing is seen, and divisions would overflow."""
 _MIN_CERTAIN = 0.5
 """Share of the light that was captured and whose direction is certain, below which most of it is a guess."""
+_DARKEST, _HARDLY_DARKER = 20, 0.85
+"""Surroundings that are asked for a shadow, the darkest, and the factor on their light above which none is seen."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +224,7 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
         bands_replaced=torch.cat([torch.zeros(count, dtype=torch.bool), *replaced])[order],
         objects=tuple(one.gaussians for one in objects),
         light=scene.light,
-        report=(_light_note(scene), *(note for one in objects for note in one.notes)),
+        report=(_light_note(scene), *(note for one in objects for note in one.notes), *_shadow_notes(on_scene.shadow)),
         estimate=scene.estimate,
         received=tuple(one.received for one in shadings),
         prepared=tuple(objects),
@@ -240,6 +242,19 @@ def _light_note(scene: SceneLight) -> Note:
         "surrounds the place, or give the light (--given-light)."
     )
     return Note(text, "warning", remedy)
+
+
+def _shadow_notes(shadow: Float[Tensor, "n 3"]) -> tuple[Note, ...]:
+    """A warning where no shadow is seen: what stands on something keeps light from its foot under any light.
+
+    Args:
+        shadow: Factors on the light of what surrounds the objects.
+    """
+    darkest = float(shadow.mean(1).sort().values[:_DARKEST].mean()) if len(shadow) else 1.0
+    if darkest < _HARDLY_DARKER:
+        return ()
+    text = f"Hardly any shadow is seen: where it is darkest it takes {1 - darkest:.0%} of the light."
+    return (Note(text, "warning", "Set the object down on what is under it, or set the sun by hand (--sun-through)."),)
 
 
 def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Tensor, "n k"]) -> _Shading:

@@ -261,11 +261,11 @@ def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tenso
 def _agreement_notes(agreement: Agreement, sheet: Path, picture: Path) -> list[Note]:
     """How well the masks agree, and what is wrong with that; the `picture` will lie at `sheet`."""
     mean, names = agreement.mean, [Path(agreement.names[index]).name for index in agreement.doubtful]
-    notes = [Note(f"the masks agree with the object by {mean:.2f} (mean IoU over the images; 1 is perfect): {sheet}")]
+    notes = [Note(f"the masks agree with the object by {mean:.0%}: {sheet}")]
     if mean < MIN_AGREEMENT:
         text = (
-            f"the masks of the images do not agree on one object (mean IoU {mean:.2f}, expected at least "
-            f"{MIN_AGREEMENT})."
+            f"the masks of the images do not agree on one object: {mean:.0%} of it and them overlap, expected at least "
+            f"{MIN_AGREEMENT:.0%}."
         )
         remedy = f"Look at {sheet}, then give clicks in two or three images (--prompts) or --box"
         notes.append(Note(text, "warning", remedy, picture))

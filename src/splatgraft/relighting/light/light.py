@@ -18,6 +18,8 @@ _AMBIENT_COUNT = 9
 _UNCERTAINTY_BLUR = 0.5
 """Share of a direction's uncertainty that blurs shadows; measured: least error in rendered scenes. All of it makes
 shadows of a right direction too pale."""
+_UNCERTAIN_DEG = 15.0
+"""Uncertainty of a direction from which on a report says so; set by hand."""
 _MIN_AMBIENT = 1e-3
 """Share of the largest ambient coefficient below which ambient irradiance does not fall: expansions may be negative."""
 
@@ -103,20 +105,20 @@ class Light:
         return replace(self, sources=sources, ambient=ambient)
 
     def describe(self, up: Float[Tensor, "3"]) -> str:
-        """One line for a report, such as 'sun 62 +- 9 degrees high, 71% of the light on it; ceiling unseen 38%'."""
+        """One line for a report, such as 'sun 62 degrees high, 71% of the light on what faces it; window 20 degrees
+        high (the direction is uncertain), 9%; 38% of what is overhead was not photographed'."""
         parts = []
         for source in self.sources[:3]:
             direction = torch.tensor(source.direction)
             height = math.degrees(math.asin(max(-1.0, min(1.0, float(direction @ up)))))
             share = sum(source.irradiance) / float(self.irradiance(direction[None]).sum())
-            parts.append(
-                f"{source.name} {height:.0f} +- {source.uncertainty_deg:.0f} degrees high, "
-                f"{100 * share:.0f}% of the light on what faces it"
-            )
+            doubt = " (the direction is uncertain)" if source.uncertainty_deg > _UNCERTAIN_DEG else ""
+            faces = "" if parts else " of the light on what faces it"
+            parts.append(f"{source.name} {height:.0f} degrees high{doubt}, {100 * share:.0f}%{faces}")
         parts = parts or ["even light without a clear source"]
         if self.unseen_up > 0.05:
-            parts.append(f"ceiling unseen {100 * self.unseen_up:.0f}%")
-        return "; ".join([*parts, f"{100 * self.coverage:.0f}% of the surroundings seen"])
+            parts.append(f"{100 * self.unseen_up:.0f}% of what is overhead was not photographed")
+        return "; ".join([*parts, f"{100 * self.coverage:.0f}% of the surroundings were photographed"])
 
 
 def angular_radius_deg(solid_angle: float) -> float:
