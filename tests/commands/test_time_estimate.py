@@ -9,6 +9,7 @@ import torch
 
 from splatgraft.core.images import write_image
 from splatgraft.project.record import Record
+from splatgraft.project.step import plain_options
 from splatgraft.workflow.flow import read_flow
 from splatgraft.workflow.time_estimate import describe_estimate, estimate_step_times
 
@@ -45,6 +46,21 @@ def test_a_better_reconstruction_takes_longer_and_what_cannot_be_read_is_left_to
     photos(tmp_path / "target", 4)
     draft, high = (seconds(tmp_path, reconstruct=f'quality = "{q}"') for q in ("draft", "high"))
     assert high["target/reconstruct"] > 10 * draft["target/reconstruct"]
+
+
+def test_what_a_draft_took_is_not_what_a_better_one_takes(tmp_path: Path) -> None:
+    for side in ("source", "target"):
+        photos(tmp_path / side, 4)
+    draft = seconds(tmp_path, reconstruct='quality = "draft"')
+    flow = read_flow(tmp_path / "project")
+    for side in ("source", "target"):
+        step = flow.steps[f"{side}/reconstruct"]
+        step.out.mkdir(parents=True)
+        record = Record("reconstruct", "0", plain_options(vars(step)), {}, (), draft[f"{side}/reconstruct"], 0)
+        (step.out / "step.json").write_text(json.dumps(asdict(record)))
+    again = seconds(tmp_path, reconstruct='quality = "draft"')
+    assert again["source/reconstruct"] == draft["source/reconstruct"]
+    assert seconds(tmp_path, reconstruct='quality = "high"')["source/reconstruct"] > 10 * draft["source/reconstruct"]
 
 
 def test_a_capture_that_was_posed_does_not_make_the_rest_seem_slow(tmp_path: Path) -> None:

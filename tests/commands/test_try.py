@@ -37,7 +37,7 @@ def test_a_first_transfer_needs_nothing_but_two_captures(
     monkeypatch.setenv("DISPLAY", ":0")
     assert first_try.DRAFT == {"quality": "draft"}
     monkeypatch.setattr(first_try, "DRAFT", {"quality": "draft", "iterations": 60, "budget": 400})
-    assert main(["try", *captures]) == 0
+    assert main(["try", *captures, "--draft"]) == 0
     printed = capsys.readouterr()
     page = Path("images__into_room") / "report" / "index.html"
     assert printed.out.splitlines()[-1] == str(page)
@@ -53,13 +53,19 @@ def test_a_first_transfer_needs_nothing_but_two_captures(
     assert len([line for line in said if line.startswith("helps most: ") and len(line) > 20]) == 1
     assert "splatgraft run images__into_room" in next(line for line in said if line.startswith("finer: "))
     assert f"{page}: opened in the browser" in said
-    # a second time there is nothing to do, and a refined project is kept
+    # without --draft it goes on to a finer result, and does not pose the photos again
     toml = page.parents[1] / "project.toml"
     toml.write_text(toml.read_text() + "# mine\n")
     assert main(["try", *captures, "--keep-closed"]) == 0
     again = capsys.readouterr().err
-    assert "begins" not in again
     assert "opened" not in again
+    assert again.index("the draft; the same at standard quality follows") < again.index("source/reconstruct   begins")
+    assert "capture       begins" not in again
+    assert 'finer: quality = "high"' in again
+    assert tomllib.loads(toml.read_text())["reconstruct"]["quality"] == "standard"
+    # a third time there is nothing to do, and what was written into the project stays
+    assert main(["try", *captures, "--keep-closed"]) == 0
+    assert "begins" not in capsys.readouterr().err
     assert toml.read_text().endswith("# mine\n")
 
 
@@ -117,5 +123,5 @@ def test_what_cannot_be_used_and_a_folder_of_the_same_name_are_left_alone(
     monkeypatch.setattr(first_try, "run_steps", lambda project, *_, **__: began.append(project))
     for _ in range(2):  # a second time the same project goes on
         assert main(["try", source, target, "--keep-closed"]) == 0
-    assert began == [Path("images__into_room_2") / "project.toml"] * 2
+    assert began == [Path("images__into_room_2") / "project.toml"] * 3  # draft, standard, and nothing new
     assert [path.name for path in (tmp_path / "images__into_room").iterdir()] == ["letter.txt"]

@@ -1,4 +1,4 @@
-"""The command `try`: the whole flow on two captures of one's own, at draft quality, with nothing to decide first."""
+"""The command `try`: the whole flow on two captures of one's own, with nothing to decide first: a draft, then finer."""
 
 import re
 import shlex
@@ -23,12 +23,15 @@ from splatgraft.workflow.run import run_steps
 
 DRAFT = {"quality": "draft"}
 """Keys of [reconstruct] of a first try."""
+_FINER = {"draft": "standard", "standard": "high"}
+"""The quality after each."""
 
 
 @dataclass(frozen=True)
 class Try:
-    """Run the whole flow on two captures at draft quality, with nothing to decide first; the same command goes on after
-    an interruption. Poses that are not plausible are used and said to be so."""
+    """Run the whole flow on two captures with nothing to decide first: a draft, whose report opens, then again at
+    standard quality, which replaces it. The same command goes on after an interruption. Poses that are not plausible
+    are used and said to be so."""
 
     object: Positional
     """The capture with the object: photos (a folder or a .zip), a video, a COLMAP folder, a folder with
@@ -37,6 +40,8 @@ class Try:
     """The capture or the scene that receives it."""
     out: Path | None = None
     """Folder of the project; where not given, OBJECT_into_PLACE here, or with a number where that is taken."""
+    draft: bool = False
+    """Stop at the draft."""
     keep_closed: bool = False
     """Only print the report's path, where there is a desktop to open it on."""
 
@@ -45,13 +50,17 @@ class Try:
         folder = self.out or self._free_folder()
         self._write_project(folder, console)
         project = folder / PROJECT_FILE
+        page = read_flow(project).layout.report / REPORT_FILE
         run_steps(project, console, accept_doubtful=True)
-        flow = read_flow(project)
-        for line in refinements(flow, folder):
-            console.say(line)
-        page = flow.layout.report / REPORT_FILE
         if not self.keep_closed and open_page(page):
             console.say(f"{page}: opened in the browser")
+        if _quality(project) == "draft" and not self.draft:
+            console.say(f"{page}: the draft; the same at standard quality follows and replaces it, or Ctrl-C keeps it")
+            with atomic_write(project) as stream:
+                stream.write(with_keys(project.read_text(), "reconstruct", {"quality": _FINER["draft"]}).encode())
+            run_steps(project, console, accept_doubtful=True)
+        for line in refinements(read_flow(project), folder):
+            console.say(line)
         return 0
 
     def _free_folder(self) -> Path:
@@ -65,7 +74,7 @@ class Try:
         raise AssertionError
 
     def _write_project(self, folder: Path, console: Console) -> None:
-        """A project at draft quality; one that this command wrote earlier, and that may be refined, is kept."""
+        """A project at draft quality; one that this command wrote earlier, and that may be finer now, is kept."""
         project = folder / PROJECT_FILE
         init = Init(folder, source=self.object, target=self.place)
         if project.is_file():
@@ -84,7 +93,7 @@ class Try:
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(project) as stream:
             stream.write(text.encode())
-        console.say(f"{project}: written, at draft quality")
+        console.say(f"{project}: written, for a draft first")
 
 
 def refinements(flow: Flow, folder: Path) -> list[str]:
@@ -110,8 +119,14 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
         lines.append("no step warned of its result: look at the pictures; a cut that is off is what people mend most")
         helps = [DEFAULT_REMEDIES["segment"]]
     lines.append(f"helps most: {next(filter(None, helps), '').replace('PROJECT', str(shown))}")
-    finer = f'quality = "standard" under [reconstruct] in {shown / PROJECT_FILE}'
-    return [*lines, f"finer: {finer}, then splatgraft run {shown}"]
+    quality = _FINER.get(_quality(folder / PROJECT_FILE) or "")
+    finer = f'finer: quality = "{quality}" under [reconstruct] in {shown / PROJECT_FILE}, then splatgraft run {shown}'
+    return [*lines, *([finer] if quality else [])]
+
+
+def _quality(project: Path) -> str | None:
+    """Of its reconstructions; None where the file does not say."""
+    return read_toml(project).get("reconstruct", {}).get("quality")
 
 
 def _more(sentences: list[str]) -> str:

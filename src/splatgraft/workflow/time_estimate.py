@@ -14,8 +14,8 @@ from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture
 from splatgraft.formats.captures.masks import find_photos
 from splatgraft.formats.captures.photo_archive import count_archived_photos, is_archive
-from splatgraft.project.record import read_record
-from splatgraft.project.step import Step
+from splatgraft.project.record import Record, read_record
+from splatgraft.project.step import Step, plain_options
 from splatgraft.reconstruction import predict_cpu_seconds
 from splatgraft.workflow.flow import Flow
 
@@ -43,7 +43,8 @@ def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, 
 
     The finished steps of the project give the factor to the typical times.
     """
-    measured = {name: found.seconds for name, step in flow if (found := read_record(step.out)) is not None}
+    records = {name: (step, found) for name, step in flow if (found := read_record(step.out)) is not None}
+    measured = {name: found.seconds for name, (step, found) in records.items() if _is_as_before(step, found)}
     typical = {name: _typical_seconds(step, flow) for name, step in flow}
     known = [name for name in measured if measured[name] > 0]
     factor = sum(measured[name] for name in known) / sum(typical[name] for name in known) if known else 1.0
@@ -62,6 +63,14 @@ def describe_estimate(planned: Sequence[PlannedStep]) -> str:
     measured = all(step.is_measured for step in planned)
     basis = "as before" if measured else "a guess for two idle cores: half or twice that"
     return f"{len(planned)} step{'s' if len(planned) > 1 else ''} to run: about {duration} ({basis})"
+
+
+def _is_as_before(step: Step, record: Record) -> bool:
+    """Whether a step will take what it took: a reconstruction depends on its options."""
+    if not isinstance(step, Reconstruct):
+        return True
+    now = plain_options(vars(step.options))
+    return all(record.options.get(name, value) == value for name, value in now.items())
 
 
 def _typical_seconds(step: Step, flow: Flow) -> float:
