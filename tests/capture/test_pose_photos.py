@@ -133,6 +133,29 @@ def test_a_full_quick_model_needs_no_second_effort_and_masks_are_undistorted_lik
     assert carried[:, 21:].max() == 0
 
 
+def test_photos_on_their_side_are_turned_with_their_masks_and_that_is_said(tmp_path, answer):
+    count = 12
+    upright_ones = pinhole(circle(count), 50.0, width=40, height=30)
+    lying = upright_ones.turned(torch.ones(count, dtype=torch.long))
+    answer(colmap_answer([f"{i:02d}.jpg" for i in range(count)], lying.world_from_camera, (40, 30)))
+    photos = photo_paths(tmp_path / "photos", count)
+    mask = torch.zeros(30, 40, 3)
+    mask[:, :20] = 1
+    write_image(tmp_path / "mask.png", mask)
+    said = []
+    masks = (tmp_path / "mask.png", *[None] * (count - 1))
+    posed, _ = pose(replace(photos, masks=masks), tmp_path, say=said.append)
+    assert posed.cameras.sizes.tolist() == [[30, 40]] * count
+    # clockwise: what was on the left is on top
+    carried = posed.mask(0)
+    assert carried.shape == posed.image(0).shape[:2] == (40, 30)
+    assert carried[:19].min() == 1
+    assert carried[21:].max() == 0
+    assert float(posed.cameras.world_from_camera[:, 2, 0].abs().max()) < 1e-4  # level
+    assert float(posed.cameras.world_from_camera[:, 2, 1].max()) < 0  # and not upside down
+    assert "12 of 12 photos lie on their side or upside down and were turned" in said
+
+
 def test_a_dying_process_is_reported_in_one_line(tmp_path, monkeypatch):
     (tmp_path / "colmap_process").mkdir()
     program = tmp_path / "colmap_process" / "__main__.py"

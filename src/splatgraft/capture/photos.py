@@ -97,19 +97,23 @@ def _camera_traits(copy: Path) -> tuple[object, ...]:
 
 
 def write_undistorted(
-    copy: Path, path: Path, distortion: Distortion, *, mask: tuple[Path, Path] | None = None
+    copy: Path, path: Path, distortion: Distortion, *, mask: tuple[Path, Path] | None = None, quarters: int = 0
 ) -> Float[Tensor, "3 3"]:
     """Write the pinhole image of `copy` to `path` as JPEG with its exposure metadata, and of a mask (from, to) as PNG.
 
+    Both are turned counterclockwise by `quarters`.
+
     Returns:
-        The pinhole's matrix.
+        The pinhole's matrix, before they are turned.
     """
     width, height = distortion.size
     intrinsics = torch.from_numpy(distortion.pinhole())
-    _write_jpeg(path, distortion.undistort(read_rgb(copy), intrinsics, width=width, height=height), copy)
+    image = distortion.undistort(read_rgb(copy), intrinsics, width=width, height=height)
+    _write_jpeg(path, torch.rot90(image, quarters), copy)
     if mask is not None:
         coverage = read_mask(mask[0])[..., None].expand(-1, -1, 3)
-        write_image(mask[1], distortion.undistort(coverage, intrinsics, width=width, height=height)[..., 0])
+        seen = distortion.undistort(coverage, intrinsics, width=width, height=height)[..., 0]
+        write_image(mask[1], torch.rot90(seen, quarters))
     return intrinsics.float()
 
 

@@ -16,7 +16,7 @@ from splatgraft.capture.colmap_process.job import MAX_ERROR_PX, MIN_TRACK, PHASE
 from splatgraft.capture.photos import camera_groups, working_copies, working_masks, write_undistorted
 from splatgraft.capture.pose_report import Lens, PoseReport, Unposed, find_doubts
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.capture_orientation import estimate_up, quarter_turns
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import stored_size
 from splatgraft.core.planes import dominant_level_plane
@@ -129,7 +129,9 @@ def pose_photos(
             f"found {report.registered}; {_ADVICE}; without a pose: {', '.join(map(str, report.missing))}"
         )
     progress(total - 1, total, "undistorting")
-    posed = _posed_images(model, copies[0].parent, masks, workspace)
+    posed, on_their_side = _posed_images(model, copies[0].parent, masks, workspace)
+    if on_their_side:
+        say(f"{on_their_side} of {len(posed)} photos lie on their side or upside down and were turned")
     progress(total, total, str(report))
     return posed, report
 
@@ -204,39 +206,44 @@ def _run(job: Job, advance: Callable[[int, str], None], say: Callable[[str], Non
     return json.loads(job.output.read_text())
 
 
-def _posed_images(model: Mapping[str, Any], photos: Path, masks: Mapping[str, Path], workspace: Path) -> PosedImages:
+def _posed_images(
+    model: Mapping[str, Any], photos: Path, masks: Mapping[str, Path], workspace: Path
+) -> tuple[PosedImages, int]:
+    """The photos, undistorted and set upright, and how many had to be turned."""
     (workspace / "images").mkdir(exist_ok=True)
     if masks:
         (workspace / "masks").mkdir(exist_ok=True)
-    poses, intrinsics, sizes, paths = [], [], [], []
+    poses = torch.tensor([[*image["world_from_camera"], [0, 0, 0, 1]] for image in model["images"]])
+    turns = quarter_turns(poses)
+    intrinsics, sizes, paths = [], [], []
     mask_paths: list[Path | None] = []
-    for image in model["images"]:
+    for image, quarters in zip(model["images"], turns.tolist(), strict=True):
         copy, path = photos / image["name"], workspace / "images" / image["name"]
         fx, fy, cx, cy, *coefficients = image["camera"]
         size = stored_size(copy)
         matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
         distortion = Distortion(matrix, torch.tensor([*coefficients, 0], dtype=torch.float64), size)
         mask = (masks[copy.name], workspace / "masks" / f"{copy.stem}.png") if copy.name in masks else None
-        intrinsics.append(write_undistorted(copy, path, distortion, mask=mask))
+        intrinsics.append(write_undistorted(copy, path, distortion, mask=mask, quarters=quarters))
         mask_paths.append(mask[1] if mask else None)
-        poses.append([*image["world_from_camera"], [0, 0, 0, 1]])
         sizes.append(size)
         paths.append(path)
     cameras = Cameras(
-        world_from_camera=torch.tensor(poses),
+        world_from_camera=poses,
         intrinsics=torch.stack(intrinsics),
         sizes=torch.tensor(sizes),
         names=tuple(path.name for path in paths),
-    )
+    ).turned(turns)
     rows = _good_points(model)
     upright_from_sfm = upright(cameras, rows[:, :3])
-    return PosedImages(
+    posed = PosedImages(
         image_paths=tuple(paths),
         cameras=upright_from_sfm.cameras(cameras),
         points=upright_from_sfm.points(rows[:, :3]),
         point_colors=rows[:, 3:6] / 255,
         mask_paths=tuple(mask_paths) if masks else (),
     )
+    return posed, int((turns > 0).sum())
 
 
 def upright(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Similarity:

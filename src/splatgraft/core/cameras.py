@@ -96,6 +96,19 @@ class Cameras:
         scale = torch.diag_embed(torch.cat([ratio, torch.ones_like(ratio[:, :1])], 1))
         return replace(self, intrinsics=scale @ self.intrinsics, sizes=sizes)
 
+    def turned(self, quarters: Int[Tensor, "v"]) -> "Cameras":
+        """Cameras of images turned counterclockwise by so many quarters each, as torch.rot90 does; same centres."""
+        poses, intrinsics, sizes = self.world_from_camera.clone(), self.intrinsics.clone(), self.sizes.clone()
+        once = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).to(poses)
+        for i, count in enumerate(quarters.tolist()):
+            for _ in range(count % 4):
+                # the pixel at x, y goes to y, width - x
+                pixels = torch.tensor([[0.0, 1, 0], [-1, 0, float(sizes[i, 0])], [0, 0, 1]]).to(intrinsics)
+                intrinsics[i] = pixels @ intrinsics[i] @ once.to(intrinsics)
+                poses[i, :3, :3] = poses[i, :3, :3] @ once
+                sizes[i] = sizes[i].flip(0)
+        return replace(self, world_from_camera=poses, intrinsics=intrinsics, sizes=sizes)
+
     def cropped(self, windows: Sequence[Window]) -> "Cameras":
         """Cameras of images cut to `windows`, one window per camera; names and poses stay."""
         intrinsics = self.intrinsics.clone()

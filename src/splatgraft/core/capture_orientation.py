@@ -1,7 +1,9 @@
 """Up direction and focus point of a capture, from its camera poses alone, by reweighted least squares."""
 
+import math
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
@@ -12,6 +14,15 @@ _ROLL_RAD = 0.05
 """Roll above which a camera counts less: hand-held cameras are level to about three degrees."""
 _MEAN_UP_WEIGHT = 0.01
 """Weight of the images' mean up, equal to that of horizontal axes that spread over 6 degrees."""
+_GOES_ROUND, _LEVEL = 0.35, 0.1
+"""An axis of the images is level, and the cameras go round: least middle eigenvalue of its second moments (a circle has
+a half, an arc of 135 degrees .35), and most that the smallest is of it."""
+_MORE_LEVEL = 0.25
+"""Most that this share is of the other axis's."""
+_LOOKING_DOWN = 0.05
+"""Mean sine of the angle below the horizon at which cameras look from above at what they go round."""
+_UP_AFTER, _UP_BEFORE = 0.5, 0.3
+"""Cosine between up and the up of an image that is turned, and of one that is not, as one that looks straight down."""
 _RESIDUAL_FLOOR = 0.1
 """Distance of an axis from the focus point, over the median one, below which weights stop growing."""
 _MIN_IN_FRONT = 0.7
@@ -24,15 +35,43 @@ def estimate_up(cameras: Cameras) -> Float[Tensor, "3"]:
     The images' mean up decides the sign, and the direction where all cameras face one way. Rolled cameras are
     outliers of an iteratively reweighted least-squares fit.
     """
-    right = cameras.world_from_camera[:, :3, 0].double()
-    mean_up = torch.nn.functional.normalize(-cameras.world_from_camera[:, :3, 1].double().mean(0), dim=0)
+    right, down, _ = cameras.world_from_camera[:, :3, :3].double().unbind(2)
+    return _up_of(right, down).to(cameras.world_from_camera)
+
+
+def _up_of(right: Float[Tensor, "v 3"], down: Float[Tensor, "v 3"]) -> Float[Tensor, "3"]:
+    mean_up = torch.nn.functional.normalize(-down.mean(0), dim=0)
     up = mean_up
     for _ in range(_ROUNDS):
         weight = _ROLL_RAD / (_ROLL_RAD + (right @ up).abs())
         spread = (right * weight[:, None]).T @ right / weight.sum()
         prior = _MEAN_UP_WEIGHT * torch.eye(3, dtype=torch.float64)
         up = torch.nn.functional.normalize(torch.linalg.solve(spread + prior, _MEAN_UP_WEIGHT * mean_up), dim=0)
-    return up.to(cameras.world_from_camera)
+    return up
+
+
+def quarter_turns(world_from_camera: Float[Tensor, "v 4 4"]) -> Int[Tensor, "v"]:
+    """Counterclockwise quarter turns, 0 to 3, that set each image upright; 0 where that is not clear.
+
+    Where cameras go round something, the images' horizontal axis stays perpendicular to up. Where it is the vertical
+    one that does, all images lie on their side; as cameras look from above, up is known. Single images are turned by
+    the up direction of the others.
+    """
+    right, down, forward = world_from_camera[:, :3, :3].double().unbind(2)
+    moments = [torch.linalg.eigh(axis.T @ axis / max(1, len(axis))) for axis in (right, down)]
+    middle = moments[1].eigenvalues[1]
+    flat_right, flat_down = (m.eigenvalues[0] / m.eigenvalues[1].clamp_min(1e-9) for m in moments)
+    up = _up_of(right, down)
+    if middle > _GOES_ROUND and flat_down < min(_LEVEL, _MORE_LEVEL * float(flat_right)):
+        up = moments[1].eigenvectors[:, 0]
+        looking = float((forward @ up).mean())
+        if abs(looking) < _LOOKING_DOWN:
+            return torch.zeros(len(right), dtype=torch.long)
+        up = -math.copysign(1.0, looking) * up
+    # what is up after each number of turns
+    ups = torch.stack([-down, right, down, -right]) @ up
+    clear = (ups.amax(0) > _UP_AFTER) & (ups[0] < _UP_BEFORE)
+    return torch.where(clear, ups.argmax(0), 0)
 
 
 def focus_point(cameras: Cameras) -> Float[Tensor, "3"]:
