@@ -387,6 +387,13 @@ def test_a_place_is_away_from_the_table_s_edge_and_a_warning_says_where_none_is(
     assert any("near the edge" in note.text for note in placed(0.2).warnings)
 
 
+def test_a_size_that_is_guessed_does_not_fill_a_small_table():
+    small = sheet((0, 0, TABLE), (0.3, 0, 0), (0, 0.3, 0), spacing=0.03)
+    placed = place_object(small, THING, cameras=(ring_of_cameras(), OWN))
+    # its rim keeps its own width from the edge where it can: at 3 radii from the middle about .7 of the disc is table
+    assert placed.target_from_object.scale * 2 * placed.base.radius < 0.3
+
+
 def test_corners_do_not_reach_over_the_table_s_edge():
     cameras = cameras_that_look_at_the_edge()
     # a bar that is too little of the object to count in its radius

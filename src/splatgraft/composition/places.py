@@ -80,7 +80,7 @@ def suggest_places(
     """Places near the point that the cameras look at, each with a scale: level ones in view of the cameras first.
 
     Captures have no common unit of length, so a scale that is not given is a guess from the size in the images; it is
-    reduced where no level place is large enough. Where no place is level and in view, the nearest to it is given with
+    reduced where no level place is large enough, or where it would fill what carries it. Where no place is level and in view, the nearest to it is given with
     the reason. At least one, apart from each other by the object's radius; a ValueError where there is no surface.
     """
     focus, reach, reasons = _search_area(target, cameras)
@@ -100,7 +100,9 @@ def suggest_places(
         flat = _level_share(ground, radius=wide, tolerance=_FLAT_SLOPE * wide)
         carried = _level_share(ground, radius=_ROOM / _MARGIN * wide, tolerance=_FLAT_SLOPE * wide, or_higher=True)
         score = flat**2 * carried**2 * visible * central
-        if float(flat.flatten()[int(score.argmax())]) > _FLAT_ENOUGH or scale is not None:
+        best = int(score.argmax())
+        has_room = float(flat.flatten()[best]) > _FLAT_ENOUGH and float(carried.flatten()[best]) > _NEAR_THE_EDGE
+        if has_room or scale is not None:
             break
         size *= _SHRINK
     if size < wanted:
