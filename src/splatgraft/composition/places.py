@@ -37,9 +37,6 @@ _FLAT_ENOUGH = 0.8
 """Share of level ground at which the object is not made smaller."""
 _SHRINK, _ROUNDS = 0.8, 8
 """Factor on the scale where no place is level enough, and scales tried."""
-_EDGE = (
-    "It stands near the edge of what carries it: no free place in view has more room. Name another (--on), or --scale."
-)
 _MIN_SCORE = 0.01
 """Below it no place is level and in view."""
 _MAX_PLACES = 6
@@ -80,8 +77,9 @@ def suggest_places(
     """Places near the point that the cameras look at, each with a scale: level ones in view of the cameras first.
 
     Captures have no common unit of length, so a scale that is not given is a guess from the size in the images; it is
-    reduced where no level place is large enough, or where it would fill what carries it. Where no place is level and in view, the nearest to it is given with
-    the reason. At least one, apart from each other by the object's radius; a ValueError where there is no surface.
+    reduced where no level place is large enough, or where it would fill what carries it. Where no place is level and in
+    view, the nearest to it is given with the reason. At least one, apart from each other by the object's radius; a
+    ValueError where there is no surface.
     """
     focus, reach, reasons = _search_area(target, cameras)
     up = torch.nn.functional.normalize(up.to(focus), dim=0)
