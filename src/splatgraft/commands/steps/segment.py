@@ -212,20 +212,19 @@ class Segment:
         views, small = _small_masks(masked)
         closed = close_unseen_side(object_, views, small)
         share = closed.guessed_share
-        if share > 0:
+        text = f"{share:.0%} of the object's surface was never photographed: its shape and colour there are a guess."
+        if share > _MUCH_GUESSED:
             middle = closed.gaussians.means.median(0).values
             gap, (first, last) = widest_gap(views, middle)
             away = views.centers - middle
             write_image(folder / COVERAGE_FILE, Coverage.of(away, away[:0], estimate_up(views)).draw())
-            text = (
-                f"{share:.0%} of the object's surface was never photographed: its shape and colour there are a guess. "
-                "The picture shows the directions around it from above, with its photos as dark dots."
-            )
+            text += " The picture shows the directions around it from above, with its photos as dark dots."
             if gap > _WIDE_GAP_DEG:
                 text += f" No photo was taken over {gap:.0f} degrees around it, between {first} and {last}."
             remedy = "Photograph it from there too, or turn that side away (compose: yaw_deg)"
-            level = "warning" if share > _MUCH_GUESSED else "minor"
-            context.console.tell(Note(text, level, remedy, picture=folder / COVERAGE_FILE))
+            context.console.tell(Note(text, "warning", remedy, picture=folder / COVERAGE_FILE))
+        elif share > 0:
+            context.console.tell(Note(text))
         return closed.gaussians, closed.is_guessed
 
     def _compare(
