@@ -125,3 +125,35 @@ def test_photos_that_no_model_holds_are_posed_from_the_points_of_the_others(tmp_
     command = [sys.executable, "-c", REFINE, str(PROGRAM.parent), str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+PARTNERS = """
+import sys
+from pathlib import Path
+
+import pycolmap
+
+sys.path.insert(0, sys.argv[1])
+from colmap_process.database import _promising_pairs
+from colmap_process.job import Job
+
+folder = Path(sys.argv[2])
+pycolmap.set_random_seed(0)
+options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=40, num_points3D=150)
+with pycolmap.Database.open(folder / "photos.db") as opened:
+    truth = pycolmap.synthesize_dataset(options, opened)
+job = Job("", "", str(folder), False, [[image.name for image in truth.images.values()]], True, 2, 0)
+print(_promising_pairs(job, folder / "photos.db").read_text())
+"""
+"""Forty photos that all show the same points, as those before a background that stands still do."""
+
+
+def test_where_all_photos_match_each_is_compared_with_its_best_partners_alone(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", PARTNERS, str(PROGRAM.parent), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    pairs = [line.split() for line in done.stdout.splitlines() if line]
+    assert len(pairs) < 0.9 * 40 * 39 / 2
+    partners = [sum(name in pair for pair in pairs) for name in {name for pair in pairs for name in pair}]
+    assert len(partners) == 40
+    assert min(partners) >= 16
