@@ -97,7 +97,7 @@ def test_where_less_than_half_is_posed_all_is_done_once_more_and_the_better_mode
     posed, report = pose(photo_paths(tmp_path / "photos", 8), tmp_path, say=said.append)
     assert "took 30 s (features 20, mapping 10)" in said[0]
     assert "only 3 of 8 photos got a pose: all is done once more with more features" in said[1]
-    assert "about 10 min" in said[1]
+    assert "about 20 min" in said[1]
     assert (report.registered, report.photos, report.missing) == (7, 8, (Unposed("07", 900, 12),))
     assert "7 of 8 photos registered" in str(report)
     assert "without a pose: 07 (900 features, at most 12 matches: of another place" in str(report)
@@ -114,7 +114,7 @@ def test_what_a_pass_posed_is_a_result_and_more_is_offered_with_its_time(tmp_pat
     assert report.registered == 5
     assert [one.name for one in report.missing] == ["05", "06", "07"]
     assert "photos with a pose: expected at least 70%, found 5 of 8" in said[1]
-    assert 'effort = "thorough" finds more features, which takes about 10 min' in said[1]
+    assert 'effort = "thorough" finds more features, which takes about 20 min' in said[1]
 
 
 def test_a_full_quick_model_needs_no_second_effort_and_masks_are_undistorted_like_photos(tmp_path, answer):

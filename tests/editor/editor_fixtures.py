@@ -42,9 +42,13 @@ def page(project: Path) -> Iterator[Page]:
         yield found
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser without windows; tests that use it are marked `browser` (tests/conftest.py)."""
+    """A browser without windows; tests that use it are marked `browser` (tests/conftest.py).
+
+    It is closed behind each module: Playwright cannot be started twice in one process, and test_exported_page.py has a
+    browser of its own.
+    """
     from editor_driver import with_browser
 
     with with_browser() as found:
