@@ -95,7 +95,7 @@ def test_the_process_ends_with_its_parent(tmp_path: Path) -> None:
         assert process.wait() == 1
 
 
-REFINE = """
+BEGIN = """
 import sys
 from pathlib import Path
 
@@ -103,10 +103,23 @@ import pycolmap
 
 sys.path.insert(0, sys.argv[1])
 from colmap_process.job import Job
-from colmap_process.refinement import refined
 
 folder = Path(sys.argv[2])
 pycolmap.set_random_seed(0)
+"""
+"""pycolmap shares no process with Pillow: what calls it runs in one of its own."""
+
+
+def printed_by(program: str, folder: Path) -> str:
+    command = [sys.executable, "-c", BEGIN + program, str(PROGRAM.parent), str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+REFINE = """
+from colmap_process.refinement import refined
+
 options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=10, num_points3D=300)
 with pycolmap.Database.open(folder / "photos.db") as opened:
     truth = pycolmap.synthesize_dataset(options, opened)
@@ -118,27 +131,16 @@ for i in photos[7:]:
 job = Job(str(folder), "", str(folder), False, [[truth.images[i].name for i in photos]], True, 1, 0)
 assert refined(job, folder / "photos.db", [part]).num_reg_images() == 10
 """
-"""A synthetic model without three of its ten photos; pycolmap shares no process with Pillow."""
+"""A synthetic model without three of its ten photos."""
 
 
 def test_photos_that_no_model_holds_are_posed_from_the_points_of_the_others(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", REFINE, str(PROGRAM.parent), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    printed_by(REFINE, tmp_path)
 
 
 PARTNERS = """
-import sys
-from pathlib import Path
-
-import pycolmap
-
-sys.path.insert(0, sys.argv[1])
 from colmap_process.database import _promising_pairs
-from colmap_process.job import Job
 
-folder = Path(sys.argv[2])
-pycolmap.set_random_seed(0)
 options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=40, num_points3D=150)
 with pycolmap.Database.open(folder / "photos.db") as opened:
     truth = pycolmap.synthesize_dataset(options, opened)
@@ -149,10 +151,7 @@ print(_promising_pairs(job, folder / "photos.db").read_text())
 
 
 def test_where_all_photos_match_each_is_compared_with_its_best_partners_alone(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", PARTNERS, str(PROGRAM.parent), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    pairs = [line.split() for line in done.stdout.splitlines() if line]
+    pairs = [line.split() for line in printed_by(PARTNERS, tmp_path).splitlines() if line]
     assert len(pairs) < 0.9 * 40 * 39 / 2
     partners = [sum(name in pair for pair in pairs) for name in {name for pair in pairs for name in pair}]
     assert len(partners) == 40
