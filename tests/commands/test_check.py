@@ -109,6 +109,18 @@ def test_faulty_photos_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "leave" not in advice
 
 
+def test_photos_in_no_order_hang_together_by_whatever_shows_the_same_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wall = np.hstack([texture(seed) for seed in range(5)])
+    width, height = SIZE
+    # each shows what two or three others show
+    photos = [wall[:height, 150 * i : 150 * i + width] for i in np.random.default_rng(1).permutation(46)]
+    photos[3] = np.rot90(photos[3])  # held on its side, which is no other camera
+    _, findings, verdict = check(save(tmp_path / "photos", photos), capsys)
+    assert (verdict, findings["overlap"]["level"], findings["sizes"]["level"]) == ("good", "good", "good")
+
+
 def test_one_photo_many_times_and_pictures_of_nothing_in_common_are_not_usable(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -141,6 +153,11 @@ def test_given_poses_and_masks_are_seen_and_a_video_is_looked_at(
     assert "given for 8 images" in findings["poses"]["text"]
     assert findings["masks"]["text"] == "8 masks"
     assert findings["overlap"]["level"] == "good"
+    assert "the photos go 315 of 360 degrees" in findings["coverage"]["text"]
+    photograph(tmp_path / "front", plane((0.3, 0.5, 0.3)), ball(), around_deg=120.0)
+    _, findings, _ = check(tmp_path / "front", capsys)
+    assert findings["coverage"]["level"] == "doubtful"
+    assert "between " in findings["coverage"]["text"]
     path = tmp_path / "walk.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, SIZE)
     for photo in walk(count=12):

@@ -1,9 +1,11 @@
 """What photos tell before poses are sought: sharpness, overlap and brightness, from small grey versions.
 
-Overlap is counted in SIFT matches between photos that follow one another (Lowe 2004: ratio test), verified by epipolar
-geometry (USAC, MAGSAC++). The same matches tell the exposure of each photo against the others, as one surface should
-have one brightness. Sharpness is the perceptual blur metric of Crete-Roffet et al. 2007, which depends little on what
-is shown: how much the picture loses when it is blurred once more.
+Overlap is counted in SIFT matches (Lowe 2004: ratio test), verified by epipolar geometry (USAC, MAGSAC++), between
+photos that follow one another; what these do not hold together is compared, as structure from motion does it, with the
+photos that share most of the largest features, wherever in the order they are. The matches of neighbours tell the
+exposure of each photo against the others, as one surface should have one brightness. Sharpness is the perceptual blur
+metric of Crete-Roffet et al. 2007, which depends little on what is shown: how much the picture loses when it is blurred
+once more.
 """
 
 from collections import Counter
@@ -35,8 +37,10 @@ _EPIPOLAR_PX = 1.5
 """Distance of a match from its epipolar line, at most."""
 _MIN_MATCHES = 15
 """Verified matches from which two photos show the same place: what COLMAP demands (min_num_inliers)."""
-_CANDIDATES = 20
-"""Photos elsewhere in the order with which a photo without a neighbour is matched, at most."""
+_PARTNERS = 4
+"""Photos anywhere in the order with which a photo is matched that its neighbours do not hold."""
+_PARTNER_FEATURES = 300
+"""Largest features of a photo by which its partners are found (preemptive matching: Wu 2013, section 3)."""
 _STILL_PX = 0.5
 """Shift below which a match does not move: below what a hand can hold still."""
 
@@ -80,6 +84,8 @@ class Finding:
 
 @dataclass(frozen=True)
 class _Features:
+    """Of one photo, the largest first."""
+
     points: np.ndarray
     descriptors: np.ndarray
     luminance: np.ndarray
@@ -122,14 +128,13 @@ def find_in_photos(
         for step in range(1, min(_NEIGHBOURS, n - 1) + 1):
             match(index, (index + step) % n)
         progress(index + 1, n, "comparing neighbours")
-    # photos of the smaller groups with photos spread over the rest, which may join them
-    apart = _groups(n, found)
-    for group in apart[1:]:
-        others = [i for other in apart if other is not group for i in other]
+    for group in _groups(n, found)[1:]:
+        others = [i for i in range(n) if i not in group]
         for i in group:
-            for j in others[:: max(1, len(others) // _CANDIDATES)]:
+            for j in _partners(features, i, others):
                 match(i, j)
-    links, overlap = [link for link in found.values() if link is not None], _overlap(found, names)
+    links = [link for pair, link in found.items() if link is not None and pair[1] - pair[0] <= _NEIGHBOURS]
+    overlap = _overlap(found, names)
     if has_poses and overlap.level != "good":
         overlap = Finding("overlap", "good", f"{overlap.text}; poses are given, which need none", photos=overlap.photos)
     return _sharpness(blur), overlap, _exposure(links, names)
@@ -160,7 +165,8 @@ def _features(sift: cv2.SIFT, photo: Grey) -> _Features:
     keypoints, descriptors = sift.detectAndCompute(photo, None)
     if descriptors is None or len(keypoints) == 0:
         return _Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32))
-    points = np.array([keypoint.pt for keypoint in keypoints], np.float32)
+    largest = np.argsort([-keypoint.size for keypoint in keypoints], kind="stable")
+    points, descriptors = np.array([keypoints[k].pt for k in largest], np.float32), descriptors[largest]
     # Hellinger distance (RootSIFT, Arandjelovic and Zisserman 2012)
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-6))
     # display values to light: a power is enough for ratios
@@ -169,27 +175,47 @@ def _features(sift: cv2.SIFT, photo: Grey) -> _Features:
     return _Features(points, descriptors.astype(np.float32), light[rows, columns])
 
 
-def _link(features: Sequence[_Features], i: int, j: int) -> _Link | None:
-    """The verified matches of two photos; None where there are too few."""
-    one, other = features[i], features[j]
-    if min(len(one.points), len(other.points)) < _MIN_MATCHES:
-        return None
-    cosine = one.descriptors @ other.descriptors.T
+def _partners(features: Sequence[_Features], i: int, others: Sequence[int]) -> list[int]:
+    """Those of `others` whose largest features match those of photo `i` best, the best first."""
+    largest = [features[j].descriptors[:_PARTNER_FEATURES] for j in others]
+    # one product for all, since many small ones cost more
+    cosines = features[i].descriptors[:_PARTNER_FEATURES] @ np.concatenate(largest).T
+    ends = np.cumsum([len(one) for one in largest])[:-1]
+    counted = {
+        j: len(_distinct(cosine)[0]) if min(cosine.shape) > 1 else 0
+        for j, cosine in zip(others, np.split(cosines, ends, axis=1), strict=True)
+    }
+    return sorted((j for j in others if counted[j]), key=lambda j: -counted[j])[:_PARTNERS]
+
+
+def _distinct(cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows and columns of cosines of unit vectors that are nearest to each other and much nearer than the second.
+
+    The best of each row is overwritten.
+    """
     rows = np.arange(len(cosine))
     best = cosine.argmax(1)
     nearest = cosine[rows, best]
     mutual = cosine.argmax(0)[best] == rows
     cosine[rows, best] = -1
     # of unit vectors the squared distance is 2 - 2 cos
-    distinct = 1 - nearest < _RATIO**2 * (1 - cosine.max(1))
-    kept = np.flatnonzero(mutual & distinct)
+    kept = np.flatnonzero(mutual & (1 - nearest < _RATIO**2 * (1 - cosine.max(1))))
+    return kept, best[kept]
+
+
+def _link(features: Sequence[_Features], i: int, j: int) -> _Link | None:
+    """The verified matches of two photos; None where there are too few."""
+    one, other = features[i], features[j]
+    if min(len(one.points), len(other.points)) < _MIN_MATCHES:
+        return None
+    kept, best = _distinct(one.descriptors @ other.descriptors.T)
     if len(kept) < _MIN_MATCHES:
         return None
-    a, b = one.points[kept], other.points[best[kept]]
+    a, b = one.points[kept], other.points[best]
     verified = _verified(a, b)
     if verified.sum() < _MIN_MATCHES:
         return None
-    ratio = np.maximum(other.luminance[best[kept]], 1e-4) / np.maximum(one.luminance[kept], 1e-4)
+    ratio = np.maximum(other.luminance[best], 1e-4) / np.maximum(one.luminance[kept], 1e-4)
     return _Link(i, j, int(verified.sum()), float(np.median(np.log2(ratio[verified]))))
 
 
@@ -207,9 +233,10 @@ def _verified(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def find_in_sizes(sizes: Sequence[tuple[int, int]], names: Sequence[str]) -> Finding:
-    """The number of photos of each size."""
-    (width, height), most = Counter(sizes).most_common(1)[0]
-    odd = tuple(name for name, size in zip(names, sizes, strict=True) if size != (width, height))
+    """The number of photos of each size, upright or on the side."""
+    # a photo held on its side is of the same camera
+    (width, height), most = Counter((max(size), min(size)) for size in sizes).most_common(1)[0]
+    odd = tuple(name for name, size in zip(names, sizes, strict=True) if (max(size), min(size)) != (width, height))
     if not odd:
         return Finding("sizes", "good", f"all {len(sizes)} photos have {width} x {height} px")
     text = f"{most} of {len(sizes)} photos have {width} x {height} px, {len(odd)} another: {_named(odd)}"
@@ -275,22 +302,21 @@ def _overlap(found: Mapping[tuple[int, int], _Link | None], names: Sequence[str]
         sizes = ", ".join(str(len(group)) for group in groups[:4])
         remedy = "take photos a step apart that share two thirds of the picture, with texture in view, of one place"
         return Finding("overlap", "unusable", text + sizes, remedy, apart)
-    text = f"{len(apart)} of {n} photos share little with those taken before and after them: {_named(apart)}"
-    # photos that neighbours do not hold are often held by others: without them fewer of the rest get a pose
+    text = f"{len(apart)} of {n} photos share little with the others and may get no pose: {_named(apart)}"
+    # more features may still hold them, and they then hold others
     return Finding("overlap", "doubtful", text, "keep them, and take photos between them and the rest", apart)
 
 
 def _exposure(links: Sequence[_Link], names: Sequence[str]) -> Finding:
-    """How much brighter each photo shows surfaces than the photos before and after it do, in the mean of both.
+    """By links of neighbours, how much brighter each photo shows surfaces than those before and after it do.
 
     Gloss changes smoothly from photo to photo, so that it cancels; a change of exposure does not.
     """
     before: list[list[float]] = [[] for _ in names]
     after: list[list[float]] = [[] for _ in names]
     for link in links:
-        if link.second - link.first <= len(names) // 2:
-            before[link.second].append(link.stops)
-            after[link.first].append(-link.stops)
+        before[link.second].append(link.stops)
+        after[link.first].append(-link.stops)
     pairs = zip(before, after, strict=True)
     jumps = [abs(0.5 * float(np.median(b) + np.median(a))) if a and b else 0.0 for b, a in pairs]
     largest_first = sorted(range(len(names)), key=lambda i: -jumps[i])

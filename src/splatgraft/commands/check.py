@@ -18,6 +18,8 @@ from splatgraft.capture.photo_inspection import (
 )
 from splatgraft.capture.usable_views import find_odd_photos
 from splatgraft.capture.video import grey_frames
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import focus_point
 from splatgraft.core.images import read_exif, read_grey, stored_size
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.folders.input_description import require_input
@@ -27,11 +29,14 @@ from splatgraft.formats.captures.masks import PhotoFiles, find_photos
 from splatgraft.formats.captures.photo_archive import is_archive, unpack_photos
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
+from splatgraft.segmentation import widest_gap
 
 _FRAMES = 40
 """Frames of a video that are looked at; the command `capture` takes 120."""
 _DRAFT_SECONDS = 45.0
 """For a draft of any size; two idle cores."""
+_WIDE_GAP_DEG = 60.0
+"""Turn without photos that is named."""
 _FOCAL_LENGTH = 0x920A
 
 
@@ -91,6 +96,7 @@ class Check:
         yield _lens(used)
         if posed is not None:
             yield Finding("poses", "good", f"given for {len(posed)} images, with {len(posed.points)} points")
+            yield _coverage(posed.cameras)
         else:
             yield Finding("poses", "good", "none: structure from motion finds them")
         yield _masks(sum(path is not None for path in photos.masks))
@@ -119,6 +125,19 @@ def _lens(photos: Sequence[Path]) -> Finding:
     known = sum(_FOCAL_LENGTH in read_exif(photo) for photo in photos)
     estimated = "all photos" if known == len(photos) else f"{known} of {len(photos)} photos: else it is estimated"
     return Finding("lens", "good", f"focal length in EXIF of {estimated}")
+
+
+def _coverage(cameras: Cameras) -> Finding:
+    """How far round the photos go about what they look at."""
+    try:
+        gap, (first, last) = widest_gap(cameras, focus_point(cameras))
+    except ValueError:  # they look outwards
+        return Finding("coverage", "good", "the photos look all ways: a place, no object to cut out")
+    text = f"the photos go {360 - gap:.0f} of 360 degrees round what they look at"
+    if gap < _WIDE_GAP_DEG:
+        return Finding("coverage", "good", text)
+    remedy = "photograph an object from there too, as its back is guessed else; a place need not be seen from there"
+    return Finding("coverage", "good" if gap < 180 else "doubtful", f"{text}, none between {first} and {last}", remedy)
 
 
 def _masks(count: int) -> Finding:
