@@ -393,9 +393,17 @@ def test_a_clipped_window_is_a_source_where_it_was_photographed(radius_deg, whit
     assert math.degrees(math.acos(min(1.0, float(torch.tensor(main.direction) @ window)))) < 5
     # brighter than the camera recorded: white over its solid angle is 0.095
     assert main.luminance > 0.2
+    assert main.name == "window"  # a room's wall is behind it
     if radius_deg == 14:  # wide enough that it is no sun behind a window
-        assert main.name == "window"
         assert main.distance == pytest.approx(20, rel=0.05)
+
+
+@pytest.mark.parametrize(("height", "name"), [(0.15, "sun or window"), (0.6, "sun or lamp")])
+def test_what_shadows_alone_show_is_named_by_where_it_may_be(height, name):
+    sun = torch.nn.functional.normalize(torch.tensor([0.3, 0.3, height]), dim=0)
+    light = estimated(sunlit_scene(sun, strength=3.0), views((0.0, 1.5)))
+    assert light.sources[0].name == name
+    assert f"{name} " in light.describe(UP)
 
 
 @pytest.mark.parametrize("strength", [0.0, 1.0])

@@ -23,6 +23,7 @@ from splatgraft.relighting.light.evidence import find_highlights, find_shading_e
 from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
+    FARTHEST,
     SOLID_ANGLE,
     NoLight,
     panorama_at,
@@ -58,7 +59,15 @@ _MAX_SOURCES = 4
 _NEIGHBOUR_COSINE = math.cos(math.radians(14))
 """Cosine of the largest angle to the brightest direction at which a direction belongs to its source."""
 _SUN = 0.03
-"""Steradians; a smaller clipped patch is called sun, a larger one window."""
+"""Steradians; a smaller clipped patch may show the sun, whose rays are parallel."""
+_LAMP = 0.64
+"""Sine of the height from which a source in a room is a lamp, and below it a window."""
+_SEEN_NAMES, _UNSEEN_NAMES = ("window", "lamp"), ("sun or window", "sun or lamp")
+"""Of sources with a surface behind them, and of those that no picture shows: low ones and high ones."""
+_SAME_SOURCE = 0.94
+"""Cosine between two sources from which they are one: 20 degrees."""
+_SKY = 0.5
+"""Share of `FARTHEST` from which nothing stands behind a bright patch."""
 _UNSEEN_RADIUS_DEG = 1.0
 """Angular radius of a source that no camera saw, beside the uncertainty of its direction."""
 _HALF_BIN_DEG = 4.0
@@ -101,8 +110,15 @@ class EstimatedLight:
 
     def with_sun(self, sun: Sun, scene: Gaussians) -> "EstimatedLight":
         """With another sun, which nothing blocks that `scene` shows where the view from the place towards it ends."""
-        placed = with_source_distances(with_sun(self.mean, sun), scene, self.place)
-        return replace(self, sun=replace(sun, blockers_within=placed.sources[0].blockers_within))
+        named = replace(sun, name=sun.name or self._name_at(sun.direction))
+        placed = with_source_distances(with_sun(self.mean, named), scene, self.place)
+        return replace(self, sun=replace(named, blockers_within=placed.sources[0].blockers_within))
+
+    def _name_at(self, direction: Float[Tensor, "3"]) -> str:
+        """Of what shadows show in a direction: what pictures show there, or what may be there."""
+        shown = (s for s in self.mean.sources if float(torch.tensor(s.direction) @ direction.float()) > _SAME_SOURCE)
+        names = [source.name for source in shown if source.name in _SEEN_NAMES]
+        return names[0] if names else _UNSEEN_NAMES[float(direction.float() @ self.evidence.up) > _LAMP]
 
     def at(self, scene: Gaussians, cameras: Cameras, place: BoundingSphere) -> "EstimatedLight | NoLight":
         """At a place in the same region: the same sources, and ambient light with what is near there."""
@@ -226,15 +242,16 @@ def _source(
     r, g, b = (extra.sum(0) * SOLID_ANGLE).tolist()
     if visible > 0:
         size = max(visible, 0.1) * SOLID_ANGLE
-        name = "sun" if size < _SUN else "window"
+        distance = _mean_distance(evidence.far.distance[group], weight * shares)
+        name = _SEEN_NAMES[float(direction @ evidence.up) > _LAMP] if distance < _SKY * FARTHEST else "sun"
         # a small patch may show the sun through a window; a large one stands where the panorama shows it
-        distance = _mean_distance(evidence.far.distance[group], weight * shares) if name == "window" else math.inf
+        distance = math.inf if size < _SUN else distance
         radius = angular_radius_deg(size)
         return LightSource((x, y, z), (r, g, b), radius, _CLIPPED_ERROR_DEG, name=name, distance=distance)
     away = torch.rad2deg(torch.acos((towards @ direction).clamp(-1, 1)))
     spread = float((weight * away**2).sum() / weight.sum().clamp_min(1e-9)) ** 0.5
-    error = math.hypot(spread, _HALF_BIN_DEG)
-    return LightSource((x, y, z), (r, g, b), _UNSEEN_RADIUS_DEG, error, 1.0, "sun", blockers_within=within)
+    error, name = math.hypot(spread, _HALF_BIN_DEG), _UNSEEN_NAMES[float(direction @ evidence.up) > _LAMP]
+    return LightSource((x, y, z), (r, g, b), _UNSEEN_RADIUS_DEG, error, 1.0, name, blockers_within=within)
 
 
 def _mean_distance(distances: Float[Tensor, "p"], weight: Float[Tensor, "p"]) -> float:

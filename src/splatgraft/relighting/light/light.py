@@ -50,7 +50,7 @@ class LightSource:
     confidence: float = 1.0
     """Probability that this light exists, in [0, 1]; scales its shadow."""
     name: str = "light"
-    """Shown in reports: sun, window, lamp."""
+    """Shown in reports: sun, window, lamp, or what of them it may be."""
     blockers_within: float = math.inf
     """World units; occluders farther away do not block it, such as the window that it comes through."""
     distance: float = math.inf

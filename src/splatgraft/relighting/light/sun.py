@@ -131,8 +131,8 @@ class Sun:
     """Log likelihood over that of all other light alone; infinite where it was set by hand."""
     error_deg: float = _ERROR_DEG
     """Standard error of the direction."""
-    name: str = "sun"
-    """As in `LightSource`."""
+    name: str = ""
+    """Where it was set by hand, as in `LightSource`."""
     blockers_within: float = math.inf
     """World units; occluders farther away do not block it."""
 
@@ -481,11 +481,11 @@ def with_sun(light: Light, sun: Sun) -> Light:
     """A light whose sun is the one that shadows show; the irradiance on the surface stays.
 
     Args:
-        light: Estimated; its own suns are left out, its windows and lamps stay.
+        light: Estimated; its far sources are left out, those at a distance stay.
         sun: Of the same place; where its ratio is None it is as strong as the suns that it replaces, and not below
             `_MIN_RATIO_BY_HAND`.
     """
-    others = replace(light, sources=tuple(one for one in light.sources if not one.name.startswith("sun")))
+    others = replace(light, sources=tuple(one for one in light.sources if math.isfinite(one.distance)))
     before, shaded = (one.irradiance(sun.normal[None])[0] for one in (light, others))
     ratio = (before / shaded - 1).clamp_min(_MIN_RATIO_BY_HAND) if sun.ratio is None else sun.ratio
     scale = float(before @ LUMINANCE) / float((shaded * (1 + ratio)) @ LUMINANCE)
@@ -494,6 +494,11 @@ def with_sun(light: Light, sun: Sun) -> Light:
     x, y, z = sun.direction.tolist()
     r, g, b = irradiance.tolist()
     found = LightSource(
-        (x, y, z), (r, g, b), sun.radius_deg, sun.error_deg, name=sun.name, blockers_within=sun.blockers_within
+        (x, y, z),
+        (r, g, b),
+        sun.radius_deg,
+        sun.error_deg,
+        name=sun.name,
+        blockers_within=sun.blockers_within,
     )
     return replace(others, sources=(found, *dimmed), ambient=scale * others.ambient)
