@@ -14,6 +14,7 @@ from splatgraft.editor.project import Project, RenderedViews
 from splatgraft.editor.session import Session
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.formats.placement import read_placement
+from splatgraft.project.record import read_record
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.runtime.settings import read_toml
 
@@ -25,6 +26,11 @@ def test_a_transfer_between_two_scene_files(tmp_path: Path, capsys: pytest.Captu
     assert "a scene without photographs: 8 pictures" in said
     assert "up is taken to be (0.00, 0.00, 1.00)" in said
     root = project.parent
+    # what is a guess is shown
+    (guess,) = [note for note in read_record(root / "target" / "capture").warnings if note.in_doubt]
+    assert guess.picture is not None
+    assert (root / "target" / "capture" / guess.picture).is_file()
+    assert "upside down" in guess.remedy
     assert (root / "source/scene/scene.ply").read_bytes() == (tmp_path / "source.ply").read_bytes()
     # the masks of the rendered images separate the red ball from the plane
     object_ = read_gaussians(root / "object" / "object.ply")

@@ -21,6 +21,7 @@ from splatgraft.core.planes import least_squares_normal, sample_planes
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering import render
+from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress, silent
 
 _HALF_FOV = math.radians(30)
@@ -122,7 +123,7 @@ def place_virtual_cameras(
     *,
     stated_up: tuple[float, float, float] | None = None,
     progress: Progress = silent,
-) -> tuple[PosedImages, tuple[str, ...]]:
+) -> tuple[PosedImages, tuple[Note, ...]]:
     """Place rings of cameras around the scene's dense part or within it, without those whose view is blocked.
 
     The up direction that the scene's file states counts where `options` have none.
@@ -134,9 +135,9 @@ def place_virtual_cameras(
     centre, radius = dense_part(solid.means)
     given = options.up or stated_up
     if given is None:
-        up, reason = estimate_scene_up(solid.means, centre, radius)
+        up, reason, is_sure = estimate_scene_up(solid.means, centre, radius)
     else:
-        up = torch.nn.functional.normalize(torch.tensor(given), dim=0)
+        up, is_sure = torch.nn.functional.normalize(torch.tensor(given), dim=0), True
         reason = "as given" if options.up else "as the file's header states; another is named by --up"
     poses, dropped = _unoccluded_poses(scene, _positions(options, centre, radius, up), up, progress)
     width = options.picture_width
@@ -144,15 +145,22 @@ def place_virtual_cameras(
     cameras = pinhole(poses, focal, width=width, height=width * 3 // 4, prefix="look")
     axis = int(up.abs().argmax())
     along = f", thus {'xyz'[axis]} {'up' if up[axis] > 0 else 'down'}" if abs(float(up[axis])) >= _ALIGNED_COS else ""
+    text = f"up is taken to be {_shown(up)}{along}: {reason}"
+    upside_down = (
+        f"Where the picture is upside down or on its side, give the scene's up (up = {_list(-up)} turns it over)"
+    )
     report = [
-        f"a scene without photographs: {len(cameras)} pictures are made of it, from {options.look} {_shown(centre)}",
-        f"up is taken to be {_shown(up)}{along}: {reason}",
+        Note(
+            f"a scene without photographs: {len(cameras)} pictures are made of it, from {options.look} {_shown(centre)}"
+        ),
+        Note(text) if is_sure else Note(f"{text}. The picture shows it so.", "warning", upside_down),
     ]
     if dropped:
-        report.append(f"{dropped} of {options.views} views were left out: something stands in their way")
+        report.append(Note(f"{dropped} of {options.views} views were left out: something stands in their way"))
     inner = float(((solid.means - centre).norm(dim=1) < 0.5 * radius).float().mean())
     if options.look == "around" and inner < _HOLLOW_SHARE:
-        report.append("it is hollow: where it was seen from within, as a room from its middle, say look = within")
+        remedy = "Where it was seen from within, as a room from its middle, say look = within"
+        report.append(Note("the scene is hollow.", "warning", remedy))
     colors = rgb_from_dc(solid.sh[:, 0]).clamp(0, 1)
     return PosedImages((), cameras, solid.means, colors), tuple(report)
 
@@ -177,11 +185,12 @@ def dense_part(points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "3"], float]
 
 def estimate_scene_up(
     points: Float[Tensor, "m 3"], centre: Float[Tensor, "3"], radius: float
-) -> tuple[Float[Tensor, "3"], str]:
+) -> tuple[Float[Tensor, "3"], str, bool]:
     """Up direction of a scene: the normal of the largest plane in the dense part, on the side with more points.
 
     The conventions of files decide the sign where the normal is nearly z (+z, since there may be as much below a table
-    as on it), and where both sides are alike (-y, as structure from motion leaves it, or +z). With the reason.
+    as on it), and where both sides are alike (-y, as structure from motion leaves it, or +z). With the reason, and
+    whether the scene itself decided.
     """
     near = points[(points - centre).norm(dim=1) < 2 * radius]
     near = near[:: max(1, len(near) // _PLANE_POINTS)]
@@ -195,7 +204,7 @@ def estimate_scene_up(
     customary = normals[:, 1:].abs().amax(1) > _ALIGNED_COS
     best = int((counts * torch.where(customary, 1.0, _UNALIGNED_WEIGHT)).argmax())
     if counts[best] < _MIN_SHARE * len(near):
-        return torch.tensor([0.0, -1.0, 0.0]), "no level surface was found, and most files have it so"
+        return torch.tensor([0.0, -1.0, 0.0]), "no level surface was found, and most files have it so", False
     inliers = near[heights[best].abs() < thickness]
     middle = inliers.mean(0)
     normal = least_squares_normal(inliers - middle).float()
@@ -205,9 +214,9 @@ def estimate_scene_up(
     below = float(((height < -3 * thickness) & (height > -radius) & beside).sum())
     share = f"the normal of a surface that holds {float(counts[best]) / len(near):.0%} of the dense part"
     if abs(float(normal[2])) < _ALIGNED_COS and max(above, below) > _SIDE_RATIO * min(above, below) + 1:
-        return normal if above > below else -normal, f"{share}, on whose one side most things stand"
+        return normal if above > below else -normal, f"{share}, on whose one side most things stand", True
     customary_side = float(normal @ torch.tensor([0.0, -1.0, 1.0])) >= 0
-    return normal if customary_side else -normal, f"{share}; which of its sides is a guess by custom"
+    return normal if customary_side else -normal, f"{share}; which of its sides is a guess by custom", False
 
 
 def _positions(
@@ -277,6 +286,10 @@ def _directions(views: int, up: Float[Tensor, "3"], elevations_deg: tuple[float,
     elevation = torch.deg2rad(torch.tensor(elevations_deg))[index % len(elevations_deg)]
     flat = azimuth.cos()[:, None] * x + azimuth.sin()[:, None] * y
     return elevation.cos()[:, None] * flat + elevation.sin()[:, None] * up
+
+
+def _list(vector: Float[Tensor, "3"]) -> str:
+    return "[" + ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in vector.tolist()) + "]"
 
 
 def _shown(vector: Float[Tensor, "3"]) -> str:

@@ -130,13 +130,16 @@ class Capture:
         read = read_scene(self.capture, axes=self.axes)
         scene = read.gaussians
         found, report = place_virtual_cameras(scene, self.look, stated_up=read.metadata.up, progress=context.progress)
-        for sentence in (*read.said(), *report):
+        for sentence in read.said():
             context.console.say(f"{self.capture}: {sentence}")
         (folder / "images").mkdir()
         paths = tuple(folder / "images" / f"{name}.png" for name in found.cameras.names)
         for index, (path, camera) in enumerate(zip(paths, found.cameras, strict=True)):
             write_image(path, render(scene, camera).color[0].clamp(0, 1))
             context.progress(index + 1, len(paths), "pictures of the scene")
+        for note in report:
+            picture = paths[0] if note.in_doubt else None
+            context.console.tell(replace(note, text=f"{self.capture}: {note.text}", picture=picture))
         return replace(found, image_paths=paths)
 
     def _photos(self, folder: Path, context: Context) -> PhotoFiles:
