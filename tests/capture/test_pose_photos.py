@@ -99,7 +99,7 @@ def test_where_less_than_half_is_posed_all_is_done_once_more_and_the_better_mode
     assert "only 3 of 8 photos got a pose: all is done once more with more features" in said[1]
     assert "about 20 min" in said[1]
     assert (report.registered, report.photos, report.missing) == (7, 8, (Unposed("07", 900, 12),))
-    assert "7 of 8 photos registered" in str(report)
+    assert "7 of 8 photos have a pose" in str(report)
     assert "without a pose: 07 (900 features, at most 12 matches: of another place" in str(report)
     assert len(posed) == 7
     assert posed.image(0).shape == (30, 40, 3)

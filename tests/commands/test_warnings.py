@@ -117,6 +117,9 @@ def test_exposures_are_warned_of_once_in_a_run(tmp_path: Path, capsys: pytest.Ca
     for side in ("source", "target"):
         exposed(tmp_path / "photos" / side, [fixed(1 / 60), fixed(1 / 15)])
     assert main(["run", str(path), "--to", "reconstruct"]) == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if "expected one exposure" in line]
+    lines = capsys.readouterr().err.splitlines()
+    said = [line for line in lines if "expected one exposure" in line]
     assert len(said) == 2
     assert len(set(said)) == 2
+    # nor is the device, which all steps share
+    assert sum(line.startswith("device: ") for line in lines) == 1

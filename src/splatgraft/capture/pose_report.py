@@ -122,8 +122,8 @@ class PoseReport:
     def __str__(self) -> str:
         """One line for people."""
         line = (
-            f"{self.registered} of {self.photos} photos registered, mean reprojection error "
-            f"{self.mean_reprojection_px:.2f} px, {self.points} points, {self.explained:.0%} of matches explained"
+            f"{self.registered} of {self.photos} photos have a pose, with a mean reprojection error of "
+            f"{self.mean_reprojection_px:.2f} px over {self.points:,} points"
         )
         if self.lenses:
             low, high = (limit(lens.focal_px for lens in self.lenses) for limit in (min, max))

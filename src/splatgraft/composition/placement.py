@@ -107,7 +107,7 @@ def place_object(
         support=support,
         hidden_fraction=hidden,
         coverage=Coverage.of(photographs, views, support.normal),
-        warnings=tuple(Note(reason, "warning") for reason in found.reasons) + _warnings(support, hidden),
+        warnings=found.notes + _warnings(support, hidden),
     )
 
 
@@ -144,10 +144,11 @@ def _warnings(support: Support, hidden: float) -> tuple[Note, ...]:
         text = f"{hidden:.0%} of the object is hidden from every camera: it may stick in a wall or in furniture."
         found.append(Note(text, "warning"))
     if support.flat_fraction < 0.6:
-        found.append(Note(f"Only {support.flat_fraction:.0%} of the ground under the object is level.", "warning"))
+        text = f"The object stands on uneven ground: {support.flat_fraction:.0%} of what is under it is level."
+        found.append(Note(text, "warning", "Move it (compose: at), or make it smaller (scale)"))
     if support.obstructed_fraction > 0.1:
-        taken = support.obstructed_fraction
-        found.append(Note(f"{taken:.0%} of the ground under the object is taken by something else.", "warning"))
+        text = f"The object cuts into something: {support.obstructed_fraction:.0%} of its place is taken."
+        found.append(Note(text, "warning", "Move it (compose: at), or make it smaller (scale)"))
     return tuple(found)
 
 

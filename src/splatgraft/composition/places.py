@@ -12,6 +12,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up, focus_point
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import render
+from splatgraft.runtime.note import Note
 
 # set by hand
 _VIEWS, _VIEW_WIDTH_PX = 12, 240
@@ -62,8 +63,8 @@ class Suggestion:
     """Share of the ground under the object that is level, in [0, 1]."""
     visible_fraction: float
     """Share of the views that show the object's base point, in [0, 1]."""
-    reasons: tuple[str, ...] = ()
-    """Why it is not as good as wanted, one sentence each; none where it is."""
+    notes: tuple[Note, ...] = ()
+    """What is not as good as wanted; none where all is."""
 
 
 def suggest_places(
@@ -81,7 +82,7 @@ def suggest_places(
     view, the nearest to it is given with the reason. At least one, apart from each other by the object's radius; a
     ValueError where there is no surface.
     """
-    focus, reach, reasons = _search_area(target, cameras)
+    focus, reach, notes = _search_area(target, cameras)
     up = torch.nn.functional.normalize(up.to(focus), dim=0)
     # surfaces lie below most cameras; ceilings and lamps do not
     top = max(float(((cameras.centers - focus) @ up).median()), _MIN_TOP * reach)
@@ -104,27 +105,29 @@ def suggest_places(
             break
         size *= _SHRINK
     if size < wanted:
-        reasons.append(f"The object was made smaller by {size / wanted:.2f}, as no larger level place is in view.")
+        smaller = f"The object was made smaller, {size / wanted:.0%} of the guess: no larger level place is in view."
+        notes.append(Note(smaller, "minor"))
     if not float(score.max()) > _MIN_SCORE:
         # nothing is level and in view: flatness and view each count a little by themselves
         score = (0.05 + flat**2) * (0.05 + visible) * central * (ground.alpha > 0.5)
-        reasons.append("No level place is in view of the cameras: this one is the nearest to it.")
+        notes.append(Note("No level place is in view of the cameras: this one is the nearest to it.", "warning"))
     apart = max(size * base.radius, 2 * ground.pixel)
     found: list[Suggestion] = []
     score, points = score.flatten().clone(), ground.points.reshape(-1, 3)
     while len(found) < _MAX_PLACES and float(score.max()) > 0:
         best = int(score.argmax())
         shares = float(flat.flatten()[best]), float(visible.flatten()[best])
-        said = reasons
+        said = notes
         if float(carried.flatten()[best]) < _NEAR_THE_EDGE:
-            said = [*reasons, "It stands near the edge of what carries it: no free place in view has more room."]
+            edge = "It stands near the edge of what carries it: no free place in view has more room."
+            said = [*notes, Note(edge, "warning")]
         found.append(Suggestion(points[best], size, *shares, tuple(said)))
         score[(points - points[best]).norm(dim=-1) < apart] = 0
     return found
 
 
-def _search_area(target: Gaussians, cameras: Cameras) -> tuple[Float[Tensor, "3"], float, list[str]]:
-    """Middle and half width of the searched square, and a reason where the cameras do not look at one place."""
+def _search_area(target: Gaussians, cameras: Cameras) -> tuple[Float[Tensor, "3"], float, list[Note]]:
+    """Middle and half width of the searched square, and what is amiss where the cameras do not look at one place."""
     up = estimate_up(cameras)
     try:
         focus = focus_point(cameras)
@@ -132,7 +135,7 @@ def _search_area(target: Gaussians, cameras: Cameras) -> tuple[Float[Tensor, "3"
         focus = cameras.centers.median(0).values
         away = (target.means[target.opacities > 0.5] - focus).norm(dim=1)
         reach = _REACH * float(away.median()) if len(away) else 1.0
-        return focus, reach, ["The cameras do not look at one place: the object stands between them."]
+        return focus, reach, [Note("The cameras do not look at one place: the object stands between them.", "warning")]
     away = cameras.centers - focus
     across = (away - (away @ up)[:, None] * up).norm(dim=-1)
     return focus, max(_REACH * float(across.median()), 1e-6), []

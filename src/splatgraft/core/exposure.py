@@ -91,6 +91,6 @@ def describe_inconsistency(exposures: Sequence[Exposure]) -> str | None:
     if not found:
         return None
     return (
-        f"expected one exposure and one white balance for all photos, found {' and '.join(found)}; where a surface's "
-        f"colour changes between photos, fog and colour patches are reconstructed: lock both when capturing"
+        f"brightness or colour changes from photo to photo, which can leave fog and patches of colour: expected one "
+        f"exposure and one white balance, found {' and '.join(found)}; lock both when capturing"
     )

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from splatgraft.composition import ObjectBase, PlaceOptions, place_object, rest_on_surface
+from splatgraft.composition import ObjectBase, Placed, PlaceOptions, place_object, rest_on_surface
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
@@ -119,11 +119,10 @@ class PlaceableObject:
 
 def suggest_placement(
     target: Gaussians, item: PlaceableObject, cameras: Cameras, options: PlaceOptions = PlaceOptions()
-) -> Similarity:
+) -> Placed:
     """A visible, level place at a plausible size, found as by `compose` with `options`; ValueError where is none."""
     both = (cameras, item.cameras)
-    placed = place_object(target, item.gaussians, cameras=both, surroundings=item.surroundings, options=options)
-    return placed.target_from_object
+    return place_object(target, item.gaussians, cameras=both, surroundings=item.surroundings, options=options)
 
 
 def drop_to_surface(
@@ -162,7 +161,8 @@ def plausible_scale(
         target_from_object.points(item.base.point)
         + 0.25 * target_from_object.scale * item.base.height * estimate_up(cameras)
     ).tolist()
-    return suggest_placement(target, item, cameras, PlaceOptions(point=(x, y, z), yaw_deg=0.0)).scale
+    options = PlaceOptions(point=(x, y, z), yaw_deg=0.0)
+    return suggest_placement(target, item, cameras, options).target_from_object.scale
 
 
 def place_beside(

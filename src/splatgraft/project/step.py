@@ -153,7 +153,7 @@ def choose_device(wanted: str, console: Console) -> "torch.device":
         raise ValueError("--device: expected a CUDA device that torch can use, found none; splatgraft doctor says more")
     device = "cuda" if wanted != "cpu" and has_cuda else "cpu"
     reason = "no CUDA device found" if wanted == "auto" and not has_cuda else f"--device {wanted}"
-    console.say(f"device: {device} ({reason})")
+    console.say_once(f"device: {device} ({reason})")
     return torch.device(device)
 
 

@@ -25,6 +25,13 @@ class Console:
         self._errors = rich.console.Console(stderr=True, highlight=False)
         self._results = rich.console.Console(highlight=False, soft_wrap=True)
         self._warned: list[Note] = []
+        self._said: set[str] = set()
+
+    def say_once(self, sentence: str) -> None:
+        """Print one line on standard error, where it was not said before."""
+        if sentence not in self._said:
+            self._said.add(sentence)
+            self.say(sentence)
 
     def say(self, sentence: str) -> None:
         """Print one line on standard error."""

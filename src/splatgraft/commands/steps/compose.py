@@ -115,8 +115,8 @@ def _size(placed: Placed, given: float | None, own: MetricScale | None, place: M
             name for name, scale in (("the object's capture", own), ("the target's capture", place)) if scale is None
         )
         why = (
-            f"a guess, three tenths of the image's height or what level ground there is, as the size of {missing} is "
-            "not known: splatgraft scale tells it, or --scale"
+            f"a guess, a third of the pictures' height or what there is room for, as the true size of {missing} is not "
+            "known: splatgraft scale tells it, or --scale"
         )
     return f"size: {'; '.join([*parts, why])}"
 

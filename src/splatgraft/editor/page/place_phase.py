@@ -188,8 +188,11 @@ class PlacePhase(Phase):
         options = replace(options, scale=session.true_scale()) if options.scale is None else options
         target = session.scenes.gaussians(session.files.target_scene)
         placed = suggest_placement(target, item, cameras, options)
-        session.change(replace(session.state, objects=(ObjectPlacement(placed),)))
-        self._context.say("placed on a level, visible surface; drag it, or type numbers")
+        session.change(replace(session.state, objects=(ObjectPlacement(placed.target_from_object),)))
+        doubts = " ".join(note.text for note in placed.warnings)
+        self._context.say(
+            f"placed. {doubts}" if doubts else "placed on a level, visible surface; drag it, or type numbers"
+        )
 
     def _choose(self) -> None:
         self._chosen = list(self._object_choice.options).index(self._object_choice.value)
@@ -227,7 +230,7 @@ class PlacePhase(Phase):
         # objects that are placed already count as part of the scene
         scene = session.scenes.composite(session.placed_state()).merged()[0]
         placed = suggest_placement(scene, item, session.scenes.cameras(session.files.target_cameras))
-        self._append(ObjectPlacement(placed, path))
+        self._append(ObjectPlacement(placed.target_from_object, path))
 
     def _append(self, item: ObjectPlacement) -> None:
         session = self._context.require_session()

@@ -34,6 +34,9 @@ _SOURCE_NUMBERS = {
 }
 """Fields of a source that are one number, and its bounds; a light.json leaves out what is infinite."""
 
+_WEAK, _STRONG = 0.25, 0.6
+"""Shares of a source in the light on what faces it, below and above which words say so."""
+
 
 @dataclass(frozen=True)
 class LightSource:
@@ -105,17 +108,21 @@ class Light:
         return replace(self, sources=sources, ambient=ambient)
 
     def describe(self, up: Float[Tensor, "3"]) -> str:
-        """One line for a report, such as 'sun 62 degrees high, 71% of the light on what faces it; window 20 degrees
-        high (the direction is uncertain), 9%; 38% of what is overhead was not photographed'."""
-        parts = []
+        """One line for a report, such as 'strong light from the sun 62 degrees high (71% of the light on what faces
+        it), a window 20 degrees high (9%; its direction is uncertain); 38% of what is overhead was not photographed'.
+        """
+        named, strongest = [], 0.0
         for source in self.sources[:3]:
             direction = torch.tensor(source.direction)
             height = math.degrees(math.asin(max(-1.0, min(1.0, float(direction @ up)))))
             share = sum(source.irradiance) / float(self.irradiance(direction[None]).sum())
-            doubt = " (the direction is uncertain)" if source.uncertainty_deg > _UNCERTAIN_DEG else ""
-            faces = "" if parts else " of the light on what faces it"
-            parts.append(f"{source.name} {height:.0f} degrees high{doubt}, {100 * share:.0f}%{faces}")
-        parts = parts or ["even light without a clear source"]
+            strongest = max(strongest, share)
+            doubt = "; its direction is uncertain" if source.uncertainty_deg > _UNCERTAIN_DEG else ""
+            faces = "" if named else " of the light on what faces it"
+            which = "the" if source.name.startswith("sun") and " or " not in source.name else "a"
+            named.append(f"{which} {source.name} {height:.0f} degrees high ({share:.0%}{faces}{doubt})")
+        lead = "mostly even light, some" if strongest < _WEAK else "light" if strongest < _STRONG else "strong light"
+        parts = [f"{lead} from {', '.join(named)}" if named else "even light without a clear source"]
         if self.unseen_up > 0.05:
             parts.append(f"{100 * self.unseen_up:.0f}% of what is overhead was not photographed")
         return "; ".join([*parts, f"{100 * self.coverage:.0f}% of the surroundings were photographed"])
