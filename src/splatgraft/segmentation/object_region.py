@@ -41,6 +41,9 @@ _CAMERAS_IN_FRONT = 0.95
 """Least share of the cameras in front of the support."""
 _ABOVE_SUPPORT = 1.5
 """Least height of a point above the support, over the support's thickness."""
+_NEAR_SUPPORT = -3.0
+"""Height over the support's thickness from which the pictures decide whether a point is the object's: a support that is
+found too high takes no foot."""
 _MIN_POINTS = 20
 """Fewer points give a cube around the middle."""
 _CUBE = 0.5
@@ -98,8 +101,8 @@ class ObjectRegion:
         return inside & torch.from_numpy(np.isfinite(apart)).to(inside.device)
 
     def allows(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        """Which points may be the object's whatever the pictures say: not behind the support, nor far from the box."""
-        inside = _above(points, self.support, 0.0)
+        """Which points may be the object's, as the pictures say: not far below the support, nor far from the box."""
+        inside = _above(points, self.support, _NEAR_SUPPORT)
         return inside & self.box.grown(_BEYOND).contains(points) if self.is_whole else inside
 
 
