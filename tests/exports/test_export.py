@@ -280,6 +280,10 @@ def test_a_turntable_as_video(project, source, tmp_path, capsys):
     # lossy, and colour at half of the size; frames of the path are below 25 dB apart
     assert psnr(found[0], expected) > 28
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+    # it is no wider than what was captured unless that is asked for
+    assert main([*words[:-4], "--frames", "2"]) == 0
+    assert source.cameras is not None
+    assert f" of {int(source.cameras.sizes[0, 0])} x " in capsys.readouterr().err
 
 
 def test_a_turntable_by_pyav_where_it_is_installed(tmp_path):

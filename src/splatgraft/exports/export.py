@@ -19,6 +19,7 @@ from splatgraft.runtime.progress import Progress, silent
 _WORLD_SUFFIXES = (".glb", ".usdz")
 """Formats whose y points up and whose unit is a metre."""
 
+_WIDTH = 1280
 _MIN_WIDTH = 16
 """Pixels."""
 _PART_BACKGROUND = 0.8
@@ -45,8 +46,8 @@ class ExportOptions:
     """Version of a .spz: 4, or 3 or 2 for programs that do not read it yet."""
     sh_degree: int = 3
     """Highest SH degree that is written, 0 to 3: files of lower ones are smaller, and highlights move less."""
-    width: int = 1280
-    """Width of pictures and videos, pixels."""
+    width: int | None = None
+    """Width of pictures and videos, pixels; 1280 where not given, and for a turntable at most the captured images'."""
     frames: int = 120
     """Number of pictures of a turntable; 24 are a second."""
 
@@ -73,8 +74,9 @@ def export_scene(
         raise ValueError(f"{to}: expected a file that ends in {', '.join(EXPORT_SUFFIXES)}, found '{to.suffix}'")
     if not 0 <= options.sh_degree <= spherical_harmonics.MAX_DEGREE:
         raise ValueError(f"--sh-degree: expected 0 to {spherical_harmonics.MAX_DEGREE}, found {options.sh_degree}")
-    if options.width < _MIN_WIDTH:
-        raise ValueError(f"--width: expected {_MIN_WIDTH} pixels or more, found {options.width}")
+    width = options.width or _WIDTH
+    if width < _MIN_WIDTH:
+        raise ValueError(f"--width: expected {_MIN_WIDTH} pixels or more, found {width}")
     gaussians, said = layer_of(source, options.layer, progress=progress)
     gaussians = _limited(gaussians, options)
     if suffix in WRITTEN_SCENE_SUFFIXES:
@@ -82,11 +84,13 @@ def export_scene(
     view, assumed = first_view(source)
     said = (*said, *assumed)
     if suffix in _TURNTABLES:
-        cameras = path_around(source, view, frames=options.frames, width=options.width)
+        if options.width is None and source.cameras is not None:
+            width = min(width, int(source.cameras.sizes[0, 0]))
+        cameras = path_around(source, view, frames=options.frames, width=width)
         return (*said, write_turntable(to, gaussians, cameras, progress=progress))
     if suffix in _PICTURES:
         with_alpha = options.layer != "all" and suffix == ".png"
-        write_picture(to, gaussians, view, width=options.width, with_alpha=with_alpha)
+        write_picture(to, gaussians, view, width=width, with_alpha=with_alpha)
         return said
     scenes = {source.title: gaussians}
     if options.layer == "all" and source.pasted is not None:

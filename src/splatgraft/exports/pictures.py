@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -93,15 +94,19 @@ def _by_pyav(path: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
 def _by_opencv(path: Path, partial: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
     import cv2
 
-    writer = None
-    for frame in frames:
-        pixels = _bytes(frame)
-        if writer is None:
-            size = (pixels.shape[1], pixels.shape[0])
-            writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"vp09"), FPS, size)
-            if not writer.isOpened():
-                raise ValueError(f"{path}: expected OpenCV to encode VP9, found that it cannot; pip install av")
-        writer.write(pixels[..., ::-1])
+    writer, written = None, None
+    # a frame is encoded while the next one is made
+    with ThreadPoolExecutor(1) as pool:
+        for frame in frames:
+            pixels = _bytes(frame)
+            if writer is None:
+                size = (pixels.shape[1], pixels.shape[0])
+                writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"vp09"), FPS, size)
+                if not writer.isOpened():
+                    raise ValueError(f"{path}: expected OpenCV to encode VP9, found that it cannot; pip install av")
+            if written is not None:
+                written.result()
+            written = pool.submit(writer.write, np.ascontiguousarray(pixels[..., ::-1]))
     if writer is not None:
         writer.release()
     return "VP9"
