@@ -172,6 +172,15 @@ def test_a_floor_below_haze_is_where_it_is():
     assert float(heights.max()) < 0.03
 
 
+def test_a_cloth_with_folds_is_level_ground():
+    cloth = sheet((0, 0, TABLE), (0.6, 0, 0), (0, 0.4, 0), spacing=0.01)
+    folds = 0.01 * torch.sin(60 * cloth.means[:, 0])
+    cloth = replace(cloth, means=cloth.means + folds[:, None] * UP)
+    found = support_below(cloth, torch.tensor([0.0, 0, TABLE + 0.05]), up=UP, radius=0.1)
+    assert found.flat_fraction > 0.8
+    assert found.obstructed_fraction < 0.05
+
+
 def test_support_beside_the_table_is_the_floor_and_nothing_below_is_said():
     found = support_below(room(), torch.tensor([-1.2, 1.0, 1.0]), up=UP, radius=0.15)
     assert abs(float(found.point[2])) < 0.01

@@ -9,7 +9,7 @@ Gaussians are, the mean stands, so that what reaches beyond them does not count 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
@@ -139,8 +139,10 @@ _LEVEL_STEP = 0.05
 """Width of a bin of the histogram of heights."""
 _TOLERANCES = (0.3, 0.2, 0.12, 0.08, 0.06, 0.06)
 """Distance from the plane of the points that each fit takes: from 20 degrees of slope to surface noise."""
-_ON_SURFACE, _ABOVE = 0.06, 0.1
-"""Largest distance from the plane of a point that lies on it, and least of one that obstructs the disc."""
+_ON_SURFACE = 0.06
+"""Largest distance of a point from the plane that is fitted to it."""
+_LEVEL = 0.15
+"""Distance from the plane within which ground is level, folds of a cloth included; what is higher obstructs."""
 _MAX_ERROR = 0.12
 """Bound on the distance of a point when a sloped plane is compared with a level one."""
 _SLOPE_GAIN = 0.7
@@ -156,7 +158,7 @@ class Support:
     normal: Float[Tensor, "3"]
     """Unit, upwards."""
     flat_fraction: float
-    """Share of the disc around it that lies on the plane, in [0, 1]."""
+    """Share of the disc around it that lies at the plane's level, in [0, 1]."""
     obstructed_fraction: float
     """Share of the disc that rises above the plane, in [0, 1]."""
 
@@ -189,14 +191,13 @@ def support_below(
         where = ", ".join(f"{x:.3g}" for x in point.tolist())
         raise ValueError(f"placement: expected a surface below ({where}), found none; name another point")
     points = ground.points[solid] - point
-    on_plane, normal, height = _fit_level_plane(points, ground.heights[solid], up=up, radius=radius)
-    flat = float(on_plane.sum() / disc.sum())
-    above = (points @ normal - height) > _ABOVE * radius
+    normal, height = _fit_level_plane(points, ground.heights[solid], up=up, radius=radius)
+    rise = (points @ normal - height) / radius
     return Support(
         point=point + up * height / (normal @ up),
         normal=normal,
-        flat_fraction=flat,
-        obstructed_fraction=float((above & ~on_plane).sum() / disc.sum()),
+        flat_fraction=float((rise.abs() < _LEVEL).sum() / disc.sum()),
+        obstructed_fraction=float((rise > _LEVEL).sum() / disc.sum()),
     )
 
 
@@ -206,8 +207,8 @@ def _fit_level_plane(
     *,
     up: Float[Tensor, "3"],
     radius: float,
-) -> tuple[Bool[Tensor, "m"], Float[Tensor, "3"], Float[Tensor, ""]]:
-    """Points on the most frequent level, its normal and its distance along the normal from the origin."""
+) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
+    """The normal of the most frequent level and its distance along it from the origin."""
     step = _LEVEL_STEP * radius
     # a moving sum of five bins: noise and a slight slope spread one surface over several
     counts = torch.bincount(((heights - heights.min()) / step).long())
@@ -231,5 +232,4 @@ def _fit_level_plane(
     errors = [(points @ n - d).abs().clamp_max(cap).mean() for n, d in ((normal, distance), (up, height))]
     if errors[0] > _SLOPE_GAIN * errors[1]:
         normal, distance = up, height
-    near = (points @ normal - distance).abs() < _ON_SURFACE * radius
-    return near, normal, distance
+    return normal, distance
