@@ -75,3 +75,16 @@ def test_a_capture_that_was_posed_does_not_make_the_rest_seem_slow(tmp_path: Pat
     planned = estimate_step_times(flow, [name for name in flow.steps if name != "source/capture"])
     assert sum(step.seconds for step in planned) <= sum(before.values())
     assert "half or twice" in describe_estimate(planned)
+
+
+def test_masks_that_have_to_be_cut_and_larger_pictures_take_longer(tmp_path: Path) -> None:
+    photos(tmp_path / "source", 40)
+    photos(tmp_path / "target", 40)
+    cut = seconds(tmp_path)
+    assert cut["segment"] > 30
+    for photo in list((tmp_path / "source" / "images").iterdir()):
+        write_image(photo.with_name(f"{photo.stem}_mask.png"), torch.ones(30, 40))
+    assert seconds(tmp_path)["segment"] < 0.3 * cut["segment"]
+    for photo in (tmp_path / "target" / "images").iterdir():
+        write_image(photo, torch.zeros(1200, 1600, 3))
+    assert seconds(tmp_path)["render"] > 2 * cut["render"]

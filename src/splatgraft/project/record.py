@@ -15,6 +15,9 @@ STEP_FILE = "step.json"
 Entry = tuple[str, int, int, str]
 """Name, size in bytes, modification time in ns, sha256 of one input file."""
 
+_LONGEST_REASON = 100
+"""Characters; what changed is left out where it is longer."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -109,7 +112,8 @@ def why_stale(job: Job) -> str | None:
     before = {**json.loads(json.dumps(job.defaults)), **record.options}
     for key in sorted(options):
         if options.get(key) != before.get(key):
-            return f"{key} is now {options.get(key)}, was {before.get(key)}"
+            text = f"{key} is now {options.get(key)}, was {before.get(key)}"
+            return text if len(text) < _LONGEST_REASON else f"{key} changed"
     for role in sorted({*job.inputs, *record.inputs}):
         before = record.inputs.get(role, ())
         now = input_entries(job.inputs.get(role, ()), before)

@@ -1,12 +1,16 @@
 """Time estimate of the steps of a run, from their earlier runs, or else from their inputs and typical times."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
 from splatgraft.capture import VIDEO_FRAMES, predict_pose_seconds
 from splatgraft.commands.steps.capture import Capture
 from splatgraft.commands.steps.reconstruct import Reconstruct
+from splatgraft.commands.steps.render import Render
+from splatgraft.commands.steps.segment import Segment
 from splatgraft.core.cameras import Cameras, pinhole
 from splatgraft.core.images import stored_size
 from splatgraft.editor.jobs import PlannedStep
@@ -23,10 +27,10 @@ _TYPICAL_SECONDS = {
     "capture": 1.0,
     "adopt": 0.2,
     "reconstruct": 56.0,
-    "segment": 6.0,
+    "segment": 5.0,
     "compose": 0.2,
     "relight": 15.0,
-    "render": 6.0,
+    "render": 1.0,
     "harmonize": 1.1,
     "consolidate": 2.0,
     "evaluate": 3.0,
@@ -34,6 +38,12 @@ _TYPICAL_SECONDS = {
 """Seconds in a first `splatgraft demo` on two cores, compilation of kernels included.
 
 Another project differs by a factor, which its finished steps give."""
+_SECONDS_PER_CUT = 1.2
+"""Of each photo whose mask has to be cut."""
+_SECONDS_PER_VIEW, _SECONDS_PER_MEGAPIXEL = 0.12, 0.2
+"""Of each picture of the place that is rendered."""
+_FACTOR = 2.0
+"""Largest factor by which finished steps correct the typical times, and its inverse the least."""
 _COMPILATION_SECONDS = 25.0
 """Seconds that compiling the kernels takes in a first reconstruction, a part of its typical time."""
 
@@ -48,6 +58,7 @@ def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, 
     typical = {name: _typical_seconds(step, flow) for name, step in flow}
     known = [name for name in measured if measured[name] > 0]
     factor = sum(measured[name] for name in known) / sum(typical[name] for name in known) if known else 1.0
+    factor = min(max(factor, 1 / _FACTOR), _FACTOR)
     return tuple(
         PlannedStep(name, measured[name], True)
         if name in measured
@@ -80,8 +91,14 @@ def _typical_seconds(step: Step, flow: Flow) -> float:
         if isinstance(step, Capture):
             return typical + predict_pose_seconds(_photos_to_pose(step))
         if isinstance(step, Reconstruct) and not torch.cuda.is_available():
-            seconds = predict_cpu_seconds(_cameras_to_fit(step, flow), step.options) / 2
+            seconds = predict_cpu_seconds(_views_of(step.capture, flow).cameras, step.options) / 2
             return _COMPILATION_SECONDS + seconds
+        if isinstance(step, Segment) and step.mask_source in ("auto", "grabcut") and step.masks is None:
+            return typical + _SECONDS_PER_CUT * _views_of(step.capture, flow).without_masks
+        if isinstance(step, Render):
+            cameras = _views_of(step.cameras, flow).cameras
+            megapixels = cameras.width * cameras.height / 1e6
+            return typical + len(cameras) * (_SECONDS_PER_VIEW + _SECONDS_PER_MEGAPIXEL * megapixels)
     except (ValueError, OSError):
         pass
     return typical
@@ -95,14 +112,27 @@ def _photos_to_pose(step: Capture) -> int:
     return len(find_photos(step.capture).paths) if step.capture.is_dir() else VIDEO_FRAMES
 
 
-def _cameras_to_fit(step: Reconstruct, flow: Flow) -> Cameras:
-    """The cameras of its capture, or, before that is made, one as large as the first photo will be."""
-    if has_poses(step.capture):
-        return read_capture(step.capture).cameras
-    made_by = next(made_by for _, made_by in flow if made_by.out == step.capture)
-    width, height = 1600, 1200
-    if isinstance(made_by, Capture) and made_by.capture.is_dir():
-        if has_poses(made_by.capture):
-            return read_capture(made_by.capture).cameras
-        width, height = stored_size(find_photos(made_by.capture).paths[0])
-    return pinhole(torch.eye(4)[None], float(width), width=width, height=height)
+@dataclass(frozen=True)
+class _Views:
+    """What a capture has, or will have."""
+
+    cameras: Cameras
+    """Of sizes that are right; before the capture is made, their poses are not."""
+    without_masks: int
+
+
+def _views_of(capture: Path, flow: Flow) -> _Views:
+    """Of a capture, or, before it is made, of what it will be made of."""
+    made_by = next((made_by for _, made_by in flow if made_by.out in (capture, capture.parent)), None)
+    given = made_by.capture if isinstance(made_by, Capture) and not has_poses(capture) else capture
+    if has_poses(given):
+        posed = read_capture(given)
+        return _Views(posed.cameras, len(posed) - len(posed.with_masks()))
+    (width, height), photos = (1600, 1200), VIDEO_FRAMES
+    without_masks = photos
+    if given.is_dir():
+        found = find_photos(given)
+        (width, height), photos = stored_size(found.paths[0]), len(found.paths)
+        without_masks = photos - sum(mask is not None for mask in found.masks)
+    poses = torch.eye(4).repeat(photos, 1, 1)
+    return _Views(pinhole(poses, float(width), width=width, height=height), without_masks)
