@@ -123,7 +123,8 @@ class _Views:
 
 def _views_of(capture: Path, flow: Flow) -> _Views:
     """Of a capture, or, before it is made, of what it will be made of."""
-    made_by = next((made_by for _, made_by in flow if made_by.out in (capture, capture.parent)), None)
+    capture = capture.parent if capture.suffix == ".json" else capture
+    made_by = next((made_by for _, made_by in flow if made_by.out == capture), None)
     given = made_by.capture if isinstance(made_by, Capture) and not has_poses(capture) else capture
     if has_poses(given):
         posed = read_capture(given)
