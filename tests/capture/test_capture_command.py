@@ -17,6 +17,8 @@ from splatgraft.cli import main
 from splatgraft.commands.steps.reconstruct import far_worse
 from splatgraft.core import images
 from splatgraft.core.exposure import Exposure
+from splatgraft.core.posed_images import LeftOut
+from splatgraft.folders.capture_files import left_out_notes
 from splatgraft.formats import read_capture
 from splatgraft.formats.captures.exif import exif_of, read_exposure
 from splatgraft.formats.captures.photo_archive import unpack_photos
@@ -43,6 +45,13 @@ def change(folder: Path, *frames: int, **keys: object) -> None:
     for entry in [meta["frames"][index] for index in frames] if frames else [meta]:
         entry.update(keys)
     path.write_text(json.dumps(meta))
+
+
+@pytest.mark.parametrize(("kept", "level"), [(50, "minor"), (20, "warning")])
+def test_a_capture_with_plenty_of_photos_is_not_in_doubt_for_those_left_out(kept: int, level: str) -> None:
+    left_out = [LeftOut(f"{i}.jpg", f"{i}.jpg: expected an image file, found none") for i in range(17)]
+    head, _ = left_out_notes(Path("fox"), kept, left_out)
+    assert (head.level, f"goes on with {kept} of {kept + 17} images" in head.text) == (level, True)
 
 
 def test_what_is_not_usable_is_named_counted_and_left_out(tmp_path: Path, capture) -> None:

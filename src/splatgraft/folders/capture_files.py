@@ -13,6 +13,8 @@ from splatgraft.runtime.note import Note
 
 _NAMED = 8
 """Most images that a message names."""
+_PLENTY = 40
+"""Images that are enough whatever is left out."""
 _FEW = 4
 """Photos kept per photo left out from which on the capture is not in doubt; set by hand."""
 
@@ -78,7 +80,7 @@ def left_out_notes(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[N
         f"left out: {reasons[0]}" + (f" (and {len(reasons) - 1} more alike)" if len(reasons) > 1 else "")
         for reasons in alike.values()
     ]
-    level = "minor" if _FEW * len(left_out) <= kept else "warning"
+    level = "minor" if _FEW * len(left_out) <= kept or kept >= _PLENTY else "warning"
     return [Note(head, level), *(Note(line) for line in lines[:_NAMED])]
 
 
