@@ -3,8 +3,7 @@
     python data/render_table.py build/table --blender-python .venv-blender/bin/python
 
 A room of the generator (kitchen, seed 71000) whose window gets a sun that shines onto the table; 28 cameras around the
-table at three heights, 576x400, 20 samples and the denoiser; about 22 CPU-minutes. Writes a capture of JPEG files. The
-gallery's pictures are of a larger one: `--size 1280x888 --samples 12 --views 20`, about 46 CPU-minutes.
+table at three heights, 576x400, 20 samples and the denoiser; about 22 CPU-minutes. Writes a capture of JPEG files.
 """
 
 import argparse
@@ -23,6 +22,7 @@ from splatgraft_paper.synthesis.places import make_scene
 from splatgraft_paper.synthesis.scene import Lamp, Scene, capture_cameras
 
 SEED = 71000
+VIEWS = 28
 OBJECT_HEIGHT = 0.2
 """Metres: cameras are placed for an object of this height."""
 
@@ -47,20 +47,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--blender-python", type=Path, required=True)
-    parser.add_argument("--size", default="576x400")
-    parser.add_argument("--samples", type=int, default=20)
-    parser.add_argument("--views", type=int, default=28)
     arguments = parser.parse_args()
-    scene, (width, height) = kitchen(), map(int, arguments.size.split("x"))
-    cameras = capture_cameras(scene, scene.places[0], OBJECT_HEIGHT, arguments.views, SEED)
+    scene = kitchen()
+    cameras = capture_cameras(scene, scene.places[0], OBJECT_HEIGHT, VIEWS, SEED)
     takes = (Take("target", scene=True, passes=("color", "depth")),)
-    job = Job(scene=scene, objects={}, cameras=cameras, takes=takes, size=RenderSize(width, height, arguments.samples))
+    job = Job(scene=scene, objects={}, cameras=cameras, takes=takes, size=RenderSize(576, 400, 20))
     rendered = arguments.out / "render"
     render_job(job, rendered, arguments.blender_python)
     folder = arguments.out / "table"
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "images").mkdir(parents=True)
-    names = tuple(f"{index:04d}.jpg" for index in range(arguments.views))
+    names = tuple(f"{index:04d}.jpg" for index in range(VIEWS))
     posed = rendered_cameras(rendered, names)
     points, colors = sparse_points(rendered / "target", posed, count=12_000)
     for index, name in enumerate(names):
