@@ -6,12 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 from test_measure import example_truth, view
+from tiny_project import ball
 
-from splatgraft.core.cameras import pinhole
+from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.evaluation import evaluate, measure, true_views
-from splatgraft.folders.evaluated_scenes import Pictures
+from splatgraft.folders.evaluated_scenes import EvaluatedScenes, Pictures
 
 TRUTHS = [example_truth(shadow, seed) for seed, shadow in enumerate((0.5, 0.97, 0.6))]
 
@@ -67,9 +68,26 @@ def test_a_view_of_the_whole_object_is_shown_before_a_larger_one_that_is_cut() -
         mask[10 : 10 + size, left : left + size] = 1.0
         return Pictures(name, *(torch.zeros(40, 60, 3) for _ in range(3)), mask=mask)
 
-    cut, whole, small, tiny = at("cut", 0, 16), at("whole", 20, 10), at("small", 20, 9), at("tiny", 20, 4)
+    cut, whole, small, tiny = at("cut", 0, 16), at("whole", 20, 10), at("small", 20, 9), at("tiny", 20, 3)
     assert max((cut, whole, small), key=lambda p: p.prominence) is whole
     # one that hardly shows it is not
     assert max((cut, tiny), key=lambda p: p.prominence) is cut
     # nor one of the side that no photograph shows
     assert max((replace(whole, guessed_share=0.5), small), key=lambda p: p.prominence) is small
+
+
+def test_the_best_view_is_sought_among_all_cameras() -> None:
+    object_ = ball()
+    nothing = torch.zeros(object_.count, dtype=torch.bool)
+    eyes = torch.tensor([[0.0, -3.0, 0.5]]).repeat(30, 1)
+    # all but one look past it, so that the rim cuts it
+    aims = torch.tensor([[1.1, 0.0, 0.3]]).repeat(30, 1)
+    aims[17] = torch.tensor([0.0, 0.0, 0.3])
+    poses = torch.cat([look_at(eye[None], aim, torch.tensor([0.0, 0, 1])) for eye, aim in zip(eyes, aims, strict=True)])
+    cameras = pinhole(poses, 200.0, width=160, height=120)
+    scenes = EvaluatedScenes(object_, object_, ~nothing, nothing, cameras)
+    assert scenes.best_view == 17
+    # a narrower one that is cut is no better, and one of the whole object from nearer is
+    nearer = cameras.world_from_camera.clone()
+    nearer[5] = look_at(torch.tensor([[0.0, -2.5, 0.5]]), torch.tensor([0.0, 0.0, 0.3]), torch.tensor([0.0, 0, 1]))[0]
+    assert replace(scenes, cameras=pinhole(nearer, 200.0, width=160, height=120)).best_view == 5

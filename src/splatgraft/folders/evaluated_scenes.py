@@ -1,5 +1,6 @@
 """Pictures of the same views of result, composite and target, and of the ground truth where there is one."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,8 +22,10 @@ from splatgraft.project.layout import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
 from splatgraft.rendering import render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
-_CUT_OBJECT = 0.25
+_CUT_OBJECT = 0.05
 """What the coverage of an object counts that the picture's rim cuts; set by hand."""
+_LOOK_PX, _LOOKED_AT = 160, 40
+"""Longest side at which views are looked at for the best one, and how many at most."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +51,9 @@ class Pictures:
 
     @property
     def prominence(self) -> float:
-        """How well the view shows the object: its coverage as photographed, pixels; a quarter of it where the picture's
-        rim cuts it."""
-        rim = torch.cat([self.mask[0], self.mask[-1], self.mask[:, 0], self.mask[:, -1]])
-        cut = _CUT_OBJECT if bool((rim > 0.5).any()) else 1.0
-        return float(self.mask.sum()) * (1 - self.guessed_share) * cut
+        """How well the view shows the object: its coverage as photographed, pixels; a twentieth of it where the
+        picture's rim cuts it."""
+        return _prominence(self.mask, self.guessed_share)
 
 
 @dataclass(frozen=True)
@@ -106,18 +107,37 @@ class EvaluatedScenes:
         color = render(scene, camera).color
         return color[0].cpu().clamp(0, 1)
 
+    @property
+    def best_view(self) -> int:
+        """Which of the cameras, or of `_LOOKED_AT` of them, shows the object best, as `Pictures.prominence` has it."""
+        small = self.cameras.resized(min(1.0, _LOOK_PX / int(self.cameras.sizes.max())))
+        every = math.ceil(len(small) / _LOOKED_AT)
+        return max(range(0, len(small), every), key=lambda index: _prominence(*self._object_from(small[index])))
+
     def pictures_from(self, camera: Cameras) -> Pictures:
         """One view from any camera."""
-        flags = torch.stack([self.is_object, self.is_guessed], 1).float()
-        object_, guessed = render(self.composite, camera, features=flags).features[0].cpu().clamp(0, 1).unbind(-1)
+        object_, guessed_share = self._object_from(camera)
         return Pictures(
             name=camera.names[0],
             before=self.picture(self.composite.select(~self.is_object), camera),
             copy_paste=self.picture(self.composite, camera),
             result=self.picture(self.result, camera),
             mask=object_,
-            guessed_share=float(guessed.sum() / object_.sum().clamp_min(1e-6)),
+            guessed_share=guessed_share,
         )
+
+    def _object_from(self, camera: Cameras) -> tuple[Float[Tensor, "h w"], float]:
+        """The object's coverage, and how much of it no photograph shows."""
+        flags = torch.stack([self.is_object, self.is_guessed], 1).float()
+        drawn = render(self.composite, camera, features=flags, outputs=frozenset())
+        object_, guessed = drawn.features[0].cpu().clamp(0, 1).unbind(-1)
+        return object_, float(guessed.sum() / object_.sum().clamp_min(1e-6))
+
+
+def _prominence(mask: Float[Tensor, "h w"], guessed_share: float) -> float:
+    rim = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    cut = _CUT_OBJECT if bool((rim > 0.5).any()) else 1.0
+    return float(mask.sum()) * (1 - guessed_share) * cut
 
 
 @dataclass(frozen=True)
