@@ -90,7 +90,7 @@ def _place(found: EstimatedLight | NoLight, truth: Light) -> TrainingPlace:
 def log_irradiance(place: TrainingPlace, numbers: dict[str, float]) -> Float[Tensor, "200"]:
     """Estimated, base 2, gray."""
     problem = radiance_problem(place.evidence, settings=RadianceSettings(**numbers))
-    radiance = search_radiance(problem).radiance(place.evidence, torch.ones(3))
+    radiance = search_radiance(problem).radiance(place.evidence)
     return irradiance_of(radiance.mean(1), NORMALS).clamp_min(1e-6).log2()
 
 

@@ -2,20 +2,24 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from shapes import UP, ring, sunlit_scene, surfels
 
+from splatgraft.cli import main
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import look_at, pinhole
+from splatgraft.core.capture_orientation import estimate_up, focus_point
 from splatgraft.core.composite import PlacedObject
 from splatgraft.core.directions import even_directions, fit_sh
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
+from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
 from splatgraft.relighting.light.light import Light, fit_ambient
@@ -398,6 +402,15 @@ def test_a_clipped_window_is_a_source_where_it_was_photographed(radius_deg, whit
         assert main.distance == pytest.approx(20, rel=0.05)
 
 
+def test_what_no_camera_saw_is_white_whatever_the_colour_of_what_stands_around():
+    grey = sunlit_scene(UP, strength=0.0)
+    red = replace(grey, sh=dc_from_rgb(rgb_from_dc(grey.sh[:, 0]) * torch.tensor([1.0, 0.4, 0.4]))[:, None])
+    light = estimated(red, views((0.0, 1.5)))
+    r, g, b = light.irradiance(UP[None])[0].tolist()
+    # the floor itself shines a little from below the horizon
+    assert max(r, g, b) < 1.1 * min(r, g, b)
+
+
 @pytest.mark.parametrize(("height", "name"), [(0.15, "sun or window"), (0.6, "sun or lamp")])
 def test_what_shadows_alone_show_is_named_by_where_it_may_be(height, name):
     sun = torch.nn.functional.normalize(torch.tensor([0.3, 0.3, height]), dim=0)
@@ -482,3 +495,32 @@ def test_values_that_are_not_finite_or_huge_leave_the_light_finite(field, value)
     found = light.light.irradiance(even_directions(50))
     assert bool(torch.isfinite(found).all())
     assert float(found.max()) < 100
+
+
+@pytest.mark.long
+def test_the_light_of_a_room_is_the_same_from_two_runs_of_poses(tmp_path):
+    pytest.importorskip("pycolmap")
+    # of the shipped ones, half as large, fewer get a pose
+    photos = Path(__file__).parents[3] / "shared" / "data" / "bananas" / "images"
+    if not photos.is_dir():
+        pytest.skip(f"no {photos}")
+    found = []
+    for seed in range(2):
+        posed, scene = tmp_path / f"posed{seed}", tmp_path / f"scene{seed}"
+        assert main(["capture", str(photos), "--seed", str(seed), "--accept-doubtful", "--out", str(posed)]) == 0
+        assert main(["reconstruct", str(posed), "--quality", "draft", "--out", str(scene)]) == 0
+        cameras = read_cameras(posed)
+        focus = focus_point(cameras)
+        away = float((cameras.centers - focus).norm(dim=1).median())
+        place = BoundingSphere(focus + 0.2 * away * estimate_up(cameras), 0.1 * away)
+        light = estimate_light(read_gaussians(scene / "scene.ply"), place, cameras)
+        assert isinstance(light, EstimatedLight)
+        found.append((cameras, light.mean))
+    # the worlds of the two runs differ: the rotation between them, from the cameras that both have
+    common = [name for name in found[0][0].names if name in found[1][0].names]
+    assert len(common) >= 8
+    poses = [c.world_from_camera[[c.names.index(name) for name in common], :3, :3].double() for c, _ in found]
+    u, _, v = torch.linalg.svd((poses[0] @ poses[1].transpose(1, 2)).sum(0))
+    rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ v))]).double()) @ v
+    strongest = [torch.tensor(light.sources[0].direction).double() for _, light in found]
+    assert math.degrees(math.acos(min(1.0, float(strongest[0] @ rotation @ strongest[1])))) < 10

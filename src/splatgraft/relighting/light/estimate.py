@@ -30,7 +30,7 @@ from splatgraft.relighting.light.panorama import (
     place_surroundings,
     surroundings_at,
 )
-from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem, seen_sky
+from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
 from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, with_sun
 from splatgraft.relighting.normals import estimate_normals
@@ -98,8 +98,6 @@ class EstimatedLight:
     """What no camera recorded."""
     evidence: LightEvidence
     """What the estimate rests on."""
-    tint: Float[Tensor, "3"]
-    """Linear rgb of mean 1, of what was seen above the horizon; what no camera saw is taken to have it too."""
     place: BoundingSphere
     """Where the sources were estimated."""
 
@@ -129,7 +127,7 @@ class EstimatedLight:
         if isinstance(panorama, NoLight):
             return panorama
         evidence = replace(self.evidence, around=place_surroundings(scene, cameras, place))
-        _, rest = _split_peaks(self.hidden.radiance(evidence, self.tint), evidence, within=math.inf)
+        _, rest = _split_peaks(self.hidden.radiance(evidence), evidence, within=math.inf)
         mean = replace(self.mean, ambient=_ambient_of(rest), **_seen_shares(evidence))
         return replace(self, evidence=evidence, mean=mean)
 
@@ -170,12 +168,9 @@ def estimate_light(
         up=up,
     )
     hidden = search_radiance(radiance_problem(evidence))
-    color = (surfaces.weights[:, None] * surfaces.colors).sum(0)
-    sky = seen_sky(evidence.far, up, color.clamp_min(1e-3))
-    tint = sky / sky.mean().clamp_min(1e-6)
-    sources, rest = _split_peaks(hidden.radiance(evidence, tint), evidence, within=region.radius)
+    sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
     mean = with_source_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
-    found = EstimatedLight(mean, None, hidden, evidence, tint, place)
+    found = EstimatedLight(mean, None, hidden, evidence, place)
     sun = set_sun(sun_through, whole, cameras, up) if sun_through else find_sun(whole, cameras, region, up)
     return found if sun is None else found.with_sun(sun, scene)
 

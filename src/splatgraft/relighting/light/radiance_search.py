@@ -70,17 +70,16 @@ class RadianceEstimate:
     residual: Float[Tensor, "m"]
     """Observed over explained brightness of the receivers, logarithm, at the best maximum."""
 
-    def radiance(self, evidence: LightEvidence, tint: Float[Tensor, "3"]) -> Float[Tensor, "k 3"]:
-        """Linear rgb radiance from all `DIRECTIONS` at the object.
+    def radiance(self, evidence: LightEvidence) -> Float[Tensor, "k 3"]:
+        """Linear rgb radiance from all `DIRECTIONS` at the object; what no camera saw is white, as cameras balance it.
 
         Args:
             evidence: At the object; its near surroundings may be others than those of the estimate.
-            tint: Linear rgb of mean 1, of what no camera saw.
         """
         around = evidence.around
-        unseen = ((1 - around.seen).clamp_min(0) * self.unseen)[:, None] * tint
-        # clipped parts are white: their own tint was lost
-        return around.radiance + unseen + (evidence.visible_sources * self.clipped)[:, None]
+        # clipped parts are white, too: their own tint was lost
+        white = (1 - around.seen).clamp_min(0) * self.unseen + evidence.visible_sources * self.clipped
+        return around.radiance + white[:, None]
 
 
 def search_radiance(problem: RadianceProblem) -> RadianceEstimate:
