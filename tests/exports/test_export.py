@@ -132,6 +132,7 @@ def test_what_is_no_scene_is_one_line(tmp_path, capsys, name):
         ("a.sog", {"layer": "object"}, "--layer object: expected the folder of a project"),
         ("a.sog", {"layer": "scene"}, "--layer scene: expected the folder of a project"),
         ("a.sog", {"sh_degree": 4}, "--sh-degree: expected 0 to 3, found 4"),
+        ("a.png", {"width": 0}, "--width: expected 16 pixels or more, found 0"),
         ("a.mp4", {"frames": 1}, "--frames: expected 2 or more, found 1"),
         ("a.png", {"width": 8}, "--width: expected 16 pixels or more, found 8"),
     ],

@@ -147,7 +147,7 @@ def place_virtual_cameras(
     along = f", thus {'xyz'[axis]} {'up' if up[axis] > 0 else 'down'}" if abs(float(up[axis])) >= _ALIGNED_COS else ""
     text = f"up is taken to be {_shown(up)}{along}: {reason}"
     upside_down = (
-        f"Where the picture is upside down or on its side, give the scene's up (up = {_list(-up)} turns it over)"
+        f"Where the picture is upside down or on its side, give the scene's up (up = [{_numbers(-up)}] turns it over)"
     )
     report = [
         Note(
@@ -288,9 +288,9 @@ def _directions(views: int, up: Float[Tensor, "3"], elevations_deg: tuple[float,
     return elevation.cos()[:, None] * flat + elevation.sin()[:, None] * up
 
 
-def _list(vector: Float[Tensor, "3"]) -> str:
-    return "[" + ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in vector.tolist()) + "]"
-
-
 def _shown(vector: Float[Tensor, "3"]) -> str:
-    return "(" + ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in vector.tolist()) + ")"
+    return "(" + _numbers(vector) + ")"
+
+
+def _numbers(vector: Float[Tensor, "3"]) -> str:
+    return ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in vector.tolist())

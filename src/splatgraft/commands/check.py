@@ -29,14 +29,12 @@ from splatgraft.formats.captures.masks import PhotoFiles, find_photos
 from splatgraft.formats.captures.photo_archive import is_archive, unpack_photos
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
-from splatgraft.segmentation import widest_gap
+from splatgraft.segmentation import WIDE_GAP_DEG, widest_gap
 
 _FRAMES = 40
 """Frames of a video that are looked at; the command `capture` takes 120."""
 _DRAFT_SECONDS = 45.0
 """For a draft of any size; two idle cores."""
-_WIDE_GAP_DEG = 60.0
-"""Turn without photos that is named."""
 _FOCAL_LENGTH = 0x920A
 
 
@@ -134,7 +132,7 @@ def _coverage(cameras: Cameras) -> Finding:
     except ValueError:  # they look outwards
         return Finding("coverage", "good", "the photos look all ways: a place, no object to cut out")
     text = f"the photos go {360 - gap:.0f} of 360 degrees round what they look at"
-    if gap < _WIDE_GAP_DEG:
+    if gap < WIDE_GAP_DEG:
         return Finding("coverage", "good", text)
     remedy = "photograph an object from there too, as its back is guessed else; a place need not be seen from there"
     return Finding("coverage", "good" if gap < 180 else "doubtful", f"{text}, none between {first} and {last}", remedy)

@@ -145,10 +145,10 @@ def _warnings(support: Support, hidden: float) -> tuple[Note, ...]:
         found.append(Note(text, "warning"))
     if support.flat_fraction < 0.6:
         text = f"The object stands on uneven ground: {support.flat_fraction:.0%} of what is under it is level."
-        found.append(Note(text, "warning", "Move it (compose: at), or make it smaller (scale)"))
+        found.append(Note(text, "warning", "Move it (compose: point), or make it smaller (compose: scale)"))
     if support.obstructed_fraction > 0.1:
         text = f"The object cuts into something: {support.obstructed_fraction:.0%} of its place is taken."
-        found.append(Note(text, "warning", "Move it (compose: at), or make it smaller (scale)"))
+        found.append(Note(text, "warning", "Move it (compose: point), or make it smaller (compose: scale)"))
     return tuple(found)
 
 

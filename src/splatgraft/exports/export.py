@@ -74,7 +74,7 @@ def export_scene(
         raise ValueError(f"{to}: expected a file that ends in {', '.join(EXPORT_SUFFIXES)}, found '{to.suffix}'")
     if not 0 <= options.sh_degree <= spherical_harmonics.MAX_DEGREE:
         raise ValueError(f"--sh-degree: expected 0 to {spherical_harmonics.MAX_DEGREE}, found {options.sh_degree}")
-    width = options.width or _WIDTH
+    width = _WIDTH if options.width is None else options.width
     if width < _MIN_WIDTH:
         raise ValueError(f"--width: expected {_MIN_WIDTH} pixels or more, found {width}")
     gaussians, said = layer_of(source, options.layer, progress=progress)

@@ -107,6 +107,8 @@ def _by_opencv(path: Path, partial: Path, frames: Iterable[Float[Tensor, "h w 3"
             if written is not None:
                 written.result()
             written = pool.submit(writer.write, np.ascontiguousarray(pixels[..., ::-1]))
+        if written is not None:
+            written.result()
     if writer is not None:
         writer.release()
     return "VP9"

@@ -233,11 +233,8 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
 
 def _light_note(scene: SceneLight) -> Note:
     """What the light at the new place is, and whether most of it is a guess."""
-    text = (
-        "At the new place: "
-        + scene.light.describe(estimate_up(scene.cameras))
-        + ("." if scene.estimate is not None else ", as given.")
-    )
+    end = "." if scene.estimate is not None else ", as given."
+    text = f"At the new place: {scene.light.describe(estimate_up(scene.cameras))}{end}"
     certain = light_confidence(scene.light)
     if certain >= _MIN_CERTAIN:
         return Note(text)

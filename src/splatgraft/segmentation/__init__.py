@@ -22,10 +22,11 @@ from splatgraft.segmentation.selection import (
     select_object,
 )
 from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
-from splatgraft.segmentation.unseen_side import ClosedObject, close_unseen_side, widest_gap
+from splatgraft.segmentation.unseen_side import WIDE_GAP_DEG, ClosedObject, close_unseen_side, widest_gap
 
 __all__ = [
     "MIN_AGREEMENT",
+    "WIDE_GAP_DEG",
     "Agreement",
     "Box",
     "ClosedObject",

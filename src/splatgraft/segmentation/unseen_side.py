@@ -63,6 +63,8 @@ _ROUNDS = 400
 """Steps of Jacobi's method; a step carries colours one neighbour further."""
 _LEAST = 0.02
 """Share of the surface below which an object counts as seen from all sides."""
+WIDE_GAP_DEG = 60.0
+"""Turn without photographs from which it is named."""
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,7 @@ def _typical_seconds(step: Step, flow: Flow) -> float:
     typical = _TYPICAL_SECONDS[type(step).__name__.lower()]
     try:
         if isinstance(step, Capture):
-            return typical + predict_pose_seconds(_photos_to_pose(step))
+            return typical + predict_pose_seconds(_photos_to_pose(step, flow))
         if isinstance(step, Reconstruct) and not torch.cuda.is_available():
             seconds = predict_cpu_seconds(_views_of(step.capture, flow).cameras, step.options) / 2
             return _COMPILATION_SECONDS + seconds
@@ -104,12 +104,10 @@ def _typical_seconds(step: Step, flow: Flow) -> float:
     return typical
 
 
-def _photos_to_pose(step: Capture) -> int:
+def _photos_to_pose(step: Capture, flow: Flow) -> int:
     if step.poses is not None or is_scene(step.capture) or has_poses(step.capture):
         return 0
-    if is_archive(step.capture):
-        return count_archived_photos(step.capture)
-    return len(find_photos(step.capture).paths) if step.capture.is_dir() else VIDEO_FRAMES
+    return len(_views_of(step.capture, flow).cameras)
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ def _views_of(capture: Path, flow: Flow) -> _Views:
     if has_poses(given):
         posed = read_capture(given)
         return _Views(posed.cameras, len(posed) - len(posed.with_masks()))
-    (width, height), photos = (1600, 1200), VIDEO_FRAMES
+    (width, height), photos = (1600, 1200), count_archived_photos(given) if is_archive(given) else VIDEO_FRAMES
     without_masks = photos
     if given.is_dir():
         found = find_photos(given)

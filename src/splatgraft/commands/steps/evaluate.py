@@ -99,8 +99,8 @@ class Evaluate:
             pictures = [truth.pictures(scenes, index) for index in _spread(len(truth.truth), self.pictured)]
         else:
             sized = scenes.with_width(self.width)
-            chosen = [sized.best_view, *_spread(len(sized.cameras), self.pictured)]
-            pictures = [sized.pictures_from(sized.cameras[i]) for i in dict.fromkeys(chosen[: self.pictured])]
+            chosen = dict.fromkeys([sized.best_view, *_spread(len(sized.cameras), self.pictured)])
+            pictures = [sized.pictures_from(sized.cameras[i]) for i in list(chosen)[: self.pictured]]
         changes = [describe_change(p.result, p.copy_paste, p.mask) for p in pictures]
         best = max(pictures, key=lambda p: p.prominence)
         # the page begins with it

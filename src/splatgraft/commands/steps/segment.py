@@ -40,6 +40,7 @@ from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.runtime.note import Note
 from splatgraft.segmentation import (
     MIN_AGREEMENT,
+    WIDE_GAP_DEG,
     Agreement,
     Box,
     Keep,
@@ -66,8 +67,6 @@ _PICTURED = 8
 """Photographs on the sheet."""
 _MUCH_GUESSED = 0.1
 """Share of the surface that no photograph shows, from which on that is a warning."""
-_WIDE_GAP_DEG = 60.0
-"""Turn without photographs that is named."""
 
 
 @dataclass(frozen=True)
@@ -219,7 +218,7 @@ class Segment:
             away = views.centers - middle
             write_image(folder / COVERAGE_FILE, Coverage.of(away, away[:0], estimate_up(views)).draw())
             text += " The picture shows the directions around it from above, with its photos as dark dots."
-            if gap > _WIDE_GAP_DEG:
+            if gap > WIDE_GAP_DEG:
                 text += f" No photo was taken over {gap:.0f} degrees around it, between {first} and {last}."
             remedy = "Photograph it from there too, or turn that side away (compose: yaw_deg)"
             context.console.tell(Note(text, "warning", remedy, picture=folder / COVERAGE_FILE))

@@ -248,13 +248,13 @@ def radiance_problem(found: LightEvidence, *, settings: RadianceSettings = Radia
         weights=weights,
         is_white=evidence.colors.max(1).values > 0.9,
         material_weights=material_weights,
-        sky=math.log(max(float(seen_sky(far, up, mean_color.expand(3)).mean()), _DARKEST)) + s.sky_bias,
+        sky=math.log(max(float(_seen_sky(far, up, mean_color.expand(3)).mean()), _DARKEST)) + s.sky_bias,
         connected=label[:, None] == label[None],
         patches=_patches(far, clipped, label, up)[:_MAX_PATCHES],
     )
 
 
-def seen_sky(far: Surroundings, up: Float[Tensor, "3"], otherwise: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+def _seen_sky(far: Surroundings, up: Float[Tensor, "3"], otherwise: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """Geometric mean radiance of what was seen above the horizon, or of all that was seen, or `otherwise`."""
     weights = far.seen * (DIRECTIONS @ up > 0)
     if float(weights.sum()) < 2:
