@@ -2,12 +2,14 @@
 
 Parts run one after the other, each in a process of its own that is stopped after ten minutes (`--limit`). A finished
 part is not run again: the same command continues after a stop. DIR/gpu.json and DIR/gpu.md hold all results with
-the card's name, after each part. `--toy` runs the same code at toy size on the CPU; its figures mean nothing.
+the card's name, after each part; DIR/NAME.log what a part that failed printed. `--toy` runs the same code at toy size
+on the CPU; its figures mean nothing.
 
     cuda-tests    tests/rendering/test_cuda.py
     renderer      gsplat against the CPU rasteriser: pictures, gradients, W and its transpose; milliseconds
-    reconstruct   data/room at draft quality: dB on held-out views, seconds
+    reconstruct   data/room and --captures (with poses), draft and full with 7000 steps: dB on held-out views, seconds
     paper-size    benchmarks/paper_size.py: lift, relight, render, consolidate
+    paper-adam    seconds of the paper's 10,000 steps of Adam on LPIPS, VGG-16 with random weights
     harmonize-*   a random-weight harmoniser of the real size at 704x496: stock diffusers and ours; stored in fp8
     lora          one training step of a low-rank adaptation of that network
 """
@@ -19,6 +21,7 @@ import platform
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -38,6 +41,8 @@ class Setting:
 
     device: torch.device
     toy: bool
+    captures: tuple[Path, ...] = ()
+    """Captures with poses, reconstructed beside data/room."""
 
     @property
     def repeats(self) -> int:
@@ -63,6 +68,8 @@ def cuda_tests(setting: Setting) -> list[Row]:
         "-q",
         "-p",
         "no:cacheprovider",
+        "-o",
+        "filterwarnings=",
         str(ROOT / "tests/rendering/test_cuda.py"),
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
@@ -112,7 +119,7 @@ def renderer(setting: Setting) -> list[Row]:
     return rows
 
 
-def reconstruct_room(setting: Setting) -> list[Row]:
+def reconstruct_captures(setting: Setting) -> list[Row]:
     """Quality and time of reconstructions: a draft, and `full` (a million Gaussians) with 7000 steps."""
     from splatgraft.core.image_metrics import psnr
     from splatgraft.core.posed_images import held_out
@@ -120,24 +127,32 @@ def reconstruct_room(setting: Setting) -> list[Row]:
     from splatgraft.reconstruction import ReconstructOptions, reconstruct
     from splatgraft.rendering import render
 
-    capture = read_capture(ROOT / "data" / "room")
     toy = {"iterations": 3, "budget": 500, "resolution": 0.15}
     device = setting.device.type
     draft = ReconstructOptions(quality="draft", device=device, eval_every=8)
     full = ReconstructOptions(quality="full", iterations=7000, device=device, eval_every=8)
     rows: list[Row] = []
-    for options in (replace(one, **toy) if setting.toy else one for one in (draft, full)):
-        begin = time.perf_counter()
-        scene = reconstruct(capture, options)
-        setting.synchronize()
-        seconds = time.perf_counter() - begin
-        served = options.served(capture)
-        chosen = [i for i in range(len(served)) if held_out(len(served))[i]][: 1 if setting.toy else None]
-        scene = scene.to(setting.device)
-        views = ((served.cameras[i].to(setting.device), served.image(i)) for i in chosen)
-        found = [psnr(render(scene, camera).color[0].cpu(), image) for camera, image in views]
-        decibel = float(torch.stack(found).mean())
-        rows.append({"quality": options.quality, "psnr": decibel, "seconds": seconds, "gaussians": scene.count})
+    for folder in (ROOT / "data" / "room", *setting.captures):
+        capture = read_capture(folder)
+        for options in (replace(one, **toy) if setting.toy else one for one in (draft, full)):
+            begin = time.perf_counter()
+            scene = reconstruct(capture, options)
+            setting.synchronize()
+            seconds = time.perf_counter() - begin
+            served = options.served(capture)
+            chosen = [i for i in range(len(served)) if held_out(len(served))[i]][: 1 if setting.toy else None]
+            scene = scene.to(setting.device)
+            views = ((served.cameras[i].to(setting.device), served.image(i)) for i in chosen)
+            with torch.no_grad():
+                found = [psnr(render(scene, camera).color[0].clamp(0, 1).cpu(), image) for camera, image in views]
+            cost = {"seconds": seconds, "gaussians": scene.count, "peak_gb": setting.peak_gb()}
+            row = {
+                "capture": folder.name,
+                "photos": len(served),
+                "longest_px": int(served.cameras.sizes.max()),
+            }
+            rows.append({**row, "quality": options.quality, "psnr": float(torch.stack(found).mean()), **cost})
+            print(rows[-1], flush=True)
     return rows
 
 
@@ -158,6 +173,37 @@ def paper_size(setting: Setting) -> list[Row]:
         counts = {"gaussians": size.gaussians, "gaussians_relit": found["gaussians_relit"], "views": size.views}
         rows.append({**counts, **times, "peak_mb": parts[-1]["peak_mb"]})
     return rows
+
+
+def paper_adam(setting: Setting) -> list[Row]:
+    """The paper's consolidation (its section 6): the time of a step, and of 10,000."""
+    from paper_size import Size, scene_of
+
+    from splatgraft.consolidation import ConsolidateOptions, consolidate
+    from splatgraft.fitting.perceptual_losses import lpips_vgg
+    from splatgraft.rendering import render
+
+    size = Size(4, 48, 32, 600) if setting.toy else Size(40, 704, 496, 300_000)
+    composite, cameras, _ = scene_of(size)
+    scene, cameras = composite.merged()[0].to(setting.device), cameras.to(setting.device)
+    with torch.no_grad():
+        images = [0.9 * render(scene, camera).color[0].clamp(0, 1) for camera in cameras]
+    sys.path.append(str(ROOT / "tests"))
+    from random_lpips import write_random_lpips
+
+    with tempfile.TemporaryDirectory() as folder:
+        write_random_lpips(Path(folder))
+        loss = lpips_vgg(Path(folder))
+    times = []
+    for steps in (2, 4) if setting.toy else (50, 350):
+        options = ConsolidateOptions(method="paper", loss=loss, iterations=steps)
+        begin = time.perf_counter()
+        consolidate(scene, cameras, images, options)
+        setting.synchronize()
+        times.append((time.perf_counter() - begin, steps))
+    step = (times[1][0] - times[0][0]) / (times[1][1] - times[0][1])
+    row = {"gaussians": scene.count, "size": f"{size.width}x{size.height}", "ms_a_step": 1000 * step}
+    return [{**row, "seconds_of_10000": 10_000 * step, "peak_gb": setting.peak_gb()}]
 
 
 def harmonize_plain(setting: Setting) -> list[Row]:
@@ -209,8 +255,9 @@ def lora_step(setting: Setting) -> list[Row]:
 PARTS: Mapping[str, Callable[[Setting], list[Row]]] = {
     "cuda-tests": cuda_tests,
     "renderer": renderer,
-    "reconstruct": reconstruct_room,
+    "reconstruct": reconstruct_captures,
     "paper-size": paper_size,
+    "paper-adam": paper_adam,
     "harmonize-plain": harmonize_plain,
     "harmonize-fp8": harmonize_fp8,
     "lora": lora_step,
@@ -344,13 +391,14 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("gpu"))
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--limit", type=float, default=LIMIT_S, help="seconds a part may take")
+    parser.add_argument("--captures", nargs="*", type=Path, default=[], help="captures with poses, also reconstructed")
     parser.add_argument("--toy", action="store_true", help="toy size on the CPU")
     parser.add_argument("--here", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if not args.toy and not torch.cuda.is_available():
         raise SystemExit("gpu: expected a CUDA device that torch can use, found none; --toy runs on the CPU")
     args.out.mkdir(parents=True, exist_ok=True)
-    setting = Setting(torch.device("cpu" if args.toy else "cuda"), args.toy)
+    setting = Setting(torch.device("cpu" if args.toy else "cuda"), args.toy, tuple(args.captures))
     if args.here:
         run_part(args.here, setting, args.out)
         return 0
@@ -361,12 +409,15 @@ def main() -> int:
             print(f"{name}: finished earlier", flush=True)
             continue
         command = [sys.executable, __file__, "--out", str(args.out), "--here", name, *(["--toy"] if args.toy else [])]
+        command += ["--captures", *map(str, args.captures)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=args.limit, check=False)
             if done.returncode:
+                (args.out / f"{name}.log").write_text(done.stdout + done.stderr)
                 lines = done.stderr.strip().splitlines()
                 failures[name] = lines[-1] if lines else f"exit {done.returncode}"
-        except subprocess.TimeoutExpired:
+        except subprocess.TimeoutExpired as stopped:
+            (args.out / f"{name}.log").write_bytes(stopped.stdout or b"")
             failures[name] = f"stopped after {args.limit:.0f} s"
         print(f"{name}: {failures.get(name, 'done')}", flush=True)
         write_report(args.out, list(PARTS), failures, card)

@@ -110,7 +110,7 @@ def test_a_project_that_cannot_be_says_so_in_one_line(project: Path, capsys: pyt
     for change, line in (
         (("[segment]", "[segments]"), "project.toml: expected tables among source, target, capture"),
         (("passes = 1", "pases = 1"), "project.toml [consolidate]: expected keys among"),
-        (("passes = 1", 'method = "slow"'), "[consolidate] method: expected 'fast' or 'adam', found 'slow'"),
+        (("passes = 1", 'method = "slow"'), "[consolidate] method: expected 'fast' or 'paper', found 'slow'"),
         (("[consolidate]", "[harmonize]\nlora = 'a'\n[consolidate]"), 'ray with method = "none"; found lora'),
         (("[consolidate]", "[harmonize]\nmethod = 'x'\n[consolidate]"), "[harmonize] method: expected one of compact"),
         (("budget = 400", "budget = 0"), "expected budget of at least 1, found 0"),

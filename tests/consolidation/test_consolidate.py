@@ -14,19 +14,19 @@ from memory_checkpoint import KilledError, MemoryCheckpoint
 from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.core.gaussians import concatenate
 from splatgraft.core.image_metrics import psnr
-from splatgraft.fitting.perceptual_losses import l1
+from splatgraft.fitting.perceptual_losses import l1, windowed_fourier
 from splatgraft.rendering import render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
 PLAIN = ConsolidateOptions(view_error=False)
-ADAM = ConsolidateOptions(method="adam", loss=l1, iterations=24)
+PAPER = ConsolidateOptions(method="paper", loss=l1, iterations=24)
 
 
 def score(scene, relit) -> float:
     return float(psnr(render(scene, relit.cameras).color, torch.stack(relit.images)))
 
 
-@pytest.mark.parametrize("options", [PLAIN, ConsolidateOptions(), replace(ADAM, loss=PLAIN.loss)])
+@pytest.mark.parametrize("options", [PLAIN, ConsolidateOptions(), replace(PAPER, loss=windowed_fourier)])
 def test_comes_closer_to_the_images_and_keeps_the_geometry(relit, options):
     out = consolidate(relit.composite, relit.cameras, relit.images, options)
     for field in fields(out):
@@ -97,7 +97,7 @@ def test_the_number_of_threads_changes_time_alone(relit):
 
 def test_a_killed_descent_resumes_to_the_same_bits(relit, monkeypatch):
     monkeypatch.setattr("splatgraft.consolidation.color_fit._SAVE_EVERY", 8)
-    whole = consolidate(relit.composite, relit.cameras, relit.images, ADAM)
+    whole = consolidate(relit.composite, relit.cameras, relit.images, PAPER)
     memory = MemoryCheckpoint()
 
     def die(done, total, message):
@@ -105,10 +105,10 @@ def test_a_killed_descent_resumes_to_the_same_bits(relit, monkeypatch):
             raise KilledError
 
     with pytest.raises(KilledError):
-        consolidate(relit.composite, relit.cameras, relit.images, ADAM, progress=die, checkpoint=memory)
+        consolidate(relit.composite, relit.cameras, relit.images, PAPER, progress=die, checkpoint=memory)
     assert memory.state is not None
     assert memory.state["iteration"] == 16
-    resumed = consolidate(relit.composite, relit.cameras, relit.images, ADAM, checkpoint=memory)
+    resumed = consolidate(relit.composite, relit.cameras, relit.images, PAPER, checkpoint=memory)
     assert torch.equal(resumed.sh, whole.sh)
 
 

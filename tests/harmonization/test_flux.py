@@ -22,7 +22,7 @@ from splatgraft.harmonization.flux.loading import BASE, FluxFolder
 from splatgraft.harmonization.flux.network import Autoencoder, velocity
 from splatgraft.harmonization.flux.prompt import prompt_file
 from splatgraft.harmonization.flux.sampling import noise
-from splatgraft_paper.benchmark.methods import STRENGTHS
+from splatgraft.harmonization.interface import noise_levels
 
 pytestmark = list(quiet)
 WIDE = CHANNELS * 12
@@ -107,11 +107,14 @@ def test_parts_are_found_beside_the_weights_in_the_base_and_in_the_hub_s_cache(f
         shutil.copytree(folder / "vae", tmp_path / "hub" / "vae")
         prompt.unlink(missing_ok=True)
         with pytest.raises(ValueError, match=r"embeddings, found none; `splatgraft paper train embed` makes them"):
-            flux("nviolante/dot3d")
+            flux("dot3d")
         prompt.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(folder / "empty_prompt.safetensors", prompt)
         # the same weights, aligned otherwise in memory: products may round differently, by little after four steps
-        assert torch.allclose(flux("nviolante/dot3d").harmonize(view()).image, wanted, atol=1e-4)
+        for words in ({"folder": "nviolante/dot3d"}, {"folder": "dot3d"}, {"folder": "dot3d", "variant": "image-mask"}):
+            assert torch.allclose(flux(**words).harmonize(view()).image, wanted, atol=1e-4)
+    shutil.copytree(tmp_path / "hub/image-mask", tmp_path / "hub/image-background")
+    assert flux("dot3d", variant="image-background").network.variant == "image-background"
 
 
 def test_weights_kept_in_eight_bits_give_about_the_same(folder):
@@ -211,7 +214,7 @@ def test_on_cuda_in_bf16_it_is_about_that_of_the_cpu(folder):
 
 @pytest.mark.parametrize("schedule", ["linear", "geometric"])
 def test_each_level_of_a_schedule_reaches_the_network_with_the_noise_that_belongs_to_it(folder, monkeypatch, schedule):
-    strengths, seen = STRENGTHS[schedule], []
+    strengths, seen = noise_levels(schedule, 5), []
     harmonizer = flux(folder, strengths=strengths)
     assert isinstance(harmonizer, NoisyStartHarmonizer)
 
@@ -238,7 +241,7 @@ def test_each_level_of_a_schedule_reaches_the_network_with_the_noise_that_belong
 
 
 def test_all_noise_is_the_ordinary_harmonisation_and_does_not_see_the_prior(folder):
-    harmonizer, shown = flux(folder, strengths=STRENGTHS["linear"]), view()
+    harmonizer, shown = flux(folder, strengths=noise_levels("linear", 5)), view()
     whole = harmonizer.harmonize_from(shown, 1.0).image
     assert torch.equal(whole, flux(folder).harmonize(shown).image)
     other = replace(shown, prior=1 - shown.prior)

@@ -103,6 +103,7 @@ def test_a_second_run_measures_nothing_again(measured):
         ("copy-paste", "off", None, "fourier", "once"),
         ("transfer+reinhard/l1-dssim@linear", "transfer", "reinhard", "l1-dssim", "linear"),
         ("off+flux@geometric", "off", "flux", "fourier", "geometric"),
+        ("off+flux/paper-l1-dssim", "off", "flux", "paper-l1-dssim", "once"),
     ],
 )
 def test_a_method_is_named_in_one_word(text, prior, harmonizer, loss, schedule):

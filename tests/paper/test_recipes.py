@@ -1,14 +1,20 @@
 """Recipes hold the paper's numbers, are printed before anything is loaded, and give way to the user's own options."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from splatgraft.cli import main
+from splatgraft.runtime.hub import REPOSITORIES, hub_id
+from splatgraft_paper.training import recipes as recipes_module
+from splatgraft_paper.training.flux import FluxTrainingOptions
 from splatgraft_paper.training.loop import LoopOptions
 from splatgraft_paper.training.recipes import Recipe, TrainingCost
+from splatgraft_paper.training.removal import RemovalTrainingOptions
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+WEIGHTS = Path(__file__).parents[2] / "docs" / "reference" / "weights.md"
 SOURCES = {"pairs": (1900, 51_000), "generated": (1600, 6500), "orida": (2000, 8000)}
 """Consistent and inconsistent pictures of the paper's three sources (Sec. 5.2)."""
 
@@ -23,13 +29,13 @@ def test_the_harmoniser_has_the_paper_s_numbers():
     # Sec. 5: conditioned on composite and mask, the first layer repeated, FLUX.1-schnell
     assert recipe.options["condition"] == "image-mask"
     assert recipe.options["first-layer"] == "repeat"
-    assert recipe.options["base"] == "black-forest-labs/FLUX.1-schnell"
+    assert recipe.options["base"] == "flux"
 
 
 def test_the_object_removal_has_the_paper_s_numbers():
     recipe = Recipe.read("removal")
     # Sec. 5.3: Stable Diffusion 2, a single H100, batch size of 8, 1e-5, 260K iterations, the synthetic data
-    wanted = {"steps": 260_000, "rate": 1e-5, "batch": 8, "base": "stabilityai/stable-diffusion-2"}
+    wanted = {"steps": 260_000, "rate": 1e-5, "batch": 8, "base": "stable-diffusion"}
     assert {name: recipe.options[name] for name in wanted} == wanted
     assert recipe.processes == 1
     assert [source.option for source in recipe.sources] == ["pairs"]
@@ -40,6 +46,19 @@ def test_an_ablation_is_the_paper_s_training_without_one_source(name, left_out):
     paper, ablation = Recipe.read("paper"), Recipe.read(f"without-{name}")
     assert ablation.options == paper.options
     assert ablation.sources == tuple(source for source in paper.sources if source.option != left_out)
+
+
+def test_every_base_is_a_known_repository_and_every_repository_is_documented_with_its_licence():
+    recipes = Path(recipes_module.__file__).with_name("recipe_files").glob("*.toml")
+    bases = {Recipe.read(path.stem).options["base"] for path in recipes}
+    assert bases - {"tiny"} <= set(REPOSITORIES)
+    assert FluxTrainingOptions().base in REPOSITORIES
+    assert RemovalTrainingOptions().base in REPOSITORIES
+    rows = [line.split("|") for line in WEIGHTS.read_text().splitlines() if line.startswith("| `")]
+    licences = {row[1].split("`")[1]: row[3].strip() for row in rows}
+    assert all(licences.get(repository) for repository in REPOSITORIES.values())
+    assert hub_id("dot3d") == "nviolante/dot3d"
+    assert hub_id("someone/else") == "someone/else"
 
 
 def test_the_estimate_of_hours_gives_the_paper_its_two_days():
@@ -69,7 +88,7 @@ def test_a_plan_says_what_will_run_and_loads_nothing(tmp_path, capsys):
     assert main(["paper", "train", "removal", str(tmp_path / "out"), "--recipe", "removal", "--plan"]) == 0
     printed = capsys.readouterr().err
     assert "plan: 260,000 steps of 8 pairs at 704x496, Adam at 1e-05, on 1 GPUs" in printed
-    assert "licence: Stable Diffusion 2: CreativeML Open RAIL++-M; has left the hub" in printed
+    assert "licence: Stable Diffusion 2: CreativeML Open RAIL++-M; a mirror" in printed
 
 
 def test_weights_are_shared_by_the_folders_of_a_source():

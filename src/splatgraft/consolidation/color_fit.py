@@ -66,7 +66,7 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
     changed pixel sees keep their colours exactly. The same inputs and seed give the same result.
 
     Memory above the inputs, for n Gaussians with k coefficients: 4 n (k^2 + 50 k) bytes for `fast`, 4 n 24 k for
-    `adam`, plus up to `options.cache_bytes` (views, then their corrected images, are kept until it is full), the tile
+    `paper`, plus up to `options.cache_bytes` (views, then their corrected images, are kept until it is full), the tile
     lists of two views and a few images; beyond that it does not grow with the number of views.
 
     Args:
@@ -76,7 +76,7 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
         options: Method, loss, nuisance parameters and rates.
         weights: Confidence of every pixel, v images (h, w) in [0, 1]; 1 everywhere where not given.
         progress: Called with steps done, steps in all and a short text.
-        checkpoint: Where `adam` saves its state and from where it continues.
+        checkpoint: Where `paper` saves its state and from where it continues.
 
     Returns:
         The scene with the fitted colours.
@@ -87,9 +87,10 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
     """
     _check_counts(cameras, images, weights)
     views = Views(composite, cameras, images, weights=weights, options=options)
-    if options.method == "adam":
-        begin, targets = drop_higher_bands(composite.sh), CorrectedTargets(views, estimated=False)
-        descent = _Descent(_PAPER, options.iterations, options.loss, options.seed, checkpoint)
+    if options.method == "paper":
+        begin = composite.sh if options.continued else drop_higher_bands(composite.sh)
+        descent = _Descent(_PAPER, options.iterations, options.image_loss, options.seed, checkpoint)
+        targets = CorrectedTargets(views, estimated=False)
         return replace(composite, sh=optimize_colors(begin, targets, descent, progress))
     return _consolidate_fast(composite, restrict_to_changes(views, options.unchanged_below), options, progress)
 
@@ -103,7 +104,7 @@ def _consolidate_fast(composite: Gaussians, views: Views, options: ConsolidateOp
     sh = solve(prior, targets, progress=progress)
     targets.keep()
     if options.polish_passes:
-        descent = _Descent(_POLISH, options.polish_passes * len(views), options.loss, options.seed)
+        descent = _Descent(_POLISH, options.polish_passes * len(views), options.image_loss, options.seed)
         sh = optimize_colors(sh, targets, descent, progress)
     colors = composite.sh.clone()
     colors[active] = sh

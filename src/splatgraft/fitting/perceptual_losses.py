@@ -74,15 +74,6 @@ def _magnitudes(planes: Float[Tensor, "3 y x"], window: Float[Tensor, "s s"]) ->
     return torch.fft.rfft2(patches * window, norm="ortho").abs()
 
 
-def lpips_and_l1(folder: Path | None = None) -> ImageLoss:
-    """LPIPS plus L1, of equal weight: LPIPS alone leaves a constant error of brightness nearly free.
-
-    The paper's text names the perceptual loss only, and no weight of a second term.
-    """
-    perceptual = lpips_vgg(folder)
-    return lambda image, target: perceptual(image, target) + l1(image, target)
-
-
 def lpips_vgg(folder: Path | None = None) -> ImageLoss:
     """LPIPS (Zhang 2018, version 0.1, VGG-16, linear heads) with weights from `folder`, by default torch hub's cache.
 

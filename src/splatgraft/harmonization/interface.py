@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -73,3 +73,12 @@ class HarmonizerContext:
     """Noise levels that views will be started from, in (0, 1]."""
     say: Callable[[str], None] = lambda sentence: None
     """Takes messages for the user, one line each."""
+
+
+def noise_levels(schedule: Literal["linear", "geometric"], updates: int) -> tuple[float, ...]:
+    """Noise that each of several harmonisations starts from: from 1 to 0.1 with equal differences or equal ratios.
+
+    Paper: section Ablations, Iterative Dataset Update. The first starts from noise alone.
+    """
+    steps = [number / max(updates - 1, 1) for number in range(updates)]
+    return tuple(1 - 0.9 * step if schedule == "linear" else 0.1**step for step in steps)

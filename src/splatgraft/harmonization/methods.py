@@ -68,7 +68,7 @@ class FluxOptions:
     name: ClassVar[str] = "flux"
 
     weights: str | None = None
-    """Folder or hub id of the weights, such as nviolante/dot3d/image-mask; must be given."""
+    """Folder or hub id of the weights; `dot3d` is the authors' (nviolante/dot3d). Must be given."""
     base: str | None = None
     """Folder or hub id of the model that the weights were trained from, for the parts that they lack."""
     lora: Path | None = None
@@ -86,7 +86,7 @@ class FluxOptions:
         """Load the network."""
         if self.weights is None:
             raise ValueError(
-                "harmonizer flux: expected --weights FOLDER or a hub id such as nviolante/dot3d/image-mask (24 GB, by "
+                "harmonizer flux: expected --weights FOLDER or dot3d (nviolante/dot3d of the hub, 24 GB, by "
                 "the paper's authors under their own licence), found none"
             )
         from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
+from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
@@ -40,7 +41,11 @@ class FrozenView:
         """Freeze geometry and opacity; gsplat leaves no row out."""
         self._gaussians, self._camera, self._options = gaussians.map(Tensor.detach), camera, options
         _, self.alpha, _ = self._draw(gaussians.means.new_zeros(gaussians.count, 1))
-        self.visible = (self.blend_transpose(torch.ones_like(self.alpha)[..., None]) > 0)[:, 0]
+
+    @cached_property
+    def visible(self) -> Bool[Tensor, "n"]:
+        """Which Gaussians have any weight in the view."""
+        return (self.blend_transpose(torch.ones_like(self.alpha)[..., None]) > 0)[:, 0]
 
     def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
         """W values, over black; differentiable in `values`."""

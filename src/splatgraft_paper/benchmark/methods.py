@@ -8,24 +8,11 @@ from splatgraft.commands.steps import harmonize
 from splatgraft.commands.steps.consolidate import Consolidate
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
-from splatgraft.consolidation import ConsolidateOptions, consolidate
-from splatgraft.fitting import l1_dssim
-from splatgraft.fitting.perceptual_losses import lpips_and_l1, lpips_vgg, windowed_fourier
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
-from splatgraft.formats.gaussian_flags import read_selection
-from splatgraft.harmonization import (
-    Harmonized,
-    HarmonizerContext,
-    HarmonizerInputs,
-    HarmonizerOptions,
-    NoisyStartHarmonizer,
-    NoneOptions,
-    make_harmonizer,
-    render_views,
-)
+from splatgraft.harmonization import HarmonizerOptions, NoneOptions
 from splatgraft.project.layout import LIGHT_FILE, PLACEMENT_FILE, SCENE_FILE
-from splatgraft.project.step import Context, Device, Inputs, choose_device
+from splatgraft.project.step import Context, Device, Inputs
 from splatgraft.relighting import SourceScene, relight
 from splatgraft.relighting.light.light import light_to_json
 from splatgraft.runtime.console import Console
@@ -35,13 +22,10 @@ from splatgraft_paper.benchmark.true_light import read_true_light
 from splatgraft_paper.peers.methods import method_options
 
 Prior = Literal["off", "gain", "transplat", "transfer", "true-light"]
-Loss = Literal["fourier", "l1-dssim", "lpips", "paper"]
+Loss = Literal["fourier", "l1-dssim", "lpips", "paper", "paper-l1-dssim"]
 Schedule = Literal["once", "linear", "geometric"]
-STRENGTHS = {
-    "linear": tuple(1.0 + (0.1 - 1.0) * (i / 4) for i in range(5)),
-    "geometric": tuple(0.1 ** (i / 4) for i in range(5)),
-}
-"""Noise of five updates from 1 to 0.1, with equal differences or ratios (paper: Iterative Dataset Update)."""
+UPDATES = 5
+"""Harmonisations of a schedule (paper: Iterative Dataset Update)."""
 _NAMES = {"copy-paste": "off", "reinhard": "off+reinhard", "flux": "off+flux"}
 _GRAMMAR = "PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], NAME=FOLDER, or " + ", ".join(_NAMES)
 
@@ -55,6 +39,17 @@ class Harmonize(harmonize.Harmonize):
 
 
 @dataclass(frozen=True)
+class ConsolidateForBenchmark(Consolidate):
+    """The step with updates by the methods of other projects too."""
+
+    harmonizer: HarmonizerOptions = field(default_factory=NoneOptions)
+
+    def harmonizer_options(self) -> HarmonizerOptions:
+        """The method of the views."""
+        return self.harmonizer
+
+
+@dataclass(frozen=True)
 class Method:
     """One method, as the command line names it."""
 
@@ -64,7 +59,8 @@ class Method:
     harmonizer: str | None = None
     """The image model; without one, the prior is the result."""
     loss: Loss = "fourier"
-    """Loss of the consolidation; `paper` is the paper's: 10,000 steps of Adam on LPIPS and L1."""
+    """Loss of the consolidation; `paper` is the paper's: 10,000 steps of Adam on LPIPS alone, `paper-l1-dssim` the same
+    steps on the loss of 3DGS (paper, Perceptual vs Photometric Loss)."""
     schedule: Schedule = "once"
     """Whether views are harmonised again from the consolidated scene (paper, Iterative Dataset Update)."""
     pictures: Path | None = None
@@ -144,71 +140,6 @@ class RelightForBenchmark:
 
 
 @dataclass(frozen=True)
-class UpdateIteratively:
-    """Harmonise and consolidate five times, each time from renders of the current scene (Iterative Dataset Update).
-
-    The strengths of the schedule are the noise levels that a diffusion model starts from, on renders of the current
-    scene, conditioned on the composite; a harmoniser without noise takes these renders as its prior, and this is said.
-    """
-
-    composite: Path
-    """Folder of the copy-paste result."""
-    prior: Path
-    """The initial scene, a .ply."""
-    cameras: Path
-    """The cameras that methods may use."""
-    out: Path
-    """Folder for scene.ply."""
-    harmonizer: str = "reinhard"
-    loss: Loss = "fourier"
-    """Loss of the consolidation."""
-    schedule: Schedule = "linear"
-    weights: Path | None = None
-    """Folder of LPIPS's weights."""
-    model: str | None = None
-    """The harmoniser's own weights: folder, file or hub id."""
-    iterations: int = 10_000
-    """Steps of each consolidation with the paper's loss."""
-    device: Device = "auto"
-
-    def inputs(self) -> Inputs:
-        """Scenes and cameras."""
-        return {"scenes": (self.composite / SCENE_FILE, self.prior), "cameras": (self.cameras,)}
-
-    def write(self, folder: Path, context: Context) -> None:
-        """Make the updated scene."""
-        device = choose_device(self.device, context.console)
-        composite, prior = (read_gaussians(path).to(device) for path in (self.composite / SCENE_FILE, self.prior))
-        flags = read_selection(self.composite / "is_object.npy", composite.count, self.composite / SCENE_FILE)
-        is_object = flags.to(device)
-        cameras = read_cameras(self.cameras).to(device)
-        options = method_options(self.harmonizer, weights=self.model)
-        strengths = STRENGTHS[self.schedule]
-        say = context.console.say
-        harmonizer = make_harmonizer(options, HarmonizerContext(device=device, say=say, strengths=strengths))
-        if not isinstance(harmonizer, NoisyStartHarmonizer):
-            say(f"{self.harmonizer}: no noise; each of {len(strengths)} updates begins at renders of the scene so far")
-
-        def harmonized(view: HarmonizerInputs, strength: float) -> Harmonized:
-            if isinstance(harmonizer, NoisyStartHarmonizer):
-                return harmonizer.harmonize_from(view, strength)
-            return harmonizer.harmonize(view)
-
-        scene = prior
-        for strength in strengths:
-            views = render_views(composite, is_object, cameras, prior=scene)
-            images = [harmonized(view, strength).image.to(device) for view in views]
-            scene = consolidate(prior, cameras, images, self._consolidation(), progress=context.progress)
-        write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
-
-    def _consolidation(self) -> ConsolidateOptions:
-        if self.loss == "paper":
-            return ConsolidateOptions(method="adam", loss=lpips_and_l1(self.weights), iterations=self.iterations)
-        loss = {"fourier": windowed_fourier, "l1-dssim": l1_dssim}.get(self.loss)
-        return ConsolidateOptions(loss=loss or lpips_vgg(self.weights))
-
-
-@dataclass(frozen=True)
 class MethodSettings:
     """What all methods of a run share."""
 
@@ -237,22 +168,6 @@ def run_method(
         return prior, seconds
     options = method_options(method.harmonizer, weights=settings.model)
     result = scene.work / "methods" / method.folder_name / "result"
-    if method.schedule != "once":
-        update = UpdateIteratively(
-            scene.composite,
-            prior,
-            scene.cameras,
-            result,
-            harmonizer=method.harmonizer,
-            loss=method.loss,
-            schedule=method.schedule,
-            weights=settings.weights,
-            model=settings.model,
-            iterations=settings.iterations,
-            device=settings.device,
-        )
-        seconds["update"] = perform_if_stale(update, console)
-        return result / SCENE_FILE, seconds
     views = scene.work / "views" / method.prior
     composite = scene.composite / SCENE_FILE
     # a prior without a transfer has no light, and a failed transfer found none
@@ -264,11 +179,16 @@ def run_method(
     harmonized = scene.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
     step = Harmonize(views, harmonized, options, device=settings.device)
     seconds["harmonize"] = perform_if_stale(step, console)
-    step = Consolidate(prior, views, harmonized, result, lpips_weights=settings.weights, device=settings.device)
-    if method.loss == "paper":
-        step = replace(step, loss="lpips-l1", method="adam", iterations=settings.iterations)
+    step = ConsolidateForBenchmark(
+        prior, views, harmonized, result, lpips_weights=settings.weights, device=settings.device, harmonizer=options
+    )
+    if method.loss.startswith("paper"):
+        loss = "l1-dssim" if method.loss == "paper-l1-dssim" else None
+        step = replace(step, method="paper", loss=loss, iterations=settings.iterations)
     else:
         step = replace(step, loss=method.loss)
+    if method.schedule != "once":
+        step = replace(step, updates=UPDATES, schedule=method.schedule)
     seconds["consolidate"] = perform_if_stale(step, console)
     return result / SCENE_FILE, seconds
 

@@ -15,7 +15,7 @@ from splatgraft_paper.tables.report import write_paper_report
 from splatgraft_paper.tables.run import PaperRun, perform_paper_run
 
 PAPERS_OWN = "off+flux/paper"
-"""Our implementation of the paper's method: copy-paste, FLUX, 10,000 steps of Adam on a perceptual loss."""
+"""Our implementation of the paper's method: copy-paste, FLUX, 10,000 steps of Adam on LPIPS."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class EvaluatePaper:
     measure_only: bool = False
     """Measure the pictures that are there, and run nothing: needs no GPU and no weights."""
     methods: tuple[str, ...] = (
-        "copy-paste", "transfer", PAPERS_OWN, "off+flux/l1-dssim", f"{PAPERS_OWN}@linear", f"{PAPERS_OWN}@geometric",
+        "copy-paste", "transfer", PAPERS_OWN,
+        f"{PAPERS_OWN}-l1-dssim", f"{PAPERS_OWN}@linear", f"{PAPERS_OWN}@geometric",
     )  # fmt: skip
     """Methods of ours to run, as `paper benchmark` names them; off+flux/paper is the paper's own."""
     only: tuple[str, ...] = ()

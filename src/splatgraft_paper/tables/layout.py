@@ -23,11 +23,12 @@ import torch
 from splatgraft.core.images import IMAGE_SUFFIXES
 from splatgraft.core.posed_images import held_out
 from splatgraft.project.layout import PLACEMENT_FILE
+from splatgraft.runtime.hub import REPOSITORIES
 from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY
 from splatgraft_paper.tables.paper_numbers import published_name
 
 Kind = Literal["synthetic", "real", "rotation"]
-REPOSITORY = "nviolante/dot3d"
+REPOSITORY = REPOSITORIES["dot3d"]
 """On Hugging Face, CC-BY 4.0."""
 _PARTS = ("data_3d", "data_rotation", "results_3d", "results_rotation")
 _PICTURES = {"truth": "gt", "masks": "masks", "background": "background", "composite": "composite"}

@@ -47,7 +47,7 @@ _LORA_TARGETS = (
 class FluxTrainingOptions:
     """Options of the training of the FLUX harmoniser (paper, Sec. 5)."""
 
-    base: str = "black-forest-labs/FLUX.1-schnell"
+    base: str = "flux"
     """Folder or hub id with transformer/ and vae/ (a harmoniser's to go on); `tiny` makes a small one in OUT/base."""
     data: DataOptions = field(default_factory=DataOptions)
     loop: LoopOptions = field(default_factory=LoopOptions)

@@ -22,6 +22,7 @@ from splatgraft.core.images import resize, write_image
 from splatgraft.harmonization.flux.loading import diffusers_library
 from splatgraft.harmonization.flux.tensor_file import one_line
 from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.hub import hub_id
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft_paper.training.pairs import (
     RECORD_FILE,
@@ -167,7 +168,7 @@ _PIPELINE_BYTES = 36 << 30
 def text_to_image_pipeline(base: str) -> Any:
     """Load the stock FLUX pipeline with its text encoders in bfloat16; needs transformers too."""
     try:
-        return diffusers_library().FluxPipeline.from_pretrained(base, torch_dtype=torch.bfloat16)
+        return diffusers_library().FluxPipeline.from_pretrained(hub_id(base), torch_dtype=torch.bfloat16)
     except OSError as error:
         raise ValueError(f"{base}: expected a FLUX pipeline with its text encoders, found {one_line(error)}") from error
 

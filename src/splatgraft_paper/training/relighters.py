@@ -102,14 +102,16 @@ class DiffusionRenderer:
     def relight(
         self, image: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"], lights: Sequence[Path]
     ) -> list[Float[Tensor, "h w 3"]]:
-        """Relight the image by each environment map; results have its size."""
+        """Relight the image by each environment map; it is padded by reflection for the models, and results cropped."""
         height, width = mask.shape
-        size = (max(_MULTIPLE, height // _MULTIPLE * _MULTIPLE), max(_MULTIPLE, width // _MULTIPLE * _MULTIPLE))
+        size = (-(-height // _MULTIPLE) * _MULTIPLE, -(-width // _MULTIPLE) * _MULTIPLE)
+        border = (0, size[0] - height, 0, size[1] - width)
+        padded = torch.from_numpy(cv2.copyMakeBorder(image.cpu().numpy(), *border, cv2.BORDER_REFLECT_101))
         maps = [light.resolve() for light in lights]
         with tempfile.TemporaryDirectory() as name:
             given, buffers, out = (Path(name) / part for part in ("input", "buffers", "relit"))
             (given / "picture").mkdir(parents=True)
-            write_image(given / "picture" / "frame000.png", image)
+            write_image(given / "picture" / "frame000.png", padded)
             self._run(_INVERSE, inverse_arguments(given, buffers, size))
             self._run(_FORWARD, forward_arguments(buffers, out, maps, size))
             relit = []
@@ -117,7 +119,7 @@ class DiffusionRenderer:
                 found = sorted(out.rglob(f"*.env{number:04d}.png"))
                 if not found:
                     raise ValueError(f"{self._checkout}: expected a picture relit by {light}, found none")
-                relit.append(resize(read_rgb(found[0]), width, height).clamp(0, 1))
+                relit.append(resize(read_rgb(found[0]), size[1], size[0])[:height, :width].clamp(0, 1))
             return relit
 
     def close(self) -> None:

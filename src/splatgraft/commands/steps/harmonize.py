@@ -54,7 +54,10 @@ class Harmonize:
 
     def recorded_options(self) -> dict[str, Any]:
         """The options in step.json: the method and its own."""
-        return plain_options({"method": self.method.name, **vars(self.method)})
+        lora = getattr(self.method, "lora", None)
+        # a path is left out of plain options, but `consolidate` with updates makes the method again
+        given = {} if lora is None else {"lora": str(lora.resolve())}
+        return plain_options({"method": self.method.name, **vars(self.method)}) | given
 
     def write(self, folder: Path, context: Context) -> None:
         """Make one image per view."""

@@ -21,7 +21,7 @@ from splatgraft.harmonization.flux.sampling import schnell_levels
 from splatgraft.harmonization.flux.tensor_file import one_line
 from splatgraft.harmonization.interface import HarmonizerContext
 from splatgraft.harmonization.methods import FluxOptions
-from splatgraft.runtime.hub import hub_folder
+from splatgraft.runtime.hub import REPOSITORIES, hub_folder, hub_id
 
 Say = Callable[[str], None]
 VARIANTS: tuple[str, ...] = get_args(Variant)
@@ -29,8 +29,8 @@ INPUTS = 3
 """Latents that a harmoniser's first layer takes: the noisy one, the composite's and the condition's."""
 DESCRIPTION_FILE = "harmonizer.json"
 _PREFIX = "transformer."
-BASE = "black-forest-labs/FLUX.1-schnell"
-_AUTHORS = "nviolante/dot3d"
+BASE = REPOSITORIES["flux"]
+_AUTHORS = REPOSITORIES["dot3d"]
 _BYTES = {"bf16": 2.0, "fp8": 1.0, "offload": 0.1}
 """Bytes of a parameter on the device, best precision first; offload holds the two blocks in use."""
 _RESERVED_BYTES = 1.2e9
@@ -46,14 +46,18 @@ def diffusers_library() -> Any:
 
 
 def local_folder(weights: str, say: Say, *, parts: Sequence[str] = ("transformer",)) -> Path:
-    """Resolve a folder or a hub id OWNER/NAME[/FOLDER] to a local folder; its `parts` and vae/ are fetched once."""
+    """Resolve a folder, a hub id OWNER/NAME[/FOLDER] or a short name to a local folder.
+
+    Its `parts` and vae/ are fetched once.
+    """
+    weights = hub_id(weights)
     folder = Path(weights)
     if folder.is_dir():
         return folder
     names = weights.split("/")
     if folder.exists() or folder.is_absolute() or weights.startswith(".") or len(names) not in (2, 3) or not all(names):
         raise ValueError(
-            f"{weights}: expected a folder with transformer/ or a hub id such as {_AUTHORS}/image-mask, found "
+            f"{weights}: expected a folder with transformer/ or a hub id such as {_AUTHORS} (for short dot3d), found "
             f"{'a file' if folder.exists() else 'none'}"
         )
     repository, inner = "/".join(names[:2]), "".join(names[2:])
@@ -209,7 +213,10 @@ def merge_lora(transformer: Any, path: Path) -> int:
 def load_flux(options: FluxOptions, context: HarmonizerContext) -> FluxNetwork:
     """Load the network, with precomputed modulations."""
     say, device = context.say, context.device
-    folder = local_folder(str(options.weights), say)
+    weights = hub_id(str(options.weights))
+    if weights == _AUTHORS and options.variant != "auto":
+        weights = f"{_AUTHORS}/{options.variant}"
+    folder = local_folder(weights, say)
     checked = FluxFolder.open(folder)
     if options.lora is not None and not checked.is_harmonizer:
         found = declared_variant(options.lora.parent) if options.variant == "auto" else options.variant

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.harmonization.flux.tensor_file import read_tensors, write_tensors
+from splatgraft.runtime.hub import hub_id
 
 PROMPT_FILE = "empty_prompt.safetensors"
 
@@ -30,7 +31,7 @@ def prompt_file(base: str) -> Path:
     """Where `train embed` writes the embeddings of a base: in its folder, or for a hub id in the user's cache."""
     if Path(base).is_dir():
         return Path(base) / PROMPT_FILE
-    return Path.home() / ".cache" / "splatgraft" / "prompts" / base.replace("/", "--") / PROMPT_FILE
+    return Path.home() / ".cache" / "splatgraft" / "prompts" / hub_id(base).replace("/", "--") / PROMPT_FILE
 
 
 def find_prompt(base: str, *folders: Path) -> Path:
