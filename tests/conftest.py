@@ -31,6 +31,15 @@ _STORY_SECONDS = 600
 """Seconds after which a test in a browser is taken for a hang; pytest-timeout then shows what each thread does."""
 
 
+_LONGEST = ("test_page_in_browser.py", "test_examples.py", "test_try.py", "test_exported_page.py")
+"""Modules that go first, so that no worker is alone with one of them at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order the modules; `.ci/run` tells xdist to keep that order."""
+    items.sort(key=lambda item: _LONGEST.index(item.path.name) if item.path.name in _LONGEST else len(_LONGEST))
+
+
 @pytest.fixture(scope="session")
 def finished_project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of tiny_project.py's project with the results of all steps, made once for all workers.
