@@ -35,11 +35,6 @@ _LONGEST = ("test_page_in_browser.py", "test_examples.py", "test_try.py", "test_
 """Modules that go first, so that no worker is alone with one of them at the end."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order the modules; `.ci/run` tells xdist to keep that order."""
-    items.sort(key=lambda item: _LONGEST.index(item.path.name) if item.path.name in _LONGEST else len(_LONGEST))
-
-
 @pytest.fixture(scope="session")
 def finished_project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of tiny_project.py's project with the results of all steps, made once for all workers.
@@ -89,7 +84,9 @@ def pytest_sessionfinish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that use a browser, and end one that hangs in a call without a limit of its own."""
+    """Put the longest modules first, mark the tests that use a browser, and end one that hangs in a call of its own."""
+    # `.ci/run` tells xdist to keep the order
+    items.sort(key=lambda item: _LONGEST.index(item.path.name) if item.path.name in _LONGEST else len(_LONGEST))
     for item in items:
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.browser)
