@@ -74,7 +74,8 @@ def main():
             folder = out / path.parent.relative_to(given)
             folder.mkdir(parents=True, exist_ok=True)
             for name in ("rgb", *cfg["model_passes"]):
-                Image.open(path).save(folder / f"0000.0000.{name}.png")
+                picture = Image.open(path).resize(cfg["inference_res"][::-1])
+                picture.save(folder / f"0000.0000.{name}.png")
         return
     assert all(pathlib.Path(light).is_file() for light in cfg["envlight"])
     for path in given.rglob("*.basecolor.png"):
@@ -130,6 +131,15 @@ def test_many_pictures_and_lights_load_each_model_once(tmp_path, python):
             # 8 bits
             assert (picture - draft[0] / (number + 1)).abs().max() < 0.02
     assert sorted((folder / "loads.txt").read_text().split()) == ["forward", "inverse"]
+    renderer.close()
+
+
+def test_a_picture_that_the_models_cannot_take_is_padded_and_not_stretched(tmp_path, python):
+    renderer, lights = DiffusionRenderer(installation(tmp_path / "code"), python), maps(tmp_path / "maps", 1)
+    # 50 rows, of which stretching to 64 would mix neighbours
+    stripes = (torch.arange(50) % 2).float()[:, None, None].expand(50, 70, 3).contiguous()
+    (relit,) = renderer.relight(stripes, torch.ones(50, 70), lights)
+    assert torch.equal(relit, stripes)
     renderer.close()
 
 

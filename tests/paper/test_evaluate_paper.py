@@ -1,23 +1,29 @@
 """`paper tables` on a folder of the published data set: measured numbers, published ones, reasons, and our rows."""
 
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from paper_data import PLAIN, STEMS, parts_of_view, put, write_data
 from random_lpips import write_random_lpips
 from shapes import ring, surfels
+from tiny_models import CHANNELS, flux_folder
+from tiny_pairs import relit_folder
 
 from splatgraft.cli import main
 from splatgraft.core.gaussians import concatenate
 from splatgraft.core.image_metrics import psnr
 from splatgraft.core.images import read_rgb
 from splatgraft.formats import write_cameras, write_gaussians
+from splatgraft.harmonization import FluxOptions, HarmonizerInputs, make_harmonizer
 from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
 from splatgraft_paper.commands.tables import EvaluatePaper
+from splatgraft_paper.training.pairs import DataOptions, open_training_data
 
 
 @pytest.fixture(scope="module")
@@ -129,27 +135,92 @@ def write_placed_scene(root):
     return root
 
 
-def test_our_methods_run_on_a_composite_that_is_already_placed(tmp_path):
-    weights = tmp_path / "weights"
-    weights.mkdir()
-    write_random_lpips(weights)
-    root = write_placed_scene(tmp_path / "data")
-    methods = ("copy-paste", "off+reinhard/paper", "off+flux/paper")
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Every table at toy size: tiny weights of the harmoniser, random ones of LPIPS."""
+    pytest.importorskip("diffusers")
+    root = tmp_path_factory.mktemp("whole")
+    (root / "weights").mkdir()
+    write_random_lpips(root / "weights")
+    flux = flux_folder(root / "image-mask", 12 * CHANNELS)
     command = EvaluatePaper(
-        root,
-        tmp_path / "out",
-        methods=methods,
-        weights=weights,
+        write_placed_scene(root / "data"),
+        root / "out",
+        weights=root / "weights",
+        harmonizer_weights=str(flux),
+        models=(f"paper={flux}", f"without-flux={flux}", f"mine={flux}"),
+        generated=(str(relit_folder(root / "pairs")),),
+        pairs_size="32x32",
         iterations_of_consolidation=3,
     )
-    assert command.execute(Console()) == 1
-    rows, found = by_scene_and_method(command)
-    assert {"copy-paste", "off+reinhard/paper"} <= {method for _, method in rows}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert command.execute(Console()) == 0
+    return command
+
+
+def test_our_methods_run_on_a_composite_that_is_already_placed(whole):
+    rows, found = by_scene_and_method(whole)
+    assert found["missing"] == []
+    assert {"copy-paste", "off+flux/paper", "off+flux/paper-l1-dssim", "off+flux/paper@linear"} <= {m for _, m in rows}
     # the truth is a render of the same Gaussians, but for the table, which compose presses flat under the ball's foot
     assert rows[PLAIN, "copy-paste"]["values"]["psnr_whole"] > 40
     assert rows[PLAIN, "copy-paste"]["values"]["lpips_whole"] is not None
-    assert rows[PLAIN, "off+reinhard/paper"]["seconds"]["consolidate"] > 0
-    reasons = {row["method"]: row["reason"] for row in found["missing"]}
-    assert "harmonizer flux: expected --weights" in reasons["off+flux/paper"]
-    seen = json.loads((command.out / "scenes" / PLAIN / "target/capture/transforms.json").read_text())["frames"]
+    assert rows[PLAIN, "off+flux/paper"]["seconds"]["consolidate"] > 0
+    seen = json.loads((whole.out / "scenes" / PLAIN / "target/capture/transforms.json").read_text())["frames"]
     assert len(seen) == 8
+
+
+def table(command, title):
+    text = (command.out / "paper.md").read_text()
+    return next(part for part in text.split("## ") if part.startswith(title)).splitlines()
+
+
+def test_the_ablation_of_the_data_is_measured_on_each_source_s_test_split(whole):
+    _, found = by_scene_and_method(whole)
+    assert set(found["by_model"]) == {"Ours", "w/o Flux", "mine"}
+    assert found["by_model"]["Ours"] == found["by_model"]["mine"]
+    # numpy beside it, on the one held-out pair of three scenes
+    data = open_training_data(DataOptions(generated=whole.generated, size="32x32"), 0, None)
+    (pair, *rest) = data.held_out.all()
+    read = [files.read() for files in (pair, *rest)]
+    harmonizer = make_harmonizer(FluxOptions(weights=whole.harmonizer_weights))
+    empty = torch.zeros(32, 32)
+    scores = []
+    for one in read:
+        view = HarmonizerInputs(one.composite, one.background, one.mask, empty, torch.zeros(32, 32, 3), one.composite)
+        error = (harmonizer.harmonize(view).image - one.target).numpy()
+        scores.append(-10 * np.log10((error**2).mean()))
+    assert found["by_model"]["Ours"]["psnr FLUX"] == pytest.approx(float(np.mean(scores)), abs=1e-3)
+    assert found["by_model"]["Ours"]["psnr Average"] == found["by_model"]["Ours"]["psnr FLUX"]
+    lines = table(whole, "Dataset ablation")
+    assert any(line.startswith("| w/o Blender, as published | 25.69 | 0.870 | 0.164 | 47.78 |") for line in lines)
+    assert any(line.startswith("| w/o Flux, measured here | – | – | – | – |") for line in lines)
+
+
+def test_random_weights_are_never_printed_as_lpips(whole):
+    text = (whole.out / "paper.md").read_text()
+    assert "stand-in for LPIPS" in text
+    assert "| LPIPS" not in text
+    assert "LPIPS: the weights are not the published ones" in text
+    assert "Not measured: fid and kid" in text
+
+
+def test_costs_come_from_the_records_of_the_steps_and_a_dash_has_its_reason(whole):
+    rows, _ = by_scene_and_method(whole)
+    lines = {line.split(" | ")[0].strip("| "): line for line in table(whole, "Computational cost") if "|" in line}
+    spent = rows[PLAIN, "off+flux/paper"]["seconds"]["harmonize"] / 60
+    assert lines["harmonize"] == f"| harmonize | 12.50 | {spent:.2f} |"
+    # the scene came reconstructed
+    assert lines["segment"] == "| segment | 0.67 | – (no method that ran has this step) |"
+    losses = table(whole, "Perceptual against photometric")
+    assert any(line.startswith("| stand-in for LPIPS: off+flux/paper, run here |") for line in losses)
+    assert any(line.startswith("| L1 and SSIM: off+flux/paper-l1-dssim, run here |") for line in losses)
+
+
+def test_a_model_that_is_no_folder_or_without_pairs_is_one_line(whole, tmp_path, capsys):
+    words = ["paper", "tables", "--data", str(whole.data), "--out", str(tmp_path / "out"), "--measure-only", "--models"]
+    assert main([*words, "paper=nowhere"]) == 2
+    assert "--models: expected NAME=FOLDER with existing folders, found paper=nowhere" in capsys.readouterr().err
+    assert main([*words, f"paper={tmp_path}"]) == 2
+    assert "--models: expected test pairs by --pairs, --generated or --orida, found none" in capsys.readouterr().err

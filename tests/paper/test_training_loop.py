@@ -145,7 +145,7 @@ def test_kept_latents_are_the_fresh_ones_and_a_changed_picture_is_encoded_anew(t
     target = next((tmp_path / "pairs").glob("*/target.png"))
     for path in (tmp_path / "pairs").glob("*/target.png"):
         path.write_bytes(target.read_bytes() + b" ")
-    assert set(run.cache.load(drawn, roles).pictures) == {"target"}
+    assert set(run.cache.load(drawn, roles).pictures) == {"target", "composite"}
 
 
 def test_validation_shows_held_out_pairs_and_the_end_says_the_speed(tmp_path):

@@ -1,6 +1,7 @@
 """Sources of training pairs: composites as in the paper, held-out scenes, balanced choices, resuming; relighters."""
 
 import json
+import os
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -25,8 +26,17 @@ from splatgraft_paper.training.generate import (
     generate,
     read_orida,
 )
-from splatgraft_paper.training.pairs import RelitSample, crop_to_size, open_relit, open_rendered, split_mixture
+from splatgraft_paper.training.pairs import (
+    DataOptions,
+    RelitSample,
+    crop_to_size,
+    open_relit,
+    open_rendered,
+    open_training_data,
+    split_mixture,
+)
 from splatgraft_paper.training.prompts import ANGLES, ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
+from splatgraft_paper.training.recipes import Recipe
 from splatgraft_paper.training.relighters import StandInRelighter
 
 
@@ -47,6 +57,22 @@ def test_each_picture_has_a_key_of_its_own_and_a_light_changes_the_composite_alo
     one, other = relit.pairs
     assert one.key("target") == other.key("target")
     assert one.key("composite") != other.key("composite")
+    # the composite is made of all four pictures: another of any of them makes another composite
+    for path in (one.relit, one.target, one.background, one.mask):
+        before = {role: one.key(role) for role in ("composite", "target", "background", "mask")}
+        os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
+        changed = {role for role, key in before.items() if one.key(role) != key}
+        assert changed == {"composite", *({path.stem} - {one.relit.stem})}
+
+
+def test_without_a_recipe_the_sources_are_drawn_as_in_the_paper_and_their_shares_are_said(tmp_path):
+    rendered, relit = rendered_folder(tmp_path / "a", 5), relit_folder(tmp_path / "b", 1)
+    found = open_training_data(DataOptions(pairs=(str(rendered),), generated=(str(relit),), size="16x16"), 0, None)
+    paper = {source.option: source.weight for source in Recipe.read("paper").sources}
+    assert found.mixture.weights == (paper["pairs"], paper["generated"])
+    assert found.lines[0].endswith("54% of the pairs that are drawn")
+    other = DataOptions(pairs=(str(rendered),), generated=(str(relit),), size="16x16", weights=(3.0, 1.0))
+    assert "75%" in open_training_data(other, 0, None).lines[0]
 
 
 def test_scenes_are_held_out_whole_and_draws_follow_the_weights(tmp_path):

@@ -50,7 +50,7 @@ class Run:
 
 
 def run_of(objective, folders, loop, folder, *, held_out=0.5, progress=silent, say=silent):
-    mixture, kept = split_mixture(folders, weights=(), held_out=held_out, seed=loop.seed)
+    mixture, kept = split_mixture(folders, weights=[1.0] * len(folders), held_out=held_out, seed=loop.seed)
     cache = LatentCache(
         folder.parent / "latents", objective.autoencoder.encode, width=32, height=32, autoencoder="tiny"
     )

@@ -4,6 +4,7 @@ Every loss takes an image and a target, sRGB in [0, 1], and returns a scalar tha
 gradient flows to the image only. Nothing is downloaded: LPIPS reads weights from the disk.
 """
 
+import hashlib
 import math
 import pickle
 from collections.abc import Callable
@@ -117,6 +118,14 @@ def lpips_vgg(folder: Path | None = None) -> ImageLoss:
         return torch.stack([F.conv2d(((a - b) ** 2)[None], tap.to(a)).mean() for a, b, tap in pairs]).sum()
 
     return loss
+
+
+def is_published(path: Path) -> bool:
+    """Whether a file of weights has the hash that its published name ends in, as torch hub checks it."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest().startswith(path.stem.rpartition("-")[2])
 
 
 def _load(path: Path) -> dict[str, Tensor]:

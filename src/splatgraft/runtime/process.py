@@ -54,6 +54,16 @@ def run_logged(
                 raise
 
 
+def source_commit() -> str:
+    """The git commit of this package's source with `-dirty` where it was changed; `unknown` outside a checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:
+        return "unknown"
+    return done.stdout.strip() or "unknown"
+
+
 def last_line(log: Path) -> str:
     """The last line of `log` that is not blank; empty where there is none."""
     lines = log.read_text(errors="replace").strip().splitlines() if log.is_file() else []

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -14,11 +13,11 @@ from typing import Annotated
 
 import tyro
 
-import splatgraft
 import splatgraft_paper.exam
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.process import source_commit
 from splatgraft_paper.exam.measure import ROWS, SceneResult, evaluate_scene
 from splatgraft_paper.exam.scenes import SIZE, TRAINING_NUMBER, draw_scenes, read_scene, render_scene
 from splatgraft_paper.exam.summary import summarize_light, summarize_row, summary_markdown
@@ -131,7 +130,7 @@ class Exam:
     def _write_report(self, out: Path, rows: tuple[str, ...], results: list[SceneResult], failures: list[str]) -> None:
         head = {
             "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-            "commit": _commit(),
+            "commit": source_commit(),
             "number": self.number,
             "iterations": self._options.all_iterations,
             "budget": self._options.max_gaussians,
@@ -164,10 +163,3 @@ class Exam:
         if self.number == TRAINING_NUMBER:
             return f"Number {self.number}, for training: no proof"
         return f"Held-out benchmark {self.number}"
-
-
-def _commit() -> str:
-    folder = str(Path(splatgraft.__file__).parent)
-    command = ["git", "-C", folder, "describe", "--always", "--dirty", "--exclude=*"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "unknown"

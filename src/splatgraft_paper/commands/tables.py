@@ -1,18 +1,27 @@
 """The command `paper tables`: the paper's tables on the authors' data set, published numbers beside measured."""
 
-from dataclasses import dataclass, field
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
+import torch
+
+from splatgraft.fitting.perceptual_losses import VGG_FILE, is_published
 from splatgraft.project.step import Device, locked
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
+from splatgraft_paper.benchmark.image_features import INCEPTION_FILE
 from splatgraft_paper.benchmark.methods import Method, MethodSettings
 from splatgraft_paper.benchmark.run import unmeasurable_metrics
+from splatgraft_paper.tables.data_ablation import DataAblation, measure_models
 from splatgraft_paper.tables.layout import PaperScene, download, find_scenes
 from splatgraft_paper.tables.our_pictures import OurRun
+from splatgraft_paper.tables.paper_numbers import published_name
 from splatgraft_paper.tables.report import write_paper_report
 from splatgraft_paper.tables.run import PaperRun, perform_paper_run
+from splatgraft_paper.training.pairs import DataOptions
 
 PAPERS_OWN = "off+flux/paper"
 """Our implementation of the paper's method: copy-paste, FLUX, 10,000 steps of Adam on LPIPS."""
@@ -43,6 +52,16 @@ class EvaluatePaper:
     """Folder with the weights of LPIPS and Inception; torch hub's cache where not given."""
     harmonizer_weights: str | None = None
     """Weights of the image model that the methods name: folder, file or hub id, as `harmonize --weights` takes them."""
+    models: tuple[str, ...] = ()
+    """NAME=FOLDER of harmonisers for Table 3, by the names of their recipes (paper, without-blender, ..) or others."""
+    pairs: tuple[str, ...] = ()
+    """Folders of rendered pairs for Table 3, as `paper train flux` takes them, which holds the test split out."""
+    generated: tuple[str, ...] = ()
+    """Folders of generated pairs, likewise."""
+    orida: tuple[str, ...] = ()
+    """Folders of ORIDa's pairs, likewise."""
+    pairs_size: str = "704x496"
+    """Pixels of a pair, WIDTHxHEIGHT, as the models were trained."""
     iterations_of_consolidation: int = 10_000
     """Steps of the paper's consolidation."""
     options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(quality="draft", device="auto"))
@@ -68,13 +87,59 @@ class EvaluatePaper:
         )
         with locked(self.out):
             found = perform_paper_run(run, missing_metrics, console)
+            found = replace(
+                found,
+                by_model=self._by_model(missing_metrics, console),
+                stand_ins=_stand_ins(self.weights, missing_metrics),
+                device=_device_name(self.options.device),
+            )
             page = write_paper_report(self.out, found)
         console.result(page)
         failed = not self.measure_only and any(method in found.ours for _, method in found.missing)
         return 1 if failed else 0
+
+    def _by_model(self, missing: Mapping[str, str], console: Console) -> dict[str, dict[str, float]]:
+        """Table 3, where models are given."""
+        if not self.models:
+            return {}
+        named = {name: Path(folder) for name, found, folder in (text.partition("=") for text in self.models) if found}
+        if len(named) < len(self.models) or not all(folder.is_dir() for folder in named.values()):
+            raise ValueError(f"--models: expected NAME=FOLDER with existing folders, found {' '.join(self.models)}")
+        metrics = {
+            "psnr",
+            "ssim",
+            *(name for name, of in (("lpips", "lpips"), ("fid", "fid and kid")) if of not in missing),
+        }
+        ablation = DataAblation(
+            {published_name(name): folder for name, folder in named.items()},
+            DataOptions(self.pairs, self.generated, self.orida, size=self.pairs_size),
+            weights=self.weights,
+            metrics=frozenset(metrics),
+            device=cast(Device, self.options.device),
+        )
+        return measure_models(ablation, console)
 
     def _chosen(self, scenes: tuple[PaperScene, ...]) -> tuple[PaperScene, ...]:
         names = [scene.name for scene in scenes]
         if unknown := [name for name in self.only if name not in names]:
             raise ValueError(f"--only: expected names among {', '.join(names)}; found {unknown[0]}")
         return tuple(scene for scene in scenes if not self.only or scene.name in self.only)
+
+
+def _stand_ins(weights: Path | None, missing: Mapping[str, str]) -> frozenset[str]:
+    """Metrics that are measured with other weights than the published ones."""
+    folder = weights or Path(torch.hub.get_dir()) / "checkpoints"
+    files = {
+        "lpips": ("lpips", VGG_FILE),
+        "fid": ("fid and kid", INCEPTION_FILE),
+        "kid": ("fid and kid", INCEPTION_FILE),
+    }
+    return frozenset(
+        name for name, (key, file) in files.items() if key not in missing and not is_published(folder / file)
+    )
+
+
+def _device_name(device: str) -> str:
+    if device != "cpu" and torch.cuda.is_available():
+        return torch.cuda.get_device_name()
+    return f"{os.cpu_count()} cores"

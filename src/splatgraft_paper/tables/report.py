@@ -15,12 +15,13 @@ from torch import Tensor
 from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.evaluation import side_by_side
 from splatgraft.evaluation.report_page import html_page
+from splatgraft.runtime.process import source_commit
 from splatgraft_paper.benchmark.table import Table, summarize, table_section
 from splatgraft_paper.tables.layout import Kind, PaperScene, held_out_stems, match_views, pictures
-from splatgraft_paper.tables.paper_numbers import ROTATION, SCENES, SYNTHETIC, UPDATES, PublishedTable
+from splatgraft_paper.tables.paper_numbers import COST, DATA, ROTATION, SCENES, SYNTHETIC, UPDATES, PublishedTable
 from splatgraft_paper.tables.run import METRIC_VERSIONS, PaperResults
 
-_FORMATS = {"psnr": "{:.2f}", "fid": "{:.2f}", "minutes": "{:.1f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
+_FORMATS = {"psnr": "{:.2f}", "fid": "{:.2f}", "minutes": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
 _LESS_IS_BETTER = ("lpips", "fid", "kid", "flip", "minutes")
 _KEYS = {"psnr": "psnr_whole", "ssim": "ssim_padded_whole", "lpips": "lpips_whole", "flip": "flip_whole"}
 _COLUMNS = ("psnr", "ssim", "lpips", "fid", "kid", "flip")
@@ -57,7 +58,11 @@ def write_paper_report(out: Path, results: PaperResults) -> Path:
 
 
 def paper_tables(results: PaperResults) -> list[Table]:
-    """The paper's tables of scenes with truth (1, 2 and 4), and PSNR by scene."""
+    """The paper's four tables, its ablation of the loss, its costs, and PSNR by scene."""
+
+    def title(metric: str) -> str:
+        return f"{_metric(metric, results)} {'↓' if metric in _LESS_IS_BETTER else '↑'}"
+
     synthetic: list[tuple[str, ...]] = []
     for name in dict.fromkeys([*SYNTHETIC.rows, *results.methods("synthetic")]):
         if name in SYNTHETIC.rows:
@@ -76,11 +81,21 @@ def paper_tables(results: PaperResults) -> list[Table]:
             if "+" in method and (method.partition("@")[2] or "once") == schedule:
                 cells = _measured(results, "synthetic", method)
                 updates.append((_named(method, results), _minutes(results, method), *cells))
-    head = (*map(_title, _COLUMNS), "scenes")
+    losses: list[tuple[str, ...]] = []
+    for loss, ending in {_metric("lpips", results): "/paper", "L1 and SSIM": "/paper-l1-dssim"}.items():
+        for method in (method for method in results.ours if method.endswith(ending)):
+            minutes, cells = _step_minutes(results, method, "consolidate"), _measured(results, "synthetic", method)
+            losses.append((f"{loss}: {method}, run here", minutes, *cells))
+    head = (*map(title, _COLUMNS), "scenes")
     tables = [
         Table(SYNTHETIC.title, ("method", *head), tuple(synthetic)),
         Table(ROTATION.title, ("pose", *head), tuple(rotation)),
-        Table(UPDATES.title, ("schedule", _title("minutes"), *head), tuple(updates)),
+        Table(
+            DATA.title, ("model", *(f"{title(m)} {s}" for m, s in map(str.split, DATA.columns))), _data_rows(results)
+        ),
+        Table(UPDATES.title, ("schedule", title("minutes"), *head), tuple(updates)),
+        Table(_LOSS_TITLE, ("loss", title("minutes"), *head), tuple(losses)),
+        Table(COST.title, ("part", "minutes, as published", f"minutes here, {results.device}"), _cost_rows(results)),
     ]
     for kind in ("synthetic", "rotation"):
         scenes = [scene.name for scene in results.scenes if scene.kind == kind]
@@ -91,6 +106,44 @@ def paper_tables(results: PaperResults) -> list[Table]:
         if rows:
             tables.append(Table(f"PSNR by scene: {kind}", ("method", *scenes), tuple(rows)))
     return tables
+
+
+_LOSS_TITLE = "Perceptual against photometric loss of the consolidation (the paper's Sec. 7.3, which shows pictures)"
+_COST_STEPS = {
+    "reconstruct, each scene": ("reconstruct source", ""),
+    "segment": ("segment", ""),
+    "harmonize": ("harmonize", ""),
+    "consolidate, LPIPS": ("consolidate", "/paper"),
+    "consolidate, L1 and SSIM": ("consolidate", "/paper-l1-dssim"),
+}
+"""Row of the costs to the step whose record has it, and how the name of its method ends."""
+
+
+def _data_rows(results: PaperResults) -> tuple[tuple[str, ...], ...]:
+    rows: list[tuple[str, ...]] = []
+    for name in dict.fromkeys([*DATA.rows, *results.by_model]):
+        if name in DATA.rows:
+            rows.append((f"{name}, as published", *(_text(c.split()[0], DATA.value(name, c)) for c in DATA.columns)))
+        if name in results.by_model:
+            values = results.by_model[name]
+            rows.append((f"{name}, measured here", *(_text(c.split()[0], values.get(c)) for c in DATA.columns)))
+    return tuple(rows)
+
+
+def _cost_rows(results: PaperResults) -> tuple[tuple[str, ...], ...]:
+    rows: list[tuple[str, ...]] = []
+    for part, (step, ending) in _COST_STEPS.items():
+        methods = [method for method in results.ours if "@" not in method and method.endswith(ending)]
+        found = [cell for method in methods if (cell := _step_minutes(results, method, step)) != _EMPTY]
+        published = _text("minutes", COST.value(part, "minutes"))
+        rows.append((part, published, found[0] if found else f"{_EMPTY} (no method that ran has this step)"))
+    return tuple(rows)
+
+
+def _step_minutes(results: PaperResults, method: str, step: str) -> str:
+    """Mean time of one step of a method over the synthetic scenes on which it ran."""
+    spent = [item.seconds[step] for item in results.of("synthetic", method) if step in item.seconds]
+    return _text("minutes", sum(spent) / len(spent) / 60 if spent else None)
 
 
 def protocol_notes(results: PaperResults) -> list[str]:
@@ -111,7 +164,12 @@ def protocol_notes(results: PaperResults) -> list[str]:
         *(f"{name.upper()}: {text}." for name, text in METRIC_VERSIONS.items()),
         *(f"Not measured: {name}: {reason}" for name, reason in results.not_measured.items()),
         *(f"{scene}, {method}: {reason}" for (scene, method), reason in results.missing.items()),
-        f"Made by splatgraft {version('splatgraft')}: {shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}",
+        *(
+            f"{name.upper()}: the weights are not the published ones; its columns are a stand-in's."
+            for name in sorted(results.stand_ins)
+        ),
+        f"Made by splatgraft {version('splatgraft')} at commit {source_commit()}: "
+        + shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     ]
     return list(dict.fromkeys(notes))
 
@@ -120,8 +178,11 @@ def _named(method: str, results: PaperResults) -> str:
     return f"{method}, " + ("run here" if method in results.ours else "the authors' pictures, measured here")
 
 
-def _title(metric: str) -> str:
-    return f"{metric.upper() if metric != 'minutes' else metric} {'↓' if metric in _LESS_IS_BETTER else '↑'}"
+def _metric(name: str, results: PaperResults) -> str:
+    """The name of a metric in a head; of one whose weights are not the published ones, that of its stand-in."""
+    if name == "minutes":
+        return name
+    return f"stand-in for {name.upper()}" if name in results.stand_ins else name.upper()
 
 
 def _published(table: PublishedTable, row: str, columns: Sequence[str]) -> list[str]:
@@ -144,7 +205,7 @@ def _measured(results: PaperResults, kind: Kind, method: str, pose: str = "") ->
 
 def _minutes(results: PaperResults, method: str) -> str:
     found = [item.seconds for item in results.of("synthetic", method) if item.seconds]
-    spent = [sum(seconds.get(step, 0.0) for step in ("harmonize", "consolidate", "update")) for seconds in found]
+    spent = [sum(seconds.get(step, 0.0) for step in ("harmonize", "consolidate")) for seconds in found]
     return _text("minutes", sum(spent) / len(spent) / 60 if spent else None)
 
 
@@ -169,6 +230,9 @@ def _as_json(results: PaperResults, notes: Sequence[str]) -> dict[str, object]:
     return {
         "measured": measured,
         "pooled": [{"kind": k, "pose": p, "method": m, **v} for (k, p, m), v in results.pooled.items()],
+        "by_model": {name: dict(values) for name, values in results.by_model.items()},
+        "stand_ins": sorted(results.stand_ins),
+        "device": results.device,
         "missing": [{"scene": s, "method": m, "reason": r} for (s, m), r in results.missing.items()],
         "not_measured": dict(results.not_measured),
         "metrics": METRIC_VERSIONS,

@@ -65,6 +65,12 @@ class PaperResults:
     """Names of the methods of this software, in order."""
     pooled: Mapping[tuple[Kind, str, str], Mapping[str, float]] = field(default_factory=dict)
     """(kind, pose or "", method) to FID and KID."""
+    by_model: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Name of a trained model to its metrics on each source's test split, such as `psnr Blender`."""
+    stand_ins: frozenset[str] = frozenset()
+    """Metrics whose weights are not the published ones."""
+    device: str = ""
+    """What the methods ran on."""
 
     def methods(self, kind: Kind) -> list[str]:
         """Methods with pictures of scenes of a kind: the authors' first, then ours."""
@@ -122,7 +128,7 @@ class _Found:
 
 
 def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: Console) -> PaperResults:
-    """Measure and run what is missing."""
+    """Measure and run what is missing; the models of the data ablation are measured apart."""
     found = _Found("lpips" not in not_measured, console)
     for scene in run.scenes:
         composite = scene.folders.get("composite")

@@ -78,18 +78,22 @@ class PairFiles:
     relit: Path
     """The object under another light."""
 
-    def file(self, role: Role) -> Path:
-        """The file that the image of a role is made of."""
-        return self.relit if role == "composite" else getattr(self, role)
+    def files(self, role: Role) -> tuple[Path, ...]:
+        """The files that the image of a role is made of; the relit object is matched to the one in the scene."""
+        if role == "composite":
+            return (self.relit, self.target, self.background, self.mask)
+        return (getattr(self, role),)
 
     def key(self, role: Role) -> str:
-        """Identify the image of a role by the path, size and time of its file."""
-        path = self.file(role)
-        try:
-            status = path.stat()
-        except OSError as error:
-            raise ValueError(f"{path}: expected a picture of a pair, found {error.strerror}") from error
-        return f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}|{role}"
+        """Identify the image of a role by the paths, sizes and times of its files."""
+        found = [role]
+        for path in self.files(role):
+            try:
+                status = path.stat()
+            except OSError as error:
+                raise ValueError(f"{path}: expected a picture of a pair, found {error.strerror}") from error
+            found.append(f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}")
+        return "|".join(found)
 
     def read(self) -> TrainingPair:
         """Read the pair; its composite has the relit object at the exposure of that in the scene (paper, Eq. 2)."""
@@ -210,13 +214,13 @@ def split_mixture(
 ) -> tuple[Mixture, Mixture | None]:
     """Split folders into training and held-out pairs, by whole groups in the order of their names' hashes.
 
-    `weights` are relative, one per folder, by the number of training pairs where empty; `held_out` is the share of the
+    `weights` are relative, one per folder; `held_out` is the share of the
     groups of each folder, at least one group, or 0. The second mixture is None where nothing is held out.
     """
     if not folders or not all(folder.pairs for folder in folders):
         empty = next((folder.name for folder in folders if not folder.pairs), "no source")
         raise ValueError(f"training data: expected pairs, found none in {empty}")
-    if weights and (len(weights) != len(folders) or min(weights) < 0 or sum(weights) <= 0):
+    if len(weights) != len(folders) or min(weights) < 0 or sum(weights) <= 0:
         raise ValueError(f"--weights: expected {len(folders)} numbers of at least 0, found {list(weights)}")
     training, validation = [], []
     for folder in folders:
@@ -225,8 +229,7 @@ def split_mixture(
         excluded = set(groups[:count])
         training.append(tuple(pair for pair in folder.pairs if pair.group not in excluded))
         validation.append(tuple(pair for pair in folder.pairs if pair.group in excluded))
-    names = tuple(folder.name for folder in folders)
-    shares = tuple(weights) or tuple(float(len(pairs)) for pairs in training)
+    names, shares = tuple(folder.name for folder in folders), tuple(weights)
     train = Mixture(names, shares, tuple(training), seed)
     used = [i for i, pairs in enumerate(validation) if pairs]
     if not used:
@@ -246,7 +249,7 @@ class DataOptions:
     orida: tuple[str, ...] = ()
     """Folders that `splatgraft paper synth orida` made."""
     weights: tuple[float, ...] = ()
-    """Relative frequency of each folder, in the order above; a recipe's, or the numbers of pairs, where not given."""
+    """Relative frequency of each folder, in the order above; the recipe's, or the paper's, where not given."""
     size: str = "704x496"
     """Pixels of a training picture, WIDTHxHEIGHT, multiples of 16."""
     held_out: float = 0.05
@@ -265,17 +268,19 @@ class TrainingData:
     height: int
     """Pixels."""
     lines: tuple[str, ...] = ()
-    """One for each folder: how much of it is for training."""
+    """One for each folder: how much of it is for training, and its share of the pairs that are drawn."""
 
 
 def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -> TrainingData:
-    """Open the folders and hold out scenes; a recipe's sources must all be given, and its weights are the default."""
+    """Open the folders and hold out scenes; a recipe's sources must all be given, and its weights are the default.
+
+    Without a recipe the weights are the paper's, of the sources that are given.
+    """
     width, height = parse_image_size(options.size, multiple_of=16)
     given = {"pairs": options.pairs, "generated": options.generated, "orida": options.orida}
-    weights = options.weights
-    if recipe:
-        shares = recipe.weights({name: len(folders) for name, folders in given.items()})
-        weights = weights or shares
+    counts = {name: len(folders) for name, folders in given.items()}
+    chosen = recipe or Recipe.read("paper").of(counts)
+    weights = options.weights or chosen.weights(counts)
     folders = [
         open_rendered(Path(folder)) if name == "pairs" else open_relit(Path(folder))
         for name, listed in given.items()
@@ -285,7 +290,8 @@ def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -
         raise ValueError("training data: expected --pairs, --generated or --orida, found none")
     mixture, held_out = split_mixture(folders, weights=weights, held_out=options.held_out, seed=seed)
     lines = [
-        f"data: {len(own)} pairs to train on, {len(folder.pairs) - len(own)} held out, {folder.name}"
-        for folder, own in zip(folders, mixture.pairs, strict=True)
+        f"data: {len(own)} pairs to train on, {len(folder.pairs) - len(own)} held out, {folder.name}; "
+        f"{share / sum(weights):.0%} of the pairs that are drawn"
+        for folder, own, share in zip(folders, mixture.pairs, weights, strict=True)
     ]
     return TrainingData(mixture, held_out, width, height, tuple(lines))

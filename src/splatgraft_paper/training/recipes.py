@@ -3,7 +3,7 @@
 import argparse
 import math
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +85,10 @@ class Recipe:
             elif value is not False:
                 words += [f"--{name}", str(value)]
         return words
+
+    def of(self, folders: dict[str, int]) -> "Recipe":
+        """The recipe with those of its sources that have folders."""
+        return replace(self, sources=tuple(source for source in self.sources if folders.get(source.option)))
 
     def weights(self, folders: dict[str, int]) -> tuple[float, ...]:
         """The weight of each folder, in the order of `folders`."""

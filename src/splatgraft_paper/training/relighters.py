@@ -138,6 +138,8 @@ class DiffusionRenderer:
             process.stdin.flush()
             answer: dict[str, Any] = json.loads(process.stdout.readline())
         except (OSError, ValueError):
+            # a process whose pipes have closed may still be ending
+            self.close()
             answer = {"error": f"its process ended ({last_line(self._log) or 'no output'})"}
         if answer["error"] is not None:
             status = answer["error"].startswith("exit status")
