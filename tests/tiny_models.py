@@ -87,3 +87,28 @@ def removal_folder(folder: Path) -> Path:
     tiny_autoencoder().save_pretrained(folder / "vae")
     write_tensors(folder / "empty_prompt.safetensors", {"tokens": torch.randn(3, TEXT)})
     return folder
+
+
+def kontext_folder(folder: Path) -> Path:
+    """A whole FluxKontextPipeline of the classes that diffusers' own tests take, tiny, with a few words."""
+    from diffusers import FlowMatchEulerDiscreteScheduler, FluxKontextPipeline
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer, T5Config, T5EncoderModel, T5TokenizerFast
+
+    words = ["<|startoftext|>", "<|endoftext|>", *(f"{letter}</w>" for letter in "abcdefghij")]
+    pieces = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), *((f"\u2581{letter}", -1.0) for letter in "abcdefghij")]
+    torch.manual_seed(4)
+    clip = CLIPTextConfig(
+        bos_token_id=0, eos_token_id=1, pad_token_id=1, hidden_size=POOLED, projection_dim=POOLED, intermediate_size=37,
+        num_attention_heads=4, num_hidden_layers=2, vocab_size=len(words),
+    )  # fmt: skip
+    t5 = T5Config(vocab_size=200, d_model=TEXT, d_kv=8, d_ff=32, num_layers=1, num_heads=2)
+    FluxKontextPipeline(
+        scheduler=FlowMatchEulerDiscreteScheduler(),
+        vae=tiny_autoencoder(),
+        text_encoder=CLIPTextModel(clip),
+        tokenizer=CLIPTokenizer(vocab={word: i for i, word in enumerate(words)}, merges=[], model_max_length=77),
+        text_encoder_2=T5EncoderModel(t5),
+        tokenizer_2=T5TokenizerFast(vocab=pieces, extra_ids=0),
+        transformer=tiny_transformer(guidance_embeds=True),
+    ).save_pretrained(folder)
+    return folder

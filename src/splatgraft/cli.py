@@ -30,6 +30,7 @@ _TABLE = (
     ("relight", "steps.relight", "give the object the light of its new place"),
     ("render", "steps.render", "render a scene or a composite from given cameras"),
     ("harmonize", "steps.harmonize", "make the light of each rendered view agree"),
+    ("harmonize photo", "harmonize_photo", "the same for one picture and its mask, without any scene"),
     ("consolidate", "steps.consolidate", "fit the colours of the scene to the harmonised views"),
     ("evaluate", "steps.evaluate", "compare, picture and report"),
     ("export", "export", "write a scene or a result as a page, for another program, or as pictures"),
@@ -172,11 +173,12 @@ def _below(first: Sequence[str]) -> dict[str, str]:
 
 
 def _first_words() -> dict[str, str]:
-    """The commands of one word, and a line for those that share their first word."""
+    """The commands that begin with a command of one word, and a line for each group that has none."""
     table = commands()
-    groups = {name.split()[0] for name in table if " " in name}
+    alone = {name for name in table if " " not in name}
+    groups = {name.split()[0] for name in table} - alone
     lines = {f"{first} ...": f"the commands that `splatgraft {first} --help` lists" for first in sorted(groups)}
-    return {name: one.summary for name, one in table.items() if " " not in name} | lines
+    return {name: one.summary for name, one in table.items() if name.split()[0] in alone} | lines
 
 
 _HEAD = "usage: splatgraft COMMAND [OPTIONS]; `splatgraft COMMAND --help` says more"

@@ -14,7 +14,8 @@ import torch
 from PIL import Image
 
 from splatgraft.harmonization import HarmonizerContext, HarmonizerInputs, make_harmonizer
-from splatgraft_paper.peers.image_editing import KEY_VARIABLE, PROMPT, ImageEditingOptions
+from splatgraft.harmonization.image_editing import PROMPT
+from splatgraft_paper.peers.image_editing import KEY_VARIABLE, ImageEditingOptions
 from splatgraft_paper.peers.methods import method_options
 from splatgraft_paper.peers.mv_colight import MVCoLight, network_input
 
@@ -33,8 +34,8 @@ MISSING = {
     "lbm": "harmonizer lbm: expected the package lbm",
     "mv-colight": "harmonizer mv-colight: expected --checkout with the code of",
     "image-editing": "--max-cost: expected at least 0.04 US dollars, found 0.00",
-    "flux": "harmonizer flux: expected --weights FOLDER or a hub id",
-    "magic": "expected one of compact, flux, image-editing, lbm, mv-colight, none, reinhard, found 'magic'",
+    "flux": "harmonizer flux: expected --weights FOLDER or dot3d",
+    "magic": "expected one of compact, edit, flux, image-editing, lbm, mv-colight, none, reinhard, found 'magic'",
 }
 
 

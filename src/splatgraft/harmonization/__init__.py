@@ -11,6 +11,7 @@ from splatgraft.harmonization.interface import (
 from splatgraft.harmonization.methods import (
     HARMONIZERS,
     CompactOptions,
+    EditOptions,
     FluxOptions,
     HarmonizerOptions,
     NoneOptions,
@@ -20,6 +21,7 @@ from splatgraft.harmonization.methods import (
 __all__ = [
     "HARMONIZERS",
     "CompactOptions",
+    "EditOptions",
     "FluxOptions",
     "Harmonized",
     "HarmonizedViews",

@@ -95,8 +95,35 @@ class FluxOptions:
         return FluxHarmonizer(load_flux(self, context), seed=self.seed, steps=self.sampling_steps)
 
 
+@dataclass(frozen=True)
+class EditOptions:
+    """An open image-editing model with a prompt, such as FLUX.1 Kontext, FLUX.2 or Qwen-Image-Edit."""
+
+    name: ClassVar[str] = "edit"
+
+    model: str | None = None
+    """Folder or hub id of a diffusers pipeline that takes an image and a prompt; must be given."""
+    prompt: str | None = None
+    """What to do; the paper's prompt (Sec. 7) where not given."""
+    seed: int = 0
+    """Seed of the noise, shared by all views."""
+    sampling_steps: int | None = None
+    """Steps of the diffusion sampling; the pipeline's own where not given."""
+
+    def make(self, context: HarmonizerContext) -> Harmonizer:
+        """Load the pipeline."""
+        if self.model is None:
+            raise ValueError(
+                "harmonizer edit: expected --model FOLDER or a hub id such as Qwen/Qwen-Image-Edit-2509 (mind the "
+                "licence of each), found none"
+            )
+        from splatgraft.harmonization.image_editing import load_editor
+
+        return load_editor(self, context)
+
+
 HARMONIZERS: dict[str, type[HarmonizerOptions]] = {
-    kind.name: kind for kind in (NoneOptions, CompactOptions, FluxOptions)
+    kind.name: kind for kind in (NoneOptions, CompactOptions, FluxOptions, EditOptions)
 }
 """Name of a method to its options."""
 

@@ -19,6 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from splatgraft.core.images import resize
+from splatgraft.harmonization.image_editing import PROMPT
 from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
 
 KEY_VARIABLE = "SPLATGRAFT_IMAGE_EDITING_KEY"
@@ -26,15 +27,6 @@ DOLLARS_PER_VIEW = 0.04
 """Price of one image by gemini-2.5-flash-image at the time of writing; other services differ."""
 _URL = "https://generativelanguage.googleapis.com/v1beta/models/gemini-2.5-flash-image:generateContent"
 _TIMEOUT_SECONDS = 180
-
-PROMPT = (
-    "I copy-pasted an object from one photograph to the other. I will give you the photograph and the mask of the "
-    "copied object, white is the object and black is the background. Edit the photograph such that the copied object "
-    "looks realistically composited in the environment. Create realistic contact shadows, ambient occlusion, global "
-    "illumination, accurate lighting match, seamless blending etc. This is crucial: Do not change anything else other "
-    "than the composited object."
-)
-"""The paper's prompt, verbatim."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from splatgraft.folders.harmonized_views import (
     picture_folders,
 )
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import HARMONIZERS, CompactOptions, FluxOptions, NoneOptions
+from splatgraft.harmonization import HARMONIZERS, CompactOptions, EditOptions, FluxOptions, NoneOptions
 from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
 
 
@@ -33,6 +33,7 @@ class Harmonize:
         Annotated[NoneOptions, subcommand("none")]
         | Annotated[CompactOptions, subcommand("compact")]
         | Annotated[FluxOptions, subcommand("flux")]
+        | Annotated[EditOptions, subcommand("edit")]
     ) = field(default_factory=NoneOptions)
     """The image model; its options are further keys of the table, or options of the sub-command."""
     device: Device = "auto"
@@ -45,7 +46,8 @@ class Harmonize:
     def inputs(self) -> Inputs:
         """All pictures of all views, and the small files that identify the weights."""
         files: dict[str, tuple[Path, ...]] = {"views": ViewFolder.open(self.views).files()}
-        lora, weights = getattr(self.method, "lora", None), getattr(self.method, "weights", None)
+        lora = getattr(self.method, "lora", None)
+        weights = getattr(self.method, "weights", None) or getattr(self.method, "model", None)
         if lora is not None:
             files["lora"] = (lora,)
         if weights is not None and Path(weights).is_dir():
