@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.core.directions import even_directions
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear, write_image
 from splatgraft.evaluation.measure import find_regions
 from splatgraft.relighting import Light, Relit, SourceScene, relight
@@ -23,11 +23,13 @@ from splatgraft.relighting.gain import relight_by_gain
 from splatgraft_paper.benchmark.measure import measure_view
 from splatgraft_paper.benchmark.transplat import relight_by_irradiance_ratio
 from splatgraft_paper.exam.scenes import ExamScene, TrueView
+from splatgraft_paper.peers.deferred_reflection import ReflectiveScene, fit_reflections, insert
 
 ROWS: Mapping[str, str] = {
     "paste": "the object as it was captured",
     "gain": "one gain per channel, from the light around both places",
     "transplat": "the ratio of irradiances at each normal (TranSplat's diffuse path), both estimated; no shadow",
+    "3dgs-dr": "3DGS-DR: the object reflects an environment that is fitted to the target's photographs; no shadow",
     "transfer": "the transfer, everything estimated",
     "true-new-light": "the transfer with the ground-truth new light",
     "true-lights": "the transfer with both ground-truth lights",
@@ -36,7 +38,7 @@ ROWS: Mapping[str, str] = {
 }
 
 
-def make_row(row: str, scene: ExamScene) -> tuple[Gaussians, Relit | None]:
+def make_row(row: str, scene: ExamScene) -> tuple[Gaussians | ReflectiveScene, Relit | None]:
     """The scene that a row gives, and the transfer in layers where the row is one."""
     if row == "paste":
         return scene.composite.bake()[0], None
@@ -44,11 +46,24 @@ def make_row(row: str, scene: ExamScene) -> tuple[Gaussians, Relit | None]:
         return relight_by_gain(scene.composite, scene.cameras, sources=[scene.source])[0].bake()[0], None
     if row == "transplat":
         return relight_by_irradiance_ratio(scene.composite, sources=[scene.source])[0].bake()[0], None
+    if row == "3dgs-dr":
+        return _with_reflections(scene), None
     if row == "fitted":
         return _fitted_to_truth(scene), None
     source, light = _with_truth(row, scene)
     relit = relight(scene.composite, scene.cameras, sources=[source], light=light)
     return relit.bake()[0], relit
+
+
+def _with_reflections(scene: ExamScene) -> ReflectiveScene:
+    """The object's reflections and the target's environment, each fitted to the photographs of its own capture."""
+    composite, placed = scene.composite, scene.composite.objects[0]
+    source = fit_reflections(concatenate([scene.source.gaussians, placed.gaussians]), scene.photos["source"])
+    is_object = torch.arange(source.gaussians.count) >= scene.source.gaussians.count
+    taken = source.select(is_object)
+    moved = replace(placed, gaussians=taken.gaussians).in_target()
+    target = fit_reflections(composite.target.select(~composite.erased), scene.photos["target"])
+    return insert(target, [replace(taken, gaussians=moved)])
 
 
 def _fitted_to_truth(scene: ExamScene) -> Gaussians:
@@ -144,7 +159,7 @@ def evaluate_scene(scene: ExamScene, rows: Sequence[str], picture: Path) -> Scen
     return SceneResult(scene.name, values, light, normals_deg, tuple(notes))
 
 
-def measure_row(result: Gaussians, views: Sequence[TrueView]) -> dict[str, float | None]:
+def measure_row(result: Gaussians | ReflectiveScene, views: Sequence[TrueView]) -> dict[str, float | None]:
     """The values of `METRICS`, means over the views where they are defined."""
     found = [measure_view(view.picture(result), view.truth, background=view.background) for view in views]
     out: dict[str, float | None] = {}

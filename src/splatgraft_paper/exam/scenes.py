@@ -1,8 +1,9 @@
 """Scenes of the held-out benchmark: drawn from a number alone, rendered, reconstructed, and read with their truth."""
 
 import random
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.posed_images import held_out
+from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.evaluation import Truth
 from splatgraft.folders.composite_folder import read_composite
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
@@ -28,6 +29,7 @@ from splatgraft.runtime.workers import Task, run_tasks
 from splatgraft_paper.benchmark.measure import true_view
 from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY, GroundTruthScene, compose_scene
 from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE, read_probe, write_true_light
+from splatgraft_paper.peers.deferred_reflection import ReflectiveScene
 from splatgraft_paper.synthesis.benchmark import BenchmarkScene, BenchmarkSize, find_defect, gather, plan
 from splatgraft_paper.synthesis.jobs import RenderSize, render_job
 from splatgraft_paper.synthesis.places import KINDS
@@ -87,8 +89,11 @@ class TrueView:
     background: Float[Tensor, "h w 3"]
     """The reconstructed target without the object, sRGB in [0, 1]."""
 
-    def picture(self, scene: Gaussians) -> Float[Tensor, "h w 3"]:
+    @torch.no_grad()
+    def picture(self, scene: Gaussians | ReflectiveScene) -> Float[Tensor, "h w 3"]:
         """A scene from this view, sRGB in [0, 1]."""
+        if isinstance(scene, ReflectiveScene):
+            return scene.picture(self.camera).clamp(0, 1)
         return render(scene, self.camera).color[0].clamp(0, 1)
 
 
@@ -112,6 +117,8 @@ class ExamScene:
     """True, at its place in the source, source's frame."""
     normals: Float[Tensor, "n 3"] | None
     """True, of the object's Gaussians, source's frame; None where the object's surface is not known."""
+    photos: Mapping[str, PosedImages] = field(default_factory=dict)
+    """Those that the `source` and the `target` were reconstructed from."""
 
 
 def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: Console) -> ExamScene:
@@ -131,6 +138,7 @@ def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: C
         fitted_views=_true_views(files, composite.target, are_held_out=False),
         new_light=read_probe(folder / "probe.npy", folder / "suns.json"),
         old_light=read_probe(folder / "old_light" / "0000.npy", folder / "old_light" / "suns.json"),
+        photos={side: read_capture(work / side / "capture") for side in ("source", "target")},
         normals=_read_normals(folder / "surface.npy", composite.objects[0].gaussians, source.cameras),
     )
 
