@@ -60,7 +60,7 @@ def load_editor(options: "EditOptions", context: HarmonizerContext) -> "ImageEdi
         pipeline.enable_model_cpu_offload(device=context.device)
     takes_mask = name.startswith(_SEVERAL)
     context.say(f"edit: {name} of {model}, given " + ("composite and mask" if takes_mask else "the composite alone"))
-    settings = {"prompt": options.prompt or PROMPT}
+    settings: dict[str, Any] = {"prompt": options.prompt or PROMPT}
     if options.sampling_steps is not None:
         settings["num_inference_steps"] = options.sampling_steps
     return ImageEditor(pipeline, takes_mask, frozenset(known), settings, options.seed)

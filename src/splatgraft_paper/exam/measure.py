@@ -72,7 +72,8 @@ def _fitted_to_truth(scene: ExamScene) -> Gaussians:
     The shadow is the ratio of the true pictures with and without the object, on the target as it was reconstructed, so
     that errors of the reconstruction count as little as in the other rows.
     """
-    lit, _ = make_row("true-lights", scene)
+    source, light = _with_truth("true-lights", scene)
+    lit = relight(scene.composite, scene.cameras, sources=[source], light=light).bake()[0]
     images = []
     for view in scene.fitted_views:
         regions = find_regions(view.truth)
