@@ -8,11 +8,12 @@ import gpu
 import pytest
 import torch
 
+QUICK = ("paper-adam", "lora")
 TOY = gpu.Setting(torch.device("cpu"), toy=True)
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(part, marks=pytest.mark.long if part == "paper-size" else ()) for part in gpu.PARTS]
+    "name", [pytest.param(part, marks=pytest.mark.long if part not in QUICK else ()) for part in gpu.PARTS]
 )
 def test_every_part_runs_at_toy_size(name, tmp_path):
     if name.startswith("harmonize") or name == "lora":

@@ -101,6 +101,7 @@ def test_true_normals_are_those_of_the_nearest_surface():
     assert median_angle_deg(found, found, ~chosen) is None
 
 
+@pytest.mark.long
 def test_fitted_colours_make_the_true_shadow_in_views_they_were_not_fitted_to():
     x, y = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(-1, 1, 41), indexing="ij")
     points = torch.stack([x.flatten(), y.flatten(), torch.zeros(x.numel())], 1)
