@@ -25,6 +25,7 @@ from test_state import LIGHT
 from tiny_project import ball, plane
 
 from splatgraft.cli import main
+from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.gaussians import concatenate
 from splatgraft.editor.page.page import Page
 from splatgraft.editor.page.photo_clicks import PhotoView
@@ -86,6 +87,24 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
     window.until(lambda: difference(window, first) > 6, what="another view")
     second = picture_of(window)
     window.until(lambda: difference(window, second) < 3, what="the picture of the new view")
+    # F turns to the object, Home goes back to the first view
+    camera, session = page.context.guarded.editing().camera, page.context.require_session()
+    placed = session.objects()[0].target_from_object.gaussians(session.placeable_object(0).gaussians)
+    middle = bounding_sphere(placed).center.numpy()
+    window.page.keyboard.press("f")
+    window.until(lambda: float(np.abs(camera.look_at - middle).max()) < 1e-3, what="the view turned to the object")
+    window.page.keyboard.press("Home")
+    begun = page.context.cameras()[0].centers[0].numpy()
+    window.until(lambda: float(np.abs(camera.position - begun).max()) < 1e-3, what="the first view again")
+    # what flies the camera does nothing else
+    count = len(session.objects())
+    window.page.keyboard.press("d")
+    window.page.keyboard.press("s")
+    window.page.keyboard.press("Control+d")
+    window.until(lambda: len(session.objects()) == count + 1, what="a second object")
+    assert not page.phases["Place"]._snap.value
+    window.page.keyboard.press("Control+z")
+    window.until(lambda: len(session.objects()) == count, what="one object again")
     # without the canvas the window shows splats, which have one colour per Gaussian and no light
     window.check("Draw on the canvas", False)
     window.until(lambda: difference(window, second) > 3, what="splats")
@@ -319,7 +338,23 @@ def test_controls_fit_and_the_scene_is_seen_at_the_sizes_of_a_desktop_a_laptop_a
     assert window.unknown_errors() == []
 
 
-KEYS = ("g", "d", "b", "s", "Delete", "Escape", "ArrowLeft", "ArrowRight", "Control+z", "Control+Shift+z", "Tab")
+KEYS = (
+    "g",
+    "d",
+    "Control+d",
+    "b",
+    "s",
+    "Shift+S",
+    "f",
+    "Home",
+    "Delete",
+    "Escape",
+    "ArrowLeft",
+    "ArrowRight",
+    "Control+z",
+    "Control+Shift+z",
+    "Tab",
+)
 TEXTS = ("0", "-1", "1e30", "nan", "", "0.5", "-", "../../..", "/dev/null", "<b>x</b>", "\u0000", "9" * 400)
 
 

@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import viser
 
+from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.editor.page.opening import View, look_through, typical_distance
 from splatgraft.editor.page.scene_view import SceneView
@@ -195,6 +197,17 @@ class PageContext:
             half_height = camera.height / (2 * float(camera.intrinsics[0, 1, 1]))
             pose, aspect = camera.world_from_camera[0].double().numpy(), camera.width / camera.height
             look_through(window, View(pose, self.scene_scale(), half_height, aspect))
+
+    def frame(self, window: viser.ClientHandle | None, sphere: BoundingSphere) -> None:
+        """Let a window look at a sphere, so that it fills two thirds of the height, from the direction that it has."""
+        if window is None:
+            return
+        camera, center = window.camera, sphere.center.double().numpy()
+        away = np.asarray(camera.position) - np.asarray(camera.look_at)
+        distance = 1.5 * sphere.radius / np.sin(min(camera.fov, camera.fov * camera.aspect) / 2)
+        with window.atomic():
+            camera.position = center + away / max(float(np.linalg.norm(away)), 1e-9) * distance
+            camera.look_at = center
 
     def show_target(self) -> bool:
         """Show the target and the placed objects in the 3D view, or a sample of a target that is being read.

@@ -8,6 +8,8 @@ from typing import Any
 
 import viser
 
+from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.gaussians import concatenate
 from splatgraft.editor.page.context import HISTORY_ORDER, PageContext, Phase, note
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.light_phase import LightPhase
@@ -80,6 +82,8 @@ class Page:
         redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
         context.on(self._phase_buttons, lambda: self.show_phase(self._phase_buttons.value.removeprefix(_CURRENT_MARK)))
         context.on(self._history, lambda: self._undo() if self._history.value == "Undo" else self._redo())
+        context.on(gui.add_command("Look at the object", hotkey="F"), self._frame_object)
+        context.on(gui.add_command("Back to the first view", hotkey="home"), self._first_view)
         context.on(undo, self._undo)
         context.on(redo, self._redo)
         if opening is not None:
@@ -211,6 +215,28 @@ class Page:
             with window.atomic():
                 window.camera.up_direction = view[2]
                 window.camera.position, window.camera.look_at, window.camera.fov = view[0], view[1], view[3]
+
+    def _frame_object(self) -> None:
+        """Turn the editing window's view to the object, as large as it fits, from the direction that it has."""
+        context, session = self.context, self.context.require_session()
+        if context.phase == "Select":
+            which = session.selection()
+            scene = None if which is None else session.scenes.gaussians(session.files.source_scene).select(which)
+        else:
+            objects = session.objects()
+            parts = [
+                item.target_from_object.gaussians(session.placeable_object(i).gaussians)
+                for i, item in enumerate(objects)
+            ]
+            scene = concatenate(parts) if parts else None
+        if scene is None or not scene.count:
+            raise ValueError("look at the object: expected one that is cut out or placed, found none")
+        context.frame(context.guarded.editing(), bounding_sphere(scene))
+
+    def _first_view(self) -> None:
+        cameras = self.context.cameras()
+        if cameras is not None:
+            self.context.look_through(self.context.guarded.editing(), cameras[0])
 
     # polling of files and jobs
 

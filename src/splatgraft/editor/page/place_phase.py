@@ -62,7 +62,7 @@ class PlacePhase(Phase):
         self._snap = gui.add_checkbox(
             "Snap",
             False,
-            hint=f"A drag turns in steps of {SNAP_DEGREES:.0f} degrees and ends on a near surface (key S)",
+            hint=f"A drag turns in steps of {SNAP_DEGREES:.0f} degrees and ends on a near surface (Shift+S)",
         )
         self._object_buttons = context.on(gui.add_button_group("Object ", ("Duplicate", "Delete")), self._object_button)
         with gui.add_folder("Another object", expand_by_default=False):
@@ -81,9 +81,10 @@ class PlacePhase(Phase):
         context.on(self._add, lambda: self._add_file(parse_path(self._path.value)))
         context.on(self._erase, self._erase_box)
         self._add_key("Drop to the surface", "G", lambda: self._apply_operation("Drop"))
-        self._add_key("Duplicate the object", "D", self._duplicate)
+        self._add_key("Duplicate the object", "D", self._duplicate, modifier="cmd/ctrl")
         self._add_key("Delete the object", "delete", self._delete)
-        self._add_key("Snap on or off", "S", self._toggle_snap)
+        # held without a modifier, S and D fly the camera
+        self._add_key("Snap on or off", "S", self._toggle_snap, modifier="shift")
 
     def leave(self) -> None:
         """Hide the handles."""
@@ -130,8 +131,8 @@ class PlacePhase(Phase):
         self._erase.disabled = not self._show_box.value
         self._restore.disabled = session.state.erased is None
 
-    def _add_key(self, label: str, key: Any, work: Callable[[], object]) -> None:
-        command = self._context.gui.add_command(label, hotkey=key)
+    def _add_key(self, label: str, key: Any, work: Callable[[], object], *, modifier: Any = None) -> None:
+        command = self._context.gui.add_command(label, hotkey=key, modifier=modifier)
         self._context.on(command, lambda: work() if self._context.phase == "Place" else None)
 
     def _toggle_snap(self) -> None:
