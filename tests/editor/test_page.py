@@ -331,6 +331,11 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         assert session.undo()
         page.refresh()
         assert not run._stale.visible
+        placed = session.objects()[0].target_from_object
+        session.set_placement(0, replace(placed, translation=placed.translation + 0.01))
+        page.refresh()
+        assert "out of date (you moved the object)" in run._stale.content
+        assert "you moved the object" in run._steps.content
 
 
 def test_a_picture_that_was_begun_before_select_is_not_shown_there(page: Page) -> None:
@@ -342,8 +347,8 @@ def test_a_picture_that_was_begun_before_select_is_not_shown_there(page: Page) -
         request, window=window, camera=request.camera.resized(0.2), left="Target alone", right="Target alone"
     )
     page.preview._is_on_canvas = True
-    page.preview._draw_once(late, note="", stage="final")
+    page.preview._draw_once(late, note="", stage="full quality")
     assert page.preview.canvas.is_shown
     page.show_phase("Select")
-    page.preview._draw_once(late, note="", stage="final")
+    page.preview._draw_once(late, note="", stage="full quality")
     assert not page.preview.canvas.is_shown

@@ -187,3 +187,22 @@ def _has_no_photos(flow: Flow, side: Side) -> bool:
 def _rendered_views(flow: Flow, side: Side) -> RenderedViews:
     step = flow.steps[f"{side}/capture"]
     return RenderedViews(step.look.up, step.look.look == "within") if isinstance(step, Capture) else RenderedViews()
+
+
+_EDITS = {
+    "placement.json": "you moved the object",
+    "erased.npy": "you erased part of the place",
+    "corrections.npy": "you changed the selection",
+    "prompts.json": "you clicked in the photos",
+    "light.json": "you changed the light",
+}
+
+
+def in_words(step: str, reason: str) -> str:
+    """Why a step is stale, as its user would say it; other reasons as they are."""
+    # `compose` finds a place from the cameras until there is one by hand
+    if step == "compose" and reason.partition(":")[0] in ("cameras", "placement"):
+        return _EDITS["placement.json"]
+    if reason.startswith("waits for "):
+        return f"after {reason.removeprefix('waits for ')}"
+    return next((words for file, words in _EDITS.items() if f": {file} changed" in reason), reason)

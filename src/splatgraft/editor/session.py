@@ -16,7 +16,7 @@ from splatgraft.editor.history import History, StateStore
 from splatgraft.editor.jobs import Jobs
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.placement import ObjectSize, PlaceableObject
-from splatgraft.editor.project import PROBLEM, Project, ProjectFiles, RenderedViews
+from splatgraft.editor.project import PROBLEM, Project, ProjectFiles, RenderedViews, in_words
 from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState, check_height_cm, check_state
@@ -257,7 +257,10 @@ class Session:
         name, reason = step, found[step]
         while reason is not None and (before := reason.removeprefix("waits for ")) in found and before != reason:
             name, reason = before, found[before]
-        return None if reason is None else f"{name}: {reason}"
+        if reason is None:
+            return None
+        words = in_words(name, reason)
+        return words if words != reason else f"{name}: {reason}"
 
 
 def stamps_of(project: Path) -> Stamps:

@@ -289,7 +289,7 @@ class PreviewPanel:
             self._draw_once(coarse, note=note, stage="coarse")
             if self._worker.superseded:
                 return
-        self._draw_once(request, note=note, stage=stage or ("draft" if request.draft else "final"))
+        self._draw_once(request, note=note, stage=stage or ("draft" if request.draft else "full quality"))
 
     def _draw_once(self, request: PictureRequest, *, note: str, stage: str) -> None:
         start = time.monotonic()

@@ -14,7 +14,7 @@ from splatgraft.editor.page.context import PageContext, Phase, note
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.page.server import FILES_PREFIX
-from splatgraft.editor.project import ExportPage
+from splatgraft.editor.project import ExportPage, in_words
 from splatgraft.exports.export import Layer
 from splatgraft.harmonization import HARMONIZERS
 from splatgraft.project.layout import EXPORTS_FOLDER, REPORT_FILE
@@ -60,7 +60,7 @@ class RunPhase(Phase):
         rows = []
         for name, reason in session.project.reasons().items():
             mark = "&#10003;" if reason is None else "&middot;"
-            why = f'<td style="opacity:.6">{html.escape(reason or "")}</td>'
+            why = f'<td style="opacity:.6">{html.escape(in_words(name, reason or ""))}</td>'
             rows.append(f'<tr><td style="width:1.4em">{mark}</td><td>{name}</td>{why}</tr>')
         self._steps.content = note(
             f"<table>{''.join(rows)}</table>{_command(session.project.run_words('consolidate'))}"
