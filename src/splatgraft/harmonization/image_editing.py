@@ -43,6 +43,8 @@ def load_editor(options: "EditOptions", context: HarmonizerContext) -> "ImageEdi
     Raises: ValueError where there is no such pipeline, or it does not take an image and a prompt.
     """
     model, on_cuda = str(options.model), context.device.type == "cuda"
+    if not Path(model).exists():
+        context.say(f"weights: {model} of the Hugging Face hub; its licence: https://huggingface.co/{model}")
     try:
         pipeline: Any = diffusers_library().DiffusionPipeline.from_pretrained(
             model, torch_dtype=torch.bfloat16 if on_cuda else torch.float32
