@@ -21,7 +21,8 @@ from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.editor.state_files import read_state
 from splatgraft.formats.metric_scale import MetricScale, read_scale, write_scale
-from splatgraft.relighting import LayerWeights
+from splatgraft.relighting import LayerWeights, Light, LightSource
+from splatgraft.relighting.light.light import fit_ambient
 
 
 def phase_of(page: Page, name: str) -> Any:
@@ -127,6 +128,25 @@ def test_the_object_s_height_is_shown_and_typed_in_centimetres(page: Page) -> No
     page.refresh()
     assert str(path) in size._note.content
     assert not size._height.visible
+
+
+def test_the_strength_of_a_source_stays_as_it_was_set(page: Page) -> None:
+    light, session = phase_of(page, "Light"), page.context.require_session()
+    suns = tuple(LightSource((0.0, 0.6, 0.8), (value,) * 3, name=name) for value, name in ((2.0, "sun"), (0.5, "lamp")))
+    session.change(replace(session.placed_state(), light=Light(sources=suns, ambient=fit_ambient(torch.ones(3)))))
+    page.refresh()
+    assert light._strength.value == 1
+    sends(light._strength, 3.0)
+    assert light._strength.value == 3
+    assert session.state.light is not None
+    assert session.state.light.sources[0].irradiance == pytest.approx((6.0, 6.0, 6.0))
+    # of what it was, not of what it is; nor is a dark source lost
+    sends(light._strength, 0.0)
+    sends(light._strength, 0.5)
+    assert session.state.light.sources[0].irradiance == pytest.approx((1.0, 1.0, 1.0))
+    assert session.state.light.sources[1] == suns[1]
+    sends(light._source_choice, "2: lamp")
+    assert light._strength.value == 1
 
 
 def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(page: Page) -> None:

@@ -32,6 +32,7 @@ _LAYERS = (
     ("gloss", "Gloss", (0.0, 2.0), "Reflections on the object; 1 is as computed"),
 )
 """Field of `LayerWeights`, label, range of the slider and hint."""
+Float3 = tuple[float, float, float]
 _NO_NAMES: tuple[str, ...] = ("1",)
 _MAX_SOURCES = 4
 _HANDLE_PX = 70.0
@@ -60,6 +61,10 @@ class LightPhase(Phase):
         self._reset = context.on(gui.add_button("Back to the estimate", color="gray"), self._reset_to_estimate)
         self._handle: viser.TransformControlsHandle | None = None
         self._dragged_light: Light | None = None
+        self._full: tuple[Float3, ...] = ()
+        """Irradiance of each source at a strength of 1: what it was before the slider changed it."""
+        self._scaled: tuple[LightSource, ...] | None = None
+        """The sources that the slider made last."""
         context.on(self._estimate_button, self._show_estimate)
         for slider in self._sliders.values():
             context.on(slider, self._set_weights)
@@ -91,6 +96,12 @@ class LightPhase(Phase):
         names = tuple(f"{i + 1}: {s.name}" for i, s in enumerate(light.sources[:_MAX_SOURCES]))
         if names and tuple(self._source_choice.options) != names:
             self._source_choice.options = names
+        if light.sources != self._scaled:
+            self._full, self._scaled = tuple(source.irradiance for source in light.sources), light.sources
+        if light.sources:
+            index = min(self._index(), len(light.sources) - 1)
+            now, full = max(light.sources[index].irradiance), max(self._full[index])
+            self._strength.value = round(now / full, 2) if full > 0 else 1.0
         described = light.describe(session.up())
         by = "Estimated: " if session.state.light is None else "" if SET_BY_HAND in described else "Set by hand: "
         self._text.content = note(html.escape(by + described), kind="light")
@@ -127,11 +138,10 @@ class LightPhase(Phase):
         if light is None:
             return
         index, factor = self._index(), float(self._strength.value)
-        source = light.sources[index]
-        r, g, b = (factor * value for value in source.irradiance)
-        edited = _with_source(light, index, replace(source, irradiance=(r, g, b)))
+        r, g, b = (factor * value for value in self._full[index])
+        edited = _with_source(light, index, replace(light.sources[index], irradiance=(r, g, b)))
+        self._scaled = edited.sources
         session.change(replace(session.placed_state(), light=edited))
-        self._strength.value = 1.0
 
     # arrows
 
