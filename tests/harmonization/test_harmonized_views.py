@@ -63,7 +63,7 @@ def test_the_method_is_a_sub_command_and_its_old_form_as_an_option_is_understood
     assert [read_rgb(path).shape for path in sorted((tmp_path / "new" / "images").iterdir())][2] == (16, 32, 3)
     assert len(list((tmp_path / "new" / "confidence").iterdir())) == 4
     assert main(["harmonize", str(views), "--method=magic"]) == 2
-    assert "--method: expected one of compact, flux" in capsys.readouterr().err
+    assert "--method: expected one of compact, edit, flux" in capsys.readouterr().err
     assert main(["harmonize", "compact", str(views), "--strength", "2"]) == 2
     assert "--strength: expected a number from 0 to 1, found 2.0" in capsys.readouterr().err
 

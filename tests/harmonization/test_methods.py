@@ -80,5 +80,5 @@ def test_all_views_are_harmonised_as_each_alone(name: str, has_confidence: bool)
 
 
 def test_names_that_there_are_not_are_refused_with_those_that_there_are() -> None:
-    with pytest.raises(ValueError, match="expected one of compact, flux, none, found 'magic'"):
+    with pytest.raises(ValueError, match="expected one of compact, edit, flux, none, found 'magic'"):
         harmonize([], "magic")
