@@ -4,8 +4,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from splatgraft.commands.steps import harmonize
-from splatgraft.commands.steps.consolidate import Consolidate
+from splatgraft.commands.steps import consolidate, harmonize
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
 from splatgraft.folders.composite_folder import placement_files, read_composite
@@ -39,10 +38,11 @@ class Harmonize(harmonize.Harmonize):
 
 
 @dataclass(frozen=True)
-class ConsolidateForBenchmark(Consolidate):
+class Consolidate(consolidate.Consolidate):
     """The step with updates by the methods of other projects too."""
 
     harmonizer: HarmonizerOptions = field(default_factory=NoneOptions)
+    """The method of the views, which updates use again."""
 
     def harmonizer_options(self) -> HarmonizerOptions:
         """The method of the views."""
@@ -179,7 +179,7 @@ def run_method(
     harmonized = scene.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
     step = Harmonize(views, harmonized, options, device=settings.device)
     seconds["harmonize"] = perform_if_stale(step, console)
-    step = ConsolidateForBenchmark(
+    step = Consolidate(
         prior, views, harmonized, result, lpips_weights=settings.weights, device=settings.device, harmonizer=options
     )
     if method.loss.startswith("paper"):
