@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.consolidation import ConsolidateOptions, consolidate
+from splatgraft.core.contact import flatten_contact_layers
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear, write_image
@@ -63,6 +64,8 @@ def _with_reflections(scene: ExamScene) -> ReflectiveScene:
     taken = source.select(is_object)
     moved = replace(placed, gaussians=taken.gaussians).in_target()
     target = fit_reflections(composite.target.select(~composite.erased), scene.photos["target"])
+    # as in a composite: what the object stands on does not cover its foot
+    target = replace(target, gaussians=flatten_contact_layers(target.gaussians, [moved]))
     return insert(target, [replace(taken, gaussians=moved)])
 
 

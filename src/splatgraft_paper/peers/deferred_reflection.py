@@ -8,7 +8,7 @@ colours; the shortest axis is its normal. Blended strength R and normal N of a p
 The paper extends it to insertion: the object is cut out and shown under the environment of the target, which is fitted
 to the target's own photographs. No shadow is cast. What differs from the publication: the start is a finished
 reconstruction, whose number of Gaussians stays, so its resets of opacity, which go with densification, are left out;
-the map is a panorama instead of a cube; rates are raised for shorter runs as in `reconstruction`.
+the map is a panorama instead of a cube; rates of all else are raised for shorter runs as in `reconstruction`.
 """
 
 import math
@@ -142,10 +142,10 @@ def fit_reflections(
     own |= {"first": own["sh"][:, :1].contiguous(), "higher": own.pop("sh")[:, 1:].contiguous()}
     leaves = {name: tensor.requires_grad_() for name, tensor in own.items()}
     raised = min((_PUBLISHED_STEPS / options.steps) ** _SHORT_POWER, _SHORT_MOST)
-    rates = _RATES | {"first": _RATES["sh"], "higher": _RATES["sh"] * _HIGHER_BANDS}
-    adam = torch.optim.Adam(
-        [{"params": [leaf], "lr": raised * rates[name]} for name, leaf in leaves.items()], eps=1e-15
-    )
+    rates = {name: raised * rate for name, rate in _RATES.items()}
+    # not raised: Adam's steps are as long where no strength reaches and the gradient is all but 0
+    rates |= {"environment": _RATES["environment"], "first": rates["sh"], "higher": rates["sh"] * _HIGHER_BANDS}
+    adam = torch.optim.Adam([{"params": [leaf], "lr": rates[name]} for name, leaf in leaves.items()], eps=1e-15)
     generator = torch.Generator().manual_seed(options.seed)
     every = round(_PROPAGATE_EVERY / raised)
     images = [photos.image(index) for index in range(len(photos))]
