@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from splatgraft.cli import main
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft_paper.synthesis import pairs
+from splatgraft_paper.synthesis.jobs import RenderWorkers
 
 
 def write_sample(folder, seed=0):
@@ -63,3 +65,20 @@ def test_broken_manifest_line_is_named(tmp_path):
     (tmp_path / "manifest.jsonl").write_text('{"folder": "a"}\n')
     with pytest.raises(ValueError, match=r"manifest.jsonl, line 1: expected folder, camera"):
         pairs.read_manifest(tmp_path)
+
+
+def test_the_paper_s_amount_is_1900_targets_and_a_little_over_51000_composites_and_its_hours_are_said_first(
+    tmp_path, monkeypatch, capsys
+):
+    def nothing(*_):
+        raise ValueError("stopped before anything is rendered")
+
+    monkeypatch.setattr(RenderWorkers, "python", nothing)
+    assert main(["paper", "synth", "pairs", str(tmp_path / "out"), "--paper", "--lights", "1"]) == 2
+    said = capsys.readouterr().err
+    assert "pairs: 1,900 targets, 51,300 composites (the paper: 1,900 and 51,000, --paper); about " in said
+    assert main(["paper", "synth", "pairs", str(tmp_path / "out")]) == 2
+    assert "pairs: 600 targets, 1,800 composites" in capsys.readouterr().err
+    # Sec. 5.2: 704x496 with 128 samples, of which one picture of a room takes 336 CPU seconds
+    plan = pairs.PairPlan(objects=2, lights=0)
+    assert plan.cpu_seconds == pytest.approx(15 * 336, rel=0.02)
