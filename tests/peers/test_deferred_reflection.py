@@ -1,7 +1,5 @@
 """3DGS-DR against a mirror ball that is known in closed form: its environment, and its look under another one."""
 
-import math
-
 import pytest
 import torch
 from shapes import ring, surfels
@@ -11,13 +9,13 @@ from splatgraft.core.image_metrics import psnr
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.rendering import render
+from splatgraft_paper.benchmark.true_light import panorama_pixels, sample_panorama
 from splatgraft_paper.peers.deferred_reflection import (
     FitOptions,
     ReflectiveScene,
     fit_reflections,
     insert,
     pixel_rays,
-    sample_panorama,
 )
 
 RADIUS = 0.5
@@ -45,11 +43,7 @@ def mirror(camera, environment):
 
 
 def panorama_of(environment, rows=32):
-    polar = (torch.arange(rows) + 0.5) / rows * math.pi
-    around = (0.5 - (torch.arange(2 * rows) + 0.5) / (2 * rows)) * 2 * math.pi
-    polar, around = torch.meshgrid(polar, around, indexing="ij")
-    ring_of = polar.sin()
-    return environment(torch.stack([ring_of * around.cos(), ring_of * around.sin(), polar.cos()], -1))
+    return environment(panorama_pixels(torch.zeros(rows, 2 * rows, 3))[0])
 
 
 def ball(count=1500):

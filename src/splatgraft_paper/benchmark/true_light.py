@@ -60,7 +60,7 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
     panorama, peaks = _without_peaks(panorama)
     directions, solid_angles = cube_directions(_FACE)
     cube = Panorama(
-        radiance=_sampled(panorama, directions),
+        radiance=sample_panorama(panorama, directions),
         alpha=torch.ones(6, _FACE, _FACE),
         directions=directions,
         solid_angles=solid_angles,
@@ -124,15 +124,18 @@ def panorama_pixels(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h 
     return directions, flat * (math.pi / h) * (2 * math.pi / w)
 
 
-def _sampled(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, "6 s s 3"]) -> Float[Tensor, "6 s s 3"]:
-    x, y, z = directions.unbind(-1)
-    across, down = -torch.atan2(y, x) / math.pi, -torch.asin(z.clamp(-1, 1)) / (math.pi / 2)
+def sample_panorama(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """An equirectangular panorama at unit directions, interpolated linearly; differentiable in both."""
+    x, y, z = directions.reshape(-1, 3).unbind(-1)
+    across = -torch.atan2(y, x) / math.pi
+    # the arc sine of z, but its gradient is finite at the poles
+    down = -torch.atan2(z, torch.hypot(x, y).clamp_min(1e-6)) / (math.pi / 2)
     # one column repeated on both sides, so that the seam at -x is interpolated too
     wide = torch.cat([panorama[:, -1:], panorama, panorama[:, :1]], 1).permute(2, 0, 1)[None]
     across = across * panorama.shape[1] / (panorama.shape[1] + 2)
-    grid = torch.stack([across, down], -1).reshape(1, 6 * directions.shape[1], directions.shape[2], 2)
+    grid = torch.stack([across, down], -1)[None, None]
     values = torch.nn.functional.grid_sample(wide, grid, padding_mode="border", align_corners=False)
-    return values[0].permute(1, 2, 0).reshape(directions.shape).contiguous()
+    return values[0, :, 0].T.reshape(directions.shape).contiguous()
 
 
 def _bright_patches(panorama: Panorama) -> tuple[list[LightSource], Bool[Tensor, "6 s s"]]:

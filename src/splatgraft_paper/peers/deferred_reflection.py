@@ -25,7 +25,7 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.fitting import l1_dssim
 from splatgraft.rendering import render
-from splatgraft.runtime.progress import Progress, silent
+from splatgraft_paper.benchmark.true_light import sample_panorama
 
 _FIRST_STRENGTH = 1e-3
 _PUBLISHED_STEPS = 27_000
@@ -35,7 +35,7 @@ _RATES |= {"quaternions": 0.001}
 """Published learning rates; the centres stay, as they have converged."""
 _HIGHER_BANDS = 1 / 20
 _SHORT_POWER, _SHORT_MOST = 0.6, 8.0
-"""Exponent of the published number of steps over ours, the factor on all rates, and its bound (as `reconstruction`)."""
+"""Exponent of the published steps over ours, the factor on all rates but the environment's, and its bound."""
 _PROPAGATE_EVERY, _PROPAGATE_UNTIL = 1_000, 0.8
 """Steps at the published rates between two propagations of normals, and the share of all after which there are none."""
 _REFLECTS = 0.02
@@ -43,7 +43,7 @@ _REFLECTS = 0.02
 _WIDER, _OPAQUE = 1.5, 0.9
 """Factor on the two longer axes of reflective Gaussians, and least opacity of all, at each propagation."""
 _SABOTAGE = 0.4
-"""Largest change of band 0 of the others, in sRGB: their colours are spoilt so that they may turn to reflecting."""
+"""Largest change of the others' band 0: their colours are spoilt so that they may turn to reflecting."""
 
 
 @dataclass(frozen=True)
@@ -83,29 +83,7 @@ def insert(target: ReflectiveScene, objects: Sequence[ReflectiveScene]) -> Refle
 
 def pixel_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
     """Unit directions in the world from one camera through the centres of its pixels."""
-    k, pose = camera.intrinsics[0], camera.world_from_camera[0, :3, :3]
-    rows, columns = torch.meshgrid(
-        torch.arange(camera.height, device=k.device) + 0.5,
-        torch.arange(camera.width, device=k.device) + 0.5,
-        indexing="ij",
-    )
-    local = torch.stack([(columns - k[0, 2]) / k[0, 0], (rows - k[1, 2]) / k[1, 1], torch.ones_like(rows)], -1)
-    return F.normalize(local @ pose.T, dim=-1)
-
-
-def sample_panorama(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """The panorama at unit directions, interpolated linearly; differentiable in both."""
-    flat = directions.reshape(-1, 3)
-    horizontal = flat[:, :2].norm(dim=1).clamp_min(1e-6)
-    polar = torch.atan2(horizontal, flat[:, 2]) / math.pi
-    around = 0.5 - torch.atan2(flat[:, 1], flat[:, 0]) / (2 * math.pi)
-    # one column of the other side beyond each edge, where the panorama closes
-    wrapped = torch.cat([panorama[:, -1:], panorama, panorama[:, :1]], 1).permute(2, 0, 1)[None]
-    width = panorama.shape[1]
-    x = 2 * (around * width + 1) / (width + 2) - 1
-    grid = torch.stack([x, 2 * polar - 1], -1)[None, None]
-    found = F.grid_sample(wrapped, grid, padding_mode="border", align_corners=False)
-    return found[0, :, 0].T.reshape(directions.shape)
+    return F.normalize(camera.rays() @ camera.world_from_camera[0, :3, :3].T, dim=-1)
 
 
 @dataclass(frozen=True)
@@ -119,16 +97,13 @@ class FitOptions:
     seed: int = 0
 
 
-def fit_reflections(
-    start: Gaussians, photos: PosedImages, options: FitOptions = FitOptions(), *, progress: Progress = silent
-) -> ReflectiveScene:
+def fit_reflections(start: Gaussians, photos: PosedImages, options: FitOptions = FitOptions()) -> ReflectiveScene:
     """Fit strengths and an environment, beside colours, opacities and shapes, to the photographs of a scene.
 
     Args:
         start: The scene as it was reconstructed from the photographs, on the CPU; the number of Gaussians stays.
         photos: v posed images.
         options: Length and size.
-        progress: Called with steps done, steps in all and a short text.
 
     Raises:
         ValueError: The loss is not finite.
@@ -161,8 +136,6 @@ def fit_reflections(
         adam.step()
         if step and step % every == 0 and step < _PROPAGATE_UNTIL * options.steps:
             _propagate(leaves, generator)
-        if (step + 1) % 50 == 0 or step + 1 == options.steps:
-            progress(step + 1, options.steps, f"loss {float(loss.detach()):.4f}")
     with torch.no_grad():
         found = _scene(start, leaves)
         gaussians = found.gaussians.map(Tensor.detach)

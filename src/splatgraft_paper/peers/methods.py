@@ -14,6 +14,7 @@ from torch import Tensor
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.harmonization import HARMONIZERS, HarmonizerContext, HarmonizerOptions
 from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerInputs
+from splatgraft.runtime.hub import REPOSITORIES
 from splatgraft_paper.peers.image_editing import ImageEditingOptions
 from splatgraft_paper.peers.mv_colight import MVCoLightOptions
 
@@ -81,7 +82,7 @@ class LbmOptions:
 
     name: ClassVar[str] = "lbm"
 
-    weights: str = "jasperai/LBM_relighting"
+    weights: str = REPOSITORIES["lbm"]
     """Folder or hub id of the weights."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
